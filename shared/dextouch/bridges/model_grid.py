@@ -88,35 +88,25 @@ def store_episode(
         ConflictError: the id exists.
         NonFiniteError: NaN or infinity among the numbers.
     """
-    rate_hz = attributes.model_rate_hz
     with store.writer(attributes=attributes) as writer:
+
+        def add(name: str, **properties: object) -> None:
+            known = {"name": name, "nominal_rate_hz": attributes.model_rate_hz, **properties}
+            writer.add_stream(StreamDescriptor.model_validate(known))
+
         for name, found in episode.numbers.items():
             keep = slice(None) if found.keep is None else found.keep
-            writer.add_stream(
-                StreamDescriptor.model_validate(
-                    {
-                        "name": name,
-                        "kind": found.kind,
-                        "shape": found.values.shape[1:],
-                        "dtype": str(found.values.dtype),
-                        "unit": found.unit,
-                        "nominal_rate_hz": rate_hz,
-                        "frame": found.frame,
-                    }
-                )
-            )
+            shape, dtype = found.values.shape[1:], str(found.values.dtype)
+            add(name, kind=found.kind, shape=shape, dtype=dtype, unit=found.unit, frame=found.frame)
             writer.append(name, values=found.values[keep], t_ref_ns=episode.t_ref_ns[keep])
         for name, camera in episode.cameras.items():
-            writer.add_stream(
-                StreamDescriptor(
-                    name=name,
-                    kind="image",
-                    shape=camera.shape,
-                    dtype="uint8",
-                    unit=images,
-                    nominal_rate_hz=rate_hz,
-                    frame=camera.frame,
-                )
+            add(
+                name,
+                kind="image",
+                shape=camera.shape,
+                dtype="uint8",
+                unit=images,
+                frame=camera.frame,
             )
             _store_images(writer, name, camera, images)
 

@@ -47,6 +47,17 @@ class GroupReader(Generic[A]):
         """The stamps by which a stream is sorted, int64 [n], read-only."""
         return self._column(self._stamps[self._stream(name).name])
 
+    def values(self, name: str, start: int, stop: int) -> np.ndarray:
+        """Values of samples start … stop−1; images come decoded.
+
+        Raises:
+            UnknownNameError: no such stream.
+            InvalidInputError: samples outside the stream.
+            CorruptDataError: damaged bytes.
+        """
+        self._check_span("samples", name, start, stop)
+        return self._values(name, start, stop)
+
     def images(
         self,
         name: str,

@@ -82,17 +82,6 @@ class RecordingReader(GroupReader[RecordingAttributes]):
         )
         return SampleBatch(t_host_ns, t_device_ns, sequence, np.empty((len(t_host_ns), 0)))
 
-    def values(self, name: str, start: int, stop: int) -> np.ndarray:
-        """Values of samples start … stop−1; images come decoded.
-
-        Raises:
-            UnknownNameError: no such stream.
-            InvalidInputError: samples outside the stream.
-            CorruptDataError: damaged bytes.
-        """
-        self._check_span("samples", name, start, stop)
-        return self._values(name, start, stop)
-
 
 class EpisodeReader(GroupReader[EpisodeAttributes]):
     """Reader of an episode: streams on one reference clock, actions on the model grid."""

@@ -15,8 +15,7 @@ from dextouch.bridges.lerobot import (
     export_lerobot,
     import_lerobot,
     source,
-    tables,
-    video_reader,
+    video,
 )
 from dextouch.bridges.lerobot.layout import confined, fill_path
 from dextouch.episodes import EpisodeStore
@@ -262,9 +261,9 @@ def test_a_video_with_fewer_images_is_refused(folder, store, tmp_path):
     [
         (source, "MAX_INFO_BYTES", 100, CorruptDataError),
         (source, "MAX_EPISODE_FRAMES", 8, CorruptDataError),
-        (tables, "MAX_TABLE_ROWS", 8, LimitExceededError),
-        (tables, "MAX_TABLE_BYTES", 1000, LimitExceededError),
-        (video_reader, "MAX_SIDE_PX", 63, LimitExceededError),
+        (source, "MAX_TABLE_ROWS", 8, LimitExceededError),
+        (source, "MAX_TABLE_BYTES", 1000, LimitExceededError),
+        (video, "MAX_SIDE_PX", 63, LimitExceededError),
     ],
 )
 def test_sizes_are_bounded(folder, store, monkeypatch, module, limit, value, error):
@@ -319,15 +318,15 @@ def test_any_flipped_byte_of_the_metadata_is_survived(folder, store):
 def test_a_flipped_byte_of_a_video_is_survived(folder):
     rng = np.random.default_rng(12)
     path = folder / VIDEO
-    span = video_reader.VideoSpan(path, 0.0, 9, 15, (48, 64, 3))
+    span = video.VideoSpan(path, 0.0, 9, 15, (48, 64, 3))
     whole, refused = path.read_bytes(), 0
     for place in rng.integers(0, len(whole), 40):
         damaged = bytearray(whole)
         damaged[place] ^= int(rng.integers(1, 256))
         path.write_bytes(damaged)
         try:
-            video_reader.read_units(span)
-            list(video_reader.read_images(span))
+            video.read_units(span)
+            list(video.read_images(span))
         except DexTouchError:
             refused += 1
     assert refused

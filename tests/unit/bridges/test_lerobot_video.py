@@ -9,8 +9,7 @@ import pytest
 from dextouch.bridges.lerobot import ExportOptions, ImportOptions, export_lerobot, import_lerobot
 from dextouch.bridges.lerobot.exporting import decode_entry_points, encode_images, stored_units
 from dextouch.bridges.lerobot.rows import frames_of
-from dextouch.bridges.lerobot.video import CameraVideo
-from dextouch.bridges.lerobot.video_reader import VideoSpan, read_images, read_units
+from dextouch.bridges.lerobot.video import CameraVideo, VideoSpan, read_images, read_units
 from dextouch.episodes import EpisodeStore, VideoSettings, is_keyframe
 from dextouch.errors import CorruptDataError, ShapeError
 from tests.unit.bridges.lerobot_episodes import SIZE_PX, make_episode, pictures

@@ -3,6 +3,7 @@
 import json
 import tracemalloc
 import zipfile
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -209,7 +210,7 @@ def test_a_storage_chunk_is_unfolded_no_further_than_its_size(store, tmp_path):
     export_umi([write_episode(store, "all", num_steps=5)], path)
     bomb = Zstd().encode(b"\0" * (1 << 26))
     rewritten(path, lambda e: e.update({"data/camera0_rgb/3.0.0.0": bomb}))
-    with ZarrZipReader(path) as archive:
+    with closing(ZarrZipReader(path)) as archive:
         archive.metadata("data/camera0_rgb")
         tracemalloc.start()
         try:
@@ -270,13 +271,13 @@ def test_a_truncated_or_flipped_file_never_gives_wrong_numbers(store, other, tmp
 def test_rows_across_storage_chunks_and_empty_slices(tmp_path):
     rows = np.arange(30, dtype=np.int64).reshape(10, 3)
     writer = ZarrZipWriter(tmp_path / "x.zip")
-    writer.add_array("data/x", dtype="int64", row_shape=(3,), chunk_rows=4)
     for start in (0, 1, 7):
-        writer.append("data/x", rows[start : {0: 1, 1: 7, 7: 10}[start]])
-    with pytest.raises(InvalidInputError, match="data/x"):
-        writer.append("data/x", np.zeros((2, 4)))
+        writer.append("data/x", rows[start : {0: 1, 1: 7, 7: 10}[start]], chunk_rows=4)
+    for wrong in (np.zeros((2, 4), dtype=np.int64), np.zeros((2, 3))):
+        with pytest.raises(InvalidInputError, match="data/x"):
+            writer.append("data/x", wrong)
     writer.finish({})
-    with ZarrZipReader(tmp_path / "x.zip") as archive:
+    with closing(ZarrZipReader(tmp_path / "x.zip")) as archive:
         for start, stop in ((0, 10), (3, 9), (4, 8), (5, 5), (10, 10)):
             np.testing.assert_array_equal(archive.read("data/x", start, stop), rows[start:stop])
         with pytest.raises(InvalidInputError):

@@ -1,24 +1,69 @@
 """Writer of a LeRobotDataset v3.0: data and video files, episode table, metadata and card."""
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.rows import EpisodeFrames
-from dextouch.bridges.lerobot.sidecar import Sidecar, write_sidecar
 from dextouch.bridges.lerobot.statistics import Statistics, combine, value_statistics
-from dextouch.bridges.lerobot.tables import ParquetFiles, data_table, write_tasks
 from dextouch.bridges.lerobot.video import CameraVideo
 from dextouch.episodes import disk_errors
 from dextouch.errors import InvalidInputError
 
 # Rows of the table of episodes that are written together.
 ROWS_AT_ONCE: Final = 100
+
+
+def _data_table(features: layout.Features, columns: Mapping[str, np.ndarray]) -> pa.Table:
+    """Rows of the data files from columns [n, *shape].
+
+    A feature of shape [1] is a plain value, one of another axis a fixed list, one of several axes
+    lists of lists.
+    """
+    table = {}
+    for name, values in columns.items():
+        shape = [] if features[name]["shape"] == [1] else features[name]["shape"]
+        column = pa.array(np.asarray(values, dtype=features[name]["dtype"]).reshape(-1))
+        kind = column.type
+        for size in reversed(shape):
+            column = pa.FixedSizeListArray.from_arrays(column, size)
+            kind = pa.list_(kind, size if len(shape) == 1 else -1)
+        table[name] = column.cast(kind)
+    return pa.Table.from_pydict(table)
+
+
+class _ParquetFiles:
+    """Numbered parquet files of one kind; each table becomes a row group."""
+
+    def __init__(self, folder: Path, template: str, *, file_bytes: int = sys.maxsize) -> None:
+        self._folder, self._template, self._file_bytes = folder, template, file_bytes
+        self._path, self._number = folder, -1
+        self._writer: pq.ParquetWriter | None = None
+
+    def append(self, table: pa.Table) -> int:
+        """Write a table and return the number of its file."""
+        with disk_errors(f"write a table of {self._folder}"):
+            if self._writer is None or self._path.stat().st_size >= self._file_bytes:
+                self.close()
+                self._number += 1
+                self._path = layout.numbered_path(self._folder, self._template, self._number)
+                self._writer = pq.ParquetWriter(self._path, table.schema, compression="snappy")
+            self._writer.write_table(table)
+        return self._number
+
+    def close(self) -> None:
+        """Complete the file that is open."""
+        if self._writer is not None:
+            with disk_errors(f"complete {self._path}"):
+                self._writer.close()
+            self._writer = None
 
 
 class DatasetWriter:
@@ -53,8 +98,8 @@ class DatasetWriter:
         self._total: dict[str, Statistics] = {}
         with disk_errors(f"create {folder}"):
             folder.mkdir(parents=True)
-        self._data = ParquetFiles(folder, layout.DATA_PATH, file_bytes=layout.DATA_FILE_MB << 20)
-        self._episodes = ParquetFiles(folder, layout.EPISODES_PATH)
+        self._data = _ParquetFiles(folder, layout.DATA_PATH, file_bytes=layout.DATA_FILE_MB << 20)
+        self._episodes = _ParquetFiles(folder, layout.EPISODES_PATH)
         self._rows: list[dict[str, Any]] = []
         self._videos = {
             camera: CameraVideo(folder, layout.IMAGES + camera, fps=fps, shape=shape)
@@ -66,7 +111,7 @@ class DatasetWriter:
         frames: EpisodeFrames,
         videos: Mapping[str, Sequence[bytes]],
         image_statistics: Mapping[str, Statistics],
-        sidecar: Sidecar,
+        sidecar: layout.Sidecar,
     ) -> None:
         """Write one episode.
 
@@ -103,7 +148,7 @@ class DatasetWriter:
             row[f"{key}/from_timestamp"] = place.from_timestamp_s
             row[f"{key}/to_timestamp"] = place.to_timestamp_s
         columns = self._columns(frames, task_index)
-        file_number = self._data.append(data_table(self._features, columns))
+        file_number = self._data.append(_data_table(self._features, columns))
         row["data/chunk_index"], row["data/file_index"] = layout.file_place(file_number)
         row["dataset_from_index"] = self.num_frames
         row["dataset_to_index"] = self.num_frames + len(frames)
@@ -112,7 +157,8 @@ class DatasetWriter:
         for name, values in statistics.items():
             self._total[name] = combine(self._total.get(name), values)
             row.update({f"stats/{name}/{kind}": value.tolist() for kind, value in values.items()})
-        write_sidecar(self._folder, sidecar)
+        name = layout.SIDECAR_PATH.format(episode_index=sidecar.episode_index)
+        self._write(name, json.dumps(sidecar.model_dump(mode="json"), indent=2) + "\n")
         row["meta/episodes/chunk_index"] = row["meta/episodes/file_index"] = 0
         self._rows.append(row)
         if len(self._rows) == ROWS_AT_ONCE:
@@ -139,7 +185,7 @@ class DatasetWriter:
         }
         return {name: column for name, column in columns.items() if name in self._features}
 
-    def close_files(self) -> None:
+    def close(self) -> None:
         """Complete the data, video and episode files."""
         for video in self._videos.values():
             video.close()
@@ -153,7 +199,7 @@ class DatasetWriter:
             self._rows = []
 
     def finish(self, repo_id: str) -> None:
-        """Write the metadata, when the files are closed.
+        """Complete the files and write the metadata.
 
         Args:
             repo_id: name of the dataset, for its card.
@@ -161,15 +207,31 @@ class DatasetWriter:
         Raises:
             StorageError: the write failed.
         """
-        write_tasks(self._folder / layout.TASKS_FILE, list(self._tasks))
+        self.close()
+        self._write_tasks()
         statistics = {
             name: {kind: value.tolist() for kind, value in values.items()}
             for name, values in self._total.items()
         }
-        self._write_json(layout.STATS_FILE, statistics)
-        self._write_json(layout.INFO_FILE, self._info())
-        with disk_errors(f"write {layout.CARD_FILE}"):
-            (self._folder / layout.CARD_FILE).write_text(_card(repo_id))
+        for name, content in ((layout.STATS_FILE, statistics), (layout.INFO_FILE, self._info())):
+            self._write(name, json.dumps(content, indent=4, allow_nan=False) + "\n")
+        self._write(layout.CARD_FILE, _card(repo_id))
+
+    def _write_tasks(self) -> None:
+        """A table whose pandas index is the task's text."""
+        kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "str")}
+        described = [
+            {"name": n, "field_name": n, "pandas_type": p, "numpy_type": d, "metadata": None}
+            for n, (p, d) in kinds.items()
+        ]
+        header = {"index_columns": ["task"], "column_indexes": [], "columns": described}
+        numbers = pa.array(np.arange(len(self._tasks), dtype=np.int64))
+        texts = pa.array(list(self._tasks), pa.string())
+        table = pa.Table.from_pydict({"task_index": numbers, "task": texts})
+        path = self._folder / layout.TASKS_FILE
+        with disk_errors(f"write {path}"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(header)}), path)
 
     def _info(self) -> dict[str, Any]:
         return {
@@ -188,11 +250,11 @@ class DatasetWriter:
             "splits": {"train": f"0:{self.num_episodes}"},
         }
 
-    def _write_json(self, name: str, content: object) -> None:
+    def _write(self, name: str, text: str) -> None:
         path = self._folder / name
         with disk_errors(f"write {path}"):
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps(content, indent=4, allow_nan=False) + "\n")
+            path.write_text(text)
 
 
 def _card(repo_id: str) -> str:

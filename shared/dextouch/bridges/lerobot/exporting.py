@@ -4,6 +4,7 @@ import re
 import shutil
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,9 +13,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dextouch.bridges.lerobot.dataset import DatasetWriter
-from dextouch.bridges.lerobot.layout import IMAGES
+from dextouch.bridges.lerobot.layout import IMAGES, Sidecar
 from dextouch.bridges.lerobot.rows import frames_of, images_at
-from dextouch.bridges.lerobot.sidecar import Sidecar
 from dextouch.bridges.lerobot.statistics import Statistics, image_statistics, sample_places
 from dextouch.episodes import (
     FULL_FORM,
@@ -81,32 +81,20 @@ def export_lerobot(
     if folder.exists():
         raise ConflictError(f"{folder}: exists already; choose another folder")
     partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.partial")
-    try:
-        num_frames = _write(readers, partial, repo_id, options)
-        with disk_errors(f"complete {folder}"):
-            partial.rename(folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    return num_frames
-
-
-def _write(
-    readers: Iterable[EpisodeReader], folder: Path, repo_id: str, options: ExportOptions
-) -> int:
     dataset: DatasetWriter | None = None
-    cameras: tuple[str, ...] = ()
-    try:
+    with ExitStack() as stack:
+        stack.callback(shutil.rmtree, partial, ignore_errors=True)
         for reader in readers:
             if dataset is None:
                 cameras = options.cameras or _cameras_of(reader)
-                dataset = _new_dataset(reader, folder, cameras, options)
+                dataset = _new_dataset(reader, partial, cameras, options)
+                stack.callback(dataset.close)
             _add_episode(dataset, reader, cameras, options)
-    finally:
-        if dataset is not None:
-            dataset.close_files()
-    if dataset is None:
-        raise InvalidInputError("export to LeRobot: got no episode, expected at least one")
-    dataset.finish(repo_id)
+        if dataset is None:
+            raise InvalidInputError("export to LeRobot: got no episode, expected at least one")
+        dataset.finish(repo_id)
+        with disk_errors(f"complete {folder}"):
+            partial.rename(folder)
     return dataset.num_frames
 
 
@@ -161,16 +149,13 @@ def _add_episode(
     how: dict[str, Literal["remuxed", "encoded"]] = {}
     where = f"episode {reader.attributes.episode_id!r}"
     for camera in cameras:
-        stored = stored_units(reader, camera, frames.image_indices[camera])
-        how[camera] = "encoded" if stored is None else "remuxed"
-        videos[camera] = (
-            stored
-            if stored is not None
-            else encode_images(
-                images_at(reader, camera, frames.image_indices[camera]), dataset.fps, options
-            )
-        )
-        entries = [data for data in videos[camera] if is_keyframe(data)]
+        indices = frames.image_indices[camera]
+        units, how[camera] = stored_units(reader, camera, indices), "remuxed"
+        if units is None:
+            images, how[camera] = images_at(reader, camera, indices), "encoded"
+            units = encode_images(images, dataset.fps, options)
+        videos[camera] = units
+        entries = [data for data in units if is_keyframe(data)]
         sampled = [entries[place] for place in sample_places(len(entries))]
         statistics[IMAGES + camera] = image_statistics(
             decode_entry_points(sampled, reader.streams[camera].shape, where=f"{where}: {camera!r}")

@@ -4,29 +4,56 @@ import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Int64
 from pydantic import ValidationError
 
-from dextouch.bridges.lerobot.content import content_of
-from dextouch.bridges.lerobot.mapping import FeatureMap, map_features
+from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.rows import WORLD
-from dextouch.bridges.lerobot.sidecar import Sidecar, read_sidecar
-from dextouch.bridges.lerobot.source import EpisodeEntry, LeRobotFolder
-from dextouch.bridges.model_grid import ImageUnit, store_episode
+from dextouch.bridges.lerobot.source import DatasetInfo, EpisodeEntry, FeatureInfo, LeRobotFolder
+from dextouch.bridges.lerobot.video import read_images, read_units
+from dextouch.bridges.model_grid import (
+    GridEpisode,
+    GridImages,
+    GridNumbers,
+    ImageUnit,
+    store_episode,
+    tactile_numbers,
+)
 from dextouch.episodes import EpisodeStore, disk_errors
-from dextouch.errors import ConflictError, InvalidInputError
-from dextouch.hands.actions import AnchorPoses
+from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, UnknownNameError
+from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import Domain, EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
+from dextouch.tactile.layout import NUM_TAXELS
+
+HEAD = "camera_head"
+_CAMERA_NAME = re.compile(r"camera_[a-z0-9_]{1,57}")
+# Usual feature of a role, and the shape of its rows.
+_ROLES = {
+    "action": (layout.ACTION, (ACTION_DIM,)),
+    "state": (layout.STATE, (ACTION_DIM,)),
+    "tactile": (layout.TACTILE, (2, NUM_TAXELS)),
+}
+# What our own exports keep beside LeRobot's features; None: one number a camera.
+_OURS: dict[str, tuple[str, tuple[int, ...] | None]] = {
+    layout.MEASURED: ("float32", (ACTION_DIM,)),
+    layout.VALID: ("bool", (2,)),
+    layout.STAMP: ("int64", (1,)),
+    layout.IMAGE_DT: ("int64", None),
+}
 
 
 @dataclass(frozen=True)
 class ImportOptions:
     """Options of an import: information that the dataset itself lacks.
 
-    `mapping`: our name → the dataset's feature. `id_prefix`: put before every id (needed when ids
-    exist already); `images`: the unit that images are stored in. Only for datasets of other origin:
-    `K_head` in pixels, `domain` and `task` (without it the dataset's own text).
+    `mapping`: our name → the dataset's feature, for features under other names: `action`, `state`,
+    `tactile` and cameras (`camera_head`, `camera_wrist_left`, …). `id_prefix`: put before every id
+    (needed when ids exist already); `images`: the unit that images are stored in. Only for datasets
+    of other origin: `K_head` in pixels, `domain` and `task` (without it the dataset's own text).
     """
 
     mapping: Mapping[str, str] = field(default_factory=dict)
@@ -54,21 +81,29 @@ def import_lerobot(
 
     Raises:
         NotFoundError: a file is missing.
-        InvalidInputError: another version of the format, or features that do not fit.
+        UnknownNameError: a mapping of an unknown name, or to a feature that the dataset lacks.
+        InvalidInputError: another version of the format, or features that do not fit; all are
+            listed, with what the dataset has.
         CorruptDataError: damaged or truncated files, or paths that lead out of the folder.
         LimitExceededError: larger than the limits of this reader.
         ConflictError: an id exists already.
     """
     source = LeRobotFolder(folder)
-    features = map_features(source.info, options.mapping)
+    features = _map_features(source.info, options.mapping)
     ids: list[str] = []
     for entry in source.episodes:
-        sidecar = read_sidecar(folder, entry.index)
-        episode, anchor = content_of(source, entry, features, sidecar)
+        sidecar = source.sidecar(entry)
+        episode, anchor = _content(source, entry, features, sidecar)
         if sidecar is None:
-            attributes = _foreign_attributes(source, entry, anchor, features, options)
+            changes = _foreign_attributes(source, entry, anchor, features, options)
         else:
-            attributes = _known_attributes(source, anchor, sidecar, options)
+            changes = _known_attributes(source, anchor, sidecar, options)
+        try:
+            attributes = EpisodeAttributes.model_validate(changes)
+        except ValidationError as error:
+            raise InvalidInputError(
+                f"import from LeRobot: the options make no episode ({error})"
+            ) from error
         if store.exists(attributes.episode_id):
             raise ConflictError(
                 f"episode {attributes.episode_id!r} exists already; give another id_prefix"
@@ -78,61 +113,208 @@ def import_lerobot(
     return ids
 
 
+@dataclass(frozen=True)
+class _FeatureMap:
+    """The dataset's features by role; None where it has none of that role."""
+
+    action: str
+    state: str | None
+    tactile: str | None
+    cameras: dict[str, str]
+
+
+def _map_features(info: DatasetInfo, names: Mapping[str, str]) -> _FeatureMap:
+    for ours, theirs in names.items():
+        if ours not in _ROLES and not _CAMERA_NAME.fullmatch(ours):
+            raise UnknownNameError("name of a mapping", ours, [*_ROLES, "camera_…"])
+        if theirs not in info.features:
+            raise UnknownNameError("feature of the dataset", theirs, list(info.features))
+    roles: dict[str, str] = {}
+    problems = []
+    for ours, (usual, shape) in _ROLES.items():
+        name = names.get(ours, usual)
+        got = info.features.get(name)
+        if got is not None and got.dtype in {"float32", "float64"} and got.numbers() == shape:
+            roles[ours] = name
+        elif ours == "action" or ours in names:
+            said = f"{name!r} is {_describe(got)}, expected float32 {[*shape]}" if got else ""
+            problems.append(f"{ours!r}: {said or f'no feature {name!r}'}")
+    cameras = _cameras(info, names)
+    if HEAD not in cameras:
+        problems.append(f"{HEAD!r}: no video feature {layout.IMAGES + HEAD!r}")
+    problems += [
+        f"{ours!r}: {name!r} is {_describe(info.features[name])}, expected video [h, w, 3]"
+        for ours, name in cameras.items()
+        if not info.features[name].is_video()
+    ]
+    if problems:
+        has = "; ".join(f"{name!r} {_describe(f)}" for name, f in info.features.items())
+        raise InvalidInputError(
+            f"LeRobot dataset does not fit: {'; '.join(problems)}. It has: {has}. Name the right "
+            "ones, for example mapping={'camera_head': 'observation.images.top'}",
+            missing=problems,
+        )
+    return _FeatureMap(roles["action"], roles.get("state"), roles.get("tactile"), cameras)
+
+
+def _cameras(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]:
+    """Cameras under our own names, and those given by the mapping."""
+    own = {
+        name.removeprefix(layout.IMAGES): name
+        for name, feature in info.features.items()
+        if name.startswith(layout.IMAGES)
+        and _CAMERA_NAME.fullmatch(name.removeprefix(layout.IMAGES))
+        and feature.dtype == "video"
+        and name not in names.values()
+    }
+    return own | {ours: theirs for ours, theirs in names.items() if ours not in _ROLES}
+
+
+def _describe(feature: FeatureInfo) -> str:
+    return f"{feature.dtype} {list(feature.shape)}"
+
+
+def _content(
+    source: LeRobotFolder,
+    entry: EpisodeEntry,
+    features: _FeatureMap,
+    sidecar: layout.Sidecar | None,
+) -> tuple[GridEpisode, AnchorPoses | None]:
+    """An episode's numbers and where its videos are.
+
+    Actions are relative to the measured poses of the first frame; these are returned where they are
+    not those that the dataset's description gives.
+    """
+    where = f"{source.folder}: episode {entry.index}"
+    columns = _columns(source, entry, features)
+    t_ns = columns.get(layout.STAMP)
+    if t_ns is None:
+        t_ns = np.rint(np.arange(entry.length) * (1e9 / source.info.fps))
+    t_ns = t_ns.astype(np.int64)
+    if (np.diff(t_ns) <= 0).any():
+        raise CorruptDataError(f"{where}: {layout.STAMP!r} does not rise from frame to frame")
+    measured, commanded, anchor = _actions(columns, features, sidecar, where)
+    numbers = {"action": GridNumbers("robot_state", "action", measured)}
+    if commanded is not None:
+        numbers["action_commanded"] = GridNumbers("robot_state", "action", commanded)
+    if features.tactile is not None:
+        valid = columns.get(layout.VALID, np.ones((entry.length, 2), dtype=bool))
+        kpa = columns[features.tactile].astype(np.float32)
+        numbers = tactile_numbers(kpa, valid.astype(bool)) | numbers
+    cameras = {}
+    for camera, key in features.cameras.items():
+        span = source.span(entry, key)
+        stamps = _image_stamps(source, key, t_ns, columns.get(layout.IMAGE_DT), where)
+        cameras[camera] = GridImages(
+            span.shape, stamps, partial(read_images, span), partial(read_units, span)
+        )
+    return GridEpisode(t_ns, numbers, cameras), anchor
+
+
+def _columns(
+    source: LeRobotFolder, entry: EpisodeEntry, features: _FeatureMap
+) -> dict[str, np.ndarray]:
+    wanted = [features.action, features.state, features.tactile]
+    for name, (dtype, shape) in _OURS.items():
+        feature = source.info.features.get(name)
+        if feature is None:
+            continue
+        if feature.dtype != dtype or (shape is not None and feature.shape != shape):
+            raise CorruptDataError(
+                f"{source.folder}: feature {name!r} is {feature.dtype} {list(feature.shape)}, "
+                f"expected {dtype} {list(shape or ['cameras'])}"
+            )
+        wanted.append(name)
+    return source.columns(entry, [name for name in wanted if name is not None])
+
+
+def _actions(
+    columns: dict[str, np.ndarray],
+    features: _FeatureMap,
+    sidecar: layout.Sidecar | None,
+    where: str,
+) -> tuple[np.ndarray, np.ndarray | None, AnchorPoses | None]:
+    """Measured and commanded actions, and the poses that they are relative to."""
+    action = columns[features.action].astype(np.float64)
+    if sidecar is None:
+        if features.state is None:
+            return action, None, None
+        state = columns[features.state][:1].astype(np.float64)
+        return action, None, poses_from_actions(state, WORLD).anchor(0)
+    measured, commanded = action, None
+    if sidecar.action_kind == "commanded":
+        if layout.MEASURED not in columns:
+            raise CorruptDataError(f"{where}: feature {layout.MEASURED!r} is missing")
+        measured, commanded = columns[layout.MEASURED].astype(np.float64), action
+    if sidecar.grid == "model":
+        return measured, commanded, None
+    # Frame 0 need not be step 0: actions become relative to what they now begin with.
+    anchor = poses_from_actions(measured[:1], sidecar.attributes.anchor.to_poses()).anchor(0)
+    if commanded is not None:
+        commanded = reanchor(commanded, 0, anchor_action=measured[0])
+    return reanchor(measured, 0), commanded, anchor
+
+
+def _image_stamps(
+    source: LeRobotFolder, key: str, t_ns: np.ndarray, offsets_ns: np.ndarray | None, where: str
+) -> Int64[np.ndarray, " n"]:
+    """Stamp of the image of each frame: the frame's own where the dataset says nothing."""
+    if offsets_ns is None:
+        return t_ns
+    names = source.info.features[layout.IMAGE_DT].names
+    columns = offsets_ns.reshape(len(t_ns), -1)
+    camera = key.removeprefix(layout.IMAGES)
+    if not isinstance(names, list) or camera not in names[: columns.shape[1]]:
+        return t_ns
+    stamps = t_ns + columns[:, names.index(camera)].astype(np.int64)
+    if (np.diff(stamps) < 0).any():
+        raise CorruptDataError(f"{where}: stamps of {camera!r} in {layout.IMAGE_DT!r} go back")
+    return stamps
+
+
 def _known_attributes(
-    source: LeRobotFolder, anchor: AnchorPoses | None, sidecar: Sidecar, options: ImportOptions
-) -> EpisodeAttributes:
+    source: LeRobotFolder,
+    anchor: AnchorPoses | None,
+    sidecar: layout.Sidecar,
+    options: ImportOptions,
+) -> dict[str, object]:
     """The exported attributes, with the anchor of the first frame and the source in the lineage."""
     known = sidecar.attributes
     came_from = LineageEntry(kind="episode", id=known.episode_id, sha256=sidecar.content_sha256)
-    changes = {
+    return known.model_dump() | {
         "episode_id": f"{options.id_prefix}{known.episode_id}",
         "model_rate_hz": float(source.info.fps),
         "lineage": (*known.lineage, came_from),
         "anchor": known.anchor if anchor is None else StoredAnchor.from_poses(anchor),
         "streams": (),
     }
-    return _checked(known.model_dump() | changes)
 
 
 def _foreign_attributes(
     source: LeRobotFolder,
     entry: EpisodeEntry,
     anchor: AnchorPoses | None,
-    features: FeatureMap,
+    features: _FeatureMap,
     options: ImportOptions,
-) -> EpisodeAttributes:
+) -> dict[str, object]:
     if options.K_head is None:
         raise InvalidInputError(
             f"{source.folder}: has no information about its head camera "
-            f"({features.cameras['camera_head']!r}); give K_head= in pixels"
+            f"({features.cameras[HEAD]!r}); give K_head= in pixels"
         )
     name = re.sub(r"[^a-z0-9_-]+", "-", source.folder.resolve().name.lower()).strip("-_")
     data_file = source.data_file(entry)
     with disk_errors(f"read {data_file}"), data_file.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return _checked(
-        {
-            "episode_id": f"{options.id_prefix}{(name or 'lerobot')[:96]}-{entry.index:06d}",
-            "task": (options.task or entry.task or "unknown")[:128],
-            "instruction": entry.task[:2000],
-            "domain": options.domain,
-            "origin": "recorded",
-            "model_rate_hz": float(source.info.fps),
-            "anchor": StoredAnchor.from_poses(anchor or WORLD),
-            "K_head": options.K_head,
-            "lineage": (
-                LineageEntry(
-                    kind="recording", id=f"lerobot:{name}/episode-{entry.index:06d}", sha256=digest
-                ),
-            ),
-        }
-    )
-
-
-def _checked(fields: Mapping[str, object]) -> EpisodeAttributes:
-    try:
-        return EpisodeAttributes.model_validate(fields)
-    except ValidationError as error:
-        raise InvalidInputError(
-            f"import from LeRobot: the options make no episode ({error})"
-        ) from error
+    came_from = f"lerobot:{name}/episode-{entry.index:06d}"
+    return {
+        "episode_id": f"{options.id_prefix}{(name or 'lerobot')[:96]}-{entry.index:06d}",
+        "task": (options.task or entry.task or "unknown")[:128],
+        "instruction": entry.task[:2000],
+        "domain": options.domain,
+        "origin": "recorded",
+        "model_rate_hz": float(source.info.fps),
+        "anchor": StoredAnchor.from_poses(anchor or WORLD),
+        "K_head": options.K_head,
+        "lineage": (LineageEntry(kind="recording", id=came_from, sha256=digest),),
+    }

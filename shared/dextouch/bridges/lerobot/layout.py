@@ -3,11 +3,15 @@
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
+
+from pydantic import Field
 
 from dextouch.errors import CorruptDataError, InvalidInputError
+from dextouch.frozen_model import FrozenModel
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.tactile.layout import NUM_TAXELS
+from dextouch.schemas import ActionKind, EpisodeAttributes
+from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
 CODEBASE_VERSION: Final = "v3.0"
 INFO_FILE: Final = "meta/info.json"
@@ -34,29 +38,46 @@ IMAGE_DT: Final = "dextouch.image_dt_ns"
 
 Feature = dict[str, Any]
 Features = dict[str, Feature]
+Grid = Literal["model", "camera", "uniform"]
 
 _FIELD = re.compile(r"\{([a-z_]+)(?::0(\d{1,2})d)?\}")
 
 
-def pose_names(name: str) -> list[str]:
-    """Names of a 9-D pose: translation in metres, then two columns of the rotation matrix."""
-    rotation = [f"r{row}{column}" for column in (0, 1) for row in range(3)]
-    return [f"{name}.{part}" for part in ("x_m", "y_m", "z_m", *rotation)]
+class Sidecar(FrozenModel):
+    """JSON file of an episode with the DexTouch attributes that LeRobot has no field for.
+
+    `grid` and `action_kind` say how its frames were made, `cameras` whether a camera's video was
+    `remuxed` (bytes unchanged) or `encoded` again.
+    """
+
+    sidecar_version: Literal[1] = 1
+    episode_index: int = Field(ge=0)
+    content_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    grid: Grid
+    action_kind: ActionKind
+    cameras: dict[str, Literal["remuxed", "encoded"]]
+    attributes: EpisodeAttributes
 
 
 def action_names() -> list[str]:
-    """Names of the 67 components of an action or a state, in order."""
-    joints = [f"{name}_rad" for side in ("left", "right") for name in RobotHand(side).joint_names]
-    wrists = [*pose_names("wrist_left"), *pose_names("wrist_right")]
-    return [*wrists, *joints, *pose_names("camera_head")]
+    """Names of the 67 components of an action or a state, in order.
+
+    A pose is a translation in metres and two columns of the rotation matrix.
+    """
+    rotation = [f"r{row}{column}" for column in (0, 1) for row in range(3)]
+    left, right, head = (
+        [f"{name}.{part}" for part in ("x_m", "y_m", "z_m", *rotation)]
+        for name in ("wrist_left", "wrist_right", "camera_head")
+    )
+    joints = [f"{name}_rad" for side in SIDES for name in RobotHand(side).joint_names]
+    return [*left, *right, *joints, *head]
 
 
-def _feature(dtype: str, shape: Sequence[int], names: list[str] | None) -> Feature:
+def _feature(dtype: str, shape: Sequence[int], names: list[str] | None = None) -> Feature:
     return {"dtype": dtype, "shape": list(shape), "names": names}
 
 
-def video_feature(shape: Sequence[int], fps: int) -> Feature:
-    """The feature of a camera whose images are `shape` [height, width, 3]."""
+def _video_feature(shape: Sequence[int], fps: int) -> Feature:
     info = {
         "video.height": shape[0],
         "video.width": shape[1],
@@ -76,25 +97,24 @@ def dataset_features(
     """Every feature of an export, by name.
 
     Args:
-        cameras: shape of each camera's images.
+        cameras: shape [height, width, 3] of each camera's images.
         fps: frames a second of the dataset.
         has_measured: actions are commanded ones, and measured ones are stored beside them.
     """
     names = action_names()
-    features = {IMAGES + name: video_feature(shape, fps) for name, shape in cameras.items()}
-    features[STATE] = _feature("float32", [len(names)], names)
+    pose, number = _feature("float32", [len(names)], names), _feature("int64", [1])
+    features = {IMAGES + name: _video_feature(shape, fps) for name, shape in cameras.items()}
+    features[STATE] = pose
     features[TACTILE] = _feature("float32", [2, NUM_TAXELS], ["hand", "taxel_kpa"])
-    features[ACTION] = _feature("float32", [len(names)], names)
+    features[ACTION] = pose
     if has_measured:
-        features[MEASURED] = _feature("float32", [len(names)], names)
-    features[VALID] = _feature("bool", [2], ["left", "right"])
-    features[STAMP] = _feature("int64", [1], None)
+        features[MEASURED] = pose
+    features |= {VALID: _feature("bool", [2], list(SIDES)), STAMP: number}
     if cameras:
         features[IMAGE_DT] = _feature("int64", [len(cameras)], list(cameras))
-    features["timestamp"] = _feature("float32", [1], None)
-    for name in ("frame_index", "episode_index", "index", "task_index"):
-        features[name] = _feature("int64", [1], None)
-    return features
+    features["timestamp"] = _feature("float32", [1])
+    counters = ("frame_index", "episode_index", "index", "task_index")
+    return features | dict.fromkeys(counters, number)
 
 
 def file_place(number: int) -> tuple[int, int]:
@@ -128,7 +148,7 @@ def fill_path(template: str, **values: int | str) -> str:
 def numbered_path(folder: Path, template: str, number: int, **values: str) -> Path:
     """Path of the n-th file of a kind; its folder is created."""
     chunk, file = file_place(number)
-    path = folder / fill_path(template, chunk_index=chunk, file_index=file, **values)
+    path = folder / template.format(chunk_index=chunk, file_index=file, **values)
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 

@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
+from dextouch.bridges.lerobot.layout import Grid
 from dextouch.bridges.model_grid import BLOCK_IMAGES
 from dextouch.episodes import EpisodeReader, mean_over_ranges, nearest_indices, step_ranges
 from dextouch.errors import InvalidInputError, NotFoundError
@@ -22,7 +22,6 @@ from dextouch.images import decode_jpeg
 from dextouch.schemas import ActionKind
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
-Grid = Literal["model", "camera", "uniform"]
 WORLD = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
 
 

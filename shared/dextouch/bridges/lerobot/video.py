@@ -1,18 +1,26 @@
-"""Muxing of H.264 access units into the mp4 files of a dataset."""
+"""Videos of a dataset: H.264 muxed into mp4 files, and frame-exact reading of their spans."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Final, TypeVar
 
 import av
-from av.container import OutputContainer
+import numpy as np
+from av.bitstream import BitStreamFilterContext
+from av.container import InputContainer, OutputContainer
 from av.video.stream import VideoStream
+from jaxtyping import UInt8
 
 from dextouch.bridges.lerobot.layout import VIDEO_FILE_MB, VIDEO_PATH, numbered_path
 from dextouch.episodes import disk_errors, is_keyframe, parameter_sets
-from dextouch.errors import CorruptDataError, ShapeError
+from dextouch.errors import CorruptDataError, LimitExceededError, NotFoundError, ShapeError
+
+MAX_SIDE_PX: Final = 8192
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -85,8 +93,7 @@ class CameraVideo:
                 output.mux(packet)
                 self._num_images += 1
         self._num_bytes += size
-        stop = self._num_images
-        return VideoPlace(self._file_number, first / self._fps, stop / self._fps)
+        return VideoPlace(self._file_number, first / self._fps, self._num_images / self._fps)
 
     def close(self) -> None:
         """Complete the file that is open."""
@@ -115,3 +122,119 @@ class CameraVideo:
             raise CorruptDataError(f"{where}: is not an H.264 stream ({error})") from error
         stream.time_base = Fraction(1, self._fps)
         return output, stream
+
+
+@dataclass(frozen=True)
+class VideoSpan:
+    """The images of one episode in a file: `count` of them, 1 / `fps` s apart.
+
+    `shape` is that of the images, [height, width, 3]; `from_s` the time of the first one.
+    """
+
+    path: Path
+    from_s: float
+    count: int
+    fps: int
+    shape: tuple[int, ...]
+
+
+def read_images(span: VideoSpan) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """Decode the images of a span one by one; any codec that PyAV's build supports.
+
+    Raises:
+        NotFoundError: no such file.
+        CorruptDataError: damaged, truncated, of another size, or without an image in its place.
+    """
+    with _opened(span) as (container, stream):
+        frames = ((frame.pts, frame) for frame in container.decode(stream))
+        for frame in _in_place(span, stream, frames):
+            if (frame.height, frame.width) != tuple(span.shape[:2]):
+                raise CorruptDataError(
+                    f"{span.path}: got an image of {frame.height} x {frame.width} pixels, "
+                    f"expected {span.shape[0]} x {span.shape[1]}"
+                )
+            yield frame.to_ndarray(format="rgb24", interpolation="BICUBIC")
+
+
+def read_units(span: VideoSpan) -> list[bytes] | None:
+    """Copy the access units of a span (Annex B) without decoding, where possible.
+
+    None where the video is not 4:2:0 H.264, begins in the middle of a GOP, or has B-frames.
+
+    Raises:
+        NotFoundError: no such file.
+        CorruptDataError: damaged, truncated, of another size, or without an image in its place.
+    """
+    units: list[bytes] = []
+    with _opened(span) as (container, stream):
+        if stream.codec.canonical_name != "h264" or stream.pix_fmt != "yuv420p":
+            return None
+        for data, is_reordered in _in_place(span, stream, _access_units(container, stream)):
+            if is_reordered or (not units and not is_keyframe(data)):
+                return None
+            units.append(data)
+    return units
+
+
+def _access_units(
+    container: InputContainer, stream: VideoStream
+) -> Iterator[tuple[int | None, tuple[bytes, bool]]]:
+    """Time stamp, bytes, and whether it is decoded at another time than it is shown."""
+    annexb = BitStreamFilterContext("h264_mp4toannexb", stream)
+    for packet in container.demux(stream):
+        # The filter consumes the packet, so its time stamps must be read first.
+        pts, dts = packet.pts, packet.dts
+        data = b"".join(bytes(part) for part in annexb.filter(packet)) if packet.size else b""
+        if data:
+            yield pts, (data, pts != dts)
+
+
+@contextmanager
+def _opened(span: VideoSpan) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """The container, at the last entry point before the span."""
+    if not span.path.is_file():
+        raise NotFoundError(f"{span.path}: is missing from the dataset")
+    try:
+        # A playlist or a network address must never be followed from a dataset's file.
+        with av.open(span.path, format="mp4", options={"protocol_whitelist": "file"}) as container:
+            if not container.streams.video:
+                raise CorruptDataError(f"{span.path}: holds no video")
+            stream = container.streams.video[0]
+            stream.thread_count = 1
+            size = (stream.height, stream.width)
+            if max(size) > MAX_SIDE_PX:
+                raise LimitExceededError(
+                    f"{span.path}: got images {size}, expected ≤ {MAX_SIDE_PX} pixels"
+                )
+            if size != tuple(span.shape[:2]):
+                raise CorruptDataError(f"{span.path}: got images {size}, expected {span.shape[:2]}")
+            if stream.time_base is None:
+                raise CorruptDataError(f"{span.path}: has no timestamps")
+            start = max(0, round((span.from_s - 0.5 / span.fps) / stream.time_base))
+            container.seek(start, stream=stream)
+            yield container, stream
+    except (av.error.FFmpegError, ValueError) as error:
+        raise CorruptDataError(
+            f"{span.path}: is not a complete mp4 file ({error}); copy the dataset again"
+        ) from error
+
+
+def _in_place(
+    span: VideoSpan, stream: VideoStream, items: Iterable[tuple[int | None, T]]
+) -> Iterator[T]:
+    """The items of a span by their time stamps; refuses a gap."""
+    done, place, base = 0, span.count, stream.time_base or Fraction(1)
+    for pts, item in items:
+        found = -1 if pts is None else round((float(pts * base) - span.from_s) * span.fps)
+        if found > done:
+            place = found
+            break
+        if found == done:
+            yield item
+            done += 1
+            if done == span.count:
+                return
+    raise CorruptDataError(
+        f"{span.path}: image {done} of {span.count} after {span.from_s:.3f} s is missing "
+        f"(the next one is {place}); copy the dataset again"
+    )

@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from pydantic import ValidationError
 
 from dextouch.bridges.mcap.messages import MessageCodec, Sent
 from dextouch.bridges.mcap.records import records
 from dextouch.bridges.mcap.writing import ABOUT, ATTRIBUTES_FILE, BRIDGE_VERSION, COUNTS
-from dextouch.episodes import EpisodeStore, EpisodeWriter, WriteOptions
+from dextouch.episodes import EpisodeStore, EpisodeWriter, Kind, WriteOptions
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 from dextouch.streams import ENCODED_UNITS, encoded_values
@@ -41,23 +41,29 @@ def import_mcap(path: Path, store: EpisodeStore) -> str:
         ConflictError: the id is in the store already.
     """
     attributes, counts = _about(path)
-    if attributes is None:
-        raise InvalidInputError(
-            f"{path}: holds no attachment {ATTRIBUTES_FILE!r} of DexTouch; only files that "
-            "`dextouch export --format mcap` wrote can be imported"
-        )
-    if isinstance(attributes, EpisodeAttributes):
-        with store.writer(attributes=attributes) as writer:
-            _Import(path, attributes, writer).run(counts)
-        return attributes.episode_id
+    kind: Kind = "episode" if isinstance(attributes, EpisodeAttributes) else "recording"
     # A killed import is repeated from its file; a partial one must not look like a recovered take.
     options = WriteOptions(recoverable=False)
-    with store.writer(kind="recording", attributes=attributes, options=options) as writer:
-        _Import(path, attributes, writer).run(counts)
+    with store.writer(kind=kind, attributes=attributes, options=options) as writer:
+        streams = {
+            f"/{stream.name}": _Stream(MessageCodec(stream), writer, is_episode=kind == "episode")
+            for stream in attributes.streams
+        }
+        _read_messages(path, streams)
+        for topic, stream in streams.items():
+            stream.flush()
+            expected = counts.get(stream.codec.descriptor.name)
+            if stream.num_samples != expected:
+                raise CorruptDataError(
+                    f"{path}: {topic} holds {stream.num_samples} messages, expected {expected}; "
+                    "the file was cut or filtered after the export"
+                )
+    if isinstance(attributes, EpisodeAttributes):
+        return attributes.episode_id
     return attributes.recording_id
 
 
-def _about(path: Path) -> tuple[Attributes | None, dict[str, int]]:
+def _about(path: Path) -> tuple[Attributes, dict[str, int]]:
     """What is needed before the samples: attributes, and the number of samples of each stream."""
     kind, text, counts = "", None, {}
     for record in records(path):
@@ -74,8 +80,17 @@ def _about(path: Path) -> tuple[Attributes | None, dict[str, int]]:
         elif isinstance(record, Attachment) and record.name == ATTRIBUTES_FILE:
             text = record.data
     if text is None or kind not in {"episode", "recording"}:
-        return None, counts
-    return _attributes(path, kind, text), counts
+        raise InvalidInputError(
+            f"{path}: holds no attachment {ATTRIBUTES_FILE!r} of DexTouch; only files that "
+            "`dextouch export --format mcap` wrote can be imported"
+        )
+    if len(text) > MAX_ATTRIBUTES_BYTES:
+        raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} has {len(text)} bytes")
+    model = EpisodeAttributes if kind == "episode" else RecordingAttributes
+    try:
+        return model.model_validate_json(text), counts
+    except ValidationError as error:
+        raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} is invalid ({error})") from error
 
 
 def _count(path: Path, text: str) -> int:
@@ -84,25 +99,13 @@ def _count(path: Path, text: str) -> int:
     return int(text)
 
 
-def _attributes(path: Path, kind: str, text: bytes) -> Attributes:
-    if len(text) > MAX_ATTRIBUTES_BYTES:
-        raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} has {len(text)} bytes")
-    try:
-        if kind == "episode":
-            return EpisodeAttributes.model_validate_json(text)
-        return RecordingAttributes.model_validate_json(text)
-    except ValidationError as error:
-        raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} is invalid ({error})") from error
-
-
-class _Pending:
-    """Buffered samples of one stream, written together."""
+class _Stream:
+    """One stream of an import, with samples that are written together."""
 
     def __init__(self, codec: MessageCodec, writer: EpisodeWriter, *, is_episode: bool) -> None:
         self.codec, self._writer, self._is_episode = codec, writer, is_episode
-        self.num_samples = 0
+        self.num_samples = self._num_bytes = 0
         self._sent: list[Sent] = []
-        self._num_bytes = 0
 
     def add(self, data: bytes) -> None:
         """Add one message."""
@@ -122,69 +125,32 @@ class _Pending:
             values = encoded_values([s.value for s in sent if isinstance(s.value, bytes)])
         else:
             values = np.stack([np.asarray(s.value) for s in sent])
-        t_ns = np.array([s.t_ns for s in sent], dtype=np.int64)
-        if self._is_episode:
-            self._writer.append(descriptor.name, values=values, t_ref_ns=t_ns)
-            return
-        self._writer.append(
-            descriptor.name,
-            values=values,
-            t_host_ns=t_ns,
-            t_device_ns=np.array([s.t_device_ns for s in sent], dtype=np.int64),
-            sequence=np.array([s.sequence for s in sent], dtype=np.int64),
-        )
+        stamps = np.array([(s.t_ns, s.t_device_ns, s.sequence) for s in sent], dtype=np.int64)
+        names = ("t_ref_ns",) if self._is_episode else ("t_host_ns", "t_device_ns", "sequence")
+        columns = dict(zip(names, stamps.T, strict=False))
+        self._writer.append(descriptor.name, values=values, **columns)
 
 
-class _Import:
-    """Import of one file into a writer."""
-
-    def __init__(self, path: Path, attributes: Attributes, writer: EpisodeWriter) -> None:
-        self._path = path
-        is_episode = isinstance(attributes, EpisodeAttributes)
-        self._pending = {
-            f"/{stream.name}": _Pending(MessageCodec(stream), writer, is_episode=is_episode)
-            for stream in attributes.streams
-        }
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, _Pending | None] = {}
-
-    def run(self, counts: Mapping[str, int]) -> None:
-        """Read all messages, then check the number of samples of each stream."""
-        for record in records(self._path):
-            self._take(record)
-        for topic, pending in self._pending.items():
-            pending.flush()
-            expected = counts.get(pending.codec.descriptor.name)
-            if pending.num_samples != expected:
-                raise CorruptDataError(
-                    f"{self._path}: {topic} holds {pending.num_samples} messages, expected "
-                    f"{expected}; the file was cut or filtered after the export"
-                )
-
-    def _take(self, record: McapRecord) -> None:
+def _read_messages(path: Path, streams: Mapping[str, _Stream]) -> None:
+    schemas: dict[int, str] = {}
+    # None: channels added by other tools.
+    channels: dict[int, _Stream | None] = {}
+    for record in records(path):
         if isinstance(record, Schema):
-            self._schemas[record.id] = record
+            schemas[record.id] = record.name
         elif isinstance(record, Channel):
-            self._channels[record.id] = self._known(record)
-        elif isinstance(record, Message):
-            if record.channel_id not in self._channels:
+            stream = channels[record.id] = streams.get(record.topic)
+            got = (record.message_encoding, schemas.get(record.schema_id))
+            if stream is not None and got != ("protobuf", stream.codec.message):
                 raise CorruptDataError(
-                    f"{self._path}: a message of channel {record.channel_id}, which does not exist"
+                    f"{path}: {record.topic} has messages {got[0]!r} {got[1]!r}, "
+                    f"expected 'protobuf' {stream.codec.message!r}"
                 )
-            pending = self._channels[record.channel_id]
-            if pending is not None:
-                pending.add(record.data)
-
-    def _known(self, channel: Channel) -> _Pending | None:
-        """The stream of a channel; None for channels added by other tools."""
-        pending = self._pending.get(channel.topic)
-        if pending is None:
-            return None
-        schema = self._schemas.get(channel.schema_id)
-        name = schema.name if schema else None
-        if (channel.message_encoding, name) != ("protobuf", pending.codec.message):
-            raise CorruptDataError(
-                f"{self._path}: {channel.topic} has messages {channel.message_encoding!r} "
-                f"{name!r}, expected 'protobuf' {pending.codec.message!r}"
-            )
-        return pending
+        elif isinstance(record, Message):
+            if record.channel_id not in channels:
+                raise CorruptDataError(
+                    f"{path}: a message of channel {record.channel_id}, which does not exist"
+                )
+            stream = channels[record.channel_id]
+            if stream is not None:
+                stream.add(record.data)

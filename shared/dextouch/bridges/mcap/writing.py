@@ -10,10 +10,15 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from dextouch import __version__
-from dextouch.bridges.blocks import Reader, blocks
-from dextouch.bridges.mcap.messages import MessageCodec, Sent, calibration_message
-from dextouch.bridges.mcap.schemas import CALIBRATION, descriptor_set, raw_encoding
-from dextouch.bridges.new_file import new_file
+from dextouch.bridges.exports import Reader, blocks, new_file
+from dextouch.bridges.mcap.messages import (
+    CALIBRATION,
+    MessageCodec,
+    Sent,
+    calibration_message,
+    descriptor_set,
+    raw_encoding,
+)
 from dextouch.episodes import EpisodeReader
 from dextouch.errors import InvalidInputError
 from dextouch.images import encode_jpeg

@@ -1,6 +1,7 @@
 """Import of zip files written by `export_umi`, as episodes on the model grid."""
 
 from collections.abc import Iterator
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -17,7 +18,7 @@ from dextouch.bridges.model_grid import (
     store_episode,
     tactile_numbers,
 )
-from dextouch.bridges.umi.layout import (
+from dextouch.bridges.umi.writing import (
     ATTRIBUTES_KEY,
     COMMANDED,
     ENDS,
@@ -69,7 +70,7 @@ def import_umi(path: Path, store: EpisodeStore) -> list[str]:
         LimitExceededError: larger than the limits of this reader.
         ConflictError: an id is in the store already.
     """
-    with ZarrZipReader(path) as archive:
+    with closing(ZarrZipReader(path)) as archive:
         meta = _meta(archive, path)
         ends = _ends(archive, path, meta)
         for episode, start, stop in zip(meta.episodes, [0, *ends], ends, strict=False):

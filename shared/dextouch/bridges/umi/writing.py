@@ -1,25 +1,14 @@
 """Export of episodes to one zip file in the layout of UMI's replay buffer."""
 
 from collections.abc import Iterable
+from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.bridges.new_file import new_file
-from dextouch.bridges.umi.layout import (
-    ATTRIBUTES_KEY,
-    CHUNK_ROWS,
-    COMMANDED,
-    ENDS,
-    LAYOUT_VERSION,
-    MODEL_CAMERAS,
-    NUMBERS,
-    ROBOTS,
-    camera_array,
-    camera_dt_array,
-)
+from dextouch.bridges.exports import new_file
 from dextouch.bridges.umi.zarr_zip import ZarrZipWriter
 from dextouch.episodes import EpisodeReader
 from dextouch.errors import InvalidInputError
@@ -27,7 +16,39 @@ from dextouch.geometry.rotations import vector_from_rotation
 from dextouch.hands.actions import poses_from_actions
 from dextouch.schemas import json_ready
 
+MODEL_CAMERAS: Final = ("camera_wrist_left", "camera_wrist_right", "camera_head")
+ENDS: Final = "meta/episode_ends"
+COMMANDED: Final = "data/action_commanded"
+ATTRIBUTES_KEY: Final = "dextouch"
+LAYOUT_VERSION: Final = 1
 BLOCK_STEPS = 32
+_HAND = {
+    "eef_pos": ("<f4", (3,)),
+    "eef_rot_axis_angle": ("<f4", (3,)),
+    "joint_pos": ("<f4", (20,)),
+    "demo_start_pose": ("<f8", (6,)),
+    "demo_end_pose": ("<f8", (6,)),
+}
+# Arrays of numbers: type and shape of a row. robot0 is the left hand, robot1 the right one.
+NUMBERS: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
+    **{f"data/{robot}_{n}": kind for robot in ("robot0", "robot1") for n, kind in _HAND.items()},
+    "data/head_pos": ("<f4", (3,)),
+    "data/head_rot_axis_angle": ("<f4", (3,)),
+    "data/tactile": ("<f4", (2, 320)),
+    "data/tactile_valid": ("|b1", (2,)),
+    "data/action": ("<f8", (67,)),
+    "data/t_ref_ns": ("<i8", ()),
+}
+
+
+def camera_array(index: int) -> str:
+    """Name of the image array of a camera."""
+    return f"data/camera{index}_rgb"
+
+
+def camera_dt_array(index: int) -> str:
+    """Name of the array of image time minus step time, for a camera."""
+    return f"data/camera{index}_dt_ns"
 
 
 def export_umi(readers: Iterable[EpisodeReader], path: Path, *, overwrite: bool = False) -> int:
@@ -46,106 +67,56 @@ def export_umi(readers: Iterable[EpisodeReader], path: Path, *, overwrite: bool 
         InvalidInputError: no episode, or one that is inconsistent with the first.
         StorageError: the write failed.
     """
-    with new_file(path, overwrite=overwrite) as partial:
-        writer = ZarrZipWriter(partial)
-        try:
-            export = _Export(writer)
-            for reader in readers:
-                export.add(reader)
-            return export.finish()
-        finally:
-            writer.close()
-
-
-def _signature(reader: EpisodeReader) -> dict[str, tuple[int, ...]]:
-    """Properties that all episodes of a file share: image shapes by camera, commanded actions."""
-    cameras: dict[str, tuple[int, ...]] = {
-        c: reader.streams[c].shape for c in MODEL_CAMERAS if c in reader.streams
-    }
-    commanded: dict[str, tuple[int, ...]] = (
-        {"action_commanded": (67,)} if "action_commanded" in reader.streams else {}
-    )
-    return {**cameras, **commanded}
-
-
-class _Export:
-    """One file that is being written."""
-
-    def __init__(self, writer: ZarrZipWriter) -> None:
-        self._writer = writer
-        self._signature: dict[str, tuple[int, ...]] | None = None
-        self._cameras: tuple[str, ...] = ()
-        self._attributes: list[dict[str, Any]] = []
-        self._ends: list[int] = []
-
-    def add(self, reader: EpisodeReader) -> None:
-        """Append one episode."""
-        episode_id, signature = reader.attributes.episode_id, _signature(reader)
-        if reader.num_steps == 0:
-            raise InvalidInputError(f"{episode_id}: has no step of the model grid to export")
-        if self._signature is None:
-            self._start(signature)
-        elif signature != self._signature:
-            raise InvalidInputError(
-                f"{episode_id}: got {signature}, expected {self._signature} as in the first "
-                "episode; export episodes of different cameras to different files"
-            )
-        for name, rows in _numbers(reader).items():
-            self._writer.append(name, rows)
-        for start in range(0, reader.num_steps, BLOCK_STEPS):
-            self._add_windows(reader, start, min(BLOCK_STEPS, reader.num_steps - start))
-        self._ends.append((self._ends[-1] if self._ends else 0) + reader.num_steps)
-        self._attributes.append(
-            {"attributes": json_ready(reader.attributes), "content_sha256": reader.content_sha256}
-        )
-
-    def _start(self, signature: dict[str, tuple[int, ...]]) -> None:
-        self._signature = signature
-        self._cameras = tuple(name for name in MODEL_CAMERAS if name in signature)
-        for index, camera in enumerate(self._cameras):
-            self._writer.add_array(
-                camera_array(index),
-                dtype="uint8",
-                row_shape=signature[camera],
-                chunk_rows=1,
-                attributes={"stream": camera},
-            )
-            self._add_numbers(camera_dt_array(index), "<i8", ())
-        for name, (dtype, shape) in NUMBERS.items():
-            self._add_numbers(name, dtype, shape)
-        if "action_commanded" in signature:
-            self._add_numbers(COMMANDED, "<f8", (67,))
-        self._add_numbers(ENDS, "<i8", ())
-
-    def _add_numbers(self, name: str, dtype: str, shape: tuple[int, ...]) -> None:
-        self._writer.add_array(name, dtype=dtype, row_shape=shape, chunk_rows=CHUNK_ROWS)
-
-    def _add_windows(self, reader: EpisodeReader, start: int, num_steps: int) -> None:
-        window = reader.window(start, num_steps, cameras=self._cameras)
-        for index, camera in enumerate(self._cameras):
-            self._writer.append(camera_array(index), window.images[camera])
-            self._writer.append(camera_dt_array(index), window.image_dt_ns[camera])
-        self._writer.append("data/tactile", window.tactile_kpa)
-        self._writer.append("data/tactile_valid", window.tactile_valid)
-
-    def finish(self) -> int:
-        """Complete the file and return the number of steps."""
-        if not self._ends:
+    first: dict[str, tuple[int, ...]] | None = None
+    cameras: tuple[str, ...] = ()
+    ends, attributes = [0], []
+    with new_file(path, overwrite=overwrite) as partial, closing(ZarrZipWriter(partial)) as writer:
+        for reader in readers:
+            shared = _shared(reader)
+            if first is None:
+                first, cameras = shared, tuple(name for name in MODEL_CAMERAS if name in shared)
+            elif shared != first:
+                raise InvalidInputError(
+                    f"{reader.attributes.episode_id}: got {shared}, expected {first} as in the "
+                    "first episode; export episodes of different cameras to different files"
+                )
+            _append(writer, reader, cameras)
+            ends.append(ends[-1] + reader.num_steps)
+            known = json_ready(reader.attributes)
+            attributes.append({"attributes": known, "content_sha256": reader.content_sha256})
+        if first is None:
             raise InvalidInputError("UMI export: got no episode, expected at least one")
-        self._writer.append(ENDS, np.array(self._ends, dtype=np.int64))
-        self._writer.finish(
-            {
-                "": {"layout": "UMI replay buffer, two hands, with touch"},
-                "meta": {
-                    ATTRIBUTES_KEY: {
-                        "layout_version": LAYOUT_VERSION,
-                        "cameras": list(self._cameras),
-                        "episodes": self._attributes,
-                    }
-                },
-            }
+        writer.append(ENDS, np.array(ends[1:], dtype="<i8"))
+        about = {"layout_version": LAYOUT_VERSION, "cameras": cameras, "episodes": attributes}
+        texts: dict[str, dict[str, Any]] = {
+            "": {"layout": "UMI replay buffer, two hands, with touch"},
+            "meta": {ATTRIBUTES_KEY: about},
+        }
+        writer.finish(texts | {camera_array(i): {"stream": n} for i, n in enumerate(cameras)})
+    return ends[-1]
+
+
+def _shared(reader: EpisodeReader) -> dict[str, tuple[int, ...]]:
+    """What all episodes of a file have in common: shapes of images and of commanded actions."""
+    if reader.num_steps == 0:
+        raise InvalidInputError(
+            f"{reader.attributes.episode_id}: has no step of the model grid to export"
         )
-        return self._ends[-1]
+    names = (*MODEL_CAMERAS, "action_commanded")
+    return {name: reader.streams[name].shape for name in names if name in reader.streams}
+
+
+def _append(writer: ZarrZipWriter, reader: EpisodeReader, cameras: tuple[str, ...]) -> None:
+    for name, rows in _numbers(reader).items():
+        writer.append(name, rows.astype(NUMBERS[name][0] if name in NUMBERS else "<f8"))
+    for start in range(0, reader.num_steps, BLOCK_STEPS):
+        count = min(BLOCK_STEPS, reader.num_steps - start)
+        window = reader.window(start, count, cameras=cameras)
+        for index, camera in enumerate(cameras):
+            writer.append(camera_array(index), window.images[camera], chunk_rows=1)
+            writer.append(camera_dt_array(index), window.image_dt_ns[camera])
+        writer.append("data/tactile", window.tactile_kpa)
+        writer.append("data/tactile_valid", window.tactile_valid)
 
 
 def _numbers(reader: EpisodeReader) -> dict[str, np.ndarray]:
@@ -160,12 +131,10 @@ def _numbers(reader: EpisodeReader) -> dict[str, np.ndarray]:
             )
         arrays[COMMANDED] = commanded.values
     poses = poses_from_actions(data.values, reader.attributes.anchor.to_poses())
-    hands = {
-        "left": (poses.Ts_world_wrist_left, poses.joints_left_rad),
-        "right": (poses.Ts_world_wrist_right, poses.joints_right_rad),
-    }
-    for robot, side in ROBOTS.items():
-        Ts_world_wrist, joints_rad = hands[side]
+    for robot, Ts_world_wrist, joints_rad in (
+        ("robot0", poses.Ts_world_wrist_left, poses.joints_left_rad),
+        ("robot1", poses.Ts_world_wrist_right, poses.joints_right_rad),
+    ):
         pose = _pose_6d(Ts_world_wrist)
         arrays |= {
             f"data/{robot}_eef_pos": pose[:, :3],

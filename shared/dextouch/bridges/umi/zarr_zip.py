@@ -35,6 +35,8 @@ from dextouch.errors import (
 from dextouch.frozen_model import FrozenModel
 
 ZSTD_LEVEL: Final = 1
+# Rows of a storage chunk of numbers.
+CHUNK_ROWS: Final = 256
 MAX_CHUNK_BYTES: Final = 1 << 27
 MAX_METADATA_BYTES: Final = 1 << 26
 MAX_ROWS: Final = 1 << 40
@@ -70,11 +72,10 @@ class ArrayMetadata(FrozenModel):
 
 @dataclass
 class _NewArray:
-    """An array that grows: the number of rows in storage chunks, and those that fill none yet."""
+    """An array that grows: its rows in storage chunks, and those that fill none yet."""
 
     pending: Shaped[np.ndarray, "n ..."]
     chunk_rows: int
-    attributes: Mapping[str, Any]
     num_rows: int = 0
 
     def metadata(self) -> ArrayMetadata:
@@ -102,26 +103,19 @@ class ZarrZipWriter:
         self._arrays: dict[str, _NewArray] = {}
         self._zstd = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
 
-    def add_array(
-        self,
-        name: str,
-        *,
-        dtype: str,
-        row_shape: tuple[int, ...],
-        chunk_rows: int,
-        attributes: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Declare an array `GROUP/NAME` of one of the types of `ArrayMetadata`."""
-        empty = np.empty((0, *row_shape), dtype=dtype)
-        self._arrays[name] = _NewArray(empty, chunk_rows, attributes or {})
+    def append(self, name: str, rows: np.ndarray, *, chunk_rows: int = CHUNK_ROWS) -> None:
+        """Append rows [n, ...] to the array `GROUP/NAME`.
 
-    def append(self, name: str, rows: np.ndarray) -> None:
-        """Append rows [n, *row_shape]; they are cast to the array's type."""
-        array = self._arrays[name]
-        rows, row_shape = np.asarray(rows), array.pending.shape[1:]
-        if rows.shape[1:] != row_shape:
-            raise InvalidInputError(f"{name}: got rows of {rows.shape[1:]}, expected {row_shape}")
-        pending = np.concatenate([array.pending, rows.astype(array.pending.dtype)])
+        The first rows set its type, one of `ArrayMetadata`, the shape of its rows and the length of
+        its storage chunks.
+        """
+        array = self._arrays.setdefault(name, _NewArray(rows[:0], chunk_rows))
+        row_shape, dtype = array.pending.shape[1:], array.pending.dtype
+        if (rows.shape[1:], rows.dtype) != (row_shape, dtype):
+            raise InvalidInputError(
+                f"{name}: got rows of {rows.dtype} {rows.shape[1:]}, expected {dtype} {row_shape}"
+            )
+        pending = np.concatenate([array.pending, rows])
         while len(pending) >= array.chunk_rows:
             self._write_chunk(name, array, pending[: array.chunk_rows])
             array.num_rows += array.chunk_rows
@@ -136,21 +130,20 @@ class ZarrZipWriter:
         self._zip.writestr(zipfile.ZipInfo(name, _DATE), data)
 
     def finish(self, attributes: Mapping[str, Mapping[str, Any]]) -> None:
-        """Write buffered rows, the metadata and the attributes of groups (by name, "" the root)."""
-        groups = {"", *attributes, *(name.rpartition("/")[0] for name in self._arrays)}
-        for group in sorted(groups):
-            prefix = f"{group}/" if group else ""
-            self._write(f"{prefix}.zgroup", _json({"zarr_format": 2}))
-            if attributes.get(group):
-                self._write(f"{prefix}.zattrs", _json(attributes[group]))
-        for name, array in self._arrays.items():
-            if len(array.pending):
-                missing = array.chunk_rows - len(array.pending)
-                padding = np.zeros_like(array.pending, shape=(missing, *array.pending.shape[1:]))
-                self._write_chunk(name, array, np.concatenate([array.pending, padding]))
-            self._write(f"{name}/.zarray", _json(array.metadata().model_dump()))
-            if array.attributes:
-                self._write(f"{name}/.zattrs", _json(array.attributes))
+        """Write buffered rows, the metadata, and attributes by name ("" is the root group)."""
+        groups = {"", *(name.rpartition("/")[0] for name in self._arrays)}
+        for name in [*sorted(groups), *self._arrays]:
+            prefix, array = f"{name}/" if name else "", self._arrays.get(name)
+            if array is None:
+                self._write(f"{prefix}.zgroup", _json({"zarr_format": 2}))
+            else:
+                if len(array.pending):
+                    missing = [(0, array.chunk_rows - len(array.pending))]
+                    missing += [(0, 0)] * (array.pending.ndim - 1)
+                    self._write_chunk(name, array, np.pad(array.pending, missing))
+                self._write(f"{prefix}.zarray", _json(array.metadata().model_dump()))
+            if name in attributes:
+                self._write(f"{prefix}.zattrs", _json(attributes[name]))
         self._zip.close()
 
     def close(self) -> None:
@@ -196,27 +189,19 @@ class ZarrZipReader:
             self._zip = zipfile.ZipFile(path)
         self._entries: dict[str, zipfile.ZipInfo] = {}
         for entry in self._zip.infolist():
-            self._check_name(entry.filename)
-            self._entries[entry.filename] = entry
-
-    def _check_name(self, name: str) -> None:
-        parts = name.rstrip("/").split("/")
-        if name.startswith("/") or "\\" in name or ".." in parts or "" in parts or ":" in name:
-            self.close()
-            raise CorruptDataError(f"{self._path}: holds an entry named {name!r}; refused")
-        if name in self._entries:
-            self.close()
-            raise CorruptDataError(f"{self._path}: holds two entries named {name!r}; refused")
+            name = entry.filename
+            parts = name.rstrip("/").split("/")
+            if name in self._entries or {"", ".."} & {*parts} or "\\" in name or ":" in name:
+                self.close()
+                raise CorruptDataError(
+                    f"{path}: holds an entry named {name!r} that leads elsewhere or comes twice; "
+                    "refused"
+                )
+            self._entries[name] = entry
 
     def close(self) -> None:
         """Close the file."""
         self._zip.close()
-
-    def __enter__(self) -> "ZarrZipReader":
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def arrays(self, group: str) -> list[str]:
         """Names of the arrays of a group."""
