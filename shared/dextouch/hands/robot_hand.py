@@ -1,27 +1,60 @@
 """Kinematic models of robot hands: joint names, limits and forward kinematics in the wrist frame.
 
 `HandModel` is built from finger tables (of a module or, by `dextouch.hands.hand_files`, of a file);
-`RobotHand` is the Wuji Hand 2. All share one wrist frame: fingers along -z, the thumb side +x,
+`RobotHand` is the Wuji Hand 2. Hinges of a finger are ordered from the wrist outwards. Each has a
+frame in its parent's frame (the first: in the wrist frame), rotates about an axis of its own frame,
+and has limits. All hands share one wrist frame: fingers along -z, the thumb side +x,
 the right palm faces +y, the left -y.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache, cached_property
 from importlib.resources import files
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from dextouch.errors import NonFiniteError, ShapeError, UnknownNameError
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_quaternion, rotation_from_vector
-from dextouch.hands.finger_table import FingerTable, JointRow, check_fingers
+from dextouch.hands.skeleton import CHAINS
 
 NUM_JOINTS: Final = 20
 NUM_FINGERS: Final = 5
 SIDES: Final[tuple[Literal["left", "right"], ...]] = ("left", "right")
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+MAX_HINGES: Final = 6
+# Tolerance of unit axes, small enough not to affect fingertip positions.
+AXIS_TOLERANCE: Final = 1e-9
+_POINT_NAMES: Final = ("knuckle", "PIP", "DIP")
+
+
+class JointRow(NamedTuple):
+    """One hinge: pose of its frame in the parent, axis and limits."""
+
+    name: str
+    position_m: Vector3
+    q_wxyz: Quaternion
+    axis: Vector3
+    limits_rad: tuple[float, float]
+
+
+class FingerTable(NamedTuple):
+    """One finger: 1 to 6 hinges from the wrist outwards, and the tip in the last hinge's frame.
+
+    `chain` is the finger of the tracked skeleton that this one follows (`CHAINS`). `points` are the
+    indices of the hinges whose origins are the knuckle (of the thumb: the CMC joint), the PIP (MCP)
+    and the DIP (IP) joint. A finger with fewer hinges repeats an index: that bone has zero length.
+    """
+
+    chain: str
+    joints: tuple[JointRow, ...]
+    tip_m: Vector3
+    points: tuple[int, int, int]
 
 
 class HandModel:
@@ -34,14 +67,16 @@ class HandModel:
 
     Raises:
         UnknownNameError: any other side, or a chain that the tracked skeleton lacks.
-        InvalidInputError: invalid tables; the message names the joint.
+        InvalidInputError: no finger, a chain or name given twice, too few or many hinges, limits
+            that are not an interval, an axis that is not a unit vector, points out of order; the
+            message names the joint.
         NonFiniteError: NaN or infinity in a table.
     """
 
     def __init__(self, side: str, fingers: Sequence[FingerTable], *, name: str) -> None:
         if side not in SIDES:
             raise UnknownNameError("side", side, list(SIDES))
-        check_fingers(fingers, where=name)
+        _check_fingers(fingers, name)
         self.side = side
         self.name = name
         self.fingers = tuple(fingers)
@@ -170,3 +205,60 @@ def _wuji_hand_2() -> dict[str, tuple[FingerTable, ...]]:
     text = files("dextouch.hands").joinpath("wuji_hand_2.json").read_text(encoding="utf-8")
     tables: dict[str, tuple[FingerTable, ...]] = json.loads(text, object_hook=row)
     return tables
+
+
+def _check_fingers(fingers: Sequence[FingerTable], where: str) -> None:
+    _check_unique((finger.chain for finger in fingers), f"{where}: finger chain")
+    _check_unique((row.name for finger in fingers for row in finger.joints), f"{where}: joint")
+    if not fingers:
+        raise InvalidInputError(f"{where}: got no finger, expected at least one")
+    for finger in fingers:
+        if finger.chain not in CHAINS:
+            raise UnknownNameError(f"chain of a finger of {where}", finger.chain, list(CHAINS))
+        _check_finger(finger, f"{where}, finger {finger.chain!r}")
+
+
+def _check_unique(names: Iterable[str], what: str) -> None:
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise InvalidInputError(
+                f"{what} {name!r} appears twice; names must differ, fingers share no hinge",
+                got=name,
+            )
+        seen.add(name)
+
+
+def _check_finger(finger: FingerTable, where: str) -> None:
+    count = len(finger.joints)
+    if not 1 <= count <= MAX_HINGES:
+        raise InvalidInputError(f"{where}: got {count} hinges, expected 1 … {MAX_HINGES}")
+    knuckle, pip, dip = finger.points
+    if not 0 <= knuckle <= pip <= dip < count:
+        raise InvalidInputError(
+            f"{where}: got hinges {finger.points} as {', '.join(_POINT_NAMES)}; expected indices "
+            f"of its {count} hinges from the wrist outwards"
+        )
+    _check_finite(finger.tip_m, f"{where}: tip")
+    for row in finger.joints:
+        _check_row(row, f"{where}, joint {row.name!r}")
+
+
+def _check_row(row: JointRow, where: str) -> None:
+    for what, values in zip(row._fields[1:], row[1:], strict=True):
+        _check_finite(values, f"{where}: {what}")
+    lower, upper = row.limits_rad
+    if lower >= upper:
+        raise InvalidInputError(
+            f"{where}: got limits {lower} … {upper} rad, expected lower < upper"
+        )
+    if not any(row.q_wxyz):
+        raise InvalidInputError(f"{where}: got a quaternion of zeros, expected a rotation")
+    length = float(np.linalg.norm(row.axis))
+    if abs(length - 1) > AXIS_TOLERANCE:
+        raise InvalidInputError(f"{where}: got an axis of length {length}, expected a unit vector")
+
+
+def _check_finite(values: Sequence[float], what: str) -> None:
+    if not np.isfinite(values).all():
+        raise NonFiniteError(f"{what}: got {tuple(values)}, expected finite numbers")

@@ -11,8 +11,13 @@ from pathlib import Path
 from typing import Final
 from xml.parsers import expat
 
-from dextouch.errors import InvalidInputError, LimitExceededError, UnknownNameError
-from dextouch.hands.hand_files.reading import read_bounded
+from dextouch.errors import (
+    InvalidInputError,
+    LimitExceededError,
+    NotFoundError,
+    StorageError,
+    UnknownNameError,
+)
 
 MAX_BYTES: Final = 8 * 2**20
 MAX_DEPTH: Final = 100
@@ -25,7 +30,7 @@ _NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Element:
-    """One XML element."""
+    """One XML element; what it lacks or holds wrongly raises InvalidInputError with its place."""
 
     tag: str
     attributes: dict[str, str]
@@ -45,107 +50,40 @@ class Element:
         return (child for child in self.children if child.tag in tags)
 
     def child(self, tag: str) -> "Element | None":
-        """The only child with that tag, or None.
-
-        Raises:
-            InvalidInputError: several children.
-        """
+        """The only child with that tag, or None."""
         found = list(self.each(tag))
         if len(found) > 1:
             raise self.refusal(f"got {len(found)} <{tag}>, expected at most one")
         return found[0] if found else None
 
     def text(self, name: str) -> str:
-        """A required attribute.
-
-        Raises:
-            InvalidInputError: missing or empty.
-        """
+        """A required attribute, not empty."""
         value = self.attributes.get(name)
         if not value:
             raise self.refusal(f"got no {name!r}, expected one; name it in the model")
         return value
 
     def choice(self, name: str, *valid: str) -> str:
-        """An attribute with a fixed set of values; the first one is the default.
-
-        Raises:
-            UnknownNameError: another value.
-        """
+        """An attribute with a fixed set of values; the first one is the default."""
         value = self.attributes.get(name, valid[0])
         if value not in valid:
             raise UnknownNameError(f"value of {name!r} in {self}:", value, list(valid))
         return value
 
-    def numbers(self, name: str, count: int) -> tuple[float, ...] | None:
-        """Numbers of an attribute; None if it is absent.
-
-        Raises:
-            InvalidInputError: another count, or a number that is not finite or above 1e6.
-        """
+    def numbers(self, name: str, *defaults: float) -> tuple[float, ...]:
+        """An attribute of as many finite numbers as there are defaults."""
         text = self.attributes.get(name)
         if text is None:
-            return None
+            return defaults
         words = text.split()
-        if len(words) == count and all(_NUMBER.fullmatch(word) for word in words):
+        if len(words) == len(defaults) and all(_NUMBER.fullmatch(word) for word in words):
             values = tuple(float(word) for word in words)
             if all(abs(value) <= MAX_NUMBER for value in values):
                 return values
         raise self.refusal(
-            f"got {name}={text[:80]!r}, expected {count} finite numbers of at most {MAX_NUMBER:g}"
+            f"got {name}={text[:80]!r}, expected {len(defaults)} finite numbers of at most "
+            f"{MAX_NUMBER:g}"
         )
-
-
-class _Builder:
-    def __init__(self, file: str) -> None:
-        self._file = file
-        self._open: list[Element] = []
-        self._count = 0
-        self.root: Element | None = None
-        self._parser = expat.ParserCreate()
-        self._parser.StartElementHandler = self._start
-        self._parser.EndElementHandler = self._end
-        self._parser.StartDoctypeDeclHandler = self._doctype
-
-    def parse(self, data: bytes) -> Element:
-        try:
-            self._parser.Parse(data, True)  # noqa: FBT003 - takes no keywords
-        except expat.ExpatError as error:
-            raise InvalidInputError(
-                f"{self._file} line {error.lineno}: got invalid XML "
-                f"({expat.ErrorString(error.code)}); is the file complete?"
-            ) from error
-        except (ValueError, LookupError) as error:
-            raise InvalidInputError(
-                f"{self._file}: got an unknown text encoding: {error}"
-            ) from error
-        if self.root is None:
-            raise InvalidInputError(f"{self._file}: got no XML element")
-        return self.root
-
-    def _start(self, tag: str, attributes: dict[str, str]) -> None:
-        self._count += 1
-        if len(self._open) >= MAX_DEPTH or self._count > MAX_ELEMENTS:
-            raise LimitExceededError(
-                f"{self._line()}: got more than {MAX_DEPTH} nested or {MAX_ELEMENTS} XML elements"
-            )
-        element = Element(tag, attributes, self._line())
-        if self._open:
-            self._open[-1].children.append(element)
-        else:
-            self.root = element
-        self._open.append(element)
-
-    def _end(self, tag: str) -> None:
-        self._open.pop()
-
-    def _doctype(self, *_: object) -> None:
-        raise InvalidInputError(
-            f"{self._line()}: got a document type; entities are never read, remove the declaration"
-        )
-
-    def _line(self) -> str:
-        return f"{self._file} line {self._parser.CurrentLineNumber}"
 
 
 def read_elements(path: Path) -> Element:
@@ -156,4 +94,65 @@ def read_elements(path: Path) -> Element:
         LimitExceededError: over 8 MiB, 100 levels or 20 000 elements.
         InvalidInputError: invalid XML, or a document type.
     """
-    return _Builder(path.name).parse(read_bounded(path, MAX_BYTES))
+    parser = expat.ParserCreate()
+    document = Element("", {}, path.name)
+    ancestors = [document]
+    count = 0
+
+    def line() -> str:
+        return f"{path.name} line {parser.CurrentLineNumber}"
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal count
+        count += 1
+        if len(ancestors) > MAX_DEPTH or count > MAX_ELEMENTS:
+            raise LimitExceededError(
+                f"{line()}: got more than {MAX_DEPTH} nested or {MAX_ELEMENTS} XML elements"
+            )
+        ancestors[-1].children.append(Element(tag, attributes, line()))
+        ancestors.append(ancestors[-1].children[-1])
+
+    def doctype(*_: object) -> None:
+        raise InvalidInputError(
+            f"{line()}: got a document type; entities are never read, remove the declaration"
+        )
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = lambda _: ancestors.pop()
+    parser.StartDoctypeDeclHandler = doctype
+    try:
+        parser.Parse(read_bounded(path, MAX_BYTES), True)  # noqa: FBT003 - takes no keywords
+    except expat.ExpatError as error:
+        raise InvalidInputError(
+            f"{path.name} line {error.lineno}: got invalid XML "
+            f"({expat.ErrorString(error.code)}); is the file complete?"
+        ) from error
+    except (ValueError, LookupError) as error:
+        raise InvalidInputError(f"{path.name}: got an unknown text encoding: {error}") from error
+    return document.children[0]
+
+
+def read_bounded(path: Path, max_bytes: int) -> bytes:
+    """Read a regular file of limited size.
+
+    Raises:
+        NotFoundError: no such file.
+        InvalidInputError: a folder, pipe or device.
+        LimitExceededError: larger than `max_bytes`.
+        StorageError: not readable.
+    """
+    try:
+        if not path.exists():
+            raise NotFoundError(f"{path}: no such file")
+        if not path.is_file():
+            raise InvalidInputError(f"{path}: got a folder or device, expected a regular file")
+        with path.open("rb") as file:
+            data = file.read(max_bytes + 1)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be read: {error.strerror}") from error
+    if len(data) > max_bytes:
+        raise LimitExceededError(
+            f"{path}: got more than {max_bytes} bytes, expected a hand's description of at most "
+            "that; meshes belong into files of their own"
+        )
+    return data

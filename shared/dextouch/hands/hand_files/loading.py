@@ -1,7 +1,8 @@
 """Loading of a hand model file and its mapping file into a `HandModel` in our wrist frame.
 
-Common mistakes of mappings are detected in the resulting hand: millimetres instead of metres, the
-thumb on the wrong side, fingers that bend backwards.
+Fixed joints between hinges are merged into the frame of the next hinge or into the tip, so that
+hinge angles are those of the model. Common mistakes of mappings are detected in the resulting hand:
+millimetres instead of metres, the thumb on the wrong side, fingers that bend backwards.
 """
 
 from itertools import pairwise
@@ -12,14 +13,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.geometry import invert, transform
-from dextouch.hands.finger_table import FingerTable
-from dextouch.hands.hand_files.chains import ModelFile, finger_table, fixed_links
+from dextouch.geometry import apply, invert, transform
+from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from dextouch.hands.hand_files.elements import Element, read_elements
-from dextouch.hands.hand_files.mapping import WristMapping, read_mapping
+from dextouch.hands.hand_files.mapping import FingerMapping, WristMapping, read_mapping
 from dextouch.hands.hand_files.mjcf import MjcfModel
-from dextouch.hands.hand_files.urdf import UrdfModel
-from dextouch.hands.robot_hand import HandModel
+from dextouch.hands.hand_files.urdf import HandModelFile, Joint, Link, UrdfModel, vector3
+from dextouch.hands.robot_hand import FingerTable, HandModel, JointRow
 from dextouch.hands.skeleton import CHAINS
 
 # Plausible lengths from knuckle to tip and from wrist to first hinge; detects millimetres.
@@ -56,14 +56,9 @@ def load_hand(model_path: Path | str, mapping_path: Path | str) -> HandModel:
     model, wrist = _model(root), mapping.wrist.link_name
     if wrist not in model.parents:
         raise UnknownNameError(f"link in {where} [wrist]:", wrist, list(model.parents))
-    bases = fixed_links(model, wrist, invert(_wrist_axes(mapping.wrist, f"{where} [wrist]")))
+    bases = _fixed_links(model, wrist, invert(_wrist_axes(mapping.wrist, f"{where} [wrist]")))
     tables = [
-        finger_table(
-            model,
-            finger,
-            bases=bases,
-            where=f"{where} [[fingers]] {finger.chain!r}",
-        )
+        _finger_table(model, finger, bases, f"{where} [[fingers]] {finger.chain!r}")
         for finger in mapping.fingers
     ]
     name = root.attributes.get("model") or root.attributes.get("name") or model.source
@@ -75,7 +70,7 @@ def load_hand(model_path: Path | str, mapping_path: Path | str) -> HandModel:
     return hand
 
 
-def _model(root: Element) -> ModelFile:
+def _model(root: Element) -> HandModelFile:
     if root.tag == "robot":
         return UrdfModel(root)
     if root.tag == "mujoco":
@@ -98,6 +93,115 @@ def _wrist_axes(wrist: WristMapping, where: str) -> Float64[np.ndarray, "4 4"]:
     y = np.cross(z, x)
     y /= np.linalg.norm(y)
     return transform(np.stack([np.cross(y, z), y, z], axis=-1), np.array(wrist.origin_m))
+
+
+def _fixed_links(
+    model: HandModelFile, wrist: str, T_ours_wrist: Float64[np.ndarray, "4 4"]
+) -> dict[str, np.ndarray]:
+    """T_ours_link [4, 4] of the wrist link and of all ancestors rigidly attached to it."""
+    # Some models attach the wrist to the palm like another fingertip; fingers then start at a
+    # common ancestor.
+    T_ours_link = T_ours_wrist
+    links: dict[str, np.ndarray] = {}
+    link: str | None = wrist
+    while link is not None and link not in links:
+        links[link] = T_ours_link
+        T_parent_link, joints = model.link(link)
+        if joints:
+            break
+        T_ours_link = T_ours_link @ invert(T_parent_link)
+        link = model.parents[link]
+    return links
+
+
+def _finger_table(
+    model: HandModelFile, finger: FingerMapping, bases: dict[str, np.ndarray], where: str
+) -> FingerTable:
+    """The table of one finger, which begins at one of `bases`, links fixed in our wrist frame."""
+    tip = finger.tip
+    if tip.site is not None:
+        link, T_link_tip = model.site(tip.site)
+    elif tip.link_name in model.parents:
+        link, T_link_tip = tip.link_name, np.eye(4)
+    else:
+        raise UnknownNameError(f"link in {where} tip:", tip.link_name, list(model.parents))
+    base, links = _links_between(model, bases, link, where)
+    steps = [model.link(name) for name in links]
+    _check_joints(steps, finger, model.source, where)
+    rows: list[JointRow] = []
+    T_frame_link = bases[base]
+    for step in steps:
+        T_frame_link = T_frame_link @ step.T_parent_link
+        for joint in step.joints:
+            row, T_frame_link = _hinge(joint, T_frame_link, where)
+            rows.append(row)
+    tip_m = apply(T_frame_link @ T_link_tip, np.array([tip.offset_m]))[0]
+    knuckle, pip, dip = (
+        _index(finger, name, f"{what} of {where}")
+        for what, name in (("knuckle", finger.knuckle), ("pip", finger.pip), ("dip", finger.dip))
+    )
+    return FingerTable(finger.chain, tuple(rows), vector3(tip_m), (knuckle, pip, dip))
+
+
+def _links_between(
+    model: HandModelFile, bases: dict[str, np.ndarray], tip: str, where: str
+) -> tuple[str, list[str]]:
+    """The base link of a tip, and the links from there to the tip."""
+    links: list[str] = []
+    link = tip
+    while link not in bases:
+        if link in links:
+            raise InvalidInputError(f"{where}: the links of {model.source} form a ring at {link!r}")
+        links.append(link)
+        parent = model.parents[link]
+        if parent is None:
+            raise InvalidInputError(
+                f"{where}: the tip's link {tip!r} does not hang on the wrist link "
+                f"{next(iter(bases))!r} in {model.source}; it hangs on {link!r}"
+            )
+        link = parent
+    return link, links[::-1]
+
+
+def _check_joints(steps: list[Link], finger: FingerMapping, source: str, where: str) -> None:
+    joints = [joint for step in steps for joint in step.joints]
+    for joint in joints:
+        if joint.refusal is not None:
+            raise InvalidInputError(
+                f"{joint.where}: {joint.refusal}; fingers are chains of hinges that move on their "
+                f"own ({where}); make it fixed in the model, or leave the finger out"
+            )
+        if joint.limits_rad is None:
+            raise InvalidInputError(
+                f"{joint.where}: got no limits, expected a lowest and a highest angle; write them "
+                "into the model"
+            )
+    names = tuple(joint.name for joint in joints)
+    if names != finger.joints:
+        raise InvalidInputError(
+            f"{where}: got joints {list(finger.joints)}, but between wrist and tip {source} "
+            f"has {list(names)}; list exactly those, from the wrist outwards"
+        )
+
+
+def _hinge(joint: Joint, T_frame_link: np.ndarray, where: str) -> tuple[JointRow, np.ndarray]:
+    """A hinge's row, and T_hinge_link, the link's pose in the hinge's rotated frame."""
+    if joint.limits_rad is None:
+        raise InvalidInputError(f"{where}: joint {joint.name!r} has no limits")
+    anchor = np.array(joint.anchor_m)
+    # At the joint's zero angle, which may differ from the angle of the file's reference pose.
+    R_undrawn = rotation_from_vector(-joint.zero_rad * np.array(joint.axis))
+    T_frame_hinge = T_frame_link @ transform(R_undrawn, anchor)
+    w, x, y, z = quaternion_from_rotation(T_frame_hinge[:3, :3]).tolist()
+    position_m = vector3(T_frame_hinge[:3, 3])
+    row = JointRow(joint.name, position_m, (w, x, y, z), joint.axis, joint.limits_rad)
+    return row, transform(np.eye(3), -anchor)
+
+
+def _index(finger: FingerMapping, name: str, what: str) -> int:
+    if name not in finger.joints:
+        raise UnknownNameError(what, name, list(finger.joints))
+    return finger.joints.index(name)
 
 
 def _length_m(finger: FingerTable) -> float:

@@ -1,28 +1,50 @@
 """Mapping file (TOML) that names the wrist and fingers of a hand model (docs/hands.md)."""
 
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Final
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.errors import InvalidInputError
 from dextouch.frozen_model import FrozenModel
-from dextouch.hands.hand_files.reading import read_bounded
+from dextouch.hands.hand_files.elements import MAX_NUMBER, read_bounded
 
 MAX_BYTES: Final = 64 * 2**10
-# Far above any length or direction.
-MAX_NUMBER: Final = 1e6
 
-# Messages say the description of a value as what was expected.
-Name = Annotated[str, Field(min_length=1, description="a name")]
-Number = Annotated[float, Field(strict=True, ge=-MAX_NUMBER, le=MAX_NUMBER)]
-Vector = Annotated[tuple[Number, Number, Number], Field(description="three finite numbers")]
-TableT = TypeVar("TableT", bound=FrozenModel)
+Name = Annotated[str, Field(min_length=1)]
 
 
-class _Place(FrozenModel):
+def _three_numbers(values: object) -> object:
+    if (
+        not isinstance(values, list)
+        or len(values) != 3
+        or not all(type(x) in (int, float) and abs(x) <= MAX_NUMBER for x in values)
+    ):
+        raise ValueError(
+            f"got {values!r:.80}, expected three finite numbers of at most {MAX_NUMBER:g}"
+        )
+    return values
+
+
+Vector = Annotated[tuple[float, float, float], BeforeValidator(_three_numbers)]
+
+
+class _Table(FrozenModel):
+    @model_validator(mode="before")
+    @classmethod
+    def _has_known_keys(cls, values: object) -> object:
+        if not isinstance(values, dict):
+            raise ValueError(f"got {values!r:.80}, expected a table")  # noqa: TRY004 - pydantic's
+        # Before all else: an unknown key often explains why another is missing.
+        for key in values:
+            if key not in cls.model_fields:
+                valid = ", ".join(sorted(cls.model_fields))
+                raise ValueError(f"unknown key {key!r}; valid: {valid}")
+        return values
+
+
+class _Place(_Table):
     """A table that names one part of the model: a link (of MJCF: a body) or a site."""
 
     link: Name | None = None
@@ -51,11 +73,11 @@ class TipMapping(_Place):
     offset_m: Vector = (0.0, 0.0, 0.0)
 
 
-class FingerMapping(FrozenModel):
+class FingerMapping(_Table):
     """A finger: its chain of the tracked skeleton, joints from the wrist outwards, its tip."""
 
     chain: Name
-    joints: tuple[str, ...] = Field(description="a list of names")
+    joints: tuple[str, ...]
     knuckle: Name
     pip: Name
     dip: Name
@@ -70,12 +92,12 @@ class WristMapping(_Place):
     origin_m: Vector = (0.0, 0.0, 0.0)
 
 
-class HandMapping(FrozenModel):
+class HandMapping(_Table):
     """A hand: side, wrist and fingers."""
 
     side: Name
     wrist: WristMapping
-    fingers: tuple[FingerMapping, ...] = Field(description="a list of tables")
+    fingers: tuple[FingerMapping, ...]
 
 
 def read_mapping(path: Path) -> HandMapping:
@@ -84,56 +106,21 @@ def read_mapping(path: Path) -> HandMapping:
     Raises:
         NotFoundError, StorageError: a missing or unreadable file.
         LimitExceededError: over 64 KiB.
-        InvalidInputError: not TOML, or a key that is missing or has the wrong type.
-        UnknownNameError: an unknown key; the valid ones are listed.
+        InvalidInputError: not TOML, or a key that is unknown, missing or of the wrong type.
     """
-    values = _parse(path)
-    if "wrist" in values:
-        values["wrist"] = _checked(WristMapping, f"{path.name} [wrist]", values["wrist"])
-    if isinstance(values.get("fingers"), list):
-        values["fingers"] = [
-            _finger(f"{path.name} [[fingers]] {number}", finger)
-            for number, finger in enumerate(values["fingers"], 1)
-        ]
-    return _checked(HandMapping, path.name, values)
-
-
-def _parse(path: Path) -> dict[str, Any]:
-    data = read_bounded(path, MAX_BYTES)
     try:
-        return tomllib.loads(data.decode("utf-8"))
+        return HandMapping.model_validate(tomllib.loads(read_bounded(path, MAX_BYTES).decode()))
     except UnicodeDecodeError as error:
         raise InvalidInputError(f"{path.name}: got invalid UTF-8: {error}") from error
     # Deeply nested brackets hit the parser's recursion limit.
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InvalidInputError(f"{path.name}: got invalid TOML: {error}") from error
-
-
-def _finger(where: str, values: object) -> FingerMapping:
-    if isinstance(values, dict) and "tip" in values:
-        values = values | {"tip": _checked(TipMapping, f"{where} tip", values["tip"])}
-    return _checked(FingerMapping, where, values)
-
-
-def _checked(model: type[TableT], where: str, values: object) -> TableT:
-    """A validated table, whose own tables are validated already."""
-    if not isinstance(values, Mapping):
-        raise InvalidInputError(f"{where}: got {values!r:.80}, expected a table")
-    try:
-        return model.model_validate(values)
     except ValidationError as error:
-        # An unknown key often explains why another is missing.
-        problems = error.errors(include_url=False)
-        problem = min(problems, key=lambda found: found["type"] != "extra_forbidden")
-        if not problem["loc"]:
-            message = problem["msg"].removeprefix("Value error, ")
-            raise InvalidInputError(f"{where}: {message}") from error
-        key = str(problem["loc"][0])
-        if problem["type"] == "extra_forbidden":
-            raise UnknownNameError(f"key in {where}:", key, list(model.model_fields)) from error
-        if key not in values:
-            raise InvalidInputError(f"{where}: got no {key!r}, expected one") from error
-        raise InvalidInputError(
-            f"{where}: got {key} = {values[key]!r:.80}, "
-            f"expected {model.model_fields[key].description or 'a name'}"
-        ) from error
+        problem = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in problem["loc"])
+        message = problem["msg"].removeprefix("Value error, ")
+        if problem["type"] == "missing":
+            message = "got none, expected one"
+        elif problem["type"] != "value_error":
+            message = f"got {problem['input']!r:.80}: {message}"
+        raise InvalidInputError(f"{path.name} {where}: {message}") from error
