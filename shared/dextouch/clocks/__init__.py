@@ -9,8 +9,11 @@ if TYPE_CHECKING:
     from dextouch.clocks.clock_model import ClockSegment as ClockSegment
     from dextouch.clocks.clock_model import fit_clock as fit_clock
     from dextouch.clocks.clock_model import lateness_ns as lateness_ns
+    from dextouch.clocks.counters import SequenceReport as SequenceReport
     from dextouch.clocks.counters import TickCounter as TickCounter
+    from dextouch.clocks.counters import find_lost_samples as find_lost_samples
     from dextouch.clocks.counters import prefers_sequence as prefers_sequence
+    from dextouch.clocks.counters import unwrap_counter as unwrap_counter
     from dextouch.clocks.counting_clock import CountedSample as CountedSample
     from dextouch.clocks.counting_clock import CountedTake as CountedTake
     from dextouch.clocks.counting_clock import CountingClock as CountingClock
@@ -22,8 +25,5 @@ if TYPE_CHECKING:
     from dextouch.clocks.round_trips import PathLatency as PathLatency
     from dextouch.clocks.round_trips import RoundTrip as RoundTrip
     from dextouch.clocks.round_trips import RoundTripClock as RoundTripClock
-    from dextouch.clocks.timestamps import SequenceReport as SequenceReport
-    from dextouch.clocks.timestamps import find_lost_samples as find_lost_samples
-    from dextouch.clocks.timestamps import unwrap_counter as unwrap_counter
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)

@@ -1,15 +1,14 @@
-"""Conversion of a sample's wrapping stamps or sequence numbers to continuous device time."""
+"""Unwrapping of device counters, and detection of lost samples from sequence numbers."""
 
-from typing import Literal
+from dataclasses import dataclass
 
-from dextouch.errors import InvalidInputError
-from dextouch.streams import StreamDescriptor
+import numpy as np
+from jaxtyping import Int64
 
-ABSENT = -1
+from dextouch.errors import InvalidInputError, ShapeError
+
 # Stamps coarser than this share of the sample period are less accurate than counting samples.
 COARSE_SHARE = 0.25
-
-Source = Literal["device", "sequence", "arrival"]
 
 
 class TickCounter:
@@ -48,76 +47,6 @@ class TickCounter:
         return straight * 10**9 // self._ticks_per_s
 
 
-class DeviceCounter:
-    """Continuous device time from stamps, or else from sequence numbers times the period.
-
-    The first sample decides: stamps if present, unless they are coarser than a quarter of the
-    period and samples are numbered.
-
-    Args:
-        descriptor: the stream's descriptor; needed for counters that wrap, for the resolution
-            of stamps, and for streams that have only a sequence number.
-
-    Attributes:
-        source: of device time; None before the first sample.
-        resolution_ns: device time is truncated to multiples of this.
-    """
-
-    def __init__(self, descriptor: StreamDescriptor | None) -> None:
-        self._descriptor = descriptor
-        self._period_ns = 0 if descriptor is None else descriptor.period_ns()
-        self.resolution_ns = 0
-        self._modulus_ns: int | None = None
-        self._last: tuple[int, int] | None = None
-        self.source: Source | None = None
-
-    def straighten(
-        self, t_host_ns: int, t_device_ns: int | None, sequence: int | None
-    ) -> int | None:
-        """Device time of one sample, in ns; None if the device provides no counter.
-
-        Raises:
-            InvalidInputError: a stamp or number that earlier samples had is missing.
-        """
-        t_device_ns = None if t_device_ns == ABSENT else t_device_ns
-        sequence = None if sequence == ABSENT else sequence
-        if self.source is None:
-            self._choose(has_time=t_device_ns is not None, has_sequence=sequence is not None)
-        if self.source == "arrival":
-            return None
-        if self.source == "device" and t_device_ns is not None:
-            return self._unwrap(t_device_ns, t_host_ns)
-        if self.source == "sequence" and sequence is not None:
-            return self._unwrap(sequence * self._period_ns, t_host_ns)
-        raise InvalidInputError(
-            f"online clock: a sample at {t_host_ns} ns came without its {self.source} stamp, "
-            "which earlier samples had; expected the same fields in every sample of a stream"
-        )
-
-    def _choose(self, *, has_time: bool, has_sequence: bool) -> None:
-        if self._descriptor is None:
-            self.source = "device" if has_time else "arrival"
-            return
-        device = self._descriptor.capabilities
-        if has_time and not (has_sequence and prefers_sequence(device.tick_ns, self._period_ns)):
-            self.source = "device"
-            self.resolution_ns = device.tick_ns
-            self._modulus_ns = _modulus(device.device_time_bits, device.tick_ns)
-        elif has_sequence:
-            self.source = "sequence"
-            self._modulus_ns = _modulus(device.sequence_bits, self._period_ns)
-        else:
-            self.source = "arrival"
-
-    def _unwrap(self, count_ns: int, t_host_ns: int) -> int:
-        straight = count_ns
-        if self._modulus_ns is not None and self._last is not None:
-            expected_ns = self._last[0] + t_host_ns - self._last[1]
-            straight = nearest_congruent(count_ns, expected_ns, self._modulus_ns)
-        self._last = (straight, t_host_ns)
-        return straight
-
-
 def nearest_congruent(count: int, expected: int, modulus: int) -> int:
     """The number nearest to `expected` that is congruent to `count` modulo `modulus`."""
     half = modulus // 2
@@ -129,6 +58,69 @@ def prefers_sequence(tick_ns: int, period_ns: int) -> bool:
     return tick_ns > COARSE_SHARE * period_ns
 
 
-def _modulus(bits: int, unit_ns: int) -> int | None:
-    """Period of the counter's wraparound in ns; None if it never wraps."""
-    return None if bits > 62 else 2**bits * unit_ns
+@dataclass(frozen=True)
+class SequenceReport:
+    """Lost samples of a stream.
+
+    `num_missing_before[i]` samples are missing between sample i-1 and i (0 for the first, at a
+    duplicate and at a restart); `restart_indices` are samples whose number went back or stood.
+    """
+
+    num_missing_before: Int64[np.ndarray, " n"]
+    restart_indices: Int64[np.ndarray, " r"]
+
+    @property
+    def num_missing(self) -> int:
+        """Total number of lost samples."""
+        return int(self.num_missing_before.sum())
+
+
+def unwrap_counter(
+    raw: np.ndarray, *, modulus: int, hint: np.ndarray | None = None
+) -> Int64[np.ndarray, " n"]:
+    """Unwrap a counter that wraps at `modulus`.
+
+    Args:
+        raw: integer counts [n], each in 0 … modulus - 1.
+        modulus: count at which the counter starts again from zero, 2 … 2**62.
+        hint: another clock in the same unit [n] (arrival times). It gives the number of wraps in a
+            gap longer than a wrap; without it a step of more than half a modulus counts as one
+            wrap, a smaller step back as a step back.
+
+    Raises:
+        ShapeError: not one axis of integers, or a hint of another length.
+        InvalidInputError: a count outside 0 … modulus - 1, or an invalid modulus.
+    """
+    counts = np.asarray(raw)
+    if counts.ndim != 1 or not np.issubdtype(counts.dtype, np.integer):
+        raise ShapeError(f"counter: got {counts.dtype} {counts.shape}, expected integers [n]")
+    if not 2 <= modulus <= 2**62:
+        raise InvalidInputError(f"counter: got modulus {modulus}, expected 2 … 2**62")
+    if counts.size and (int(counts.min()) < 0 or int(counts.max()) >= modulus):
+        raise InvalidInputError(
+            f"counter: got counts {counts.min()} … {counts.max()}, expected 0 … {modulus - 1}"
+        )
+    straight = counts.astype(np.int64)
+    steps: Int64[np.ndarray, " m"] = np.diff(straight)
+    expected = np.zeros_like(steps) if hint is None else np.diff(np.asarray(hint, dtype=np.int64))
+    if expected.shape != steps.shape:
+        raise ShapeError(f"counter: got {counts.size} counts and a hint of another length")
+    half = modulus // 2
+    # The congruent step nearest to the expected one.
+    steps = expected + np.mod(steps - expected + half, modulus) - half
+    return np.concatenate([straight[:1], straight[:1] + np.cumsum(steps)]).astype(np.int64)
+
+
+def find_lost_samples(sequence: np.ndarray, *, bits: int = 64) -> SequenceReport:
+    """Gaps and restarts in a stream's sequence numbers.
+
+    Args:
+        sequence: numbers [n] as the device sent them.
+        bits: width of the device's counter, 8 … 64 (64 never wraps in practice).
+    """
+    if not 8 <= bits <= 64:
+        raise InvalidInputError(f"sequence: got a counter of {bits} bits, expected 8 … 64")
+    numbers = np.asarray(sequence, dtype=np.int64)
+    straight = numbers if bits > 62 else unwrap_counter(numbers, modulus=2**bits)
+    steps = np.diff(straight, prepend=straight[:1] - 1)
+    return SequenceReport(np.maximum(steps - 1, 0), np.flatnonzero(steps <= 0).astype(np.int64))

@@ -1,12 +1,19 @@
 """Online clock that estimates host times of samples as they arrive: causal and monotonic."""
 
-from dextouch.clocks.counters import DeviceCounter, Source
+from typing import Literal
+
+from dextouch.clocks.counters import nearest_congruent, prefers_sequence
 from dextouch.clocks.running_envelope import MIN_SLOPE_SPAN_S, RunningEnvelope
+from dextouch.errors import InvalidInputError
 from dextouch.streams import StreamDescriptor
+
+ABSENT = -1
 
 # A nominal rate can be off by percents, a crystal by tens of ppm: counted samples need a slope
 # earlier than stamped ones.
 COUNTED_SLOPE_SPAN_S = 0.5
+
+Source = Literal["device", "sequence", "arrival"]
 
 
 class OnlineClock:
@@ -86,3 +93,64 @@ class OnlineClock:
         # Stamps are truncated to whole ticks: on average the sample is half a tick later. The line
         # does not show it, since it is determined by the stamps with the smallest truncation.
         return device_ns + self._reference_ns + round(offset_ns) + self._counter.resolution_ns // 2
+
+
+class DeviceCounter:
+    """Continuous device time from stamps, or else from sequence numbers times the period.
+
+    The first sample decides: stamps if present, unless they are coarser than a quarter of the
+    period and samples are numbered. Device time is truncated to multiples of `resolution_ns`.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor | None) -> None:
+        self._descriptor = descriptor
+        self._period_ns = 0 if descriptor is None else descriptor.period_ns()
+        self.resolution_ns = 0
+        self._modulus_ns: int | None = None
+        self._last: tuple[int, int] | None = None
+        self.source: Source | None = None
+
+    def straighten(
+        self, t_host_ns: int, t_device_ns: int | None, sequence: int | None
+    ) -> int | None:
+        """Device time of one sample, in ns; None if the device provides no counter."""
+        t_device_ns = None if t_device_ns == ABSENT else t_device_ns
+        sequence = None if sequence == ABSENT else sequence
+        if self.source is None:
+            self._choose(has_time=t_device_ns is not None, has_sequence=sequence is not None)
+        if self.source == "arrival":
+            return None
+        if self.source == "device" and t_device_ns is not None:
+            return self._unwrap(t_device_ns, t_host_ns)
+        if self.source == "sequence" and sequence is not None:
+            return self._unwrap(sequence * self._period_ns, t_host_ns)
+        raise InvalidInputError(
+            f"online clock: a sample at {t_host_ns} ns came without its {self.source} stamp, "
+            "which earlier samples had; expected the same fields in every sample of a stream"
+        )
+
+    def _choose(self, *, has_time: bool, has_sequence: bool) -> None:
+        if self._descriptor is None:
+            self.source = "device" if has_time else "arrival"
+            return
+        device = self._descriptor.capabilities
+        if has_time and not (has_sequence and prefers_sequence(device.tick_ns, self._period_ns)):
+            self.source = "device"
+            self.resolution_ns = device.tick_ns
+            bits, unit_ns = device.device_time_bits, device.tick_ns
+        elif has_sequence:
+            self.source = "sequence"
+            bits, unit_ns = device.sequence_bits, self._period_ns
+        else:
+            self.source = "arrival"
+            return
+        # A wider counter never wraps.
+        self._modulus_ns = 2**bits * unit_ns if bits <= 62 else None
+
+    def _unwrap(self, count_ns: int, t_host_ns: int) -> int:
+        straight = count_ns
+        if self._modulus_ns is not None and self._last is not None:
+            expected_ns = self._last[0] + t_host_ns - self._last[1]
+            straight = nearest_congruent(count_ns, expected_ns, self._modulus_ns)
+        self._last = (straight, t_host_ns)
+        return straight

@@ -5,10 +5,10 @@ has either sign and persists.
 """
 
 import math
+from statistics import fmean, median
 from typing import NamedTuple
 
 from dextouch.clocks.lower_hull import Line, LowerHull
-from dextouch.clocks.rhythm import Rhythm
 
 WINDOW_S = 60.0
 # Below this span the slope from before the last step is kept (initially 0).
@@ -47,23 +47,31 @@ TRIAL_NS = 100_000.0
 TRIAL_ABOVE_SPREADS = 3.0
 TRIAL_BELOW_SPREADS = 0.1
 
+# Regular distances of stamps.
+LEARNED_DISTANCES = 32
+# Minimum share of distances that are one period long; the others are lost samples.
+MIN_REGULAR_SHARE = 0.75
+NEAR_SHARE = 0.05
+RATE = 0.01
+# Maximum mean deviation from the period for a regular device.
+MAX_SCATTER_S = 100e-6
+ODD_S = 100e-6
+ODD_SCATTERS = 5.0
+# After this many irregular distances in a row, the period is learned again.
+MAX_ODD = 8
+
 
 class _Trial:
     """Check whether a line that was shifted at a step agrees with the points since then.
 
     A restarted device samples at another phase; then it does not agree, and only the points since
-    the step are valid.
-
-    Args:
-        hull: of the points since the step.
-        num: number of these points.
-        least_ns: their minimum distance to the shifted line.
+    the step, those of `hull`, are valid.
     """
 
-    def __init__(self, hull: LowerHull, num: int = 0, least_ns: float = math.inf) -> None:
+    def __init__(self, hull: LowerHull) -> None:
         self.hull = hull
-        self._num = num
-        self._least_ns = least_ns
+        self._num = 0
+        self._least_ns = math.inf
 
     @property
     def is_over(self) -> bool:
@@ -202,13 +210,7 @@ class RunningEnvelope:
         self._start_after(step_s, _Trial(pending))
 
     def _step_s(self, line: Line, distance_s: float, point: tuple[float, float]) -> float | None:
-        """Size of a clock step; None if the stamps do not determine it.
-
-        Args:
-            line: before the step.
-            distance_s: between the stamps before and after the step.
-            point: device time and apparent offset of a promptly delivered sample after the step.
-        """
+        """Size of a step from the stamps around it; None if they do not determine it."""
         period_s = self._rhythm.period_s
         if period_s is None or period_s * 1e9 < MIN_PERIOD_SPREADS * self.spread_ns:
             return None
@@ -278,3 +280,66 @@ class RunningEnvelope:
         if self._trial is not None and self._trial.is_over:
             self._trial = None
         return line.at(x_s)
+
+
+class Rhythm:
+    """Regularity of a device's stamps.
+
+    The stamps of a timer-driven device are whole periods apart, even with lost samples. Only a jump
+    of its clock, or a restart of the timer, gives an irregular distance.
+    """
+
+    def __init__(self) -> None:
+        self._distances: list[float] = []
+        self._period_s = 0.0
+        self._scatter_s = 0.0
+        self._num_odd = 0
+
+    @property
+    def period_s(self) -> float | None:
+        """Sample period by the device's clock; None while unknown or irregular."""
+        if self._period_s > 0.0 and self._scatter_s <= MAX_SCATTER_S:
+            return self._period_s
+        return None
+
+    def is_odd(self, distance_s: float) -> bool:
+        """Whether a distance is not a whole number of periods of a regular device."""
+        period_s = self.period_s
+        if period_s is None:
+            return False
+        num = max(1, round(distance_s / period_s))
+        return abs(distance_s - num * period_s) > ODD_S + ODD_SCATTERS * self._scatter_s
+
+    def is_kept(self, distance_s: float) -> bool:
+        """Whether a distance is exactly one period of a regular device: no jump, no loss."""
+        period_s = self.period_s
+        return (
+            period_s is not None
+            and round(distance_s / period_s) == 1
+            and not self.is_odd(distance_s)
+        )
+
+    def add(self, distance_s: float) -> None:
+        """Add the next distance, of either sign."""
+        if self._period_s <= 0.0:
+            self._learn(distance_s)
+            return
+        departure_s = distance_s - self._period_s
+        if abs(departure_s) <= NEAR_SHARE * self._period_s:
+            self._num_odd = 0
+            self._period_s += RATE * departure_s
+            self._scatter_s += RATE * (abs(departure_s) - self._scatter_s)
+            return
+        self._num_odd += 1
+        if self._num_odd > MAX_ODD:
+            self._period_s = 0.0
+
+    def _learn(self, distance_s: float) -> None:
+        self._distances.append(distance_s)
+        if len(self._distances) < LEARNED_DISTANCES:
+            return
+        distances, self._distances = self._distances, []
+        period_s = median(distances)
+        near = [abs(d - period_s) for d in distances if abs(d - period_s) <= NEAR_SHARE * period_s]
+        if len(near) >= MIN_REGULAR_SHARE * LEARNED_DISTANCES:
+            self._period_s, self._scatter_s, self._num_odd = period_s, fmean(near), 0

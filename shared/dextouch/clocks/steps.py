@@ -57,13 +57,7 @@ class Steps(NamedTuple):
 
 
 class _Rise(NamedTuple):
-    """A lasting rise of the offset.
-
-    Attributes:
-        first: first sample after it.
-        last: first sample that is no longer delayed; None if the clock stopped.
-        is_unsure: whether the opposite is possible.
-    """
+    """A lasting rise of the offset: a delay that ended before `last`, or (None) a stop."""
 
     first: int
     last: int | None
@@ -167,13 +161,7 @@ class _Levels:
         return found
 
     def _rise(self, first: int, index: int, last: int) -> _Rise | None:
-        """The lasting rise at `index`, if any.
-
-        Args:
-            first: start of the samples that define the previous level.
-            index: of a sample from which on a full second lies above that level.
-            last: next step of the clock.
-        """
+        """The lasting rise at `index` above the samples from `first`, before the step at `last`."""
         y, host, device = self._straight_ns, self._host[index:last], self._device[index:last]
         before_ns = y[first:index].min()
         num_sudden = max(2, round(SUDDEN_S / CONFIRM_S * self._count))
@@ -234,12 +222,7 @@ class _Stamps:
         self.is_regular = self.scatter_ns < self._tolerance_ns / 2
 
     def place(self, cut: int, change_ns: float) -> int | None:
-        """The first sample after the step near `cut`; None if it was only a delay.
-
-        Args:
-            cut: first sample after a change of level, give or take a few.
-            change_ns: of the apparent offset, positive if the clock goes back.
-        """
+        """The first sample after the step near `cut`; None if it was only a delay."""
         reach = REACH if self.is_regular else IRREGULAR_REACH
         first, last = max(cut - reach, 1), min(cut + reach, len(self._departures_ns))
         departures_ns = self._departures_ns[first - 1 : last]
