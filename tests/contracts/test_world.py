@@ -16,7 +16,7 @@ from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import Observation, ReturnSelector, RolloutStart
 from dextouch.worlds import CopyFirstWorld, World
-from dextouch.worlds.admission import check_answer
+from dextouch.worlds.world import check_answer
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 from services.world_model.checkpoints import (

@@ -6,9 +6,9 @@ from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from dextouch.worlds.baseline import CopyFirstWorld as CopyFirstWorld
-    from dextouch.worlds.serve import WorldServiceSettings as WorldServiceSettings
-    from dextouch.worlds.serve import create_world_app as create_world_app
-    from dextouch.worlds.serve import serve_worlds as serve_worlds
+    from dextouch.worlds.routes import WorldServiceSettings as WorldServiceSettings
+    from dextouch.worlds.routes import create_world_app as create_world_app
+    from dextouch.worlds.routes import serve_worlds as serve_worlds
     from dextouch.worlds.world import BatchWorld as BatchWorld
     from dextouch.worlds.world import StartedRollout as StartedRollout
     from dextouch.worlds.world import State as State

@@ -68,12 +68,7 @@ class WorldWorker(Generic[State]):
         return await loop.run_in_executor(self._executor, function, *arguments)
 
     async def step(self, job: StepJob[State]) -> StepOutcome[State]:
-        """Advance one rollout.
-
-        Raises:
-            LimitExceededError: the queue is full.
-            DexTouchError: raised by the world.
-        """
+        """Advance one rollout; raises LimitExceededError where the queue is full."""
         if len(self._waiting) >= self._max_waiting:
             raise LimitExceededError(
                 f"world {self.world.description.name}: {len(self._waiting)} chunks are pending, "
@@ -96,16 +91,7 @@ class WorldWorker(Generic[State]):
 
     async def _run_waiting(self) -> None:
         while self._waiting:
-            batch = self._take_batch()
-            (result,) = await asyncio.gather(
-                self.call(self._step_all, [entry.job for entry in batch]), return_exceptions=True
-            )
-            if not isinstance(result, BaseException):
-                self._answer(batch, result)
-            elif len(batch) == 1:
-                _fail(batch[0], result)
-            else:
-                await self._one_by_one(batch)
+            await self._run(self._take_batch())
 
     def _take_batch(self) -> list[_Waiting[State]]:
         """The oldest pending chunk and, up to the limit, others of its length."""
@@ -119,16 +105,21 @@ class WorldWorker(Generic[State]):
         self._waiting = others
         return batch
 
-    async def _one_by_one(self, batch: Sequence[_Waiting[State]]) -> None:
-        """Repeat a failed batch one by one, so that only the faulty rollout fails."""
-        for entry in batch:
-            (result,) = await asyncio.gather(
-                self.call(self._step_all, [entry.job]), return_exceptions=True
-            )
-            if isinstance(result, BaseException):
-                _fail(entry, result)
-            else:
-                self._answer([entry], result)
+    async def _run(self, batch: Sequence[_Waiting[State]]) -> None:
+        jobs = [entry.job for entry in batch]
+        (result,) = await asyncio.gather(self.call(self._step_all, jobs), return_exceptions=True)
+        if not isinstance(result, BaseException):
+            began_s, device_s, steps = result
+            for entry, (stepped, snapshot) in zip(batch, steps, strict=True):
+                if not entry.outcome.done():
+                    queued_s = began_s - entry.since_s
+                    entry.outcome.set_result(StepOutcome(stepped, snapshot, queued_s, device_s))
+        elif len(batch) == 1:
+            _fail(batch[0], result)
+        else:
+            # One by one, so that only the faulty rollout fails.
+            for entry in batch:
+                await self._run([entry])
 
     def _step_all(
         self, jobs: Sequence[StepJob[State]]
@@ -149,17 +140,6 @@ class WorldWorker(Generic[State]):
             ]
         results = [(one, self.world.snapshot(one.state)) for one in stepped]
         return began_s, time.perf_counter() - began_s, results
-
-    @staticmethod
-    def _answer(
-        batch: Sequence[_Waiting[State]],
-        result: tuple[float, float, list[tuple[SteppedRollout[State], bytes]]],
-    ) -> None:
-        began_s, device_s, steps = result
-        for entry, (stepped, snapshot) in zip(batch, steps, strict=True):
-            if not entry.outcome.done():
-                queued_s = began_s - entry.since_s
-                entry.outcome.set_result(StepOutcome(stepped, snapshot, queued_s, device_s))
 
 
 def _fail(entry: _Waiting[Any], error: BaseException) -> None:

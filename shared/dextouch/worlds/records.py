@@ -22,13 +22,15 @@ class RolloutRecord:
     """Everything that another process needs to continue a rollout.
 
     `request_sha256` and `payload` are request and response of the newest chunk, for a client that
-    missed the response; None and empty before the first chunk.
+    missed the response; None and empty before the first chunk. `version` is that of the store from
+    which the record was read or computed; it is not part of the bytes.
     """
 
     info: RolloutInfo
     snapshot: bytes
     request_sha256: str | None = None
     payload: bytes = b""
+    version: int = 0
 
     def to_bytes(self) -> bytes:
         """Serialize the record."""
@@ -39,7 +41,7 @@ class RolloutRecord:
         return pack({"info": info, "request_sha256": self.request_sha256}, arrays)
 
     @staticmethod
-    def from_bytes(data: bytes) -> "RolloutRecord":
+    def from_bytes(data: bytes, *, version: int = 0) -> "RolloutRecord":
         """Deserialize a record."""
         fields, arrays = unpack(data, max_bytes=MAX_RECORD_BYTES)
         return RolloutRecord(
@@ -47,15 +49,8 @@ class RolloutRecord:
             arrays["snapshot"].tobytes(),
             fields["request_sha256"],
             arrays["payload"].tobytes() if "payload" in arrays else b"",
+            version,
         )
-
-
-@dataclass(frozen=True)
-class StoredRecord:
-    """A record with its version in the store."""
-
-    record: RolloutRecord
-    version: int
 
 
 class RecordStore:
@@ -65,33 +60,22 @@ class RecordStore:
         self._store = store
         self._ttl_s = ttl_s
 
-    async def read(self, rollout_id: str) -> StoredRecord:
-        """The newest record.
-
-        Raises:
-            NotFoundError: unknown, deleted or expired.
-        """
+    async def read(self, rollout_id: str) -> RolloutRecord:
+        """The newest record; raises NotFoundError where unknown, deleted or expired."""
         stored = await self._store.get(KEY_PREFIX + rollout_id)
         if stored is None:
             raise _unknown(rollout_id)
-        return StoredRecord(RolloutRecord.from_bytes(stored.value), stored.version)
+        return RolloutRecord.from_bytes(stored.value, version=stored.version)
 
     async def add(self, record: RolloutRecord, *, limit: int) -> None:
-        """Write a new rollout, as version 1.
-
-        Raises:
-            LimitExceededError: `limit` rollouts are active or starting.
-        """
+        """Write a new rollout; raises LimitExceededError where `limit` are active or starting."""
         await self._add(record.info.id, record.to_bytes(), limit=limit, ttl_s=self._ttl_s)
 
     @asynccontextmanager
     async def place(self, rollout_id: str, *, limit: int) -> AsyncIterator[int]:
-        """Reserve a slot for a rollout that is starting; yields the version to overwrite.
+        """Reserve a slot for a rollout that is starting; yields the version to compute it from.
 
-        The slot is released if the block fails.
-
-        Raises:
-            LimitExceededError: `limit` rollouts are active or starting.
+        The slot is released if the block fails; LimitExceededError as for `add`.
         """
         await self._add(rollout_id, b"", limit=limit, ttl_s=max(self._ttl_s, PLACE_TTL_S))
         try:
@@ -100,25 +84,20 @@ class RecordStore:
             await self._give_up(rollout_id)
             raise
 
-    async def write(self, record: RolloutRecord, *, over_version: int) -> int:
-        """Replace the version a record was computed from (compare and set); returns the new one.
+    async def write(self, record: RolloutRecord) -> int:
+        """Replace the version that the record was computed from (compare and set).
 
-        Raises:
-            ConflictError: another version is stored.
+        Returns the new version; raises ConflictError where another one is stored.
         """
         return await self._store.set(
             KEY_PREFIX + record.info.id,
             record.to_bytes(),
-            expected_version=over_version,
+            expected_version=record.version,
             ttl_s=self._ttl_s,
         )
 
     async def delete(self, rollout_id: str) -> None:
-        """Forget a rollout.
-
-        Raises:
-            NotFoundError: unknown, deleted or expired.
-        """
+        """Forget a rollout; raises NotFoundError where unknown, deleted or expired."""
         if not await self._store.delete(KEY_PREFIX + rollout_id):
             raise _unknown(rollout_id)
 

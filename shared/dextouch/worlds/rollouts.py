@@ -35,10 +35,16 @@ from dextouch.schemas import (
     encode_answer,
 )
 from dextouch.serving import StateStore
-from dextouch.worlds.admission import check_answer, check_chunk, check_selector, check_start
 from dextouch.worlds.batcher import StepJob, WorldWorker
-from dextouch.worlds.records import RecordStore, RolloutRecord, StoredRecord
-from dextouch.worlds.world import StartedRollout, World
+from dextouch.worlds.records import RecordStore, RolloutRecord
+from dextouch.worlds.world import (
+    StartedRollout,
+    World,
+    check_answer,
+    check_chunk,
+    check_selector,
+    check_start,
+)
 
 logger = structlog.get_logger(__name__)
 
@@ -140,8 +146,7 @@ class RolloutService:
                 last_step=0,
                 ttl_s=self.limits.ttl_s,
             )
-            record = RolloutRecord(info, snapshot)
-            version = await self._records.write(record, over_version=placed)
+            version = await self._records.write(RolloutRecord(info, snapshot, version=placed))
         self._live.put(info.id, version, started.state)
         logger.info("rollout_started", rollout_id=info.id, world=world, task=info.task)
         origin = RolloutOrigin(started.anchor, started.K_head)
@@ -150,7 +155,7 @@ class RolloutService:
 
     async def get(self, rollout_id: str) -> RolloutInfo:
         """State of a rollout; does not renew its time to live."""
-        return (await self._records.read(rollout_id)).record.info
+        return (await self._records.read(rollout_id)).info
 
     async def step(
         self, rollout_id: str, chunk: int, actions: np.ndarray, selector: ReturnSelector
@@ -166,25 +171,25 @@ class RolloutService:
         """
         lock = self._locks.setdefault(rollout_id, asyncio.Lock())
         async with lock:
-            stored = await self._records.read(rollout_id)
-            worker = self._worker_of(stored.record.info)
+            record = await self._records.read(rollout_id)
+            worker = self._worker_of(record.info)
             description = worker.world.description
             check_selector(selector, description)
             request = _ChunkRequest(check_chunk(actions, description), selector)
-            replayed = _replay(stored.record, chunk, request)
+            replayed = _replay(record, chunk, request)
             if replayed is not None:
                 logger.info("chunk_replayed", rollout_id=rollout_id, chunk=chunk)
                 return replayed
-            if stored.record.info.ended is not None:
-                raise _over(stored.record.info)
-            self._check_length(stored.record.info)
+            if record.info.ended is not None:
+                raise _over(record.info)
+            self._check_length(record.info)
             try:
-                return await self._advance(stored, worker, request)
+                return await self._advance(record, worker, request)
             except EndedError as error:
-                raise await self._end(stored, error) from error
+                raise await self._end(record, error) from error
             except ConflictError:
                 # Another process was faster: its response is valid if the request was the same.
-                replayed = _replay((await self._records.read(rollout_id)).record, chunk, request)
+                replayed = _replay(await self._records.read(rollout_id), chunk, request)
                 if replayed is None:
                     raise
                 return replayed
@@ -198,7 +203,7 @@ class RolloutService:
             rollout_id: of the rollout to branch; it is unchanged.
             seed: of the branch's noise; None keeps the rollout's own.
         """
-        parent = (await self._records.read(rollout_id)).record
+        parent = await self._records.read(rollout_id)
         self._worker_of(parent.info)
         changed: dict[str, object] = {"id": secrets.token_hex(16), "ended": None}
         if seed is not None:
@@ -221,13 +226,13 @@ class RolloutService:
             worker.close()
 
     async def _advance(
-        self, stored: StoredRecord, worker: WorldWorker[Any], request: _ChunkRequest
+        self, stored: RolloutRecord, worker: WorldWorker[Any], request: _ChunkRequest
     ) -> Answer:
         """Compute a chunk and commit its record."""
-        before = stored.record.info
+        before = stored.info
         state = self._live.get(before.id, stored.version)
         if state is None:
-            state = await worker.call(worker.world.restore, stored.record.snapshot)
+            state = await worker.call(worker.world.restore, stored.snapshot)
         seed = chunk_seed(before.seed, before.next_chunk, before.world_digest)
         outcome = await worker.step(StepJob(state, request.actions, seed, request.selector))
         seen, num_steps = outcome.stepped.observation, len(request.actions)
@@ -246,16 +251,16 @@ class RolloutService:
         )
         told = outcome.stepped.info
         payload = encode_answer(info, seen, tactile=request.selector.tactile, info=told)
-        record = RolloutRecord(info, outcome.snapshot, request.sha256(), payload)
-        version = await self._records.write(record, over_version=stored.version)
+        sha256 = request.sha256()
+        record = RolloutRecord(info, outcome.snapshot, sha256, payload, stored.version)
+        version = await self._records.write(record)
         self._live.put(info.id, version, outcome.stepped.state)
         return Answer(payload, queued_s=outcome.queued_s, device_s=outcome.device_s)
 
-    async def _end(self, stored: StoredRecord, error: EndedError) -> EndedError:
+    async def _end(self, record: RolloutRecord, error: EndedError) -> EndedError:
         """Mark a rollout as ended; returns the error that later chunks get."""
-        record = stored.record
         info = record.info.model_copy(update={"ended": error.reason})
-        await self._records.write(replace(record, info=info), over_version=stored.version)
+        await self._records.write(replace(record, info=info))
         self._live.drop(info.id)
         logger.info("rollout_ended", rollout_id=info.id, reason=error.reason)
         return _over(info)

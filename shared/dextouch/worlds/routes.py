@@ -1,13 +1,15 @@
-"""HTTP routes of /v1/rollouts, documented in docs/rollout_api.md."""
+"""Application that serves worlds over HTTP: the routes of /v1/rollouts (docs/rollout_api.md)."""
 
 import base64
 import json
-from typing import Annotated, TypeVar
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
 from jaxtyping import Shaped
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from dextouch.errors import InvalidInputError, ShapeError
@@ -31,12 +33,18 @@ from dextouch.serving import (
     MSGPACK,
     OCTETS,
     RequireScope,
+    ServiceSettings,
+    configure_logging,
+    create_service_app,
     media_type,
+    open_state,
+    run,
     takes,
     timed,
 )
 from dextouch.streams import unpack
-from dextouch.worlds.rollouts import Answer, RolloutService
+from dextouch.worlds.rollouts import Answer, RolloutLimits, RolloutService
+from dextouch.worlds.world import World
 
 SCOPE = "rollout"
 REPLAYED_HEADER = "dextouch-replayed"
@@ -54,6 +62,50 @@ class ActionsBody(FrozenModel):
 
 # From the query: ?steps=last&cameras=camera_head&tactile=false; unknown parameters are refused.
 Selector = Annotated[ReturnSelector, Query()]
+
+
+class WorldServiceSettings(ServiceSettings):
+    """Settings of a service of worlds; subclass to add those of a world."""
+
+    state_url: str = Field(
+        default="memory://",
+        description="where rollouts are kept: memory:// or redis://HOST:PORT/DB",
+    )
+    limits: RolloutLimits = RolloutLimits()
+
+
+def create_world_app(
+    worlds: Mapping[str, World[Any]], settings: WorldServiceSettings, *, name: str = "worlds"
+) -> FastAPI:
+    """Create the application; its shutdown ends the worlds' threads."""
+    store = open_state(settings.state_url)
+    service = RolloutService(worlds, store, settings.limits)
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        yield
+        service.close()
+        await store.close()
+
+    async def readiness() -> list[str]:
+        await service.ping()
+        return []
+
+    return create_service_app(
+        name=name,
+        settings=settings,
+        routers=[rollout_router(service)],
+        lifespan=lifespan,
+        readiness=readiness,
+    )
+
+
+def serve_worlds(
+    worlds: Mapping[str, World[Any]], settings: WorldServiceSettings, *, name: str = "worlds"
+) -> None:
+    """Serve worlds until SIGINT or SIGTERM."""
+    configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
+    run(create_world_app(worlds, settings, name=name), settings)
 
 
 def rollout_router(service: RolloutService) -> APIRouter:

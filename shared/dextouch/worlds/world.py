@@ -1,4 +1,6 @@
-"""The World protocol, implemented by the twin, world models and, one day, a real robot.
+"""The World protocol, implemented by the twin, world models and, one day, a real robot, and checks.
+
+Requests and responses are validated against a world's description by the `check_…` functions.
 
 A world is functional: `step` maps a state to a new one, so that a failed step leaves the old state
 unchanged, a step can be replayed, and a rollout can branch. States are opaque to the caller;
@@ -6,19 +8,28 @@ unchanged, a step can be replayed, and a rollout can branch. States are opaque t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.hands.actions import AnchorPoses
+from dextouch.errors import (
+    DegenerateRotationError,
+    DexTouchError,
+    InvalidInputError,
+    LimitExceededError,
+    ShapeError,
+    UnknownNameError,
+)
+from dextouch.hands.actions import ACTION_DIM, AnchorPoses
 from dextouch.schemas import (
     EVERYTHING,
     Observation,
     ReturnSelector,
     RolloutStart,
     WorldDescription,
+    check_observation,
 )
 
 State = TypeVar("State")
@@ -123,3 +134,124 @@ class BatchWorld(World[State], Protocol[State]):
             selectors: one per rollout; None requests everything.
         """
         ...
+
+
+def check_start(start: RolloutStart, description: WorldDescription) -> RolloutStart:
+    """Validate a start and keep only images of this world's cameras.
+
+    Raises:
+        UnknownNameError: task or action kind.
+        InvalidInputError: an observation where a seed is required, or vice versa.
+        ShapeError: an observation of another size than the world's.
+    """
+    if start.task not in description.tasks:
+        raise UnknownNameError("task", start.task, list(description.tasks))
+    if start.action_kind not in description.action_kinds:
+        raise UnknownNameError("action kind", start.action_kind, list(description.action_kinds))
+    way = "task_seed" if start.observation is None else "observation"
+    if way not in description.starts_from:
+        raise InvalidInputError(
+            f"world {description.name}: got a start from {way}, expected one of "
+            f"{', '.join(description.starts_from)}"
+        )
+    if start.observation is None:
+        return start
+    if len(start.observation) != 1:
+        raise ShapeError(f"start: observation has {len(start.observation)} steps, expected 1")
+    images = start.observation.images
+    wanted = {camera: images[camera] for camera in description.cameras if camera in images}
+    observation = replace(start.observation, images=wanted)
+    _check_fits(observation, description, description.cameras, where="start")
+    return replace(start, observation=observation)
+
+
+def check_chunk(
+    actions: np.ndarray, description: WorldDescription
+) -> Float64[np.ndarray, "steps 67"]:
+    """Validate the length of an action chunk and return it as float64.
+
+    Its numbers are validated by the world, which every `World` does before it changes anything.
+
+    Raises:
+        ShapeError: not [K, 67], or K is not a multiple of the world's chunk.
+        LimitExceededError: longer than the world's maximum.
+    """
+    checked = np.asarray(actions, dtype=np.float64)
+    if checked.ndim != 2 or checked.shape[1] != ACTION_DIM or len(checked) == 0:
+        raise ShapeError(f"chunk: got shape {checked.shape}, expected [K ≥ 1, {ACTION_DIM}]")
+    if len(checked) % description.chunk_multiple:
+        raise ShapeError(
+            f"chunk: got {len(checked)} steps, expected a multiple of {description.chunk_multiple}",
+            got=len(checked),
+            multiple=description.chunk_multiple,
+        )
+    if len(checked) > description.max_chunk_steps:
+        raise LimitExceededError(
+            f"chunk: got {len(checked)} steps, expected at most {description.max_chunk_steps}",
+            got=len(checked),
+            maximum=description.max_chunk_steps,
+        )
+    return checked
+
+
+def check_selector(selector: ReturnSelector, description: WorldDescription) -> None:
+    """Refuse cameras that the world lacks."""
+    for camera in selector.cameras or ():
+        if camera not in description.cameras:
+            raise UnknownNameError("camera", camera, list(description.cameras))
+
+
+def check_answer(
+    observation: Observation,
+    description: WorldDescription,
+    *,
+    first_step: int,
+    num_steps: int,
+    selector: ReturnSelector = EVERYTHING,
+) -> None:
+    """Validate a world's response.
+
+    Args:
+        observation: what it gave for a chunk.
+        description: of the world.
+        first_step: of the chunk.
+        num_steps: of the chunk.
+        selector: what was asked for: of `steps="last"` one step, the chunk's last, is expected.
+
+    Raises:
+        NonFiniteError: NaN or infinity in the response, as extreme actions may cause.
+        DexTouchError: wrong length, size or step: the world violates its description.
+    """
+    if selector.steps == "last":
+        first_step, num_steps = first_step + num_steps - 1, 1
+    cameras = tuple(camera for camera in description.cameras if selector.wants(camera))
+    where = f"answer of world {description.name} (the rollout stays as it was)"
+    if (observation.first_step, len(observation)) != (first_step, num_steps):
+        raise DexTouchError(
+            f"{where}: got {len(observation)} steps from {observation.first_step}, expected "
+            f"{num_steps} from {first_step}"
+        )
+    try:
+        _check_fits(observation, description, cameras, where=where)
+    except (ShapeError, DegenerateRotationError) as error:
+        raise DexTouchError(error.message) from error
+
+
+def _check_fits(
+    observation: Observation,
+    description: WorldDescription,
+    cameras: tuple[str, ...],
+    *,
+    where: str,
+) -> None:
+    check_observation(observation, where=where)
+    if set(observation.images) != set(cameras):
+        raise ShapeError(
+            f"{where}: got images of {sorted(observation.images)}, expected of {sorted(cameras)}"
+        )
+    expected = (description.image_height_px, description.image_width_px)
+    for camera, images in observation.images.items():
+        if images.shape[1:3] != expected:
+            raise ShapeError(
+                f"{where}: images of {camera} are {images.shape[1:3]} px, expected {expected}"
+            )

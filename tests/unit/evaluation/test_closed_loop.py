@@ -8,8 +8,8 @@ import pytest
 from dextouch.clients import http_link
 from dextouch.clients.rollouts import RolloutClient
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.baseline import CopyFirstWorld
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
 from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate, matched_start
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.hold import HoldPolicy

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from dextouch.errors import InvalidInputError
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.checkpoints import save_checkpoint
 from services.evaluation.command_line import run_evaluation
 from services.evaluation.scores import REAL
