@@ -34,6 +34,7 @@ from dextouch.schemas import (
     decode_answer,
     encode_start,
     first_problems,
+    validated,
 )
 
 MSGPACK = "application/msgpack"
@@ -98,9 +99,8 @@ class RolloutClient:
             LimitExceededError: the service has as many rollouts as it allows.
             UnavailableError: the service does not respond.
         """
-        request = _start_request(
-            world=world, task=task, seed=seed, instruction=instruction, action_kind=action_kind
-        )
+        asked = {"world": world, "task": task, "seed": seed, "instruction": instruction}
+        request = validated(StartRequest, asked | {"action_kind": action_kind}, where="start")
         observation, anchor, K_head = (None, None, None) if init is None else init
         start = RolloutStart(task, seed, instruction, action_kind, observation, anchor, K_head)
         query = _query(self.selector)
@@ -218,13 +218,6 @@ class Rollout:
         # An exception in the block matters more than a failure to close the rollout.
         with suppress(DexTouchError):
             self.close()
-
-
-def _start_request(**fields: object) -> StartRequest:
-    try:
-        return StartRequest.model_validate(fields)
-    except ValidationError as error:
-        raise InvalidInputError(f"start: {first_problems(error)}") from error
 
 
 def _query(selector: ReturnSelector) -> str:

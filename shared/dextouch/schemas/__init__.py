@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from dextouch.schemas.episodes import Verification as Verification
     from dextouch.schemas.episodes import json_ready as json_ready
     from dextouch.schemas.episodes import matrix_rows as matrix_rows
-    from dextouch.schemas.health import Health as Health
-    from dextouch.schemas.health import Readiness as Readiness
     from dextouch.schemas.observations import EVERYTHING as EVERYTHING
     from dextouch.schemas.observations import Doubt as Doubt
     from dextouch.schemas.observations import Observation as Observation
@@ -43,11 +41,14 @@ if TYPE_CHECKING:
     from dextouch.schemas.observations import start_from as start_from
     from dextouch.schemas.problems import CLASS_OF_STATUS as CLASS_OF_STATUS
     from dextouch.schemas.problems import PROBLEM_MEDIA_TYPE as PROBLEM_MEDIA_TYPE
+    from dextouch.schemas.problems import Health as Health
     from dextouch.schemas.problems import Problem as Problem
+    from dextouch.schemas.problems import Readiness as Readiness
     from dextouch.schemas.problems import error_from_problem as error_from_problem
     from dextouch.schemas.problems import first_problems as first_problems
     from dextouch.schemas.problems import problem_from_error as problem_from_error
     from dextouch.schemas.problems import status_of as status_of
+    from dextouch.schemas.problems import validated as validated
     from dextouch.schemas.recordings import ID_TAKEN as ID_TAKEN
     from dextouch.schemas.recordings import BatchReceipt as BatchReceipt
     from dextouch.schemas.recordings import ExpireUploads as ExpireUploads

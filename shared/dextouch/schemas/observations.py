@@ -2,16 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
-from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
 from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
-from dextouch.schemas.problems import first_problems
+from dextouch.schemas.problems import validated
 from dextouch.schemas.rollouts import ActionKind, RolloutInfo, StartRequest
 from dextouch.streams import pack, unpack
 
@@ -21,7 +21,6 @@ ARRAYS = ("images", "tactile_kpa", "action_reached", "object_poses")
 IMAGE_PREFIX = "image/"
 ANCHOR_NAMES = ("T_world_wrist_left", "T_world_wrist_right", "T_world_camera_head")
 RIGID_TOLERANCE = 1e-6
-ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 class ReturnSelector(FrozenModel):
@@ -263,7 +262,7 @@ def decode_answer(data: bytes, *, max_bytes: int) -> RolloutAnswer:
         InvalidInputError: not a valid response.
     """
     raw, arrays = unpack(data, max_bytes=max_bytes)
-    fields = _validated(AnswerFields, raw, where="answer")
+    fields = validated(AnswerFields, raw, where="answer")
     origin = _origin_from(arrays, where="answer") if "K_head" in arrays else None
     observation = _observation_from(fields.observation, arrays, where="answer")
     return RolloutAnswer(fields.rollout, observation, fields.info, origin)
@@ -281,7 +280,7 @@ def decode_observation(data: bytes, *, max_bytes: int) -> Observation:
         InvalidInputError: not a valid observation.
     """
     raw, arrays = unpack(data, max_bytes=max_bytes)
-    fields = _validated(ObservationFields, raw, where="observation")
+    fields = validated(ObservationFields, raw, where="observation")
     return _observation_from(fields, arrays, where="observation")
 
 
@@ -306,7 +305,7 @@ def decode_start(data: bytes, *, max_bytes: int) -> tuple[StartRequest, RolloutS
         InvalidInputError: not a valid start request.
     """
     raw, arrays = unpack(data, max_bytes=max_bytes)
-    fields = _validated(StartFields, raw, where="start")
+    fields = validated(StartFields, raw, where="start")
     if fields.observation is None:
         return fields.start, start_from(fields.start)
     observation = _observation_from(fields.observation, arrays, where="start")
@@ -389,10 +388,3 @@ def _array(arrays: Mapping[str, np.ndarray], name: str, where: str) -> np.ndarra
         listed = ", ".join(sorted(arrays)) or "none"
         raise InvalidInputError(f"{where}: array {name!r} is missing; got: {listed}")
     return arrays[name]
-
-
-def _validated(model: type[ModelT], fields: object, *, where: str) -> ModelT:
-    try:
-        return model.model_validate(fields)
-    except ValidationError as error:
-        raise InvalidInputError(f"{where}: {first_problems(error)}") from error

@@ -1,6 +1,6 @@
-"""Conversion between DexTouch errors and problem+json bodies (RFC 9457)."""
+"""Bodies that every service gives: problems (RFC 9457) from and to our errors, and probes."""
 
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json, to_json
@@ -19,9 +19,11 @@ from dextouch.errors import (
     StorageFullError,
     UnavailableError,
 )
+from dextouch.frozen_model import FrozenModel
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:dextouch:error:"
+ModelT = TypeVar("ModelT", bound=BaseModel)
 
 # Names of the error constructor's own parameters.
 RESERVED = frozenset({"self", "message"})
@@ -56,6 +58,22 @@ CLASS_OF_STATUS: dict[int, type[DexTouchError]] = {
     504: UnavailableError,
     507: StorageFullError,
 }
+
+
+class Health(FrozenModel):
+    """Liveness: the process responds."""
+
+    status: Literal["ok"] = "ok"
+    service: str
+    version: str
+
+
+class Readiness(FrozenModel):
+    """Readiness for requests; `waiting_for` names what is missing (empty when ready)."""
+
+    ready: bool
+    service: str
+    waiting_for: tuple[str, ...] = ()
 
 
 class Problem(BaseModel):
@@ -131,3 +149,15 @@ def first_problems(error: ValidationError, *, limit: int = 5) -> str:
         f"{item['msg'].removeprefix('Value error, ')}"
         for item in items
     )
+
+
+def validated(model: type[ModelT], fields: object, *, where: str) -> ModelT:
+    """A model of decoded fields.
+
+    Raises:
+        InvalidInputError: wrong fields; the message begins with `where`.
+    """
+    try:
+        return model.model_validate(fields)
+    except ValidationError as error:
+        raise InvalidInputError(f"{where}: {first_problems(error)}") from error

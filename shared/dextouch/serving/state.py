@@ -63,10 +63,6 @@ class StateStore(Protocol):
         """Delete a key; False if absent."""
         ...
 
-    async def keys(self, prefix: str) -> list[str]:
-        """Live keys that start with `prefix`, sorted."""
-        ...
-
     async def ping(self) -> None:
         """Raise UnavailableError when the store cannot be reached."""
         ...
@@ -116,7 +112,9 @@ class MemoryState:
     async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
         """See StateStore."""
         # No await between counting and writing, hence atomic in one event loop.
-        if key not in self._entries and len(await self.keys(within)) >= limit:
+        self._expire()
+        num_live = sum(other.startswith(within) for other in self._entries)
+        if key not in self._entries and num_live >= limit:
             return False
         await self.set(key, value, expected_version=0, ttl_s=ttl_s)
         return True
@@ -125,11 +123,6 @@ class MemoryState:
         """See StateStore."""
         self._expire()
         return self._entries.pop(key, None) is not None
-
-    async def keys(self, prefix: str) -> list[str]:
-        """See StateStore."""
-        self._expire()
-        return sorted(key for key in self._entries if key.startswith(prefix))
 
     async def ping(self) -> None:
         """Always succeeds."""
@@ -216,19 +209,6 @@ class RedisState:
     async def delete(self, key: str) -> bool:
         """See StateStore."""
         return bool(await self._call("DEL", REDIS_PREFIX + key))
-
-    async def keys(self, prefix: str) -> list[str]:
-        """See StateStore."""
-        found: set[bytes] = set()
-        cursor = 0
-        while True:
-            cursor, some = await self._call(
-                "SCAN", cursor, "MATCH", _literal(REDIS_PREFIX + prefix) + "*", "COUNT", 1000
-            )
-            found.update(some)
-            if cursor == 0:
-                break
-        return sorted(key.decode().removeprefix(REDIS_PREFIX) for key in found)
 
     async def ping(self) -> None:
         """See StateStore."""

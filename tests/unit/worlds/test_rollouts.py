@@ -19,7 +19,7 @@ from dextouch.errors import (
     UnknownNameError,
 )
 from dextouch.schemas import MAX_SEED, ReturnSelector, RolloutStart, decode_answer
-from dextouch.serving.state import MemoryState
+from dextouch.serving.state import MemoryState, RedisState
 from dextouch.worlds.rollouts import RolloutLimits, RolloutService, chunk_seed
 from tests.unit.worlds.fakes import (
     K_HEAD,
@@ -276,8 +276,8 @@ async def test_limits_on_number_and_length():
 
 @pytest.mark.parametrize("num_processes", [1, 2])
 async def test_of_many_starts_at_once_only_as_many_as_allowed_begin(state, num_processes):
-    for key in await state.keys(""):
-        await state.delete(key)
+    if isinstance(state, RedisState):
+        await state._client.flushdb()
     made = [service(state, max_rollouts=4) for _ in range(num_processes)]
     results = await asyncio.gather(
         *(begin(made[i % num_processes]) for i in range(24)), return_exceptions=True
@@ -303,25 +303,26 @@ class Waiting(SumWorld):
     def __init__(self):
         super().__init__()
         self.may_begin = threading.Event()
+        self.has_place = threading.Event()
 
     def reset(self, start):
         if not start.instruction:
             raise InvalidInputError("no instruction")
+        self.has_place.set()
         self.may_begin.wait(30)
         return super().reset(start)
 
 
 async def test_starts_that_fail_or_are_cancelled_leave_their_place(state):
-    for key in await state.keys(""):
-        await state.delete(key)
+    if isinstance(state, RedisState):
+        await state._client.flushdb()
     world = Waiting()
     made = service(state, world=world, max_rollouts=1)
     for _ in range(2):
         with pytest.raises(InvalidInputError, match="no instruction"):
             await begin(made, RolloutStart("stand_bottle", 3, ""))
     starting = asyncio.create_task(begin(made))
-    while not await state.keys(""):  # noqa: ASYNC110 - a store
-        await asyncio.sleep(0)
+    await asyncio.to_thread(world.has_place.wait, 30)
     with pytest.raises(LimitExceededError):
         await begin(made)
     starting.cancel()
@@ -349,8 +350,8 @@ class Failing:
 
 
 async def test_a_store_whose_answer_is_lost_holds_no_place(state):
-    for key in await state.keys(""):
-        await state.delete(key)
+    if isinstance(state, RedisState):
+        await state._client.flushdb()
     failing = Failing(state, "", UnavailableError("answer lost"))
     made = service(failing, max_rollouts=2)
     first = await begin(made)
@@ -381,7 +382,8 @@ async def test_memory_stays_flat_over_abandoned_rollouts():
         await begin(made)
         now_s[0] += 0.5
     assert len(made._live._states) <= 4
-    assert len(await store.keys("")) <= 3
+    store._expire()
+    assert len(store._entries) <= 3
     assert len(made._locks) == 0
     made.close()
 
