@@ -7,10 +7,10 @@ from functools import partial
 
 import structlog
 
-from dextouch.episodes.spool import SpoolWriter, StreamRecord
+from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import StorageError
 from dextouch.schemas import LedgerEntry, TakeCheck
-from dextouch.streams import Sample, SampleBatch
+from dextouch.streams import EncodedBatch, Sample, SampleBatch
 from services.acquisition.clock import HostWatch, StationClock
 from services.acquisition.completeness import (
     StreamFacts,
@@ -116,7 +116,7 @@ class Take:
             except StorageError as error:
                 self._end(error)
 
-    def _encode(self, name: str, samples: list[Sample]) -> tuple[StreamRecord | None, list[Sample]]:
+    def _encode(self, name: str, samples: list[Sample]) -> tuple[EncodedBatch | None, list[Sample]]:
         if name in self._gates:
             # Of video only what can be looked at without what came before the take.
             samples = self._gates[name].admit(samples)

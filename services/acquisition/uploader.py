@@ -5,11 +5,11 @@ import shutil
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import structlog
 from pydantic import ValidationError
 
+from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import disk_errors, replace_file
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import (
@@ -20,15 +20,8 @@ from dextouch.errors import (
     NotFoundError,
     StorageError,
 )
-from dextouch.schemas import (
-    ID_TAKEN,
-    BatchReceipt,
-    LedgerEntry,
-    RecordingAttributes,
-    RecordingStatus,
-    UploadStatus,
-)
-from dextouch.streams import SampleBatch, StreamDescriptor
+from dextouch.schemas import ID_TAKEN, RecordingAttributes, RecordingStatus, UploadStatus
+from dextouch.streams import StreamDescriptor, frame_body
 from services.acquisition.memory import give_back_free_memory
 
 logger = structlog.get_logger(__name__)
@@ -47,37 +40,12 @@ MAX_BATCH_SAMPLES = 120
 MAX_BATCH_BYTES = 8 * 2**20
 
 
-@runtime_checkable
-class RecordingStore(Protocol):
-    """Interface of a store's client that the uploader needs; every call is idempotent."""
-
-    def create(self, attributes: RecordingAttributes) -> RecordingStatus:
-        """Begin an upload, or return its state."""
-        ...
-
-    def send_batch(
-        self, recording_id: str, descriptor: StreamDescriptor, batch: SampleBatch, *, number: int
-    ) -> BatchReceipt:
-        """Send batch `number` of a stream."""
-        ...
-
-    def finish(
-        self,
-        recording_id: str,
-        num_batches: Mapping[str, int],
-        *,
-        success: bool | None = None,
-        ledger: tuple[LedgerEntry, ...] = (),
-    ) -> RecordingStatus:
-        """Announce that everything was sent."""
-        ...
-
-
 class Uploader:
     """Sends closed spools in the background, one after the other, until the store has them all.
 
-    What the store acknowledged is not sent again, also not by the next process: batch n of a
-    stream is always the same samples, and the store says which batch it expects next.
+    The bytes of the spool are sent as they lie there. What the store acknowledged is not sent
+    again, also not by the next process: batch n of a stream is always the same samples, and the
+    store says which batch it expects next.
 
     A take whose id another recording of the store has is stored under a second one, `second_id`. A
     take that the store refuses permanently is quarantined: it stays in the spool until `retry`.
@@ -92,7 +60,7 @@ class Uploader:
     def __init__(
         self,
         spool_root: Path,
-        store: RecordingStore | None,
+        store: EpisodeStoreClient | None,
         *,
         period_s: float,
         keep_uploaded: bool = True,
@@ -238,16 +206,17 @@ class Uploader:
         recording_id = status.recording_id
         num_batches = {}
         for name, descriptor in spool.streams.items():
-            num_samples = batch_samples(descriptor)
-            num_batches[name] = -(-spool.num_samples(name) // num_samples)
+            size, total = batch_samples(descriptor), spool.num_samples(name)
+            num_batches[name] = -(-total // size)
             if status.state == "finished":
                 continue
-            first = status.next_batch.get(name, 0)
-            batches = spool.batches(name, num_samples=num_samples, first=first)
-            for number, batch in enumerate(batches, start=first):
+            for number in range(status.next_batch.get(name, 0), num_batches[name]):
                 if self._stopping.is_set():
                     return False
-                self._store.send_batch(recording_id, descriptor, batch, number=number)
+                start, stop = number * size, min((number + 1) * size, total)
+                body = spool.body(name, start, stop)
+                data = frame_body(name, body, stop - start, number=number)
+                self._store.send_batch(recording_id, descriptor, data, number=number)
         known = spool.attributes
         status = self._store.finish(
             recording_id, num_batches, success=known.success, ledger=known.ledger
@@ -261,7 +230,7 @@ class Uploader:
                 shutil.rmtree(path)
         return True
 
-    def _begin(self, store: RecordingStore, attributes: RecordingAttributes) -> RecordingStatus:
+    def _begin(self, store: EpisodeStoreClient, attributes: RecordingAttributes) -> RecordingStatus:
         """Begin an upload, under its second id where another recording has the first."""
         try:
             return store.create(attributes)
@@ -281,10 +250,7 @@ def second_id(attributes: RecordingAttributes) -> str:
 
 def batch_samples(descriptor: StreamDescriptor) -> int:
     """Samples in each batch of a stream: fixed by what the stream is, never by chance."""
-    num_bytes = descriptor.numpy_dtype().itemsize
-    for size in descriptor.shape:
-        num_bytes *= size
-    return max(1, min(MAX_BATCH_SAMPLES, MAX_BATCH_BYTES // max(1, num_bytes)))
+    return max(1, min(MAX_BATCH_SAMPLES, MAX_BATCH_BYTES // descriptor.sample_bytes()))
 
 
 def recover_spool(spool_root: Path) -> list[str]:

@@ -1,11 +1,9 @@
 """Numbered batches of one unfinished upload, which its spool keeps."""
 
-import numpy as np
-
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import ConflictError
 from dextouch.schemas import BatchReceipt, RecordingStatus
-from dextouch.streams import SampleBatch, decode_batch
+from dextouch.streams import read_batch
 
 
 def upload_status(spool: SpoolWriter) -> RecordingStatus:
@@ -30,11 +28,11 @@ def put_batch(spool: SpoolWriter, stream: str, number: int, data: bytes) -> Batc
             expected=expected,
         )
     descriptor = next(known for known in spool.attributes.streams if known.name == stream)
-    batch = decode_batch(data, descriptor, number=number)
+    batch = read_batch(data, descriptor, number=number)
     replayed = number < expected
     if not replayed:
-        spool.append(stream, batch, flush=True)
-    elif not _same(SpoolReader(spool.path).appended(stream, number), batch):
+        spool.append_record(batch, flush=True)
+    elif SpoolReader(spool.path).appended(stream, number) != batch.body:
         raise ConflictError(
             f"{recording_id} {stream}: batch {number} exists with other samples; "
             "batches are immutable",
@@ -45,16 +43,6 @@ def put_batch(spool: SpoolWriter, stream: str, number: int, data: bytes) -> Batc
         recording_id=recording_id,
         stream=stream,
         number=number,
-        num_samples=len(batch),
+        num_samples=batch.num_samples,
         replayed=replayed,
     )
-
-
-def _same(ours: SampleBatch, theirs: SampleBatch) -> bool:
-    """Whether two batches hold the same samples; a NaN equals itself, -0.0 is not 0.0."""
-    columns = ("t_host_ns", "t_device_ns", "sequence")
-    if not all(np.array_equal(getattr(ours, name), getattr(theirs, name)) for name in columns):
-        return False
-    if ours.values.dtype == object:
-        return bool(np.array_equal(ours.values, theirs.values))
-    return ours.values.tobytes() == theirs.values.tobytes()

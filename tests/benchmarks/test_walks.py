@@ -44,7 +44,7 @@ def test_an_action_chunk_passes_through_few_files(chunk):
 
 def test_a_glove_packet_is_checked_counted_and_encoded_once():
     walk = walks.packet_to_spool("tactile_left")
-    once = ("PacketDecoder._take", "check_batch", "batch_bytes", "SpoolLogWriter.append")
+    once = ("PacketDecoder._take", "check_batch", "encode_body", "SpoolLogWriter.append")
     assert {name: walk.num_calls(name) for name in once} == dict.fromkeys(once, NUM_PACKETS)
     assert walk.num_calls("DeviceSupervisor.count") == NUM_PACKETS
     assert len(walk.files) <= 22, walk.files
@@ -56,14 +56,14 @@ def test_an_image_passes_through_few_files():
     assert len(walk.files) <= 22, walk.files
 
 
-def test_a_sample_is_encoded_once_for_the_wire_and_once_for_the_stores_spool():
+def test_an_upload_encodes_no_sample_again_and_the_store_checks_it_once():
     walk = walks.upload()
-    # 120 samples are one batch.
-    assert walk.num_calls("encode_batch", threads="MainThread") == 1
-    assert walk.num_calls("decode_batch") == 1
-    assert walk.num_calls("batch_bytes") == 1
-    assert walk.num_calls("batch_bytes", threads="MainThread") == 0
-    assert len(walk.files) <= 31, walk.files
+    # 120 samples are one batch, whose bytes are those of the station's spool.
+    once = ("frame_body", "read_batch", "decode_body", "check_batch", "SpoolLogWriter.append")
+    assert {name: walk.num_calls(name) for name in once} == dict.fromkeys(once, 1)
+    assert walk.num_calls("check_batch", threads="MainThread") == 0
+    assert walk.num_calls("encode_body") == 0
+    assert len(walk.files) <= 28, walk.files
 
 
 def test_the_clock_is_one_package():

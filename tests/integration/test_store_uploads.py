@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import LimitExceededError, StorageFullError
 from dextouch.schemas import RecordingAttributes
@@ -19,7 +20,7 @@ GLOVE = StreamDescriptor(
 )
 
 
-class FullStore:
+class FullStore(EpisodeStoreClient):
     """A store without room for anything."""
 
     def __init__(self, error):

@@ -111,7 +111,7 @@ def test_an_interrupted_upload_goes_on_under_its_second_id(tmp_path, store, tran
         np.testing.assert_array_equal(values, SpoolReader(second / "same-1").read(stream).values)
 
 
-class RefusingStore:
+class RefusingStore(EpisodeStoreClient):
     """A store that takes nothing and counts how often it was asked."""
 
     def __init__(self):

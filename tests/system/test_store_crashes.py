@@ -17,7 +17,7 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.image_queue import MAX_WAITING_IMAGES
-from dextouch.episodes.spool import SpoolReader, recover
+from dextouch.episodes.spool import SpoolReader
 from tests.system import take_source
 from tests.system.crash_child import (
     APPENDED,
@@ -29,6 +29,7 @@ from tests.system.crash_child import (
     Counters,
 )
 from tests.system.take_source import CAMERAS, NUMBERS, STREAM_NAMES
+from tests.unit.episodes.spooled_batches import recover
 
 CHILD = Path(__file__).with_name("crash_child.py")
 SEED = 7

@@ -110,10 +110,10 @@ def test_promised_modules_are_public():
 @pytest.mark.parametrize(
     "line",
     [
-        "from dextouch.streams.wire import decode_batch",
-        "from dextouch.streams import Sample, wire",
-        "import dextouch.streams.wire",
-        "import dextouch.streams.wire as wire",
+        "from dextouch.streams.batch import decode_batch",
+        "from dextouch.streams import Sample, batch",
+        "import dextouch.streams.batch",
+        "import dextouch.streams.batch as batch",
         "def late():\n    from dextouch.clocks.steps import find_steps",
         "from dextouch.bridges.lerobot.rows import frames_of",
         "from dextouch.hands.hand_files.loading import load_hand",
@@ -129,7 +129,7 @@ def test_an_import_past_a_door_is_found(line, importer):
     ("line", "importer"),
     [
         ("from dextouch.streams import decode_batch", ""),
-        ("from dextouch.streams.wire import decode_batch", "dextouch.streams.checks"),
+        ("from dextouch.streams.batch import decode_batch", "dextouch.streams.checks"),
         ("from dextouch.bridges.exports import blocks", "dextouch.bridges.lerobot.rows"),
         ("from dextouch.hands.actions import reanchor", "dextouch.worlds.routes"),
         ("from dextouch.hands.hand_files import load_hand", ""),

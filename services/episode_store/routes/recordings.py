@@ -44,7 +44,7 @@ def recordings_router(
     async def put_batch(
         recording_id: str, stream: str, number: Annotated[int, Path(ge=0)], request: Request
     ) -> BatchReceipt:
-        """Store batch n of a stream (wire format v1), exactly once even if it is repeated."""
+        """Store batch n of a stream (wire format v2 or v1), exactly once even if it is repeated."""
         announced = request.headers.get("content-length")
         return await intake.put_batch(
             recording_id, stream, number, announced=announced, read=request.body

@@ -85,14 +85,23 @@ class EpisodeStoreClient:
         return self._model(RecordingStatus, "GET", f"/v1/recordings/{_part(recording_id)}")
 
     def send_batch(
-        self, recording_id: str, descriptor: StreamDescriptor, batch: SampleBatch, *, number: int
+        self,
+        recording_id: str,
+        descriptor: StreamDescriptor,
+        batch: SampleBatch | bytes,
+        *,
+        number: int,
     ) -> BatchReceipt:
-        """Send batch `number` of a stream; the store keeps it when this returns."""
+        """Send batch `number` of a stream; the store keeps it when this returns.
+
+        Bytes are those of `dextouch.streams.frame_body` or `encode_batch`, sent as they are.
+        """
         path = (
             f"/v1/recordings/{_part(recording_id)}/streams/{_part(descriptor.name)}"
             f"/batches/{number}"
         )
-        data = encode_batch(descriptor, batch, number=number)
+        is_encoded = isinstance(batch, bytes)
+        data = batch if is_encoded else encode_batch(descriptor, batch, number=number)
         return self._model(BatchReceipt, "POST", path, content=data)
 
     def finish(

@@ -6,19 +6,15 @@ Images of `jpeg` and `h264` streams are object arrays of bytes.
 
 import os
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
-import google_crc32c
-
-from dextouch.episodes.batch_bytes import batch_bytes
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, try_lock, write_file
 from dextouch.episodes.spool_log import (
     LOG_FILE,
     LogRecords,
     SpoolLogWriter,
-    StreamRecord,
     body_at,
     open_log,
     read_records,
@@ -32,25 +28,16 @@ from dextouch.episodes.spool_reader import (
 )
 from dextouch.errors import ConflictError, InvalidInputError, StorageError, UnknownNameError
 from dextouch.schemas import RecordingAttributes
-from dextouch.streams import MAX_STREAMS, SampleBatch, check_batch, check_follows
+from dextouch.streams import (
+    MAX_STREAMS,
+    EncodedBatch,
+    SampleBatch,
+    check_batch,
+    check_follows,
+    encode_samples,
+)
 
-__all__ = [
-    "LOG_FILE",
-    "RecoveryReport",
-    "SpoolReader",
-    "SpoolWriter",
-    "StreamRecord",
-    "read_attributes",
-    "recover",
-]
-
-
-@dataclass(frozen=True)
-class RecoveryReport:
-    """Result of a recovery: samples by stream, and the number of bytes dropped."""
-
-    num_samples: dict[str, int]
-    dropped_bytes: int
+__all__ = ["LOG_FILE", "SpoolReader", "SpoolWriter", "read_attributes"]
 
 
 class SpoolWriter:
@@ -129,7 +116,7 @@ class SpoolWriter:
         if record is not None:
             self.append_record(record, flush=flush)
 
-    def encode(self, stream_name: str, batch: SampleBatch) -> StreamRecord | None:
+    def encode(self, stream_name: str, batch: SampleBatch) -> EncodedBatch | None:
         """Encode a batch for `append_record`; None for an empty one.
 
         It does not change the writer, so that several threads can call it while another one
@@ -140,15 +127,12 @@ class SpoolWriter:
             InvalidInputError: a batch that does not fit the stream.
         """
         descriptor = self.attributes.streams[self._number(stream_name)]
+        if len(batch):
+            return encode_samples(descriptor, batch)
         check_batch(descriptor, batch)
-        if not len(batch):
-            return None
-        body, t_host_ns = batch_bytes(descriptor, batch), batch.t_host_ns
-        crc = google_crc32c.value(body)
-        first_ns, last_ns = int(t_host_ns[0]), int(t_host_ns[-1])
-        return StreamRecord(stream_name, body, crc, len(batch), first_ns, last_ns)
+        return None
 
-    def append_record(self, record: StreamRecord, *, flush: bool = False) -> None:
+    def append_record(self, record: EncodedBatch, *, flush: bool = False) -> None:
         """Append an encoded batch, as `append` does.
 
         Raises:
@@ -274,31 +258,6 @@ def _create(path: Path, attributes: RecordingAttributes) -> None:
         unborn.mkdir(parents=True)
         write_file(unborn / RECORDING_FILE, attributes.model_dump_json().encode())
         unborn.rename(path)
-
-
-def recover(path: Path) -> RecoveryReport:
-    """Truncate a spool to its last valid record after a crash.
-
-    Everything that `append` acknowledged is kept. The operation is idempotent.
-
-    Raises:
-        NotFoundError: no spool there.
-        ConflictError: it is being written.
-        CorruptDataError: damage other than a torn tail; nothing is changed.
-    """
-    attributes = read_attributes(path)
-    lock = _lock(path)
-    try:
-        records = _trusted_records(path)
-        SpoolLogWriter(path, end=records.end).close()
-    finally:
-        os.close(lock)
-    rows = records.rows
-    counts = {
-        stream.name: int(rows["num_samples"][rows["stream"] == number].sum())
-        for number, stream in enumerate(attributes.streams)
-    }
-    return RecoveryReport(counts, max(0, records.num_bytes - records.end))
 
 
 def _trusted_records(path: Path) -> LogRecords:

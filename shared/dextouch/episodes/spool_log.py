@@ -1,8 +1,9 @@
 """Append-only, checksummed record file of a spool, shared by all of its streams.
 
-A record is a header with its own offset and checksum, followed by a body. All streams share one
-file, so that a single sync covers them. A torn tail differs from damage in that no valid header
-follows it.
+A record is a header with its own offset and checksum, followed by the body of a batch
+(`dextouch.streams.batch`). All streams share one file, so that a single sync covers them. A torn
+tail differs from damage in that no valid header follows it. Records of format 1, whose bodies hold
+columns, are read, and followed by those of today.
 """
 
 import os
@@ -17,10 +18,14 @@ import numpy as np
 
 from dextouch.episodes.files import disk_errors, write_parts
 from dextouch.errors import CorruptDataError, StorageError
+from dextouch.streams import EncodedBatch
 
 LOG_FILE = "batches.log"
-LOG_MAGIC = b"DXTBLOG\x01"
-_MARK = b"DXTR"
+LOG_MAGIC = b"DXTBLOG\x02"
+_LOG_MAGICS = (LOG_MAGIC, b"DXTBLOG\x01")
+_MARK = b"DXT"
+# Marks of records, and whether their bodies hold columns.
+_LAYOUTS = {b"DXTS": 0, b"DXTR": 1}
 # Magic, offset of the record, samples of its stream before it, stream, samples, length and crc32c
 # of the body; then the crc32c of the header.
 _HEADER = struct.Struct("<4sQQIIII")
@@ -34,9 +39,10 @@ RECORD_ROW = np.dtype(
         ("num_samples", "<u4"),
         ("length", "<u4"),
         ("body_crc32c", "<u4"),
+        ("in_columns", "<u4"),
     ]
 )
-_ROW = struct.Struct("<QQIIII")
+_ROW = struct.Struct("<QQIIIII")
 _BLOCK_BYTES = 1 << 14
 _SEARCH_BYTES = 1 << 20
 
@@ -127,7 +133,7 @@ def find_records(data: LogBytes) -> LogRecords:
         CorruptDataError: the bytes are not a log.
     """
     magic = data.read(0, len(LOG_MAGIC))
-    if not LOG_MAGIC.startswith(magic):
+    if not any(known.startswith(magic) for known in _LOG_MAGICS):
         raise CorruptDataError(f"log: begins with {magic!r}, expected {LOG_MAGIC!r}")
     # Packed rows: those of one minute of a station take 2 MB, against 14 MB as tuples.
     rows, gaps, place = bytearray(), [], len(LOG_MAGIC)
@@ -193,16 +199,16 @@ def read_bodies(folder: Path, rows: np.ndarray) -> Iterator[bytes]:
             yield body
 
 
-def _header_at(data: LogBytes, place: int) -> tuple[int, int, int, int, int, int] | None:
+def _header_at(data: LogBytes, place: int) -> tuple[int, ...] | None:
     """The header at an offset as a row of RECORD_ROW; None if invalid or its body is truncated."""
     header = data.read(place, HEADER_BYTES)
-    if len(header) < HEADER_BYTES or header[: len(_MARK)] != _MARK:
+    if len(header) < HEADER_BYTES or header[:4] not in _LAYOUTS:
         return None
-    _, offset, first, stream, num_samples, length, crc = _HEADER.unpack_from(header)
+    mark, offset, first, stream, num_samples, length, crc = _HEADER.unpack_from(header)
     holds = google_crc32c.value(header[: _HEADER.size]) == _CRC.unpack_from(header, _HEADER.size)[0]
     if not holds or offset != place or place + HEADER_BYTES + length > len(data):
         return None
-    return offset, first, stream, num_samples, length, crc
+    return offset, first, stream, num_samples, length, crc, _LAYOUTS[mark]
 
 
 def _next_header(data: LogBytes, place: int) -> int:
@@ -211,18 +217,6 @@ def _next_header(data: LogBytes, place: int) -> int:
     while place >= 0 and _header_at(data, place) is None:
         place = data.find(_MARK, place + 1)
     return place if place >= 0 else len(data)
-
-
-@dataclass(frozen=True)
-class StreamRecord:
-    """An encoded batch of one stream with its checksum, ready for a spool's log."""
-
-    stream_name: str
-    body: bytes
-    body_crc32c: int
-    num_samples: int
-    first_t_host_ns: int
-    last_t_host_ns: int
 
 
 class SpoolLogWriter:
@@ -244,17 +238,16 @@ class SpoolLogWriter:
             os.pwrite(self._file, LOG_MAGIC, 0)
             self._cut(self._end)
 
-    def append(self, record: StreamRecord, *, stream: int, first_sample: int) -> int:
-        """Append a record atomically and return its offset, for `undo`.
+    def append(self, batch: EncodedBatch, *, stream: int, first_sample: int) -> int:
+        """Append a batch atomically and return its offset, for `undo`.
 
         Raises:
             StorageFullError: no space; the file is unchanged.
         """
-        place, length = self._end, len(record.body)
-        header = _HEADER.pack(
-            _MARK, place, first_sample, stream, record.num_samples, length, record.body_crc32c
-        )
-        parts = (header, _CRC.pack(google_crc32c.value(header)), record.body)
+        place, length = self._end, len(batch.body)
+        counts = (first_sample, stream, batch.num_samples, length, batch.body_crc32c)
+        header = _HEADER.pack(b"DXTS", place, *counts)
+        parts = (header, _CRC.pack(google_crc32c.value(header)), batch.body)
         try:
             with disk_errors(
                 self._what, advice="what was recorded stays, free space and try again"

@@ -1,17 +1,25 @@
 """Reader of a spool: attributes of the recording and verified batches of samples."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from pydantic import ValidationError
 
-from dextouch.episodes.batch_bytes import batch_of_bytes
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.spool_log import read_bodies, read_records
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.schemas import RecordingAttributes
-from dextouch.streams import SampleBatch, StreamDescriptor
+from dextouch.streams import (
+    ENCODED_UNITS,
+    SampleBatch,
+    StreamDescriptor,
+    decode_body,
+    encode_body,
+    encoded_values,
+    sample_ends,
+)
 
 RECORDING_FILE = "recording.json"
 CLOSED_FILE = "closed"
@@ -29,7 +37,7 @@ class SpoolReader:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self._where = path, f"spool {path.name!r}"
         self.attributes = read_attributes(path)
         self.closed = (path / CLOSED_FILE).exists()
         self.streams = {d.name: d for d in self.attributes.streams}
@@ -51,23 +59,30 @@ class SpoolReader:
             InvalidInputError: outside the stream.
             CorruptDataError: a payload does not match its checksum.
         """
-        total = self.num_samples(stream_name)
-        stop = total if stop is None else stop
+        stop = self.num_samples(stream_name) if stop is None else stop
+        body = self.body(stream_name, start, stop)
+        return decode_body(self.streams[stream_name], body, stop - start, where=self._where)
+
+    def body(self, stream_name: str, start: int, stop: int) -> bytes:
+        """The bytes of samples start … stop-1 as they lie in the log; raises as `read`."""
+        rows, total = self._stream_rows(stream_name), self.num_samples(stream_name)
         if not 0 <= start <= stop <= total:
             raise InvalidInputError(
                 f"{stream_name}: got samples {start} … {stop}, expected within 0 … {total}"
             )
-        rows = self._stream_rows(stream_name)
         first = int(np.searchsorted(rows["first_sample"], start, side="right")) - 1
         last = int(np.searchsorted(rows["first_sample"], stop, side="left"))
         rows = rows[max(0, first) : max(0, first, last)]
-        batch = read_batch(self.path, self.streams[stream_name], rows)
-        skipped = start - int(rows["first_sample"][0]) if len(rows) else 0
-        wanted = slice(skipped, skipped + stop - start)
-        return SampleBatch(*(column[wanted] for column in vars(batch).values()))
+        descriptor = self.streams[stream_name]
+        body, count = _read_body(self.path, descriptor, rows), int(rows["num_samples"].sum())
+        if count == stop - start:
+            return body
+        skipped = start - int(rows["first_sample"][0])
+        ends = [0, *sample_ends(descriptor, body, count, where=self._where)]
+        return body[ends[skipped] : ends[skipped + stop - start]]
 
-    def appended(self, stream_name: str, number: int) -> SampleBatch:
-        """The samples of one append, numbered from 0.
+    def appended(self, stream_name: str, number: int) -> bytes:
+        """The bytes of one append, numbered from 0.
 
         Raises:
             InvalidInputError: no such append.
@@ -78,7 +93,7 @@ class SpoolReader:
             raise InvalidInputError(
                 f"{stream_name}: got append {number}, expected within 0 … {len(rows) - 1}"
             )
-        return read_batch(self.path, self.streams[stream_name], rows[number : number + 1])
+        return _read_body(self.path, self.streams[stream_name], rows[number : number + 1])
 
     def batches(
         self, stream_name: str, *, num_samples: int = DEFAULT_BATCH_SAMPLES, first: int = 0
@@ -101,7 +116,7 @@ class SpoolReader:
             rows = read_records(self.path).rows
             if len(rows) and int(rows["stream"].max()) >= len(self.streams):
                 raise CorruptDataError(
-                    f"spool {self.path.name!r}: its log has a stream number "
+                    f"{self._where}: its log has a stream number "
                     f"{int(rows['stream'].max())}, {RECORDING_FILE} has {len(self.streams)} streams"
                 )
             self._rows = {
@@ -112,9 +127,45 @@ class SpoolReader:
 
 def read_batch(path: Path, descriptor: StreamDescriptor, rows: np.ndarray) -> SampleBatch:
     """The samples in consecutive records of one stream of a spool, verified."""
-    counts = rows["num_samples"].tolist()
-    bodies = read_bodies(path, rows)
-    return batch_of_bytes(descriptor, bodies, counts, what=f"spool {path.name!r}")
+    count = int(rows["num_samples"].sum())
+    return decode_body(
+        descriptor, _read_body(path, descriptor, rows), count, where=f"spool {path.name!r}"
+    )
+
+
+def _read_body(path: Path, descriptor: StreamDescriptor, rows: np.ndarray) -> bytes:
+    bodies = zip(rows, read_bodies(path, rows), strict=True)
+    return b"".join(body_of(descriptor, *record, where=f"spool {path.name!r}") for record in bodies)
+
+
+def body_of(descriptor: StreamDescriptor, row: np.void, body: bytes, *, where: str) -> bytes:
+    """The body of a record; that of one of format 1, which holds columns, in today's layout.
+
+    Raises:
+        CorruptDataError: the record was written for another stream.
+    """
+    count = int(row["num_samples"])
+    # Of one sample both layouts are the same.
+    if not row["in_columns"] or count == 1:
+        return body
+    stamps, rest = body[: 24 * count], body[24 * count :]
+    is_encoded, ends = descriptor.unit in ENCODED_UNITS, [-1]
+    if not is_encoded:
+        ends = [count * descriptor.sample_bytes()]
+    elif len(rest) >= 4 * count:
+        lengths = np.frombuffer(rest, "<u4", count)
+        ends = [4 * count, *(4 * count + np.cumsum(lengths, dtype=np.int64)).tolist()]
+    if len(rest) != ends[-1]:
+        raise CorruptDataError(
+            f"{where}: a record of {len(body)} bytes is not that of {count} samples of "
+            f"{descriptor.name!r}; it was written for another stream"
+        )
+    if is_encoded:
+        values = encoded_values([rest[low:high] for low, high in pairwise(ends)])
+    else:
+        values = np.frombuffer(rest, descriptor.numpy_dtype()).reshape(count, *descriptor.shape)
+    columns = np.frombuffer(stamps, "<i8").reshape(3, count)
+    return encode_body(descriptor, SampleBatch(*columns, values))
 
 
 def read_attributes(path: Path) -> RecordingAttributes:

@@ -5,6 +5,16 @@ from typing import TYPE_CHECKING
 from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
+    from dextouch.streams.batch import MAX_BATCH_BYTES as MAX_BATCH_BYTES
+    from dextouch.streams.batch import EncodedBatch as EncodedBatch
+    from dextouch.streams.batch import decode_batch as decode_batch
+    from dextouch.streams.batch import decode_body as decode_body
+    from dextouch.streams.batch import encode_batch as encode_batch
+    from dextouch.streams.batch import encode_body as encode_body
+    from dextouch.streams.batch import encode_samples as encode_samples
+    from dextouch.streams.batch import frame_body as frame_body
+    from dextouch.streams.batch import read_batch as read_batch
+    from dextouch.streams.batch import sample_ends as sample_ends
     from dextouch.streams.checks import ENCODED_UNITS as ENCODED_UNITS
     from dextouch.streams.checks import H264_UNIT as H264_UNIT
     from dextouch.streams.checks import JPEG_UNIT as JPEG_UNIT
@@ -22,8 +32,5 @@ if TYPE_CHECKING:
     from dextouch.streams.samples import Sample as Sample
     from dextouch.streams.samples import SampleBatch as SampleBatch
     from dextouch.streams.samples import encoded_values as encoded_values
-    from dextouch.streams.wire import MAX_BATCH_BYTES as MAX_BATCH_BYTES
-    from dextouch.streams.wire import decode_batch as decode_batch
-    from dextouch.streams.wire import encode_batch as encode_batch
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)

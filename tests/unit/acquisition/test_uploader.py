@@ -5,10 +5,11 @@ import shutil
 import numpy as np
 import pytest
 
+from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import ConflictError, StorageFullError, UnavailableError
 from dextouch.schemas import BatchReceipt, RecordingAttributes, RecordingStatus
-from dextouch.streams import SampleBatch, StreamDescriptor
+from dextouch.streams import SampleBatch, StreamDescriptor, decode_batch
 from services.acquisition import uploader as uploader_module
 from services.acquisition.uploader import (
     UPLOADED_FILE,
@@ -42,7 +43,7 @@ def spool(root, name="take", count=270, *, close=True):
     return root / name
 
 
-class FakeStore:
+class FakeStore(EpisodeStoreClient):
     """Keeps batches like the store, and fails when told to."""
 
     def __init__(self):
@@ -63,6 +64,7 @@ class FakeStore:
 
     def send_batch(self, recording_id, descriptor, batch, *, number):
         self._reply()
+        batch = decode_batch(batch, descriptor, number=number)
         kept = self.batches[recording_id][descriptor.name]
         assert number == len(kept), "batch sent twice or out of order"
         kept.append(batch)

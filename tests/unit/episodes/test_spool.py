@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import struct
 
 import google_crc32c
@@ -20,14 +21,17 @@ from dextouch.errors import (
     StorageFullError,
     UnknownNameError,
 )
-from dextouch.streams import SampleBatch, encoded_values
+from dextouch.streams import SampleBatch, encode_body, encoded_values
 from tests.unit.episodes.spooled_batches import (
     ATTRIBUTES,
     CAMERA,
     GLOVE,
+    GOLDEN,
     assert_same,
     camera_batch,
     glove_batch,
+    golden_batch,
+    recover,
 )
 
 
@@ -56,35 +60,91 @@ def test_batches_come_back_and_are_the_same_whoever_cuts_them(path):
     assert_same(later, glove_batch(8, 2))
 
 
-def record(place, batch, *, first_sample, stream=0):
-    """A record of a log as docs/episode_format.md describes it, of a stream of numbers."""
-    body = b"".join(
+def columns(batch):
+    """The body of a record of format 1."""
+    return b"".join(
         np.asarray(column).astype(dtype).tobytes()
-        for column, dtype in [
-            (batch.t_host_ns, "<i8"),
-            (batch.t_device_ns, "<i8"),
-            (batch.sequence, "<i8"),
-            (batch.values, "<u2"),
-        ]
+        for column, dtype in zip(vars(batch).values(), ("<i8", "<i8", "<i8", "<u2"), strict=True)
     )
+
+
+def rows(batch):
+    """The body of a record of format 2."""
+    return b"".join(
+        struct.pack("<qqq360H", host, device, number, *values)
+        for host, device, number, values in zip(*vars(batch).values(), strict=True)
+    )
+
+
+FORMATS = {"1": (b"DXTBLOG\x01", b"DXTR", columns), "2": (b"DXTBLOG\x02", b"DXTS", rows)}
+
+
+def record(version, place, batch, *, first_sample, stream=0):
+    """A record of a log as docs/episode_format.md describes it, of a stream of numbers."""
+    _, mark, layout = FORMATS[version]
+    body = layout(batch)
     counts = (stream, len(batch), len(body), google_crc32c.value(body))
-    header = struct.pack("<4sQQIIII", b"DXTR", place, first_sample, *counts)
+    header = struct.pack("<4sQQIIII", mark, place, first_sample, *counts)
     return header + struct.pack("<I", google_crc32c.value(header)) + body
 
 
+@pytest.mark.parametrize("version", FORMATS)
 @pytest.mark.parametrize("first_sample", [0, 1, 2, 3, 2**63])
-def test_a_log_written_by_hand_is_read_if_its_samples_follow_each_other(path, first_sample):
+def test_a_log_written_by_hand_is_read_if_its_samples_follow_each_other(
+    path, first_sample, version
+):
     spool.SpoolWriter(path, ATTRIBUTES).close()
-    data = b"DXTBLOG\x01"
-    data += record(len(data), glove_batch(0, 2), first_sample=0)
-    data += record(len(data), glove_batch(2, 3), first_sample=first_sample)
+    data = FORMATS[version][0]
+    data += record(version, len(data), glove_batch(0, 2), first_sample=0)
+    data += record(version, len(data), glove_batch(2, 3), first_sample=first_sample)
     (path / LOG_FILE).write_bytes(data)
     if first_sample == 2:
         assert_same(spool.SpoolReader(path).read("glove_left"), glove_batch(0, 5))
         return
-    for read in (lambda: spool.SpoolReader(path).read("glove_left"), lambda: spool.recover(path)):
+    for read in (lambda: spool.SpoolReader(path).read("glove_left"), lambda: recover(path)):
         with pytest.raises(CorruptDataError, match="stream number 0 do not follow each other"):
             read()
+
+
+@pytest.mark.parametrize("version", FORMATS)
+def test_the_golden_spool_of_a_format_is_read_and_goes_on(tmp_path, version):
+    """A station or an upload may be older than this release."""
+    shutil.copytree(GOLDEN / f"spool_v{version}", path := tmp_path / "take-1")
+    reader = spool.SpoolReader(path)
+    for name, stream in reader.streams.items():
+        assert_same(reader.read(name), golden_batch(stream, 0, 6))
+        assert_same(reader.read(name, 2, 5), golden_batch(stream, 2, 3))
+        body = encode_body(stream, golden_batch(stream, 1, 3))
+        assert (reader.appended(name, 1), reader.body(name, 1, 4)) == (body, body)
+    with spool.SpoolWriter.resume(path) as writer:
+        for stream in reader.streams.values():
+            writer.append(stream.name, golden_batch(stream, 6, 2))
+    for name, stream in reader.streams.items():
+        assert_same(spool.SpoolReader(path).read(name), golden_batch(stream, 0, 8))
+
+
+def test_the_bytes_of_a_log_never_change(tmp_path):
+    golden = GOLDEN / "spool_v2"
+    attributes = spool.read_attributes(golden)
+    with spool.SpoolWriter(tmp_path / "take-1", attributes) as writer:
+        for stream in attributes.streams:
+            for first, count in ((0, 1), (1, 3), (4, 2)):
+                writer.append(stream.name, golden_batch(stream, first, count))
+    assert (tmp_path / "take-1" / LOG_FILE).read_bytes() == (golden / LOG_FILE).read_bytes()
+
+
+@pytest.mark.parametrize("stream", ["glove_left", "camera_head"])
+def test_an_old_record_of_another_stream_is_refused(tmp_path, stream):
+    shutil.copytree(GOLDEN / "spool_v1", path := tmp_path / "take-1")
+    attributes = spool.read_attributes(path)
+    other = {"glove_left": {"shape": (5,)}, "camera_head": {"unit": "rgb8"}}[stream]
+    streams = tuple(
+        s.model_copy(update=other) if s.name == stream else s for s in attributes.streams
+    )
+    changed = attributes.model_copy(update={"streams": streams})
+    (path / "recording.json").write_text(changed.model_dump_json())
+    with pytest.raises(CorruptDataError, match=r"spool 'take-1': .* written for another stream"):
+        spool.SpoolReader(path).read(stream)
 
 
 def test_a_living_spool_shows_full_batches_only(path):
@@ -94,7 +154,7 @@ def test_a_living_spool_shows_full_batches_only(path):
     assert not reader.closed
     assert [len(b) for b in reader.batches("glove_left", num_samples=4)] == [4]
     with pytest.raises(ConflictError, match="another process"):
-        spool.recover(path)
+        recover(path)
     writer.close()
     writer.close()
 
@@ -124,7 +184,8 @@ def test_samples_come_back_by_place_and_by_append(path):
             assert_same(reader.read("glove_left", start, stop), glove_batch(start, stop - start))
             assert len(reader.read("camera_head", start, stop)) == stop - start
     assert_same(reader.read("camera_head", 2, 5), camera_batch(2, 3))
-    assert_same(reader.appended("glove_left", 2), glove_batch(4, 5))
+    body = encode_body(GLOVE, glove_batch(4, 5))
+    assert (reader.appended("glove_left", 2), reader.body("glove_left", 4, 9)) == (body, body)
     for number in (-1, 3):
         with pytest.raises(InvalidInputError, match="append"):
             reader.appended("glove_left", number)
@@ -149,10 +210,10 @@ def test_torn_ends_are_cut_and_counted(path):
     with (path / LOG_FILE).open("ab") as file:
         file.write(b"\x01" * 1234)
     assert spool.SpoolReader(path).num_samples("glove_left") == 10
-    report = spool.recover(path)
+    report = recover(path)
     assert report.num_samples == {"glove_left": 10, "camera_head": 3}
     assert report.dropped_bytes == 1234
-    assert spool.recover(path).dropped_bytes == 0
+    assert recover(path).dropped_bytes == 0
     assert_same(spool.SpoolReader(path).read("camera_head"), camera_batch(0, 3))
 
 
@@ -162,7 +223,7 @@ def test_a_log_cut_off_anywhere_ends_with_its_last_whole_record(gloves, lost_byt
     whole = file.read_bytes()
     file.write_bytes(whole[:-lost_bytes])
     expected = max(0, 10 * GLOVE_RECORD - lost_bytes) // GLOVE_RECORD
-    assert spool.recover(gloves).num_samples["glove_left"] == expected
+    assert recover(gloves).num_samples["glove_left"] == expected
     assert_same(spool.SpoolReader(gloves).read("glove_left"), glove_batch(0, expected))
     with spool.SpoolWriter.resume(gloves) as writer:
         writer.append("glove_left", glove_batch(expected))
@@ -177,7 +238,7 @@ def test_zeroed_bytes_at_the_end_are_dropped(gloves):
     # Power loss: the length of the file reached the disk, its last bytes did not.
     file = gloves / LOG_FILE
     file.write_bytes(file.read_bytes()[:-1000] + bytes(1000))
-    report = spool.recover(gloves)
+    report = recover(gloves)
     assert report.num_samples["glove_left"] == 8
     assert report.dropped_bytes == 2 * GLOVE_RECORD
 
@@ -189,7 +250,7 @@ def test_a_damaged_header_in_the_middle_is_refused_and_changes_nothing(gloves, p
     whole[len(LOG_MAGIC) + 3 * GLOVE_RECORD + place] ^= 1
     file.write_bytes(whole)
     with pytest.raises(CorruptDataError, match="not a record, but valid ones follow"):
-        spool.recover(gloves)
+        recover(gloves)
     assert file.read_bytes() == bytes(whole)
     with pytest.raises(CorruptDataError, match="restore the file"):
         spool.SpoolReader(gloves).num_samples("glove_left")
@@ -236,20 +297,20 @@ def test_a_log_inside_an_image_is_not_read_as_one(path):
     assert spool.SpoolReader(path).read("camera_head").values[1] == forged
     whole[second] ^= 1
     file.write_bytes(whole)
-    assert spool.recover(path).num_samples == {"camera_head": 1}
+    assert recover(path).num_samples == {"camera_head": 1}
 
 
 def test_a_foreign_or_missing_log_is_refused(path):
     fill(path)
     file = path / LOG_FILE
-    file.write_bytes(b"DXTBLOG\x02" + file.read_bytes()[8:])
+    file.write_bytes(b"DXTBLOG\x03" + file.read_bytes()[8:])
     with pytest.raises(CorruptDataError, match="expected"):
-        spool.recover(path)
+        recover(path)
     file.unlink()
     with pytest.raises(CorruptDataError, match="missing"):
         spool.SpoolReader(path).num_samples("glove_left")
     # The process died before it made its log: nothing was acknowledged.
-    assert spool.recover(path).num_samples == {"glove_left": 0, "camera_head": 0}
+    assert recover(path).num_samples == {"glove_left": 0, "camera_head": 0}
 
 
 def test_a_log_of_other_streams_is_refused(path):

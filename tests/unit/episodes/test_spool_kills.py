@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dextouch.episodes import spool
-from tests.unit.episodes.spooled_batches import ATTRIBUTES, assert_same, glove_batch
+from tests.unit.episodes.spooled_batches import ATTRIBUTES, assert_same, glove_batch, recover
 
 CHILD = """
 import sys
@@ -51,7 +51,7 @@ def check_kills(folder: Path, count: int, seed: int):
     for trial in range(count):
         path = folder / f"take-{trial}"
         acknowledged = kill_in_the_middle(path, rng.randint(1, 200))
-        count = spool.recover(path).num_samples["glove_left"]
+        count = recover(path).num_samples["glove_left"]
         assert acknowledged <= count <= acknowledged + 1
         got = spool.SpoolReader(path).read("glove_left")
         assert_same(got, glove_batch(0, count))

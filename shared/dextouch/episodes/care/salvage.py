@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dextouch.episodes.batch_bytes import batch_of_bytes
 from dextouch.episodes.care.inspection import hashed_bytes
 from dextouch.episodes.format import (
     GOP_IMAGES,
@@ -31,13 +30,13 @@ from dextouch.episodes.shard_index import salvaged_index
 from dextouch.episodes.shard_reader import ShardReader, decode_rows
 from dextouch.episodes.sources import LocalFile
 from dextouch.episodes.spool_log import body_at, find_records, open_log
-from dextouch.episodes.spool_reader import read_batch
+from dextouch.episodes.spool_reader import body_of, read_batch
 from dextouch.episodes.staged_group import new_stage
 from dextouch.episodes.staging_recovery import free_id, ids_below
 from dextouch.episodes.writer import Block, write_blocks
 from dextouch.errors import CorruptDataError, InvalidInputError
 from dextouch.schemas import LineageEntry
-from dextouch.streams import StreamDescriptor, check_batch, encoded_values
+from dextouch.streams import StreamDescriptor, check_batch, decode_body, encoded_values
 
 LOST = "lost_to_damage"
 # The rows of these streams correspond by index: the steps of the model grid.
@@ -246,8 +245,8 @@ def _holds(streams: Sequence[StreamDescriptor], row: np.void, body: bytes | None
         return False
     descriptor = streams[int(row["stream"])]
     try:
-        batch = batch_of_bytes(descriptor, [body], [int(row["num_samples"])], what="log")
-        check_batch(descriptor, batch)
+        body = body_of(descriptor, row, body, where="log")
+        check_batch(descriptor, decode_body(descriptor, body, int(row["num_samples"])))
     except (CorruptDataError, InvalidInputError):
         return False
     return True

@@ -1,0 +1,309 @@
+"""A batch of samples as bytes, the same in a spool's log, on the wire and in the store's upload.
+
+The body of a batch is its samples end to end, so that bodies end to end are a body, too. A sample
+is t_host_ns, t_device_ns and sequence as int64, then its values, or of an encoded image its length
+as u32 and its bytes. On the wire a header comes first; version 1 had a body of named columns, which
+is still read. All numbers are little endian. See docs/wire_format.md.
+"""
+
+import struct
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import chain, pairwise
+
+import google_crc32c
+import numpy as np
+
+from dextouch.errors import (
+    CorruptDataError,
+    InvalidInputError,
+    LimitExceededError,
+    PacketError,
+)
+from dextouch.streams.checks import ENCODED_UNITS, check_batch
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.packing import unpack
+from dextouch.streams.samples import SampleBatch, encoded_values
+
+MAGIC = b"DXTB"
+VERSION = 2
+MAX_BATCH_BYTES = 16 * 2**20
+MAX_BATCH_SAMPLES = 65_536
+_VERSION = struct.Struct("<4sH")
+# Magic, version, bytes of the stream's name, number of the batch, samples, length and crc32c of the
+# body; then the name, and the crc32c of all this.
+_HEADER = struct.Struct("<4sHHIIII")
+_HEADER_V1 = struct.Struct("<4sHHII")
+_CRC = struct.Struct("<I")
+_STAMPS = ("t_host_ns", "t_device_ns", "sequence")
+_IMAGE = struct.Struct("<qqqI")
+
+
+@dataclass(frozen=True)
+class EncodedBatch:
+    """A batch of one stream as bytes with their crc32c, checked against the stream."""
+
+    stream_name: str
+    body: bytes
+    body_crc32c: int
+    num_samples: int
+    first_t_host_ns: int
+    last_t_host_ns: int
+
+
+def encode_samples(descriptor: StreamDescriptor, batch: SampleBatch) -> EncodedBatch:
+    """Check and encode a batch of at least one sample.
+
+    Raises:
+        InvalidInputError: a batch of another stream (see `check_batch`).
+    """
+    check_batch(descriptor, batch)
+    body = encode_body(descriptor, batch)
+    return _encoded(descriptor, body, google_crc32c.value(body), batch)
+
+
+def encode_body(descriptor: StreamDescriptor, batch: SampleBatch) -> bytes:
+    """The samples of a batch end to end, which the caller has checked."""
+    if descriptor.unit in ENCODED_UNITS:
+        stamps = (getattr(batch, stamp).tolist() for stamp in _STAMPS)
+        samples = zip(*stamps, batch.values, strict=True)
+        parts = ((_IMAGE.pack(*times, len(image)), image) for *times, image in samples)
+        return b"".join(chain.from_iterable(parts))
+    rows = np.empty(len(batch), _row(descriptor.dtype, descriptor.shape))
+    for name, column in vars(batch).items():
+        rows[name] = column
+    return rows.tobytes()
+
+
+def decode_body(
+    descriptor: StreamDescriptor, body: bytes, num_samples: int, *, where: str = "batch"
+) -> SampleBatch:
+    """The batch in a body, whose stamps and images are not checked; arrays may be read-only.
+
+    Args:
+        descriptor: of the stream.
+        body: of `encode_body`, or several end to end.
+        num_samples: in the body.
+        where: the body lies, for errors.
+
+    Raises:
+        CorruptDataError: the size of the body is not that of so many samples of the stream.
+    """
+    if descriptor.unit in ENCODED_UNITS:
+        ends = sample_ends(descriptor, body, num_samples, where=where)
+        starts = [0, *ends][:num_samples]
+        heads = [_IMAGE.unpack_from(body, start)[:3] for start in starts]
+        stamps = np.array(heads, dtype=np.int64).reshape(-1, 3).T
+        images = [body[a + _IMAGE.size : b] for a, b in zip(starts, ends, strict=True)]
+        return SampleBatch(*np.ascontiguousarray(stamps), encoded_values(images))
+    row = _row(descriptor.dtype, descriptor.shape)
+    if len(body) != num_samples * row.itemsize:
+        raise _wrong_size(descriptor, body, num_samples, where)
+    rows = np.frombuffer(body, row)
+    return SampleBatch(*(np.ascontiguousarray(rows[name]) for name in row.names or ()))
+
+
+def sample_ends(
+    descriptor: StreamDescriptor, body: bytes, num_samples: int, *, where: str = "batch"
+) -> list[int]:
+    """Offset of the end of each sample of a body; arguments and errors of `decode_body`."""
+    if descriptor.unit not in ENCODED_UNITS:
+        size = _row(descriptor.dtype, descriptor.shape).itemsize
+        ends = [size * number for number in range(1, num_samples + 1)]
+    else:
+        ends, end = [], 0
+        while end + _IMAGE.size <= len(body) and len(ends) < num_samples:
+            end += _IMAGE.size + _IMAGE.unpack_from(body, end)[3]
+            ends.append(end)
+    if len(ends) != num_samples or (ends[-1] if ends else 0) != len(body):
+        raise _wrong_size(descriptor, body, num_samples, where)
+    return ends
+
+
+def _wrong_size(
+    descriptor: StreamDescriptor, body: bytes, num_samples: int, where: str
+) -> CorruptDataError:
+    return CorruptDataError(
+        f"{where}: {len(body)} bytes are not those of {num_samples} samples of "
+        f"{descriptor.name!r}; they were written for another stream"
+    )
+
+
+@lru_cache
+def _row(dtype: str, shape: tuple[int, ...]) -> np.dtype[np.void]:
+    """Memory of one sample of numbers."""
+    values = ("values", np.dtype(dtype).newbyteorder("<"), shape)
+    return np.dtype([*((stamp, "<i8") for stamp in _STAMPS), values])
+
+
+def _encoded(
+    descriptor: StreamDescriptor, body: bytes, crc32c: int, batch: SampleBatch
+) -> EncodedBatch:
+    first_ns, last_ns = int(batch.t_host_ns[0]), int(batch.t_host_ns[-1])
+    return EncodedBatch(descriptor.name, body, crc32c, len(batch), first_ns, last_ns)
+
+
+def encode_batch(descriptor: StreamDescriptor, batch: SampleBatch, *, number: int) -> bytes:
+    """Encode a batch for the wire; equal batches give equal bytes.
+
+    Args:
+        descriptor: of the stream.
+        batch: 1 … MAX_BATCH_SAMPLES samples; values of `jpeg` and `h264` streams are bytes.
+        number: of the batch within its stream, from 0.
+
+    Raises:
+        InvalidInputError: an empty batch, or one of another stream.
+        LimitExceededError: more samples or bytes than one batch may hold.
+    """
+    check_batch(descriptor, batch)
+    return frame_body(descriptor.name, encode_body(descriptor, batch), len(batch), number=number)
+
+
+def frame_body(stream_name: str, body: bytes, num_samples: int, *, number: int) -> bytes:
+    """Put the header of the wire before a body, for example of a spool; raises as `encode_batch`.
+
+    The body is not looked at: the store checks it.
+    """
+    _check_count(stream_name, num_samples)
+    if not 0 <= number < 1 << 32:
+        raise InvalidInputError(f"{stream_name}: got batch number {number}, expected 0 … 2^32 - 1")
+    name, crc = stream_name.encode(), google_crc32c.value(body)
+    header = _HEADER.pack(MAGIC, VERSION, len(name), number, num_samples, len(body), crc) + name
+    data = b"".join((header, _CRC.pack(google_crc32c.value(header)), body))
+    if len(data) > MAX_BATCH_BYTES:
+        raise LimitExceededError(
+            f"{stream_name}: batch {number} has {len(data)} bytes, expected at most "
+            f"{MAX_BATCH_BYTES}; send fewer samples a batch"
+        )
+    return data
+
+
+def decode_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> SampleBatch:
+    """Decode and validate a batch from an untrusted source; errors of `read_batch`."""
+    found = read_batch(data, descriptor, number=number)
+    return decode_body(descriptor, found.body, found.num_samples)
+
+
+def read_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> EncodedBatch:
+    """Validate a batch from an untrusted source.
+
+    Args:
+        data: of `encode_batch` or `frame_body`, or of version 1.
+        descriptor: of the expected stream.
+        number: expected batch number.
+
+    Raises:
+        PacketError: not a batch of a known version, or damaged in transit.
+        LimitExceededError: larger than allowed.
+        InvalidInputError: a batch of another stream or number, or with wrong contents.
+    """
+    if len(data) > MAX_BATCH_BYTES:
+        raise LimitExceededError(
+            f"batch: got {len(data)} bytes, expected at most {MAX_BATCH_BYTES}"
+        )
+    if len(data) < _HEADER_V1.size:
+        raise PacketError(f"batch: got {len(data)} bytes, expected a header of {_HEADER_V1.size}")
+    magic, version = _VERSION.unpack_from(data)
+    if magic != MAGIC:
+        raise PacketError(f"batch: begins with {magic!r}, expected {MAGIC!r}")
+    if version == 1:
+        return encode_samples(descriptor, _decode_v1(data, descriptor, number))
+    if version != VERSION:
+        raise PacketError(f"batch: got version {version}, expected 1 or {VERSION}")
+    return _read(data, descriptor, number)
+
+
+def _read(data: bytes, descriptor: StreamDescriptor, number: int) -> EncodedBatch:
+    place = _HEADER.size
+    if len(data) >= place:
+        _, _, name_bytes, got_number, num_samples, length, crc = _HEADER.unpack_from(data)
+        place += name_bytes + _CRC.size
+    name = data[_HEADER.size : place - _CRC.size]
+    if len(data) < place or data[place - _CRC.size : place] != _CRC.pack(
+        google_crc32c.value(data[: place - _CRC.size])
+    ):
+        raise PacketError("batch: its header was damaged in transit, send it again")
+    body = data[place:]
+    _check_body(body, length, crc)
+    _check_identity(descriptor, name.decode(errors="replace"), got_number, number)
+    _check_count(descriptor.name, num_samples)
+    try:
+        batch = decode_body(descriptor, body, num_samples)
+    except CorruptDataError as error:
+        raise InvalidInputError(error.message) from error
+    check_batch(descriptor, batch)
+    return _encoded(descriptor, body, crc, batch)
+
+
+def _check_body(body: bytes, length: int, crc32c: int) -> None:
+    if len(body) != length:
+        raise PacketError(f"batch: got {len(body)} bytes after the header, expected {length}")
+    if google_crc32c.value(body) != crc32c:
+        raise PacketError("batch: checksum mismatch; it was damaged in transit, send it again")
+
+
+def _check_identity(
+    descriptor: StreamDescriptor, got_name: object, got_number: object, number: int
+) -> None:
+    if (got_name, got_number) != (descriptor.name, number):
+        raise InvalidInputError(
+            f"batch of {descriptor.name!r}: bytes are batch {got_number!r} of stream {got_name!r}, "
+            f"expected batch {number} of {descriptor.name!r}"
+        )
+
+
+def _check_count(what: str, count: int) -> None:
+    if count == 0:
+        raise InvalidInputError(f"{what}: an empty batch, expected at least one sample")
+    if count > MAX_BATCH_SAMPLES:
+        raise LimitExceededError(
+            f"{what}: got {count} samples in a batch, expected at most {MAX_BATCH_SAMPLES}"
+        )
+
+
+def _decode_v1(data: bytes, descriptor: StreamDescriptor, number: int) -> SampleBatch:
+    """The batch in bytes of version 1, whose arrays agree in length."""
+    _, _, flags, length, crc = _HEADER_V1.unpack_from(data)
+    if flags:
+        raise PacketError(f"batch: got version 1 with flags {flags}, expected 0")
+    body = data[_HEADER_V1.size :]
+    _check_body(body, length, crc)
+    fields, arrays = unpack(body, max_bytes=MAX_BATCH_BYTES)
+    where = f"batch of {descriptor.name!r}"
+    if set(fields) != {"stream", "number"}:
+        raise InvalidInputError(
+            f"{where}: got fields {sorted(fields)}, expected ['number', 'stream']"
+        )
+    _check_identity(descriptor, fields["stream"], fields["number"], number)
+    is_encoded = descriptor.unit in ENCODED_UNITS
+    expected = {*_STAMPS, *(("image_bytes", "image_end") if is_encoded else ("values",))}
+    if set(arrays) != expected:
+        raise InvalidInputError(
+            f"{where}: got arrays {sorted(arrays)}, expected {sorted(expected)}"
+        )
+    values = _images_v1(arrays, where) if is_encoded else arrays["values"]
+    count = len(values) if values.ndim else 0
+    for stamp in _STAMPS:
+        column = arrays[stamp]
+        if column.dtype != np.int64 or column.shape != (count,):
+            raise InvalidInputError(
+                f"{where}: {stamp} is {column.dtype} {column.shape}, expected int64 [{count}] "
+                "like the values"
+            )
+    _check_count(descriptor.name, count)
+    return SampleBatch(*(arrays[stamp] for stamp in _STAMPS), values)
+
+
+def _images_v1(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
+    data, ends = arrays["image_bytes"], arrays["image_end"]
+    if data.dtype != np.uint8 or data.ndim != 1 or ends.dtype != np.int64 or ends.ndim != 1:
+        raise InvalidInputError(f"{where}: image_bytes must be uint8 [bytes], image_end int64 [n]")
+    _check_count(where, len(ends))
+    bounds = np.concatenate([np.zeros(1, dtype=np.int64), ends])
+    # Compared, not subtracted: the difference of two forged numbers can overflow.
+    if (bounds[1:] <= bounds[:-1]).any() or int(bounds[-1]) != len(data):
+        raise InvalidInputError(
+            f"{where}: image_end must rise and end at {len(data)}, the number of bytes"
+        )
+    whole = data.tobytes()
+    return encoded_values([whole[start:end] for start, end in pairwise(bounds)])
