@@ -1,6 +1,7 @@
 """Reader of a spool: attributes of the recording and verified batches of samples."""
 
 from collections.abc import Iterator
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -60,24 +61,18 @@ class SpoolReader:
             CorruptDataError: a payload does not match its checksum.
         """
         stop = self.num_samples(stream_name) if stop is None else stop
-        body = self.body(stream_name, start, stop)
-        return decode_body(self.streams[stream_name], body, stop - start, where=self._where)
+        rows, skipped = self._span(stream_name, start, stop)
+        batch = read_batch(self.path, self.streams[stream_name], rows)
+        wanted = slice(skipped, skipped + stop - start)
+        return SampleBatch(*(column[wanted] for column in vars(batch).values()))
 
     def body(self, stream_name: str, start: int, stop: int) -> bytes:
         """The bytes of samples start … stop-1 as they lie in the log; raises as `read`."""
-        rows, total = self._stream_rows(stream_name), self.num_samples(stream_name)
-        if not 0 <= start <= stop <= total:
-            raise InvalidInputError(
-                f"{stream_name}: got samples {start} … {stop}, expected within 0 … {total}"
-            )
-        first = int(np.searchsorted(rows["first_sample"], start, side="right")) - 1
-        last = int(np.searchsorted(rows["first_sample"], stop, side="left"))
-        rows = rows[max(0, first) : max(0, first, last)]
-        descriptor = self.streams[stream_name]
-        body, count = _read_body(self.path, descriptor, rows), int(rows["num_samples"].sum())
+        rows, skipped = self._span(stream_name, start, stop)
+        descriptor, count = self.streams[stream_name], int(rows["num_samples"].sum())
+        body = b"".join(_bodies(self.path, descriptor, rows))
         if count == stop - start:
             return body
-        skipped = start - int(rows["first_sample"][0])
         ends = [0, *sample_ends(descriptor, body, count, where=self._where)]
         return body[ends[skipped] : ends[skipped + stop - start]]
 
@@ -93,7 +88,8 @@ class SpoolReader:
             raise InvalidInputError(
                 f"{stream_name}: got append {number}, expected within 0 … {len(rows) - 1}"
             )
-        return _read_body(self.path, self.streams[stream_name], rows[number : number + 1])
+        (body,) = _bodies(self.path, self.streams[stream_name], rows[number : number + 1])
+        return body
 
     def batches(
         self, stream_name: str, *, num_samples: int = DEFAULT_BATCH_SAMPLES, first: int = 0
@@ -108,6 +104,18 @@ class SpoolReader:
             stop = start + num_samples
             if stop <= total or self.closed:
                 yield self.read(stream_name, start, min(stop, total))
+
+    def _span(self, stream_name: str, start: int, stop: int) -> tuple[np.ndarray, int]:
+        """The records with samples start … stop-1, and the number of samples in them before."""
+        rows, total = self._stream_rows(stream_name), self.num_samples(stream_name)
+        if not 0 <= start <= stop <= total:
+            raise InvalidInputError(
+                f"{stream_name}: got samples {start} … {stop}, expected within 0 … {total}"
+            )
+        first = int(np.searchsorted(rows["first_sample"], start, side="right")) - 1
+        last = int(np.searchsorted(rows["first_sample"], stop, side="left"))
+        rows = rows[max(0, first) : max(0, first, last)]
+        return rows, start - int(rows["first_sample"][0]) if len(rows) else 0
 
     def _stream_rows(self, name: str) -> np.ndarray:
         if name not in self.streams:
@@ -127,15 +135,19 @@ class SpoolReader:
 
 def read_batch(path: Path, descriptor: StreamDescriptor, rows: np.ndarray) -> SampleBatch:
     """The samples in consecutive records of one stream of a spool, verified."""
-    count = int(rows["num_samples"].sum())
-    return decode_body(
-        descriptor, _read_body(path, descriptor, rows), count, where=f"spool {path.name!r}"
-    )
+    where, counts = f"spool {path.name!r}", rows["num_samples"].tolist()
+    bodies = _bodies(path, descriptor, rows)
+    if descriptor.unit not in ENCODED_UNITS or not counts:
+        return decode_body(descriptor, b"".join(bodies), sum(counts), where=where)
+    # Images are large, and not copied once more.
+    found = map(partial(decode_body, descriptor, where=where), bodies, counts)
+    return SampleBatch(*map(np.concatenate, zip(*(vars(b).values() for b in found), strict=True)))
 
 
-def _read_body(path: Path, descriptor: StreamDescriptor, rows: np.ndarray) -> bytes:
-    bodies = zip(rows, read_bodies(path, rows), strict=True)
-    return b"".join(body_of(descriptor, *record, where=f"spool {path.name!r}") for record in bodies)
+def _bodies(path: Path, descriptor: StreamDescriptor, rows: np.ndarray) -> Iterator[bytes]:
+    where = f"spool {path.name!r}"
+    for row, body in zip(rows, read_bodies(path, rows), strict=True):
+        yield body_of(descriptor, row, body, where=where)
 
 
 def body_of(descriptor: StreamDescriptor, row: np.void, body: bytes, *, where: str) -> bytes:
