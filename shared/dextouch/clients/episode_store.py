@@ -100,9 +100,9 @@ class EpisodeStoreClient:
             f"/v1/recordings/{_part(recording_id)}/streams/{_part(descriptor.name)}"
             f"/batches/{number}"
         )
-        is_encoded = isinstance(batch, bytes)
-        data = batch if is_encoded else encode_batch(descriptor, batch, number=number)
-        return self._model(BatchReceipt, "POST", path, content=data)
+        if isinstance(batch, SampleBatch):
+            batch = encode_batch(descriptor, batch, number=number)
+        return self._model(BatchReceipt, "POST", path, content=batch)
 
     def finish(
         self,

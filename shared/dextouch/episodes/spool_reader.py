@@ -176,8 +176,8 @@ def body_of(descriptor: StreamDescriptor, row: np.void, body: bytes, *, where: s
         values = encoded_values([rest[low:high] for low, high in pairwise(ends)])
     else:
         values = np.frombuffer(rest, descriptor.numpy_dtype()).reshape(count, *descriptor.shape)
-    columns = np.frombuffer(stamps, "<i8").reshape(3, count)
-    return encode_body(descriptor, SampleBatch(*columns, values))
+    hosts, devices, numbers = np.frombuffer(stamps, "<i8").reshape(3, count)
+    return encode_body(descriptor, SampleBatch(hosts, devices, numbers, values))
 
 
 def read_attributes(path: Path) -> RecordingAttributes:

@@ -93,9 +93,9 @@ def decode_body(
         ends = sample_ends(descriptor, body, num_samples, where=where)
         starts = [0, *ends][:num_samples]
         heads = [_IMAGE.unpack_from(body, start)[:3] for start in starts]
-        stamps = np.array(heads, dtype=np.int64).reshape(-1, 3).T
+        hosts, devices, numbers = np.array(heads, dtype=np.int64).reshape(-1, 3).T.copy()
         images = [body[a + _IMAGE.size : b] for a, b in zip(starts, ends, strict=True)]
-        return SampleBatch(*np.ascontiguousarray(stamps), encoded_values(images))
+        return SampleBatch(hosts, devices, numbers, encoded_values(images))
     row = _row(descriptor.dtype, descriptor.shape)
     if len(body) != num_samples * row.itemsize:
         raise _wrong_size(descriptor, body, num_samples, where)
@@ -291,7 +291,7 @@ def _decode_v1(data: bytes, descriptor: StreamDescriptor, number: int) -> Sample
                 "like the values"
             )
     _check_count(descriptor.name, count)
-    return SampleBatch(*(arrays[stamp] for stamp in _STAMPS), values)
+    return SampleBatch(arrays["t_host_ns"], arrays["t_device_ns"], arrays["sequence"], values)
 
 
 def _images_v1(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
