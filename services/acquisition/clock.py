@@ -2,6 +2,8 @@
 
 import threading
 import time
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -180,6 +182,45 @@ class _VirtualWaiter:
         with self._clock.lock:
             self._clock.open_waiters.discard(self)
             self._clock.advance()
+
+
+class PeriodicCall:
+    """Calls a function again and again, in a thread of its own, between `start` and `stop`.
+
+    Args:
+        call: what is called.
+        period_ns: from the end of one call to the next.
+        clock: on which the thread waits.
+        name: of the thread.
+    """
+
+    def __init__(
+        self, call: Callable[[], None], *, period_ns: int, clock: StationClock, name: str
+    ) -> None:
+        self._call = call
+        self._period_ns = period_ns
+        self._clock = clock
+        self._name = name
+        self._running: tuple[Waiter, threading.Thread] | None = None
+
+    def start(self) -> None:
+        """Start calling, one period from now."""
+        waiter = self._clock.waiter()
+        thread = threading.Thread(target=self._run, args=(waiter,), name=self._name, daemon=True)
+        self._running = waiter, thread
+        thread.start()
+
+    def stop(self) -> None:
+        """End the thread, after the call that is under way; nothing if it was never started."""
+        if self._running is not None:
+            waiter, thread = self._running
+            waiter.cancel()
+            thread.join()
+
+    def _run(self, waiter: Waiter) -> None:
+        with closing(waiter):
+            while waiter.wait_until(self._clock.now_ns() + self._period_ns):
+                self._call()
 
 
 @dataclass

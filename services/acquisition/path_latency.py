@@ -5,10 +5,8 @@ timestamps cannot. The difference to the estimated sample times is the path dela
 """
 
 import math
-import threading
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import closing
 from typing import Protocol, runtime_checkable
 
 import structlog
@@ -17,7 +15,7 @@ from dextouch.clocks import KnownSkew, OnlineClock, PathLatency, RoundTrip, Roun
 from dextouch.errors import DeviceError, InvalidInputError, PacketError
 from dextouch.schemas import Matrix
 from dextouch.streams import Sample, StreamDescriptor
-from services.acquisition.clock import StationClock, VirtualClock, Waiter
+from services.acquisition.clock import PeriodicCall, StationClock, VirtualClock
 from services.acquisition.drivers.base import Readings
 from services.acquisition.supervisor import DeviceSupervisor
 
@@ -54,8 +52,10 @@ class _StreamPath:
         self._descriptor = descriptor
         self._queue: deque[tuple[int, int]] = deque(maxlen=KEPT_SAMPLES)
         self._rate_hz = descriptor.nominal_rate_hz
-        self._max_samples = WINDOW_S * self._rate_hz
-        self._clock = OnlineClock(descriptor)
+        self._restart()
+
+    def _restart(self) -> None:
+        self._clock = OnlineClock(self._descriptor)
         self._num_steps = 0
         self._num_samples = 0
         # Device time of the newest sample, and when it left the device by our estimate.
@@ -85,7 +85,7 @@ class _StreamPath:
         if self._newest is None or self._num_samples < MIN_SAMPLES:
             return None
         t_remote_ns, t_estimated_ns = self._newest
-        num = min(self._num_samples, self._max_samples)
+        num = min(self._num_samples, WINDOW_S * self._rate_hz)
         edge_ns = EDGE_SPREADS * self._clock.spread_ns / math.sqrt(num)
         # Many samples tell the drift sooner than few exchanges; two ends of the edge make it.
         skew_sigma_ppm = 2e-3 * edge_ns * self._rate_hz / num
@@ -98,12 +98,6 @@ class _StreamPath:
         if found.latency_ns < -IMPOSSIBLE_SIGMAS * sigma_ns:
             return None
         return PathLatency(max(0, found.latency_ns), sigma_ns)
-
-    def _restart(self) -> None:
-        self._clock = OnlineClock(self._descriptor)
-        self._num_steps = 0
-        self._num_samples = 0
-        self._newest = None
 
 
 class _DevicePath:
@@ -163,7 +157,6 @@ class PathWatch:
     """
 
     def __init__(self, supervisors: Sequence[DeviceSupervisor], *, clock: StationClock) -> None:
-        self._clock = clock
         self._devices = [
             _DevicePath(supervisor, supervisor.driver)
             for supervisor in supervisors
@@ -172,27 +165,22 @@ class PathWatch:
         self._paths = {stream.name: stream for d in self._devices for stream in d.streams}
         # Replaced as a whole, never changed: whoever reads it needs no lock.
         self._latencies: dict[str, PathLatency] = {}
-        self._waiter: Waiter | None = None
-        self._thread = threading.Thread(target=self._run, name="path-latency", daemon=True)
+        self._looks = PeriodicCall(self.look, period_ns=PERIOD_NS, clock=clock, name="path-latency")
 
     def start(self) -> None:
         """Start asking, if there is anybody to ask."""
         if self._devices:
-            self._waiter = self._clock.waiter()
-            self._thread.start()
+            self._looks.start()
 
     def stop(self) -> None:
         """End the thread, after the exchange that is under way."""
-        if self._waiter is not None:
-            self._waiter.cancel()
-            self._thread.join()
+        self._looks.stop()
 
     def accept(self, readings: Readings) -> None:
         """Remember stamps (called by the reader threads)."""
         for name, samples in readings.items():
-            path = self._paths.get(name)
-            if path is not None:
-                path.accept(samples)
+            if name in self._paths:
+                self._paths[name].accept(samples)
 
     def look(self) -> None:
         """One round: ask all devices, then tell what is known."""
@@ -213,17 +201,10 @@ class PathWatch:
 
     def num_failures(self, stream: str) -> int | None:
         """Requests that the stream's device did not answer; None of one that is never asked."""
-        for device in self._devices:
-            if any(path.name == stream for path in device.streams):
-                return device.num_failures
-        return None
-
-    def _run(self) -> None:
-        if self._waiter is None:
-            return
-        with closing(self._waiter) as waiter:
-            while waiter.wait_until(self._clock.now_ns() + PERIOD_NS):
-                self.look()
+        counts = [
+            d.num_failures for d in self._devices for path in d.streams if path.name == stream
+        ]
+        return counts[0] if counts else None
 
 
 def add_latencies(

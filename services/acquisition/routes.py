@@ -18,7 +18,7 @@ from dextouch.schemas import (
 )
 from dextouch.serving import RequireScope
 from dextouch.streams import pack
-from services.acquisition.health import DiskJudge
+from services.acquisition.health import DiskJudge, judge_uploads
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader
 
@@ -74,8 +74,8 @@ def recorder_router(station: Station) -> APIRouter:
 def station_router(station: Station, uploader: Uploader) -> APIRouter:
     """Health, live views and uploads."""
     disk = DiskJudge(station.recorder.spool_root, station.supervisors, station.clock.now_ns())
-    station.health.watch(disk.judge)
-    station.health.watch_uploads(lambda: uploader.refused)
+    station.health.watch(disk)
+    station.health.watch(lambda evaluation: judge_uploads(evaluation, uploader.refused))
     router = APIRouter(
         prefix="/v1",
         tags=["station"],

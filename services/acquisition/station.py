@@ -60,9 +60,10 @@ class Station:
             drivers=drivers,
             clock=clock,
             calibration=calibration,
-            options=TakeOptions(safety or SpoolSafety(), self._device_events, self.health),
+            options=TakeOptions(
+                safety or SpoolSafety(), self._device_events, self.health, self.paths.latencies
+            ),
         )
-        self.recorder.measure_latencies(self.paths.latencies)
 
     def start(self) -> None:
         """Start all readers and the health evaluation."""

@@ -3,26 +3,26 @@
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 
 import structlog
 
+from dextouch.clocks import PathLatency
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import StorageError
 from dextouch.schemas import LedgerEntry, TakeCheck
 from dextouch.streams import EncodedBatch, Sample, SampleBatch
 from services.acquisition.clock import HostWatch, StationClock
-from services.acquisition.completeness import (
+from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.image_encoding import take_gates
+from services.acquisition.health import HealthMonitor
+from services.acquisition.supervisor import SpoolFlusher, SpoolSafety, StreamCounters
+from services.acquisition.take_check import (
     StreamFacts,
-    TakeSpan,
+    TakeFindings,
     check_take,
     take_ledger,
     take_quality,
 )
-from services.acquisition.drivers.base import Driver, Readings
-from services.acquisition.drivers.image_encoding import take_gates
-from services.acquisition.supervisor import SpoolFlusher, SpoolSafety, StreamCounters
-from services.acquisition.take_findings import HealthSource, TakeFindings
 
 logger = structlog.get_logger(__name__)
 
@@ -34,12 +34,14 @@ class TakeOptions:
     """How takes are kept, and who knows what happens to devices besides their drivers.
 
     `device_events` gives, by device, counts of named events since the station's start (those of the
-    drivers if None); `health` provides the findings of the station in the meantime.
+    drivers if None); `health` provides the findings of the station in the meantime, `latencies` the
+    measured path delays of streams whose delay the calibration does not name.
     """
 
     safety: SpoolSafety = field(default_factory=SpoolSafety)
     device_events: Callable[[], DeviceEvents] | None = None
-    health: HealthSource | None = None
+    health: HealthMonitor | None = None
+    latencies: Callable[[], Mapping[str, PathLatency]] = dict
 
 
 class Take:
@@ -64,38 +66,39 @@ class Take:
         options: TakeOptions,
     ) -> None:
         self.spool = spool
-        self.failure: str | None = None
-        self.span: TakeSpan | None = None
-        self.facts: list[StreamFacts] = []
         self.streams = {d.name: StreamCounters() for d in spool.attributes.streams}
+        self._failure: str | None = None
         self._drivers = drivers
         self._clock = clock
-        self._count = options.device_events or partial(_driver_events, drivers)
+        self._count = options.device_events or (
+            lambda: {name: driver.events() for name, driver in drivers.items()}
+        )
         self._started_ns = clock.now_ns()
+        self._stopped_ns: int | None = None
         self._before = self._count()
+        self._facts: list[StreamFacts] = []
         self._watch = HostWatch(clock)
         self._findings = TakeFindings(options.health, self._started_ns)
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._gates = take_gates(spool.attributes.streams)
-        self.flusher = SpoolFlusher(
+        self._flusher = SpoolFlusher(
             spool.path,
             safety=options.safety,
             clock=clock,
             on_tick=self._look_around,
-            on_failure=self._fail,
+            on_failure=self._end,
         )
 
     @property
     def has_ended(self) -> bool:
         """Whether it takes no more readings: stopped, or failed."""
-        return self.span is not None
+        return self._stopped_ns is not None
 
     @property
     def duration_s(self) -> float:
         """Length up to now, or up to the end."""
-        if self.span is not None:
-            return self.span.duration_s
-        return (self._clock.now_ns() - self._started_ns) / 1e9
+        stop_ns = self._clock.now_ns() if self._stopped_ns is None else self._stopped_ns
+        return (stop_ns - self._started_ns) / 1e9
 
     def accept(self, readings: Readings) -> None:
         """Append new readings (called by the reader threads); nothing after the end.
@@ -106,7 +109,7 @@ class Take:
             return
         encoded = [self._encode(name, samples) for name, samples in readings.items()]
         with self._lock:
-            if self.span is not None:
+            if self._stopped_ns is not None:
                 return
             try:
                 for record, samples in encoded:
@@ -126,42 +129,33 @@ class Take:
 
     def end(self) -> TakeCheck:
         """Accept no more readings, flush the spool to the disk and check the take."""
-        with self._lock:
-            span = self._end(None)
-        self.flusher.join()
+        self._end()
+        self._flusher.join()
         self._watch.look()
-        if self.failure is None:
+        if self._failure is None:
             try:
                 self.spool.flush()
             except StorageError as error:
-                self.failure = error.message
-        check = check_take(self.facts, span)
-        found = self._findings.problems(self.streams, check.problems)
-        return check.model_copy(update={"problems": (*check.problems, *found)})
+                self._failure = error.message
+        return check_take(self._facts, self.duration_s, self._findings)
 
     def release(self) -> None:
         """Give threads and files back; what was spooled stays as it is."""
-        with self._lock:
-            self._end(None)
-        self.flusher.join()
+        self._end()
+        self._flusher.join()
         self.spool.abandon()
 
     def problems(self) -> tuple[str, ...]:
         """What ended or disturbed the take as a whole."""
-        failure = (self.failure,) if self.failure else ()
+        failure = (self._failure,) if self._failure else ()
         return (*failure, *self._watch.problems())
 
     def ledger(self) -> tuple[LedgerEntry, ...]:
         """Everything that was noticed during the take, counted."""
-        entries = take_ledger(self.facts)
+        entries = take_ledger(self._facts)
         entries += [
-            LedgerEntry(
-                stream=fact.descriptor.name,
-                event=event,
-                count=e.count,
-                first_t_host_ns=e.first_t_host_ns,
-            )
-            for fact in self.facts
+            LedgerEntry(stream=name, event=event, count=e.count, first_t_host_ns=e.first_t_host_ns)
+            for name in self.streams
             for event, e in self._watch.events.items()
             if e.count
         ]
@@ -172,41 +166,33 @@ class Take:
 
     def quality(self) -> dict[str, float]:
         """Figures of the ended take by stream."""
-        if self.span is None:
-            return {}
-        return {**self._findings.quality(), **take_quality(self.facts, self.span)}
+        return {**self._findings.quality(), **take_quality(self._facts)}
 
     def _look_around(self) -> None:
         self._watch.look()
         self._findings.look()
 
-    def _fail(self, error: StorageError) -> None:
+    def _end(self, error: StorageError | None = None) -> None:
+        """Freeze what is known of the take at this moment."""
         with self._lock:
-            self._end(error)
-
-    def _end(self, error: StorageError | None) -> TakeSpan:
-        """Freeze the facts at this moment; the caller holds the lock."""
-        if self.span is not None:
-            return self.span
-        if error is not None:
-            self.failure = error.message
-            logger.error("stop_take_by_disk", error=error.message)
-        self._findings.end()
-        after = self._count()
-        for name, driver in self._drivers.items():
-            before = self._before[name]
-            events = {event: count - before[event] for event, count in after[name].items()}
-            # What was missing before the take and came in it is no loss of the take, nor a gain.
-            events["lost"] = max(0, events["lost"])
-            judged = driver.events().keys() - vars(driver.statistics).keys()
-            self.facts += [
-                StreamFacts(descriptor, self.streams[descriptor.name], events, judged)
-                for descriptor in driver.descriptors
-            ]
-        self.span = TakeSpan(self._started_ns, self._clock.now_ns())
-        self.flusher.cancel()
-        return self.span
-
-
-def _driver_events(drivers: Mapping[str, Driver]) -> DeviceEvents:
-    return {name: driver.events() for name, driver in drivers.items()}
+            if self.has_ended:
+                return
+            if error is not None:
+                self._failure = error.message
+                logger.error("stop_take_by_disk", error=error.message)
+            self._findings.end()
+            after, stopped_ns = self._count(), self._clock.now_ns()
+            for name, driver in self._drivers.items():
+                before = self._before[name]
+                events = {event: count - before[event] for event, count in after[name].items()}
+                # What was missing before the take and came in it is no loss of the take, nor a
+                # gain.
+                events["lost"] = max(0, events["lost"])
+                judged = driver.events().keys() - vars(driver.statistics).keys()
+                span_ns = (self._started_ns, stopped_ns)
+                self._facts += [
+                    StreamFacts(d, self.streams[d.name], events, span_ns, judged)
+                    for d in driver.descriptors
+                ]
+            self._stopped_ns = stopped_ns
+            self._flusher.cancel()

@@ -292,7 +292,7 @@ def fill_disk(mock: MockStation, pair: MockPair) -> None:
         mock.station.clock.now_ns(),
         free_bytes=lambda: round(SHORT_OF_DISK_S * bytes_a_s),
     )
-    health.watch(disk.judge)
+    health.watch(disk)
 
 
 def is_later(mock: MockStation, pair: MockPair) -> bool:

@@ -15,6 +15,7 @@ from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.ledger import Fate
 from tests.integration.recording_streams import human_streams, robot_streams, stream
+from tests.unit.acquisition.ledgers import accepted
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")
 GLOVE, FINGERS, TRACKER, CAMERA = (
@@ -273,7 +274,7 @@ def test_a_fault_is_counted_and_nothing_is_invented(name, undisturbed, tmp_path)
     places = places_in(batch, descriptor, ledger, truth)
     assert np.all(np.diff(places) > 0)
     if descriptor.capabilities.sequence:
-        arrived = set(ledger.accepted())
+        arrived = set(accepted(ledger))
         assert {ledger.sequence[place] for place in places} <= arrived
         if not set(script.events) & set(REFUSED_DEVICE):
             assert len(batch) == len(arrived), "what arrived whole is there"

@@ -11,8 +11,9 @@ from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import LEDGER_FILE, MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
-from services.acquisition.mocks.ledger import Fate, Ledger
+from services.acquisition.mocks.ledger import Fate
 from tests.integration.recording_streams import human_streams, robot_streams
+from tests.unit.acquisition.ledgers import load, true_times_ns
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")
 HARD = DeviceFaults(
@@ -88,15 +89,15 @@ def test_counters_equal_the_ledger(streams, tmp_path):
 def test_ledger_tells_the_truth_about_time(tmp_path):
     faults = FaultScript(others=HARD.model_copy(update={"bit_error_rate": 0.0}))
     take, spool, _ = record(human_streams(2.0), faults, tmp_path)
-    assert Ledger.load(take.spool_path / LEDGER_FILE) == take.ledger
+    assert load(take.spool_path / LEDGER_FILE) == take.ledger
     for name, descriptor in spool.streams.items():
         batch, ledger = spool.read(name), take.ledger.of(descriptor.device)
-        late_ns = batch.t_host_ns - ledger.true_times_ns(batch.sequence)
+        late_ns = batch.t_host_ns - true_times_ns(ledger, batch.sequence)
         assert late_ns.min() >= 3_000_000
         assert np.all(np.diff(batch.t_host_ns) >= 0)
         model = fit_clock(batch.t_device_ns, batch.t_host_ns)
         times_ns = model.to_host_ns(batch.t_device_ns, batch.t_host_ns)
-        error_ns = times_ns - ledger.true_times_ns(batch.sequence) - ledger.path_delay_ns
+        error_ns = times_ns - true_times_ns(ledger, batch.sequence) - ledger.path_delay_ns
         assert np.sqrt(np.mean(error_ns**2.0)) < 1e6, name
         latency_ns = spool.attributes.calibration[f"{name}_latency_ns"][0][0]
         assert latency_ns == pytest.approx(ledger.path_delay_ns, abs=1e6)
@@ -176,7 +177,7 @@ def test_real_time_on_a_pty(tmp_path):
     take, spool, _ = record(streams, FaultScript(), tmp_path, clock=RealClock())
     batch = spool.read("tactile_left")
     np.testing.assert_array_equal(batch.sequence, np.arange(30))
-    late_ns = batch.t_host_ns - take.ledger.of("glove_left").true_times_ns(batch.sequence)
+    late_ns = batch.t_host_ns - true_times_ns(take.ledger.of("glove_left"), batch.sequence)
     assert late_ns.min() >= 0
     # How late depends on the machine's other work; a stamp of another clock is off by far more.
     assert np.median(late_ns) < 500_000_000
@@ -193,6 +194,6 @@ def test_takes_of_one_station_share_the_devices_clocks(tmp_path):
     elapsed_device_ns = second.t_device_ns[-1] - first.t_device_ns[0]
     assert elapsed_device_ns == pytest.approx(elapsed_host_ns * 1.0001, abs=2)
     for take, batch in zip(takes, (first, second), strict=True):
-        true_ns = take.ledger.of("glove_left").true_times_ns(batch.sequence)
+        true_ns = true_times_ns(take.ledger.of("glove_left"), batch.sequence)
         np.testing.assert_array_equal(batch.t_host_ns, true_ns)
         assert true_ns[0] == take.ledger.start_host_ns

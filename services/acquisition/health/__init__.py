@@ -8,7 +8,7 @@ from services.acquisition.health.cells import count_taxels
 from services.acquisition.health.codes import CODES
 from services.acquisition.health.metrics import STATION_FIGURES, HealthCollector
 from services.acquisition.health.monitor import STATION, TICK_NS, HealthMonitor
-from services.acquisition.health.station import DiskJudge
+from services.acquisition.health.station import DiskJudge, judge_uploads
 
 __all__ = [
     "CODES",
@@ -19,4 +19,5 @@ __all__ = [
     "HealthCollector",
     "HealthMonitor",
     "count_taxels",
+    "judge_uploads",
 ]

@@ -8,11 +8,11 @@ cell that never changed may be an unused position.
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64, Shaped
+from jaxtyping import Bool, Float64
 
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Matrix
@@ -22,8 +22,7 @@ from services.acquisition.devices.tactile_glove.driver import FULL_SCALE_COUNTS
 from services.acquisition.drivers.base import CellLayout, Decoder, TellsCells
 from services.acquisition.glove_record import NO_CELL, GloveRecord, mapped_cells
 from services.acquisition.health.codes import CODES
-from services.acquisition.health.levels import Finding, Verdict, find
-from services.acquisition.health.samples import Block
+from services.acquisition.health.levels import Evaluation, Finding
 
 RECENT_NS = 500_000_000
 MIN_RECENT_SPAN_NS = 400_000_000
@@ -50,90 +49,100 @@ MAX_TOUCHED_SHARE = 0.25
 _SCAN_COLUMNS = 20
 
 
-class CellHistory:
-    """State of each cell from all blocks so far, and the rows of the last 0.5 s.
+class _CellHistory(ABC):
+    """State of each cell from all samples so far, and the readings of the last 0.5 s.
 
     Args:
         full_scale: the largest reading.
+        noun: what the cells are called.
     """
 
-    def __init__(self, full_scale: float) -> None:
-        self._pinned_at = SATURATED_SHARE * full_scale
-        self.t_ns = 0
-        self.recent_ns = np.empty(0, dtype=np.int64)
-        self.recent = np.empty((0, 0))
-        self.last = np.empty(0)
-        self.changed_ns = np.empty(0, dtype=np.int64)
-        self.around_ns = np.empty(0, dtype=np.int64)
-        self._pinned_ns = np.empty(0, dtype=np.int64)
-        self.silent = np.empty(0, dtype=np.bool_)
+    def __init__(self, full_scale: float, noun: str) -> None:
+        self._noun = noun
+        self._top = SATURATED_SHARE * full_scale
+        # Arrays of one element are those of all cells, until the first reading tells their number.
+        self._recent_ns = np.empty(0, dtype=np.int64)
+        self._recent = np.empty((0, 1))
+        self._changed_ns = np.zeros(1, dtype=np.int64)
+        self._around_ns = np.zeros(1, dtype=np.int64)
+        self._pinned_ns = np.full(1, _NEVER)
+        self._silent = np.zeros(1, dtype=np.bool_)
 
-    @property
-    def is_enough(self) -> bool:
-        """Whether there is enough data for a verdict."""
-        known = self.recent_ns
-        return len(known) > 0 and bool(known[-1] - known[0] >= MIN_RECENT_SPAN_NS)
+    def __call__(self, evaluation: Evaluation) -> None:
+        """One evaluation."""
+        block = evaluation.block
+        if block.values is not None and len(block):
+            self._add(self._readings(block.values), block.t_host_ns)
+        known_ns = self._recent_ns
+        if len(known_ns) and known_ns[-1] - known_ns[0] >= MIN_RECENT_SPAN_NS:
+            self._judge(evaluation, self._recent.min(axis=0), self._recent.max(axis=0))
 
-    def add(self, values: Shaped[np.ndarray, "n cells"], t_ns: np.ndarray) -> None:
-        """Add the readings of a block, one row per sample; NaN is no reading."""
-        if not len(t_ns):
-            return
-        if not len(self.last):
-            self._start(values, int(t_ns[0]))
-        changed = np.diff(values, axis=0, prepend=self.last[None]) != 0
+    @abstractmethod
+    def _readings(self, values: np.ndarray) -> np.ndarray:
+        """One row of cells a sample; NaN is no reading."""
+
+    @abstractmethod
+    def _judge(self, evaluation: Evaluation, low: np.ndarray, high: np.ndarray) -> None:
+        """Judge by the least and greatest reading of the last 0.5 s; NaN where one was."""
+
+    def _add(self, values: np.ndarray, t_ns: np.ndarray) -> None:
+        if not len(self._recent_ns):
+            self._recent, self._changed_ns = values[:0], t_ns[:1]
+        before = self._recent[-1:] if len(self._recent) else values[:1]
+        changed = np.diff(values, axis=0, prepend=before) != 0
         latest_ns = t_ns[len(t_ns) - 1 - np.argmax(changed[::-1], axis=0)]
-        self.changed_ns = np.where(changed.any(axis=0), latest_ns, self.changed_ns)
-        self.silent = self.silent & ~changed.any(axis=0)
-        self.last = values[-1]
-        self._note_pinned(~(values >= self._pinned_at), t_ns)
-        all_ns = np.concatenate([self.recent_ns, t_ns])
-        rows = np.concatenate([self.recent, values])
-        kept = all_ns >= all_ns[-1] - RECENT_NS
-        self.recent_ns, self.recent = all_ns[kept], rows[kept]
-        self.t_ns = int(all_ns[-1])
-
-    def extremes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest reading of each cell within the last 0.5 s; NaN where one was."""
-        return self.recent.min(axis=0), self.recent.max(axis=0)
-
-    def saturated(self) -> Bool[np.ndarray, " cells"]:
-        """Cells at full scale for longer than a second."""
-        return self._pinned_ns <= self.t_ns - SATURATED_NS
-
-    def find_silent(self, around: Float64[np.ndarray, " cells"]) -> None:
-        """Mark cells that stay at one reading while enough of their neighbours move.
-
-        A cell stays marked until it changes.
-
-        Args:
-            around: share of its neighbours that moved within the last 0.5 s.
-        """
-        low, high = self.extremes()
-        self.around_ns = np.where(around >= WEAK_SHARE, self.t_ns, self.around_ns)
-        quick = (high == low) & (around >= STRONG_SHARE)
-        quiet = self.changed_ns <= self.t_ns - QUIET_NS
-        slow = quiet & (self.around_ns >= self.changed_ns + RECENT_NS)
-        self.silent = self.silent | quick | slow
-
-    def _start(self, values: np.ndarray, t_ns: int) -> None:
-        num_cells = values.shape[1]
-        self.last = values[0]
-        self.recent = np.empty((0, num_cells), dtype=values.dtype)
-        self.changed_ns = np.full(num_cells, t_ns, dtype=np.int64)
-        self.around_ns = np.zeros(num_cells, dtype=np.int64)
-        self._pinned_ns = np.full(num_cells, _NEVER, dtype=np.int64)
-        self.silent = np.zeros(num_cells, dtype=np.bool_)
-
-    def _note_pinned(self, below: np.ndarray, t_ns: np.ndarray) -> None:
+        self._changed_ns = np.where(changed.any(axis=0), latest_ns, self._changed_ns)
+        self._silent = self._silent & ~changed.any(axis=0)
         # Where the present run at the top began: after the last reading below it.
+        below = ~(values >= self._top)
         index = len(t_ns) - np.argmax(below[::-1], axis=0)
         began_ns = t_ns[np.minimum(index, len(t_ns) - 1)]
-        whole_block_ns = np.minimum(self._pinned_ns, t_ns[0])
-        began_ns = np.where(below.any(axis=0), began_ns, whole_block_ns)
+        began_ns = np.where(below.any(axis=0), began_ns, np.minimum(self._pinned_ns, t_ns[0]))
         self._pinned_ns = np.where(below[-1], _NEVER, began_ns)
+        all_ns, rows = np.append(self._recent_ns, t_ns), np.concatenate([self._recent, values])
+        kept = all_ns >= all_ns[-1] - RECENT_NS
+        self._recent_ns, self._recent = all_ns[kept], rows[kept]
+
+    def _saturated(self) -> Bool[np.ndarray, " cells"]:
+        """Cells at full scale for longer than a second."""
+        return self._pinned_ns <= self._recent_ns[-1] - SATURATED_NS
+
+    def _quiet(self) -> Bool[np.ndarray, " cells"]:
+        """Cells without a change for 5 s."""
+        return self._changed_ns <= self._recent_ns[-1] - QUIET_NS
+
+    def _find_silent(
+        self, is_same: np.ndarray, around: Float64[np.ndarray, " cells"]
+    ) -> Bool[np.ndarray, " cells"]:
+        """Cells that stay at one reading while enough of their neighbours move, until they change.
+
+        Args:
+            is_same: cells without a change within the last 0.5 s.
+            around: share of its neighbours that moved within the last 0.5 s.
+        """
+        self._around_ns = np.where(around >= WEAK_SHARE, self._recent_ns[-1], self._around_ns)
+        slow = self._quiet() & (self._around_ns >= self._changed_ns + RECENT_NS)
+        self._silent = self._silent | is_same & (around >= STRONG_SHARE) | slow
+        return self._silent
+
+    def _report(
+        self,
+        evaluation: Evaluation,
+        found: Mapping[str, np.ndarray],
+        num_cells: int,
+        parts: Mapping[str, str] | None = None,
+    ) -> None:
+        """Judge the share of the cells that each code was found in; a part of that name is out."""
+        for code, cells in found.items():
+            count, word = int(cells.sum()), code.removeprefix("taxels_")
+            evaluation.figures[f"{word}_taxels_ratio"] = count / num_cells
+            if parts and code in parts:
+                evaluation.findings.append(Finding(code, "ERROR", f"{parts[code]} is {word}"))
+            else:
+                evaluation.judge(code, count / num_cells, f"{count} {self._noun} {word}")
 
 
-class TaxelJudge:
+class TaxelJudge(_CellHistory):
     """Checks the 320 taxels of our own glove from its raw counts.
 
     Args:
@@ -141,56 +150,57 @@ class TaxelJudge:
     """
 
     def __init__(self, record: GloveRecord) -> None:
+        super().__init__(float(FULL_SCALE_COUNTS), "taxels")
         self._indices = record.cells
-        self._lines = self._indices // _SCAN_COLUMNS, self._indices % _SCAN_COLUMNS
         self._tare_counts = record.tare_counts[self._indices]
         self._gain_counts_per_kpa = record.gain_counts_per_kpa[self._indices]
         sigma_counts = float(np.median(record.tare_sigma_counts[self._indices]))
         self._sigma_counts = max(TARE_SIGMA_COUNTS, sigma_counts)
-        self._history = CellHistory(float(FULL_SCALE_COUNTS))
 
-    def judge(self, block: Block, now_ns: int) -> Verdict:
-        """One evaluation."""
-        del now_ns
-        history, tare = self._history, self._tare_counts
-        if block.values is not None and len(block):
-            counts = block.values[:, self._indices].astype(np.int64)
-            history.add(counts, block.t_host_ns)
-        if not history.is_enough:
-            return Verdict()
-        moved_counts = MOVED_KPA * self._gain_counts_per_kpa
-        low, high = history.extremes()
-        history.find_silent(neighbour_share(high - low >= moved_counts))
-        at_top = low >= SATURATED_SHARE * FULL_SCALE_COUNTS
+    def _readings(self, values: np.ndarray) -> np.ndarray:
+        return values[:, self._indices].astype(np.int64)
+
+    def _judge(self, evaluation: Evaluation, low: np.ndarray, high: np.ndarray) -> None:
+        tare, moved_counts = self._tare_counts, MOVED_KPA * self._gain_counts_per_kpa
+        silent = self._find_silent(high == low, neighbour_share(high - low >= moved_counts))
+        at_top, saturated = low >= self._top, self._saturated()
         nothing = (tare >= MIN_TARE_COUNTS) & (high < NOTHING_SHARE * tare)
-        loaded = history.last > tare + moved_counts
-        saturated = history.saturated()
+        loaded = self._recent[-1] > tare + moved_counts
         found = {
-            "taxels_dead": nothing | (history.silent & ~loaded),
-            "taxels_stuck": history.silent & loaded & ~at_top,
+            "taxels_dead": nothing | (silent & ~loaded),
+            "taxels_stuck": silent & loaded & ~at_top,
             "taxels_saturated": saturated,
         }
-        counted = _verdict(found, NUM_TAXELS, "taxels")
-        parts = {code: whole_part(taxels, self._lines) for code, taxels in found.items()}
-        findings = [
-            Finding(code, "ERROR", f"{part} {_word(code)}") for code, part in parts.items() if part
-        ]
-        findings += [finding for finding in counted.findings if not parts[finding.code]]
-        drift = self._judge_drift()
-        waiting = bool((at_top & ~saturated).any())
-        figures = {**counted.figures, **drift.figures}
-        return Verdict((*findings, *drift.findings), figures, waiting)
+        parts = {code: part for code, taxels in found.items() if (part := self._part(taxels))}
+        self._report(evaluation, found, NUM_TAXELS, parts)
+        evaluation.suspicious |= bool((at_top & ~saturated).any())
+        self._judge_drift(evaluation)
 
-    def _judge_drift(self) -> Verdict:
+    def _judge_drift(self, evaluation: Evaluation) -> None:
         """Common offset of the taxels at rest; none while much of the hand is touched."""
-        offsets = self._history.recent.mean(axis=0) - self._tare_counts
+        offsets = self._recent.mean(axis=0) - self._tare_counts
         drift_counts = float(np.median(offsets))
         touched = np.abs(offsets - drift_counts) > CONTACT_THRESHOLD_KPA * self._gain_counts_per_kpa
-        if touched.mean() > MAX_TOUCHED_SHARE:
-            return Verdict()
-        drift = abs(drift_counts) / self._sigma_counts
-        text = f"the zero has moved by {drift_counts:+.1f} counts since the tare; tare again"
-        return Verdict(find("baseline", drift, text), {"baseline_drift_ratio": drift})
+        if touched.mean() <= MAX_TOUCHED_SHARE:
+            drift = evaluation.figures["baseline_drift_ratio"] = (
+                abs(drift_counts) / self._sigma_counts
+            )
+            text = f"the zero has moved by {drift_counts:+.1f} counts since the tare; tare again"
+            evaluation.judge("baseline", drift, text)
+
+    def _part(self, taxels: np.ndarray) -> str | None:
+        """Name of a pad or scan line that consists of such taxels only."""
+        tips, palm = split_pads(taxels)
+        if tips.all(axis=(1, 2)).any():
+            return "a whole fingertip"
+        if palm.all():
+            return "the whole palm"
+        rows, columns = np.divmod(self._indices, _SCAN_COLUMNS)
+        for word, lines in (("row", rows), ("column", columns)):
+            empty = np.setdiff1d(lines, lines[~taxels])
+            if len(empty):
+                return f"scan {word} {empty[0]}"
+        return None
 
 
 def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellJudge | None":
@@ -216,14 +226,11 @@ def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellJudg
             "numbers, expected as many; fix the driver of this glove"
         )
     cells = mapped_cells(descriptor, calibration)
-    if cells is None:
-        return CellJudge(layout)
-    used = np.zeros(num_cells, dtype=np.bool_)
-    used[cells[cells != NO_CELL]] = True
+    used = None if cells is None else np.isin(np.arange(num_cells), cells[cells != NO_CELL])
     return CellJudge(layout, used)
 
 
-class CellJudge:
+class CellJudge(_CellHistory):
     """Checks the cells of another manufacturer's glove.
 
     On a known grid a cell is silent when it does not change while its neighbours move: dead at
@@ -237,92 +244,52 @@ class CellJudge:
     """
 
     def __init__(self, layout: CellLayout, used: Bool[np.ndarray, " cells"] | None = None) -> None:
+        super().__init__(layout.full_scale, "cells")
         self._full_scale, self._grid, self.used = layout.full_scale, layout.grid, used
-        self._history = CellHistory(layout.full_scale)
-        self._lowest = np.empty(0)
-        self._highest = np.empty(0)
+        self._lowest = self._highest = np.full(1, np.nan)
 
-    def judge(self, block: Block, now_ns: int) -> Verdict:
-        """One evaluation."""
-        del now_ns
-        history = self._history
-        if block.values is not None and len(block):
-            values = block.values.reshape(len(block), -1).astype(np.float64)
-            history.add(values, block.t_host_ns)
-            self._remember(values)
-        if not history.is_enough:
-            return Verdict()
-        exists = np.isfinite(self._lowest)
+    def _readings(self, values: np.ndarray) -> np.ndarray:
+        rows = values.reshape(len(values), -1).astype(np.float64)
+        self._lowest = np.fmin(self._lowest, np.fmin.reduce(rows, axis=0))
+        self._highest = np.fmax(self._highest, np.fmax.reduce(rows, axis=0))
+        return rows
+
+    def _judge(self, evaluation: Evaluation, low: np.ndarray, high: np.ndarray) -> None:
+        exists, last = np.isfinite(self._lowest), self._recent[-1]
         margin = LOADED_SHARE * self._full_scale
         if self._grid is None:
             exists &= self._highest > self._lowest
-            loaded = history.last > self._lowest + margin
+            loaded = last > self._lowest + margin
             dead, stuck = np.zeros_like(exists), self._stuck(loaded)
         else:
             # The rest level of a cell that was faulty from the start is unknown: use the median.
             rest = float(np.median(self._lowest[exists])) if exists.any() else 0.0
-            loaded = history.last > rest + margin
-            history.find_silent(self._moved_around(exists, self._grid))
-            dead, stuck = history.silent & ~loaded, history.silent & loaded
-        saturated = history.saturated()
+            loaded = last > rest + margin
+            moved = (high - low >= MOVED_SHARE * self._full_scale) & exists
+            around = share_around(moved.reshape(self._grid), exists.reshape(self._grid)).ravel()
+            silent = self._find_silent(high == low, np.where(exists, around, 0.0))
+            dead, stuck = silent & ~loaded, silent & loaded
         # This maker's NaN says that there is no cell: none may come and go.
         judged = exists if self.used is None else exists & self.used
-        gone = judged & np.isnan(history.recent).any(axis=0)
-        num_cells = max(1, int(judged.sum()))
+        gone, saturated = judged & np.isnan(self._recent).any(axis=0), self._saturated()
+        num_cells, num_gone = max(1, int(judged.sum())), int(gone.sum())
         found = {
             "taxels_dead": dead & judged & ~gone,
             "taxels_stuck": stuck & judged & ~saturated,
             "taxels_saturated": saturated & judged,
         }
-        counted = _verdict(found, num_cells, "cells")
-        findings, num_gone = counted.findings, int(gone.sum())
+        self._report(evaluation, found, num_cells)
         if num_gone:
             is_error = num_gone / num_cells >= CODES["nan"].error
-            level: Literal["WARN", "ERROR"] = "ERROR" if is_error else "WARN"
-            findings += (Finding("nan", level, f"{num_gone} cells without a number"),)
-        low, _ = history.extremes()
-        pinned = low >= SATURATED_SHARE * self._full_scale
-        waiting = bool((pinned & judged & ~saturated).any())
-        return Verdict(findings, counted.figures, waiting)
-
-    def _remember(self, values: np.ndarray) -> None:
-        if not len(self._lowest):
-            self._lowest = np.full(values.shape[1], np.nan)
-            self._highest = self._lowest
-        self._lowest = np.fmin(self._lowest, np.fmin.reduce(values, axis=0))
-        self._highest = np.fmax(self._highest, np.fmax.reduce(values, axis=0))
+            text = f"{num_gone} cells without a number"
+            evaluation.findings.append(Finding("nan", "ERROR" if is_error else "WARN", text))
+        evaluation.suspicious |= bool(((low >= self._top) & judged & ~saturated).any())
 
     def _stuck(self, loaded: np.ndarray) -> np.ndarray:
-        history = self._history
-        quiet = history.changed_ns <= history.t_ns - QUIET_NS
-        num_loaded = int(loaded.sum())
-        others_move = num_loaded >= MIN_LOADED and (loaded & ~quiet).sum() >= (
-            STRONG_SHARE * num_loaded
-        )
+        quiet, num_loaded = self._quiet(), int(loaded.sum())
+        num_moving = int((loaded & ~quiet).sum())
+        others_move = num_loaded >= MIN_LOADED and num_moving >= STRONG_SHARE * num_loaded
         return loaded & quiet & others_move
-
-    def _moved_around(self, exists: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-        low, high = self._history.extremes()
-        moved = high - low >= MOVED_SHARE * self._full_scale
-        there = exists.reshape(grid).astype(np.float64)
-        count = sum_around(there) - there
-        moving = (moved & exists).reshape(grid).astype(np.float64)
-        around = (sum_around(moving) - moving) / np.maximum(count, 1.0)
-        return np.where(exists, around.ravel(), 0.0)
-
-
-def _word(code: str) -> str:
-    return code.removeprefix("taxels_")
-
-
-def _verdict(found: Mapping[str, np.ndarray], num_cells: int, noun: str) -> Verdict:
-    """Share of the cells that each code was found in."""
-    findings: tuple[Finding, ...] = ()
-    for code, cells in found.items():
-        count = int(cells.sum())
-        findings += find(code, count / num_cells, f"{count} {noun} {_word(code)}")
-    figures = {f"{_word(code)}_taxels_ratio": c.sum() / num_cells for code, c in found.items()}
-    return Verdict(findings, {name: float(ratio) for name, ratio in figures.items()})
 
 
 def count_taxels(low_counts: np.ndarray, high_counts: np.ndarray, *, side: Side) -> dict[str, int]:
@@ -349,36 +316,17 @@ def count_taxels(low_counts: np.ndarray, high_counts: np.ndarray, *, side: Side)
 
 def neighbour_share(moved: Bool[np.ndarray, "320"]) -> Float64[np.ndarray, "320"]:
     """Share of the up to 8 neighbours on its pad that moved, for each taxel."""
-    shares = []
-    for grid in split_pads(moved.astype(np.float64)):
-        around = sum_around(grid) - grid
-        count = sum_around(np.ones_like(grid)) - 1.0
-        shares.append(around / count)
-    return join_pads(shares[0], shares[1])
+    tips, palm = (share_around(pads, np.ones_like(pads)) for pads in split_pads(moved))
+    return join_pads(tips, palm)
 
 
-def whole_part(taxels: Bool[np.ndarray, "320"], lines: tuple[np.ndarray, np.ndarray]) -> str | None:
-    """Name of a pad or scan line that consists of such taxels only; None when there is none."""
-    tips, palm = split_pads(taxels)
-    if tips.all(axis=(1, 2)).any():
-        return "a whole fingertip is"
-    if palm.all():
-        return "the whole palm is"
-    for numbers, word in zip(lines, ("row", "column"), strict=True):
-        good = np.bincount(numbers[~taxels], minlength=int(numbers.max()) + 1)
-        empty = np.flatnonzero(good[: int(numbers.max()) + 1] == 0)
-        if len(empty):
-            return f"scan {word} {empty[0]} is"
-    return None
+def share_around(moved: np.ndarray, exists: np.ndarray) -> np.ndarray:
+    """Share of the up to 8 existing neighbours that moved, of each cell [..., rows, columns].
 
-
-def sum_around(grid: np.ndarray) -> np.ndarray:
-    """Sum of the 3 by 3 cells around each of a grid [..., rows, columns], itself included."""
-    rows, columns = grid.shape[-2:]
-    padded = np.zeros((*grid.shape[:-2], rows + 2, columns + 2))
-    padded[..., 1:-1, 1:-1] = grid
-    total = np.zeros_like(grid)
-    for row in range(3):
-        for column in range(3):
-            total += padded[..., row : row + rows, column : column + columns]
-    return total
+    A cell that moved exists.
+    """
+    edges = [(0, 0)] * (moved.ndim - 2) + [(1, 1), (1, 1)]
+    padded = np.pad(np.stack([moved, exists]).astype(np.float64), [(0, 0), *edges])
+    blocks = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(-2, -1))
+    num_moved, num = blocks.sum(axis=(-2, -1)) - blocks[..., 1, 1]
+    return num_moved / np.maximum(num, 1.0)

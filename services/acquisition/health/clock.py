@@ -11,8 +11,9 @@ import numpy as np
 from dextouch.clocks import CountingClock, OnlineClock
 from dextouch.errors import InvalidInputError
 from dextouch.streams import StreamDescriptor
-from services.acquisition.health.levels import Finding, Verdict, find
-from services.acquisition.health.samples import WINDOW_NS, Block, Rolling
+from services.acquisition.health.codes import CODES
+from services.acquisition.health.levels import Evaluation
+from services.acquisition.health.samples import Block, Rolling
 
 STEP_NS = 4_000_000
 HOUR_NS = 3_600_000_000_000
@@ -41,108 +42,94 @@ class ClockJudge:
     def __init__(self, descriptor: StreamDescriptor) -> None:
         self._descriptor = descriptor
         self._restart()
-        self._residuals = Rolling(WINDOW_NS)
+        self._residuals = Rolling()
         self._drift_ns = 0
-        self._offsets = Rolling(WINDOW_NS)
+        self._offsets = Rolling()
         self._steps: deque[int] = deque(maxlen=64)
         self.num_steps = 0
-        self._verdict = Verdict()
+        self._latest = Evaluation(0)
 
     def _restart(self) -> None:
         self._clock = OnlineClock(self._descriptor)
         self._known_steps = 0
-        self._last: tuple[int, int, int] | None = None
+        # Arrival, device time and sequence of the newest sample.
+        self._last = np.empty((3, 0), dtype=np.int64)
         self._departed_ns: int | None = None
         self._since_ns: int | None = None
 
-    def judge(self, block: Block, now_ns: int) -> Verdict:
+    def __call__(self, evaluation: Evaluation) -> None:
         """One evaluation."""
-        self._verdict = self._judge(block, now_ns)
-        return self._verdict
+        self._latest = Evaluation(evaluation.now_ns, evaluation.block)
+        if len(evaluation.block):
+            self._judge_block(self._latest)
+        self._judge_steps(self._latest)
+        evaluation.include(self._latest)
 
-    def repeat(self, block: Block, now_ns: int) -> Verdict:
-        """The latest verdict, which holds for all streams of the device."""
-        del block, now_ns
-        return self._verdict
+    def repeat(self, evaluation: Evaluation) -> None:
+        """The latest result, which holds for all streams of the device."""
+        evaluation.include(self._latest)
 
-    def _judge(self, block: Block, now_ns: int) -> Verdict:
-        if not len(block):
-            return Verdict(self._judge_steps(now_ns), self._figures())
+    def _judge_block(self, evaluation: Evaluation) -> None:
+        block = evaluation.block
         for t_ns in self._jumps(block):
             self._note(t_ns)
         try:
             residuals_ns = self._follow(block)
         except InvalidInputError as error:
             self._restart()
-            findings = find("clock_stamps", 1, error.message)
-            return Verdict((*findings, *self._judge_steps(now_ns)))
-        kept_s = self._residuals.add(block.t_host_ns, residuals_ns * 1e-9, now_ns)
+            evaluation.judge("clock_stamps", 1, error.message)
+            return
+        kept_s = self._residuals.add(block.t_host_ns, residuals_ns * 1e-9, evaluation.now_ns)
         skew_ppm = self._skew_ppm(int(block.t_host_ns[-1]))
-        figures = {**self._figures(), "clock_skew_ratio": skew_ppm * 1e-6}
+        evaluation.figures["clock_skew_ratio"] = skew_ppm * 1e-6
         text = f"its clock is skewed by {skew_ppm:+.0f} ppm"
-        findings = find("clock_skew", abs(skew_ppm), text)
+        evaluation.judge("clock_skew", abs(skew_ppm), text)
         if len(kept_s) >= MIN_RESIDUALS:
-            scatter = _judge_scatter(kept_s, "its clock")
-            findings, figures = findings + scatter.findings, {**figures, **scatter.figures}
-        return Verdict((*findings, *self._judge_steps(now_ns)), figures)
-
-    def _figures(self) -> dict[str, float]:
-        return {"clock_resets": float(self.num_steps)}
+            _judge_scatter(evaluation, kept_s, "its clock")
 
     def _follow(self, block: Block) -> np.ndarray:
         """Arrival minus estimated time of each sample, ns."""
-        residuals_ns = np.empty(len(block), dtype=np.int64)
-        stamps = zip(
-            block.t_host_ns.tolist(),
-            block.t_device_ns.tolist(),
-            block.sequence.tolist(),
-            strict=True,
-        )
-        for index, (t_host_ns, t_device_ns, sequence) in enumerate(stamps):
-            estimate_ns = self._clock.update(
-                t_host_ns=t_host_ns, t_device_ns=t_device_ns, sequence=sequence
-            )
-            residuals_ns[index] = t_host_ns - estimate_ns
+        stamps = np.stack([block.t_host_ns, block.t_device_ns, block.sequence], axis=1)
+        times_ns = [
+            self._clock.update(t_host_ns=t_host_ns, t_device_ns=t_device_ns, sequence=sequence)
+            for t_host_ns, t_device_ns, sequence in stamps.tolist()
+        ]
         if self._clock.num_steps > self._known_steps:
             self._known_steps = self._clock.num_steps
             # Arrivals that a busy host delays for long look like a step; the stamps tell.
             t_ns, departed_ns = int(block.t_host_ns[-1]), self._departed_ns
             if departed_ns is not None and t_ns - departed_ns < BORNE_OUT_NS:
                 self._note(t_ns)
-        return residuals_ns
+        return block.t_host_ns - np.array(times_ns, dtype=np.int64)
 
     def _jumps(self, block: Block) -> list[int]:
         """Arrivals at which the device's stamp departs from its sequence and from the host."""
         capabilities = self._descriptor.capabilities
-        stamps = np.stack([block.t_host_ns, block.t_device_ns, block.sequence])
-        if self._last is not None:
-            stamps = np.concatenate([np.array(self._last)[:, None], stamps], axis=1)
-        self._last = (int(stamps[0, -1]), int(stamps[1, -1]), int(stamps[2, -1]))
-        if stamps.shape[1] < 2:
-            return []
+        new = np.stack([block.t_host_ns, block.t_device_ns, block.sequence])
+        stamps = np.concatenate([self._last, new], axis=1)
+        self._last = stamps[:, -1:]
         host_ns, device_ns, numbers = np.diff(stamps, axis=1)
-        period_ns = self._descriptor.period_ns()
-        numbers = (
-            _signed(numbers, capabilities.sequence_bits, 1)
-            if capabilities.sequence
-            else np.ones_like(numbers)
-        )
+        t_host_ns, period_ns = stamps[0, 1:], self._descriptor.period_ns()
+        if capabilities.sequence:
+            numbers = _signed(numbers, capabilities.sequence_bits, 1)
+        else:
+            numbers = np.ones_like(numbers)
         if stamps[1].min() < 0:
-            self._note_departures(stamps[0, 1:], numbers != 1)
+            self._note_departures(t_host_ns, numbers != 1)
             return []
         device_ns = _signed(device_ns, capabilities.device_time_bits, capabilities.tick_ns)
         off_ns = np.abs(device_ns - numbers * period_ns)
         departed = (off_ns > DEPARTURE_NS + capabilities.tick_ns) | (numbers < 1)
-        self._note_departures(stamps[0, 1:], departed)
+        self._note_departures(t_host_ns, departed)
         offsets_ns = self._drift_ns + np.cumsum(host_ns - device_ns)
-        self._drift_ns = int(offsets_ns[-1])
-        self._offsets.add(stamps[0, 1:], offsets_ns, int(stamps[0, -1]))
+        self._drift_ns = int(offsets_ns[-1]) if len(offsets_ns) else self._drift_ns
+        self._offsets.add(t_host_ns, offsets_ns, int(stamps[0, -1]))
         if not capabilities.sequence:
             return []
         off_sequence = off_ns > STEP_NS + RATE_SHARE * period_ns * (numbers - 1)
         off_host = np.abs(device_ns - host_ns) > STEP_NS
         jumped = off_sequence & off_host & (numbers > 0)
-        return [int(t_ns) for t_ns in stamps[0, 1:][jumped]]
+        return [int(t_ns) for t_ns in t_host_ns[jumped]]
 
     def _note_departures(self, t_host_ns: np.ndarray, departed: np.ndarray) -> None:
         """Remember when samples were last not as far apart as their numbers say."""
@@ -178,17 +165,17 @@ class ClockJudge:
         return float(np.sign(slope_ppm) * max(0.0, abs(slope_ppm) - doubt_ppm))
 
     def _note(self, t_ns: int) -> None:
-        if self._steps and t_ns - self._steps[-1] < SAME_STEP_NS:
-            return
-        self._steps.append(t_ns)
-        self.num_steps += 1
+        if not self._steps or t_ns - self._steps[-1] >= SAME_STEP_NS:
+            self._steps.append(t_ns)
+            self.num_steps += 1
 
-    def _judge_steps(self, now_ns: int) -> tuple[Finding, ...]:
-        in_an_hour = sum(t_ns > now_ns - HOUR_NS for t_ns in self._steps)
-        text = f"its clock was set or restarted {in_an_hour} times within an hour"
-        findings = find("clock_step", in_an_hour, text)
-        is_shown = bool(self._steps) and self._steps[-1] > now_ns - STEP_SHOWN_NS
-        return tuple(finding for finding in findings if is_shown or finding.level == "ERROR")
+    def _judge_steps(self, evaluation: Evaluation) -> None:
+        evaluation.figures["clock_resets"] = float(self.num_steps)
+        in_an_hour = sum(t_ns > evaluation.now_ns - HOUR_NS for t_ns in self._steps)
+        is_new = bool(self._steps) and self._steps[-1] > evaluation.now_ns - STEP_SHOWN_NS
+        if is_new or in_an_hour >= CODES["clock_step"].error:
+            text = f"its clock was set or restarted {in_an_hour} times within an hour"
+            evaluation.judge("clock_step", in_an_hour, text)
 
 
 class CountingJudge:
@@ -203,7 +190,7 @@ class CountingJudge:
         self._period_ns = descriptor.period_ns()
         warn_s, error_s = (share * self._period_ns * 1e-9 for share in RESIDUAL_SHARES)
         self._limits_s = (warn_s, error_s)
-        self._residuals = Rolling(WINDOW_NS)
+        self._residuals = Rolling()
         self._num_resets = 0
         self._restart()
 
@@ -211,24 +198,23 @@ class CountingJudge:
         self._clock = CountingClock(self._period_ns)
         self._undated: deque[int] = deque()
 
-    def judge(self, block: Block, now_ns: int) -> Verdict:
+    def __call__(self, evaluation: Evaluation) -> None:
         """One evaluation."""
         try:
-            arrivals_ns, residuals_ns = self._follow(block)
+            arrivals_ns, residuals_ns = self._follow(evaluation.block)
         except InvalidInputError:
             # Arrivals that go back: another reader, another clock.
             self._num_resets += 1 + self._clock.num_steps
             self._restart()
-            return Verdict()
-        kept_s = self._residuals.add(arrivals_ns, residuals_ns * 1e-9, now_ns)
-        if not len(block) or len(kept_s) < MIN_RESIDUALS or not self._clock.is_steady:
-            return Verdict()
-        scatter = _judge_scatter(kept_s, "the count of its samples", at_least=self._limits_s)
-        figures = {
-            "clock_resets": float(self._num_resets + self._clock.num_steps),
-            "clock_skew_ratio": self._clock.skew_ppm * 1e-6,
-        }
-        return Verdict(scatter.findings, {**figures, **scatter.figures})
+            return
+        kept_s = self._residuals.add(arrivals_ns, residuals_ns * 1e-9, evaluation.now_ns)
+        has_enough = len(evaluation.block) and len(kept_s) >= MIN_RESIDUALS
+        if has_enough and self._clock.is_steady:
+            num_resets = self._num_resets + self._clock.num_steps
+            evaluation.figures["clock_resets"] = float(num_resets)
+            evaluation.figures["clock_skew_ratio"] = self._clock.skew_ppm * 1e-6
+            about = "the count of its samples"
+            _judge_scatter(evaluation, kept_s, about, at_least=self._limits_s)
 
     def _follow(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
         """Arrivals of the samples that got their final time now, and how long they waited, ns."""
@@ -243,8 +229,12 @@ class CountingJudge:
 
 
 def _judge_scatter(
-    residuals_s: np.ndarray, about: str, *, at_least: tuple[float, float] = (0.0, 0.0)
-) -> Verdict:
+    evaluation: Evaluation,
+    residuals_s: np.ndarray,
+    about: str,
+    *,
+    at_least: tuple[float, float] = (0.0, 0.0),
+) -> None:
     """How far 95 % lie from the median, which is path delay and cannot be told from offset.
 
     The figure of the offset's scatter is how far the lower edge of the residuals moves from second
@@ -253,9 +243,10 @@ def _judge_scatter(
     scatter_s = float(np.percentile(np.abs(residuals_s - np.median(residuals_s)), 95))
     edges_s = [part.min() for part in np.array_split(residuals_s, BINS)]
     sigma_s = float(1.4826 * np.median(np.abs(edges_s - np.median(edges_s))))
-    figures = {"clock_residual_p95_seconds": scatter_s, "clock_sigma_seconds": sigma_s}
+    evaluation.figures["clock_residual_p95_seconds"] = scatter_s
+    evaluation.figures["clock_sigma_seconds"] = sigma_s
     text = f"arrivals scatter by {scatter_s * 1e3:.1f} ms about {about}"
-    return Verdict(find("clock_residual", scatter_s, text, at_least=at_least), figures)
+    evaluation.judge("clock_residual", scatter_s, text, at_least=at_least)
 
 
 def _signed(steps: np.ndarray, bits: int, unit: int) -> np.ndarray:

@@ -2,9 +2,11 @@
 
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
+
+import numpy as np
 
 from dextouch.schemas import HealthEvent, HealthLevel, RaisedFinding
 from services.acquisition.health.codes import CODES, NEVER, SEVERITY
@@ -13,6 +15,7 @@ from services.acquisition.health.samples import Block
 RAISE_AFTER = 2
 CLEAR_AFTER = 5
 MAX_EVENTS = 2000
+NO_SAMPLES = Block(*(np.empty(0, dtype=np.int64) for _ in range(4)))
 
 
 class Finding(NamedTuple):
@@ -23,44 +26,54 @@ class Finding(NamedTuple):
     message: str
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What one check says: findings, figures by metric name, and whether to look again soon.
+@dataclass
+class Evaluation:
+    """One evaluation of a stream or of the station, to which each of its checks adds.
 
-    `suspicious` asks for another evaluation before the regular one, for faults that must last a
-    while before they count.
+    Attributes:
+        now_ns: time on the station's clock.
+        block: samples since the last evaluation; none of the station itself.
+        findings: what is wrong.
+        figures: numbers by metric name.
+        suspicious: asks for another evaluation before the regular one, for faults that must last a
+            while before they count.
     """
 
-    findings: tuple[Finding, ...] = ()
-    figures: Mapping[str, float] = field(default_factory=dict)
+    now_ns: int
+    block: Block = NO_SAMPLES
+    findings: list[Finding] = field(default_factory=list)
+    figures: dict[str, float] = field(default_factory=dict)
     suspicious: bool = False
 
+    def judge(
+        self,
+        code: str,
+        value: float | int,
+        message: str,
+        *,
+        at_least: tuple[float, float] = (-NEVER, -NEVER),
+    ) -> None:
+        """Add a finding where a value is above the limits of its code.
 
-# A check of one aspect of a stream or the station, run at every evaluation: with the samples since
-# the last one (none for the station) and the time of the station's clock.
-Judge = Callable[[Block, int], Verdict]
+        Args:
+            code: what it is.
+            value: in the unit of the code's limits.
+            message: in words.
+            at_least: limits for WARN and ERROR where those of the code are smaller.
+        """
+        rule = CODES[code]
+        if value > max(rule.warn, at_least[0]):
+            is_error = value >= max(rule.error, at_least[1])
+            self.findings.append(Finding(code, "ERROR" if is_error else "WARN", message))
+
+    def include(self, other: "Evaluation") -> None:
+        """Add the findings and figures of another evaluation."""
+        self.findings += other.findings
+        self.figures |= other.figures
 
 
-def find(
-    code: str,
-    value: float | int,
-    message: str,
-    *,
-    at_least: tuple[float, float] = (-NEVER, -NEVER),
-) -> tuple[Finding, ...]:
-    """A finding where a value is above the limits of its code.
-
-    Args:
-        code: what it is.
-        value: in the unit of the code's limits.
-        message: in words.
-        at_least: limits for WARN and ERROR where those of the code are smaller.
-    """
-    rule = CODES[code]
-    if not value > max(rule.warn, at_least[0]):
-        return ()
-    is_error = value >= max(rule.error, at_least[1])
-    return (Finding(code, "ERROR" if is_error else "WARN", message),)
+# A check of one aspect of a stream or of the station, run at every evaluation.
+Judge = Callable[[Evaluation], None]
 
 
 def raised_finding(
@@ -84,7 +97,7 @@ def raised_finding(
 
 def worst(levels: Sequence[HealthLevel], default: HealthLevel = "OK") -> HealthLevel:
     """The most severe level; STALE ranks above ERROR."""
-    return max(levels, key=_rank, default=default)
+    return max(levels, key=SEVERITY.index, default=default)
 
 
 class Hysteresis:
@@ -92,9 +105,6 @@ class Hysteresis:
 
     It rises to the milder of the last 2, and falls to the graver of the last 5.
     """
-
-    # Small, as a station has one for each code that any of its streams ever showed.
-    __slots__ = ("_recent", "level", "message", "since_ns")
 
     def __init__(self) -> None:
         self.level: HealthLevel = "OK"
@@ -105,15 +115,15 @@ class Hysteresis:
     @property
     def is_rising(self) -> bool:
         """Whether one more judgement like the last one would raise the level."""
-        return bool(self._recent) and _rank(self._recent[-1]) > _rank(self.level)
+        return bool(self._recent) and is_graver(self._recent[-1], self.level)
 
     def update(self, judgement: HealthLevel) -> HealthLevel:
         """One evaluation."""
         recent = self._recent = (*self._recent, judgement)[-CLEAR_AFTER:]
         if len(recent) >= RAISE_AFTER:
-            self.level = max(self.level, min(recent[-RAISE_AFTER:], key=_rank), key=_rank)
+            self.level = worst([self.level, min(recent[-RAISE_AFTER:], key=SEVERITY.index)])
         if len(recent) == CLEAR_AFTER:
-            self.level = min(self.level, max(recent, key=_rank), key=_rank)
+            self.level = min(self.level, worst(recent), key=SEVERITY.index)
         return self.level
 
 
@@ -139,13 +149,13 @@ class Board:
             confirming: an evaluation between the regular ones. It may raise, never clear.
         """
         judged: dict[str, HealthLevel] = {}
-        for finding in sorted(findings, key=lambda item: _rank(item.level)):
+        for finding in sorted(findings, key=lambda item: SEVERITY.index(item.level)):
             judged[finding.code] = finding.level
             self._codes.setdefault(finding.code, Hysteresis()).message = finding.message
         changes: list[tuple[str, HealthLevel]] = []
         for code, hysteresis in self._codes.items():
             judgement, before = judged.get(code, "OK"), hysteresis.level
-            if confirming and _rank(judgement) <= _rank(before):
+            if confirming and not is_graver(judgement, before):
                 continue
             if hysteresis.update(judgement) != before:
                 changes.append((code, hysteresis.level))
@@ -160,7 +170,7 @@ class Board:
             for code, h in self._codes.items()
             if h.level != "OK"
         ]
-        return tuple(sorted(raised, key=lambda item: -_rank(item.level)))
+        return tuple(sorted(raised, key=lambda item: -SEVERITY.index(item.level)))
 
 
 class EventLog:
@@ -196,5 +206,6 @@ class EventLog:
             return dict(self._raised)
 
 
-def _rank(level: HealthLevel) -> int:
-    return SEVERITY.index(level)
+def is_graver(level: HealthLevel, than: HealthLevel) -> bool:
+    """Whether a level is more severe than another."""
+    return SEVERITY.index(level) > SEVERITY.index(than)

@@ -1,6 +1,6 @@
 """Prometheus metrics of the health report, made when someone scrapes."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
@@ -60,6 +60,8 @@ DEVICE_COUNTERS: Final = {
     "reconnects": ("reconnects", "Times the device was lost after it was open."),
     "reader_failures": ("failures", "Unexpected errors in the reader."),
 }
+LEVELS = "0 OK, 1 WARN, 2 ERROR, 3 STALE."
+Rows = Sequence[tuple[Sequence[str], float | int]]
 
 
 class HealthCollector(Collector):
@@ -85,60 +87,42 @@ class HealthCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         """All metrics of one report."""
         health = self._report()
-        yield from _stream_metrics(health)
-        yield from self._device_metrics(health)
+        streams = [((s.stream, s.hand or "", s.device), s) for s in health.streams]
+        devices = [((d.hand or "", d.device), d.model_dump()) for d in health.devices]
+        for (_, name), counts in devices:
+            counts["lost"] = self._lost[name] = max(counts["lost"], self._lost.get(name, 0))
+        gauge, counter = GaugeMetricFamily, CounterMetricFamily
+        rows: Rows = [(labels, SEVERITY.index(s.level)) for labels, s in streams]
+        yield _filled(gauge("dextouch_stream_level", LEVELS, labels=STREAM_LABELS), rows)
+        rows = [(labels, s.age_s) for labels, s in streams if s.age_s is not None]
+        text = "Since the newest sample."
+        yield _filled(gauge("dextouch_sample_age_seconds", text, labels=STREAM_LABELS), rows)
+        rows = [(labels, s.num_samples) for labels, s in streams]
+        yield _filled(counter("dextouch_samples", "Samples taken.", labels=STREAM_LABELS), rows)
+        for name, text in STREAM_FIGURES.items():
+            rows = [(labels, s.figures[name]) for labels, s in streams if name in s.figures]
+            yield _filled(gauge(f"dextouch_{name}", text, labels=STREAM_LABELS), rows)
+        rows = [(labels, float(counts["connected"])) for labels, counts in devices]
+        text = "1 while the device is open."
+        yield _filled(gauge("dextouch_device_connected", text, labels=DEVICE_LABELS), rows)
+        for name, (field, text) in DEVICE_COUNTERS.items():
+            rows = [(labels, counts[field]) for labels, counts in devices]
+            yield _filled(counter(f"dextouch_{name}", text, labels=DEVICE_LABELS), rows)
         for name, text in STATION_FIGURES.items():
             if name in health.figures:
-                family = GaugeMetricFamily(f"dextouch_{name}", text)
-                family.add_metric((), health.figures[name])
-                yield family
-        events = CounterMetricFamily(
-            "dextouch_health_findings", "Times a finding was raised.", labels=("stream", "code")
-        )
-        for labels, count in sorted(self._raised().items()):
-            events.add_metric(labels, count)
-        yield events
-
-    def _device_metrics(self, health: StationHealth) -> Iterator[Metric]:
-        connected = GaugeMetricFamily(
-            "dextouch_device_connected", "1 while the device is open.", labels=DEVICE_LABELS
-        )
-        counters = {
-            name: CounterMetricFamily(f"dextouch_{name}", text, labels=DEVICE_LABELS)
-            for name, (_, text) in DEVICE_COUNTERS.items()
-        }
-        for device in health.devices:
-            labels = (device.hand or "", device.device)
-            lost = self._lost[device.device] = max(device.lost, self._lost.get(device.device, 0))
-            counts = {**device.model_dump(), "lost": lost}
-            connected.add_metric(labels, float(device.connected))
-            for name, (field, _) in DEVICE_COUNTERS.items():
-                counters[name].add_metric(labels, counts[field])
-        yield from (connected, *counters.values())
+                yield gauge(f"dextouch_{name}", text, value=health.figures[name])
+        text, labels = "Times a finding was raised.", ("stream", "code")
+        events = counter("dextouch_health_findings", text, labels=labels)
+        yield _filled(events, sorted(self._raised().items()))
 
     def describe(self) -> Iterator[Metric]:
         """Nothing ahead of time: registering asks for no report."""
         return iter(())
 
 
-def _stream_metrics(health: StationHealth) -> Iterator[Metric]:
-    level = GaugeMetricFamily(
-        "dextouch_stream_level", "0 OK, 1 WARN, 2 ERROR, 3 STALE.", labels=STREAM_LABELS
-    )
-    age = GaugeMetricFamily(
-        "dextouch_sample_age_seconds", "Since the newest sample.", labels=STREAM_LABELS
-    )
-    samples = CounterMetricFamily("dextouch_samples", "Samples taken.", labels=STREAM_LABELS)
-    figures = {
-        name: GaugeMetricFamily(f"dextouch_{name}", text, labels=STREAM_LABELS)
-        for name, text in STREAM_FIGURES.items()
-    }
-    for stream in health.streams:
-        labels = (stream.stream, stream.hand or "", stream.device)
-        level.add_metric(labels, SEVERITY.index(stream.level))
-        samples.add_metric(labels, stream.num_samples)
-        if stream.age_s is not None:
-            age.add_metric(labels, stream.age_s)
-        for name, value in stream.figures.items():
-            figures[name].add_metric(labels, value)
-    yield from (level, age, samples, *figures.values())
+def _filled(
+    family: GaugeMetricFamily | CounterMetricFamily, rows: Rows
+) -> GaugeMetricFamily | CounterMetricFamily:
+    for labels, value in rows:
+        family.add_metric(labels, value)
+    return family

@@ -1,23 +1,35 @@
 """Health monitor of a station, which evaluates all of its streams once a second."""
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
-from functools import partial
+from collections.abc import Mapping, Sequence
 
-from dextouch.schemas import HealthEvents, Matrix, StationHealth
+from dextouch.schemas import (
+    DeviceHealth,
+    HealthEvents,
+    Matrix,
+    StaleCode,
+    StationHealth,
+    StreamHealth,
+)
 from dextouch.streams import StreamDescriptor
-from services.acquisition.clock import StationClock, Waiter
-from services.acquisition.drivers.base import Driver
+from services.acquisition.clock import PeriodicCall, StationClock
+from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.glove_record import glove_record, is_ours
 from services.acquisition.health.cells import TaxelJudge, cell_judge
 from services.acquisition.health.clock import ClockJudge, CountingJudge
-from services.acquisition.health.levels import EventLog, Judge, Verdict, worst
+from services.acquisition.health.codes import CODES
+from services.acquisition.health.levels import (
+    Board,
+    Evaluation,
+    EventLog,
+    Judge,
+    raised_finding,
+    worst,
+)
 from services.acquisition.health.link import LinkJudge, TrackingJudge
-from services.acquisition.health.samples import Block, deliver
-from services.acquisition.health.station import CalibrationJudge, PathJudge, judge_uploads
+from services.acquisition.health.samples import Block, SampleQueue
+from services.acquisition.health.station import CalibrationJudge, PathJudge
 from services.acquisition.health.values import CameraJudge, FiniteJudge, PoseJudge
-from services.acquisition.health.watched import Watched, WatchedStream, device_health
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
 
@@ -26,7 +38,105 @@ PERIOD_NS = 1_000_000_000
 CONFIRM_NS = 200_000_000
 # A device may take this long after the start before its silence is an event.
 START_NS = 1_000_000_000
+STALE_AFTER_NS = {"image": 500_000_000}
+STALE_AFTER_OTHERS_NS = 200_000_000
+LATE_PERIODS = round(CODES["late"].warn)
 STATION = "station"
+
+
+class _Watched:
+    """The station or one of its streams, with its checks and their latest results."""
+
+    def __init__(self, name: str, judges: list[Judge]) -> None:
+        self.name = name
+        self.judges = judges
+        self.board = Board()
+        self.latest = Evaluation(0)
+
+    def evaluate(self, now_ns: int) -> Evaluation:
+        """What the checks find now."""
+        evaluation = Evaluation(now_ns, self.take())
+        for judge in self.judges:
+            judge(evaluation)
+        return evaluation
+
+    def take(self) -> Block:
+        """Samples since the last evaluation; none of the station itself."""
+        return Evaluation(0).block
+
+
+class _WatchedStream(_Watched):
+    """One stream of a device, and its samples that wait for the next evaluation.
+
+    A silent stream is detected for every report; it has no figures.
+    """
+
+    def __init__(
+        self, supervisor: DeviceSupervisor, descriptor: StreamDescriptor, judges: list[Judge]
+    ) -> None:
+        super().__init__(descriptor.name, judges)
+        self._supervisor = supervisor
+        self._descriptor = descriptor
+        self.counters = supervisor.streams[descriptor.name]
+        self.queue = SampleQueue(descriptor)
+        # As the event log knows it.
+        self.stale: StaleCode | None = None
+
+    def take(self) -> Block:
+        return self.queue.take()
+
+    def stale_code(self, now_ns: int) -> StaleCode | None:
+        """Why the stream is stale, None when it is not.
+
+        "unplugged" when the device is not open, "silent" when it is and nothing comes; a slow
+        stream may take 3 of its periods at least.
+        """
+        if not self._supervisor.connected.is_set():
+            return "unplugged"
+        limit_ns = STALE_AFTER_NS.get(self._descriptor.kind, STALE_AFTER_OTHERS_NS)
+        limit_ns = max(limit_ns, LATE_PERIODS * self._descriptor.period_ns())
+        last_ns = self.counters.last_t_host_ns
+        return "silent" if last_ns is None or now_ns - last_ns > limit_ns else None
+
+    def health(self, now_ns: int) -> StreamHealth:
+        """The stream at this moment."""
+        descriptor, driver = self._descriptor, self._supervisor.driver
+        findings, figures = self.board.active(now_ns), self.latest.figures
+        last_ns, stale = self.counters.last_t_host_ns, self.stale_code(now_ns)
+        age_ns = None if last_ns is None else max(0, now_ns - last_ns)
+        if stale is not None:
+            text = self._stale_words(stale, age_ns)
+            is_stale = raised_finding(stale, "STALE", text, lasted_ns=age_ns)
+            findings, figures = (is_stale, *findings), {}
+        elif not findings and age_ns is not None and age_ns > LATE_PERIODS * descriptor.period_ns():
+            findings = (raised_finding("late", "WARN", "late", lasted_ns=age_ns),)
+        skew = figures.get("clock_skew_ratio")
+        residual_s = figures.get("clock_residual_p95_seconds")
+        return StreamHealth(
+            stream=self.name,
+            device=driver.name,
+            hand=descriptor.side,
+            level=worst([finding.level for finding in findings]),
+            stale=stale,
+            reasons=tuple(finding.message for finding in findings),
+            findings=findings,
+            figures=figures,
+            rate_hz=figures.get("rate_hz"),
+            nominal_rate_hz=descriptor.nominal_rate_hz,
+            age_s=None if age_ns is None else age_ns / 1e9,
+            num_samples=self.counters.num_samples,
+            received=driver.statistics.packets,
+            lost=driver.statistics.lost,
+            skew_ppm=None if skew is None else skew * 1e6,
+            clock_residual_ms=None if residual_s is None else residual_s * 1e3,
+        )
+
+    def _stale_words(self, stale: StaleCode, age_ns: int | None) -> str:
+        if self._supervisor.last_error is not None:
+            return self._supervisor.last_error
+        if stale == "unplugged":
+            return "not connected"
+        return "no data yet" if age_ns is None else f"no data for {age_ns * 1e-9:.1f} s"
 
 
 class HealthMonitor:
@@ -56,47 +166,45 @@ class HealthMonitor:
         self._supervisors = list(supervisors)
         self._clock = clock
         self._log = EventLog()
-        streams = [watched for s in supervisors for watched in _watch(s, calibration, paths)]
-        self._streams = {watched.name: watched for watched in streams}
-        # Called by the reader threads with what they have spooled.
-        self.accept = partial(deliver, {watched.name: watched.queue for watched in streams}, clock)
-        descriptors = [watched.descriptor for watched in streams]
-        calibrated = CalibrationJudge(descriptors, calibration)
-        self._itself = Watched(STATION, [calibrated.judge, self._judge_itself])
+        streams = [stream for s in supervisors for stream in _watch(s, calibration, paths)]
+        self._streams = {stream.name: stream for stream in streams}
+        descriptors = [descriptor for s in supervisors for descriptor in s.driver.descriptors]
+        self._itself = _Watched(
+            STATION, [CalibrationJudge(descriptors, calibration), self._judge_itself]
+        )
+        self._all = [*streams, self._itself]
         self._started_ns = clock.now_ns()
         self._due_ns = self._started_ns + PERIOD_NS
         # One evaluates at a time; the other lock guards what a report reads.
         self._evaluating = threading.Lock()
         self._lock = threading.Lock()
-        self._waiter: Waiter | None = None
-        self._thread = threading.Thread(target=self._run, name="health", daemon=True)
+        self._ticks = PeriodicCall(self.tick, period_ns=TICK_NS, clock=clock, name="health")
 
     def watch(self, judge: Judge) -> None:
         """Add a check of the station itself, such as that of its disk."""
         self._itself.judges.append(judge)
 
-    def watch_uploads(self, refused: Callable[[], Mapping[str, str]]) -> None:
-        """Start monitoring which takes the store refused, and why."""
-        self.watch(lambda _block, _now_ns: judge_uploads(refused()))
-
     def start(self) -> None:
         """Start evaluating."""
-        self._waiter = self._clock.waiter()
         self._started_ns = self._clock.now_ns()
         self._due_ns = self._started_ns + PERIOD_NS
-        self._thread.start()
+        self._ticks.start()
 
     def stop(self) -> None:
         """End the thread."""
-        if self._waiter is not None:
-            self._waiter.cancel()
-            self._thread.join()
+        self._ticks.stop()
+
+    def accept(self, readings: Readings) -> None:
+        """Keep samples for the next evaluation (called by the reader threads, once spooled)."""
+        now_ns = self._clock.now_ns()
+        for name, samples in readings.items():
+            self._streams[name].queue.add(samples, now_ns)
 
     def evaluate(self) -> None:
         """One regular evaluation now."""
         now_ns = self._clock.now_ns()
         with self._evaluating:
-            for watched in (*self._streams.values(), self._itself):
+            for watched in self._all:
                 self._evaluate(watched, now_ns, confirming=False)
 
     def tick(self) -> None:
@@ -109,17 +217,17 @@ class HealthMonitor:
             self.evaluate()
             return
         with self._evaluating:
-            for watched in (*self._streams.values(), self._itself):
-                waits = watched.board.is_rising or watched.is_suspicious
-                if waits and now_ns >= watched.evaluated_ns + CONFIRM_NS:
+            for watched in self._all:
+                waits = watched.board.is_rising or watched.latest.suspicious
+                if waits and now_ns >= watched.latest.now_ns + CONFIRM_NS:
                     self._evaluate(watched, now_ns, confirming=True)
 
     def report(self) -> StationHealth:
         """Current health of every stream and device."""
         now_ns = self._clock.now_ns()
         with self._lock:
-            streams = tuple(watched.health(now_ns) for watched in self._streams.values())
-            findings, figures = self._itself.board.active(now_ns), self._itself.figures
+            streams = tuple(stream.health(now_ns) for stream in self._streams.values())
+            findings, figures = self._itself.board.active(now_ns), self._itself.latest.figures
         levels = [stream.level for stream in streams] + [finding.level for finding in findings]
         return StationHealth(
             station=self._station,
@@ -127,7 +235,7 @@ class HealthMonitor:
             findings=findings,
             figures=figures,
             streams=streams,
-            devices=tuple(device_health(s) for s in self._supervisors),
+            devices=tuple(_device_health(s) for s in self._supervisors),
         )
 
     def events(self, since_ns: int = 0) -> HealthEvents:
@@ -141,66 +249,55 @@ class HealthMonitor:
     @property
     def num_unjudged(self) -> int:
         """Number of samples that were not evaluated because the evaluation did not keep up."""
-        return sum(watched.queue.num_dropped for watched in self._streams.values())
+        return sum(stream.queue.num_dropped for stream in self._streams.values())
 
-    def _judge_itself(self, block: Block, now_ns: int) -> Verdict:
-        del block, now_ns
-        return Verdict((), {"unjudged_samples": float(self.num_unjudged)})
+    def _judge_itself(self, evaluation: Evaluation) -> None:
+        evaluation.figures["unjudged_samples"] = float(self.num_unjudged)
 
-    def _run(self) -> None:
-        if self._waiter is None:
-            return
-        with closing(self._waiter) as waiter:
-            while waiter.wait_until(self._clock.now_ns() + TICK_NS):
-                self.tick()
-
-    def _evaluate(self, watched: Watched, now_ns: int, *, confirming: bool) -> None:
-        verdicts = watched.verdicts(now_ns)
-        findings = [finding for verdict in verdicts for finding in verdict.findings]
+    def _evaluate(self, watched: _Watched, now_ns: int, *, confirming: bool) -> None:
+        evaluation = watched.evaluate(now_ns)
         with self._lock:
-            changes = watched.board.update(findings, now_ns, confirming=confirming)
-            watched.figures = {k: v for verdict in verdicts for k, v in verdict.figures.items()}
-            watched.is_suspicious = any(verdict.suspicious for verdict in verdicts)
-            watched.evaluated_ns = now_ns
+            changes = watched.board.update(evaluation.findings, now_ns, confirming=confirming)
+            watched.latest = evaluation
         for code, level in changes:
             self._log.add(now_ns, watched.name, code, level)
 
     def _notice_silence(self, now_ns: int) -> None:
-        for name, watched in self._streams.items():
-            stale, code = watched.stale, watched.stale_code(now_ns)
-            never = watched.counters.last_t_host_ns is None
+        for name, stream in self._streams.items():
+            stale, code = stream.stale, stream.stale_code(now_ns)
+            never = stream.counters.last_t_host_ns is None
             if code == stale or (never and now_ns < self._started_ns + START_NS):
                 continue
             if stale is not None:
                 self._log.add(now_ns, name, stale, "OK")
             if code is not None:
                 self._log.add(now_ns, name, code, "STALE")
-            watched.stale = code
+            stream.stale = code
 
 
 def _watch(
     supervisor: DeviceSupervisor, calibration: Mapping[str, Matrix], paths: PathWatch | None
-) -> list[WatchedStream]:
+) -> list[_WatchedStream]:
     """The streams of one device, each with the checks for its kind."""
     watched = []
     clock: ClockJudge | None = None
     driver = supervisor.driver
     for descriptor in driver.descriptors:
-        judges: list[Judge] = [LinkJudge(supervisor, descriptor).judge]
+        judges: list[Judge] = [LinkJudge(supervisor, descriptor)]
         if descriptor.capabilities.device_time and clock is None:
             clock = ClockJudge(descriptor)
-            judges.append(clock.judge)
+            judges.append(clock)
         elif descriptor.capabilities.device_time and clock is not None:
-            # All streams of a device share their timestamps: the first one's verdict is theirs.
+            # All streams of a device share their timestamps: the first one's result is theirs.
             judges.append(clock.repeat)
         elif not descriptor.capabilities.sequence:
-            judges.append(CountingJudge(descriptor).judge)
+            judges.append(CountingJudge(descriptor))
         judges += _value_judges(driver, descriptor, calibration)
         if "occluded" in driver.events():
-            judges.append(TrackingJudge(supervisor.events).judge)
+            judges.append(TrackingJudge(supervisor.events))
         if paths is not None and paths.num_failures(descriptor.name) is not None:
-            judges.append(PathJudge(descriptor.name, paths, calibration).judge)
-        watched.append(WatchedStream(supervisor, descriptor, judges))
+            judges.append(PathJudge(descriptor.name, paths, calibration))
+        watched.append(_WatchedStream(supervisor, descriptor, judges))
     return watched
 
 
@@ -212,9 +309,28 @@ def _value_judges(
         record = glove_record(descriptor, calibration) if is_ours(descriptor) else None
         cells = TaxelJudge(record) if record else cell_judge(driver.decoder, calibration)
         nan = FiniteJudge("nan", "taxels are no numbers")
-        return [nan.judge] if cells is None else [nan.judge, cells.judge]
+        return [nan] if cells is None else [nan, cells]
     if descriptor.kind == "keypoints":
-        return [FiniteJudge("tracking", "nodes are not seen").judge]
+        return [FiniteJudge("tracking", "nodes are not seen")]
     if descriptor.kind == "pose":
-        return [PoseJudge(descriptor).judge]
-    return [CameraJudge(driver).judge] if descriptor.kind == "image" else []
+        return [PoseJudge(descriptor)]
+    return [CameraJudge(driver)] if descriptor.kind == "image" else []
+
+
+def _device_health(supervisor: DeviceSupervisor) -> DeviceHealth:
+    """A device's counters."""
+    driver, events = supervisor.driver, supervisor.events()
+    sides = {descriptor.side for descriptor in driver.descriptors}
+    return DeviceHealth.model_validate(
+        {
+            **{name: events[name] for name in DeviceHealth.model_fields if name in events},
+            "device": driver.name,
+            "hand": sides.pop() if len(sides) == 1 else None,
+            "connected": supervisor.connected.is_set(),
+            "address": str(driver.info),
+            "queue_dropped": events.get("queue", 0),
+            "reconnects": supervisor.reconnects,
+            "failures": events["driver_failure"],
+            "last_error": supervisor.last_error,
+        }
+    )

@@ -9,8 +9,6 @@ import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
 from dextouch.streams import Sample, StreamDescriptor
-from services.acquisition.clock import StationClock
-from services.acquisition.drivers.base import Readings
 
 WINDOW_NS = 10_000_000_000
 # What is kept between two evaluations, which are a second apart.
@@ -23,14 +21,14 @@ JUDGED_VALUES = ("tactile", "pose", "keypoints")
 class Block:
     """Consecutive samples of one stream since the last evaluation.
 
-    `values` is None for streams whose values are not checked; `latency_ns` is the time from the
-    read's timestamp until its samples were spooled, one per delivery.
+    `latency_ns` is the time from a read's timestamp until its samples were spooled; `values` is
+    None for streams whose values are not checked.
     """
 
     t_host_ns: Int64[np.ndarray, " n"]
     t_device_ns: Int64[np.ndarray, " n"]
     sequence: Int64[np.ndarray, " n"]
-    latency_ns: Int64[np.ndarray, " k"]
+    latency_ns: Int64[np.ndarray, " n"]
     values: Shaped[np.ndarray, "n ..."] | None = None
 
     def __len__(self) -> int:
@@ -48,12 +46,10 @@ class SampleQueue:
         self.num_dropped = 0
         self._size = max(16, round(KEPT_S * descriptor.nominal_rate_hz))
         self._keeps_values = descriptor.kind in JUDGED_VALUES
-        self._stamps = np.zeros((self._size, 3), dtype=np.int64)
-        self._latencies_ns = np.zeros(self._size, dtype=np.int64)
+        self._stamps = np.zeros((self._size, 4), dtype=np.int64)
         # Made of the first sample: its device decides on their type.
         self._values: np.ndarray | None = None
         self._num_added = self._num_taken = 0
-        self._num_latencies = self._num_latencies_taken = 0
         self._lock = threading.Lock()
 
     def add(self, samples: Sequence[Sample], now_ns: int) -> None:
@@ -63,13 +59,12 @@ class SampleQueue:
             self._values = np.zeros((self._size, *first.shape), dtype=first.dtype)
         with self._lock:
             for sample in samples:
-                place = self._num_added % self._size
-                self._stamps[place] = (sample.t_host_ns, sample.t_device_ns, sample.sequence)
+                place, t_host_ns = self._num_added % self._size, sample.t_host_ns
+                stamps = (t_host_ns, sample.t_device_ns, sample.sequence, now_ns - t_host_ns)
+                self._stamps[place] = stamps
                 if self._values is not None:
                     self._values[place] = sample.values
                 self._num_added += 1
-            self._latencies_ns[self._num_latencies % self._size] = now_ns - samples[-1].t_host_ns
-            self._num_latencies += 1
             num_dropped = max(0, self._num_added - self._num_taken - self._size)
             self._num_taken += num_dropped
             self.num_dropped += num_dropped
@@ -78,21 +73,12 @@ class SampleQueue:
         """Everything that waits, oldest first."""
         with self._lock:
             places = np.arange(self._num_taken, self._num_added) % self._size
-            first = max(self._num_latencies_taken, self._num_latencies - self._size)
-            latencies_ns = self._latencies_ns[np.arange(first, self._num_latencies) % self._size]
             stamps = np.ascontiguousarray(self._stamps[places].T)
             values = None
             if self._values is not None and len(places):
                 values = self._values[places]
-            self._num_taken, self._num_latencies_taken = self._num_added, self._num_latencies
-        return Block(stamps[0], stamps[1], stamps[2], latencies_ns, values)
-
-
-def deliver(queues: Mapping[str, SampleQueue], clock: StationClock, readings: Readings) -> None:
-    """Keep samples for the next evaluation (called by the reader threads, once spooled)."""
-    now_ns = clock.now_ns()
-    for name, samples in readings.items():
-        queues[name].add(samples, now_ns)
+            self._num_taken = self._num_added
+        return Block(stamps[0], stamps[1], stamps[2], stamps[3], values)
 
 
 class CountWindow:
@@ -122,10 +108,10 @@ class Rolling:
     """Numbers with their times, those of the last `span_ns` only.
 
     Its arrays grow to what a full span needs and stay as they are: windows that come and go in
-    ever other sizes leave holes that nothing else fits into.
+    ever other sizes leave holes in the memory that nothing else fits into.
     """
 
-    def __init__(self, span_ns: int) -> None:
+    def __init__(self, span_ns: int = WINDOW_NS) -> None:
         self._span_ns = span_ns
         self._t_ns = np.zeros(MIN_ROLLING, dtype=np.int64)
         self._values = np.zeros(MIN_ROLLING)
@@ -139,11 +125,11 @@ class Rolling:
             self._values = np.concatenate([self._values, np.zeros_like(self._values)])
         self._t_ns[self._count : stop] = t_ns
         self._values[self._count : stop] = values
-        kept = self._t_ns[:stop] >= now_ns - self._span_ns
-        self._count = int(np.count_nonzero(kept))
+        kept = np.flatnonzero(self._t_ns[:stop] >= now_ns - self._span_ns)
+        self._count = len(kept)
         if self._count < stop:
-            self._t_ns[: self._count] = self._t_ns[:stop][kept]
-            self._values[: self._count] = self._values[:stop][kept]
+            self._t_ns[: self._count] = self._t_ns[kept]
+            self._values[: self._count] = self._values[kept]
         return self.values
 
     @property

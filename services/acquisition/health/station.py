@@ -11,8 +11,8 @@ import numpy as np
 from dextouch.schemas import Matrix
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_RAW_TAXELS
-from services.acquisition.health.levels import Finding, Verdict, find
-from services.acquisition.health.samples import Block, CountWindow
+from services.acquisition.health.levels import Evaluation, Finding
+from services.acquisition.health.samples import CountWindow
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
 
@@ -42,23 +42,21 @@ class DiskJudge:
         streams = [stream for s in supervisors for stream in s.streams.values()]
         self._arrived = CountWindow(lambda: {"bytes": sum(s.num_bytes for s in streams)}, now_ns)
 
-    def judge(self, block: Block, now_ns: int) -> Verdict:
+    def __call__(self, evaluation: Evaluation) -> None:
         """One evaluation."""
-        del block
-        num_bytes = self._arrived.growth(now_ns)["bytes"]
-        elapsed_ns = now_ns - self._arrived.history[0][0]
+        num_bytes = self._arrived.growth(evaluation.now_ns)["bytes"]
+        elapsed_ns = evaluation.now_ns - self._arrived.history[0][0]
         try:
             free = self._free_bytes()
         except OSError as error:
             text = f"the spool's disk cannot be read: {error.strerror}"
-            return Verdict((Finding("disk", "ERROR", text),))
-        figures = {"disk_free_bytes": float(free)}
-        if elapsed_ns < MIN_RATE_SPAN_NS or num_bytes <= 0:
-            return Verdict((), figures)
-        left_s = free / (num_bytes / (elapsed_ns * 1e-9))
-        figures["disk_left_seconds"] = left_s
-        text = f"the disk is full in {left_s / 60:.0f} minutes; upload or delete takes"
-        return Verdict(find("disk", -left_s, text), figures)
+            evaluation.findings.append(Finding("disk", "ERROR", text))
+            return
+        evaluation.figures["disk_free_bytes"] = float(free)
+        if elapsed_ns >= MIN_RATE_SPAN_NS and num_bytes > 0:
+            left_s = evaluation.figures["disk_left_seconds"] = free / num_bytes * elapsed_ns * 1e-9
+            text = f"the disk is full in {left_s / 60:.0f} minutes; upload or delete takes"
+            evaluation.judge("disk", -left_s, text)
 
 
 class CalibrationJudge:
@@ -84,19 +82,17 @@ class CalibrationJudge:
         self._made_unix_s = [v for name, v in known.items() if name.endswith(CALIBRATED_AT)]
         self._sigmas_ns = [v for name, v in known.items() if name.endswith("_latency_sigma_ns")]
 
-    def judge(self, block: Block, now_ns: int) -> Verdict:
+    def __call__(self, evaluation: Evaluation) -> None:
         """One evaluation."""
-        del block, now_ns
         text = f"calibration lacks {', '.join(self._missing)}; calibrate the station"
-        findings = find("calibration_missing", len(self._missing), text)
-        figures = {}
+        evaluation.judge("calibration_missing", len(self._missing), text)
         if self._sigmas_ns:
-            figures["latency_sigma_seconds"] = max(self._sigmas_ns) * 1e-9
+            evaluation.figures["latency_sigma_seconds"] = max(self._sigmas_ns) * 1e-9
         if self._made_unix_s:
-            age_s = figures["calibration_age_seconds"] = self._unix_s() - min(self._made_unix_s)
+            age_s = self._unix_s() - min(self._made_unix_s)
+            evaluation.figures["calibration_age_seconds"] = age_s
             text = f"the oldest calibration is {age_s / 86_400:.0f} days old; calibrate again"
-            findings += find("calibration_age", age_s, text)
-        return Verdict(findings, figures)
+            evaluation.judge("calibration_age", age_s, text)
 
 
 class PathJudge:
@@ -115,38 +111,33 @@ class PathJudge:
         # A delay without a sigma is compared by the sigma of the measurement alone.
         self._calibrated_sigma_ns = number(calibration, f"{stream}_latency_sigma_ns") or 0.0
 
-    def judge(self, block: Block, now_ns: int) -> Verdict:
+    def __call__(self, evaluation: Evaluation) -> None:
         """One evaluation."""
-        del block, now_ns
-        figures: dict[str, float] = {}
         num_failures = self._paths.num_failures(self._stream)
         if num_failures is not None:
-            figures["time_requests_failed"] = float(num_failures)
+            evaluation.figures["time_requests_failed"] = float(num_failures)
         measured = self._paths.latencies().get(self._stream)
         if measured is None:
-            return Verdict((), figures)
-        figures["path_latency_seconds"] = measured.latency_ns * 1e-9
-        figures["path_latency_sigma_seconds"] = measured.sigma_ns * 1e-9
-        if self._calibrated_ns is None:
-            return Verdict((), figures)
-        apart_ns = abs(measured.latency_ns - self._calibrated_ns)
-        sigma_ns = math.hypot(measured.sigma_ns, self._calibrated_sigma_ns)
-        text = (
-            f"its path delay is {measured.latency_ns * 1e-6:.1f} ms by its replies and "
-            f"{self._calibrated_ns * 1e-6:.1f} ms by the calibration, {apart_ns / sigma_ns:.1f} "
-            "sigma apart"
-        )
-        return Verdict(find("latency_calibration", apart_ns / sigma_ns, text), figures)
+            return
+        evaluation.figures["path_latency_seconds"] = measured.latency_ns * 1e-9
+        evaluation.figures["path_latency_sigma_seconds"] = measured.sigma_ns * 1e-9
+        if self._calibrated_ns is not None:
+            sigma_ns = math.hypot(measured.sigma_ns, self._calibrated_sigma_ns)
+            apart = abs(measured.latency_ns - self._calibrated_ns) / sigma_ns
+            text = (
+                f"its path delay is {measured.latency_ns * 1e-6:.1f} ms by its replies and "
+                f"{self._calibrated_ns * 1e-6:.1f} ms by the calibration, {apart:.1f} sigma apart"
+            )
+            evaluation.judge("latency_calibration", apart, text)
 
 
-def judge_uploads(refused: Mapping[str, str]) -> Verdict:
+def judge_uploads(evaluation: Evaluation, refused: Mapping[str, str]) -> None:
     """Whether the store refused takes for good, by its words for each."""
-    if not refused:
-        return Verdict()
-    first, reason = next(iter(refused.items()))
-    others = f" and {len(refused) - 1} more" if len(refused) > 1 else ""
-    text = f"the store refuses take {first}{others}: {reason}"
-    return Verdict(find("upload_refused", len(refused), text))
+    if refused:
+        first, reason = next(iter(refused.items()))
+        others = f" and {len(refused) - 1} more" if len(refused) > 1 else ""
+        text = f"the store refuses take {first}{others}: {reason}"
+        evaluation.judge("upload_refused", len(refused), text)
 
 
 def number(calibration: Mapping[str, Matrix], name: str) -> float | None:

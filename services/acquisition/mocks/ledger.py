@@ -3,17 +3,17 @@
 import json
 from array import array
 from collections import Counter
-from collections.abc import Iterator, MutableSequence
-from dataclasses import dataclass, field, fields
+from collections.abc import MutableSequence
+from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Int64
-
-from dextouch.errors import CorruptDataError, UnknownNameError
+from dextouch.errors import UnknownNameError
 
 FORMAT = "dextouch mock ledger 1"
+# A column of signed 64-bit numbers: 8 bytes a packet, where a list takes 40.
+_numbers = partial(array, "q")
 
 
 class Fate(StrEnum):
@@ -40,15 +40,8 @@ class Fate(StrEnum):
     OVERRUN = "overrun"
 
 
+# What must become a sample.
 ACCEPTED = (Fate.SENT, Fate.REPEATED, Fate.MARKED)
-# Numbers that are text at the same time while a ledger is saved.
-PIECE = 512
-NUMBERS = ("sequence", "t_true_ns", "t_device_ns", "t_arrival_ns", "flipped_bits")
-
-
-def _whole_numbers() -> MutableSequence[int]:
-    """A column of signed 64-bit numbers: 8 bytes a packet, where a list takes 40."""
-    return array("q")
 
 
 @dataclass
@@ -61,12 +54,12 @@ class DeviceLedger:
 
     path_delay_ns: int = 0
     script: dict[str, object] = field(default_factory=dict)
-    sequence: MutableSequence[int] = field(default_factory=_whole_numbers)
-    t_true_ns: MutableSequence[int] = field(default_factory=_whole_numbers)
-    t_device_ns: MutableSequence[int] = field(default_factory=_whole_numbers)
-    t_arrival_ns: MutableSequence[int] = field(default_factory=_whole_numbers)
+    sequence: MutableSequence[int] = field(default_factory=_numbers)
+    t_true_ns: MutableSequence[int] = field(default_factory=_numbers)
+    t_device_ns: MutableSequence[int] = field(default_factory=_numbers)
+    t_arrival_ns: MutableSequence[int] = field(default_factory=_numbers)
     fate: list[str] = field(default_factory=list)
-    flipped_bits: MutableSequence[int] = field(default_factory=_whole_numbers)
+    flipped_bits: MutableSequence[int] = field(default_factory=_numbers)
 
     def note(self, sequence: int, times_ns: tuple[int, int, int], fate: Fate, flips: int) -> None:
         """Add a packet with its true, device and arrival times."""
@@ -81,19 +74,10 @@ class DeviceLedger:
         """How many packets met this fate."""
         return Counter(self.fate)[fate.value]
 
-    def accepted(self) -> list[int]:
-        """Sequence numbers of the packets that must become samples, in order."""
-        return [s for s, fate in zip(self.sequence, self.fate, strict=True) if fate in ACCEPTED]
-
     def count_lost_between(self) -> int:
         """Packets lost between the first and the last that arrived whole: what sequences show."""
         whole = [index for index, fate in enumerate(self.fate) if fate in ACCEPTED]
         return whole[-1] - whole[0] + 1 - len(whole) if whole else 0
-
-    def true_times_ns(self, sequences: np.ndarray) -> Int64[np.ndarray, " n"]:
-        """True host time of the samples with these sequence numbers."""
-        times = dict(zip(self.sequence, self.t_true_ns, strict=True))
-        return np.array([times[int(sequence)] for sequence in sequences], dtype=np.int64)
 
 
 @dataclass
@@ -115,49 +99,11 @@ class Ledger:
         return self.devices[device]
 
     def save(self, path: Path) -> None:
-        """Write it as JSON, piece by piece: the text of a long take is many times its columns."""
+        """Write it as JSON, device by device: the text of a take is many times its columns."""
         with path.open("w", encoding="utf-8") as file:
-            file.writelines(self._json())
-
-    def _json(self) -> Iterator[str]:
-        head = {"format": FORMAT, "seed": self.seed, "start_host_ns": self.start_host_ns}
-        yield json.dumps(head)[:-1] + ', "devices": {'
-        for number, (name, device) in enumerate(self.devices.items()):
-            yield f"{', ' if number else ''}{json.dumps(name)}: {{"
-            for index, column in enumerate(fields(device)):
-                yield f"{', ' if index else ''}{json.dumps(column.name)}: "
-                yield from _json_pieces(getattr(device, column.name))
-            yield "}"
-        yield "}}"
-
-    @staticmethod
-    def load(path: Path) -> "Ledger":
-        """Read what `save` wrote.
-
-        Raises:
-            CorruptDataError: not such a file.
-        """
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-            if content.pop("format") != FORMAT:
-                raise CorruptDataError(f"{path}: not a {FORMAT!r}")
-            devices = {
-                name: DeviceLedger(**columns) for name, columns in content["devices"].items()
-            }
-            for device in devices.values():
-                for name in NUMBERS:
-                    setattr(device, name, array("q", getattr(device, name)))
-            return Ledger(content["seed"], content["start_host_ns"], devices)
-        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-            raise CorruptDataError(f"{path}: not a {FORMAT!r} ({error})") from error
-
-
-def _json_pieces(value: object) -> Iterator[str]:
-    if not isinstance(value, array):
-        yield json.dumps(value)
-        return
-    yield "["
-    for start in range(0, len(value), PIECE):
-        rows = json.dumps(value[start : start + PIECE].tolist())
-        yield f"{', ' if start else ''}{rows[1:-1]}"
-    yield "]"
+            head = {"format": FORMAT, "seed": self.seed, "start_host_ns": self.start_host_ns}
+            file.write(f'{json.dumps(head)[:-1]}, "devices": {{')
+            for index, (name, device) in enumerate(self.devices.items()):
+                text = json.dumps(vars(device), default=list)
+                file.write(f"{', ' if index else ''}{json.dumps(name)}: {text}")
+            file.write("}}")

@@ -1,9 +1,11 @@
 """A device that plays a stream of an episode as packets."""
 
+import heapq
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -93,11 +95,11 @@ class OtherFamilySource(Protocol):
 
 
 class _Event(NamedTuple):
-    """Something a device does at a time counted from the start of the take."""
+    """A packet or a plugging of a device, at a time counted from the start of the take."""
 
     t_ns: int
-    plug: bool | None
-    sample_index: int
+    sample_index: int | None
+    plug: bool = False
 
 
 class MockDevice:
@@ -161,49 +163,33 @@ class MockDevice:
         for event in self._events(schedule):
             if not waiter.wait_until(start_host_ns + event.t_ns):
                 return False
-            self._do(event, schedule)
-            if lockstep:
-                self._let_host_keep_up(event)
+            if event.sample_index is not None:
+                self._send(event.sample_index, schedule)
+            elif event.plug:
+                self.port.plug()
+            else:
+                self.port.unplug()
+            if lockstep and (event.plug or event.sample_index is not None):
+                self.port.link.wait_consumed()
+            elif lockstep:
+                self.port.link.wait_closed()
         if self._held is not None:
             # Nothing came behind it: it is the last and in order.
             self.ledger.fate[self._held[0]] = Fate.SENT.value
             self._send_held()
         return True
 
-    def _do(self, event: _Event, schedule: Schedule) -> None:
-        if event.plug is None:
-            self._send(event.sample_index, schedule)
-        elif event.plug:
-            self.port.plug()
-        else:
-            self.port.unplug()
-
-    def _let_host_keep_up(self, event: _Event) -> None:
-        if event.plug is False:
-            self.port.link.wait_closed()
-        else:
-            self.port.link.wait_consumed()
-
     def _events(self, schedule: Schedule) -> Iterator[_Event]:
-        span = (schedule.t_true_ns[0], schedule.t_arrival_ns[-1])
-        edges = [
-            _Event(t_ns, plug, -1)
+        """Packets as they arrive, and plugging behind those of the same time."""
+        start_ns, end_ns = schedule.t_true_ns[0], schedule.t_arrival_ns[-1]
+        packets = (_Event(int(t_ns), i) for i, t_ns in enumerate(schedule.t_arrival_ns))
+        edges = (
+            _Event(t_ns, None, plug)
             for window_s in self.faults.unplugged_s
             for t_ns, plug in zip((round(s * 1e9) for s in window_s), (False, True), strict=True)
-            if span[0] <= t_ns <= span[1]
-        ]
-        # A stable sort by time alone keeps the packets in order, and plugging behind them. One
-        # event is made at a time: a long take has many.
-        times_ns = np.concatenate(
-            [schedule.t_arrival_ns, np.array([edge.t_ns for edge in edges], dtype=np.int64)]
+            if start_ns <= t_ns <= end_ns
         )
-        num_packets = len(schedule.t_arrival_ns)
-        for place in np.argsort(times_ns, kind="stable"):
-            index = int(place)
-            if index < num_packets:
-                yield _Event(int(times_ns[index]), None, index)
-            else:
-                yield edges[index - num_packets]
+        return heapq.merge(packets, edges, key=attrgetter("t_ns"))
 
     def _send(self, index: int, schedule: Schedule) -> None:
         sequence = self._next_sequence
@@ -231,11 +217,12 @@ class MockDevice:
         """Send a packet through everything that can happen to it on its way."""
         if self._happens(self.faults.half_packet_probability):
             units, fate = halve_units(units), Fate.HALF
-        elif self._may_wait(fate) and self._happens(self.faults.reorder_probability):
-            self._held = (len(self.ledger.fate), units)
-            return Fate.LATE, 0
-        elif fate is Fate.SENT and self._happens(self.faults.duplicate_probability):
-            units, fate = units * 2, Fate.REPEATED
+        elif fate is Fate.SENT:
+            if self._held is None and self._happens(self.faults.reorder_probability):
+                self._held = (len(self.ledger.fate), units)
+                return Fate.LATE, 0
+            if self._happens(self.faults.duplicate_probability):
+                units, fate = units * 2, Fate.REPEATED
         fate, flips = self._put_on_line(units, fate)
         self._send_held()
         return fate, flips
@@ -257,9 +244,6 @@ class MockDevice:
         held, self._held = self._held, None
         if held is not None:
             self._put_on_line(held[1], Fate.LATE)
-
-    def _may_wait(self, fate: Fate) -> bool:
-        return fate is Fate.SENT and self._held is None
 
     def _happens(self, probability: float) -> bool:
         # No random number is drawn for what cannot happen, so that one fault does not change

@@ -1,4 +1,7 @@
-"""A pyusb backend that replays the reports of a simulated USB device."""
+"""A USB device behind the real pyusb: a bus of one simulated device, as a pyusb backend.
+
+Descriptors hold what the transport and pyusb ask for; their other fields are 0.
+"""
 
 import errno
 from array import array
@@ -13,10 +16,19 @@ from services.acquisition.mocks.ports import ReportDevice, ReportPort
 from services.acquisition.transports.usb import UsbAddress, UsbTransport
 
 FIFO_REPORTS = 32
-GET_DESCRIPTOR, SET_REPORT = 6, 9
+GET_DESCRIPTOR = 6
 STRING_DESCRIPTOR, ENGLISH_US = 3, 0x0409
 SERIAL_NUMBER_INDEX = 3
 ENDPOINT_IN, ENDPOINT_OUT, INTERRUPT = 0x81, 0x02, 3
+
+
+class Descriptor(SimpleNamespace):
+    """A descriptor of the USB standard whose fields are 0 but for those named."""
+
+    def __getattr__(self, name: str) -> int:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return 0
 
 
 @dataclass
@@ -32,19 +44,13 @@ class UsbDeviceModel(ReportDevice):
     vendor_id: int
     product_id: int
     serial_number: str | None
-    has_out_endpoint: bool = True
-    has_interrupt_endpoint: bool = True
     packet_bytes: int = 64
-    kernel_driver: bool = True
+    endpoints: tuple[int, ...] = (ENDPOINT_IN, ENDPOINT_OUT)
     generation: int = 0
-    num_open: int = 0
-    is_configured: bool = True
 
     def set_plugged(self, *, plugged: bool) -> None:
         """Plug it in or out."""
-        if plugged:
-            self.generation += 1
-            self.kernel_driver = True
+        self.generation += int(plugged)
         self.flush()
         super().set_plugged(plugged=plugged)
 
@@ -70,12 +76,22 @@ class UsbDeviceModel(ReportDevice):
 
 
 @dataclass
-class _Handle:
+class UsbHandle:
+    """A device from one plugging to its unplugging."""
+
     model: UsbDeviceModel
     generation: int
 
     def check(self) -> None:
+        """Raise what libusb says when the device has gone."""
         self.model.check(self.generation)
+
+    def deliver(self, data: "array[int]") -> int:
+        """A report to the device; how many bytes it took."""
+        self.check()
+        if self.model.on_write is not None:
+            self.model.on_write(data.tobytes())
+        return len(data)
 
 
 class MockUsbBackend(IBackend):
@@ -86,139 +102,74 @@ class MockUsbBackend(IBackend):
 
     def enumerate_devices(self) -> Iterator[object]:
         """The devices that are plugged in."""
-        return iter([_Handle(m, m.generation) for m in self.models if m.is_plugged])
+        return iter([UsbHandle(m, m.generation) for m in self.models if m.is_plugged])
 
-    def get_device_descriptor(self, dev: _Handle) -> SimpleNamespace:
+    def get_device_descriptor(self, dev: UsbHandle) -> Descriptor:
         """Ids and the index of the serial number's string."""
         model = dev.model
-        return SimpleNamespace(
-            bLength=18,
-            bDescriptorType=1,
-            bcdUSB=0x200,
-            bDeviceClass=0,
-            bDeviceSubClass=0,
-            bDeviceProtocol=0,
-            bMaxPacketSize0=64,
+        return Descriptor(
             idVendor=model.vendor_id,
             idProduct=model.product_id,
-            bcdDevice=0x100,
-            iManufacturer=0,
-            iProduct=0,
             iSerialNumber=SERIAL_NUMBER_INDEX if model.serial_number else 0,
             bNumConfigurations=1,
             address=model.generation,
             bus=1,
-            port_number=1,
-            port_numbers=(1,),
-            speed=2,
         )
 
-    def get_configuration_descriptor(self, dev: object, config: int) -> SimpleNamespace:
+    def get_configuration_descriptor(self, dev: object, config: int) -> Descriptor:
         """One configuration with one interface."""
         del dev
         if config:
             raise IndexError(config)
-        return SimpleNamespace(
-            bLength=9,
-            bDescriptorType=2,
-            wTotalLength=41,
-            bNumInterfaces=1,
-            bConfigurationValue=1,
-            iConfiguration=0,
-            bmAttributes=0x80,
-            bMaxPower=50,
-            extra_descriptors=[],
-        )
+        return Descriptor(bNumInterfaces=1, bConfigurationValue=1, extra_descriptors=[])
 
     def get_interface_descriptor(
-        self, dev: _Handle, intf: int, alt: int, config: int
-    ) -> SimpleNamespace:
-        """One interface of class HID."""
+        self, dev: UsbHandle, intf: int, alt: int, config: int
+    ) -> Descriptor:
+        """One interface."""
         del config
         if intf or alt:
             raise IndexError(intf)
-        return SimpleNamespace(
-            bLength=9,
-            bDescriptorType=4,
-            bInterfaceNumber=0,
-            bAlternateSetting=0,
-            bNumEndpoints=len(_endpoints(dev.model)),
-            bInterfaceClass=3,
-            bInterfaceSubClass=0,
-            bInterfaceProtocol=0,
-            iInterface=0,
-            extra_descriptors=[],
-        )
+        return Descriptor(bNumEndpoints=len(dev.model.endpoints), extra_descriptors=[])
 
     def get_endpoint_descriptor(
-        self, dev: _Handle, ep: int, intf: int, alt: int, config: int
-    ) -> SimpleNamespace:
+        self, dev: UsbHandle, ep: int, intf: int, alt: int, config: int
+    ) -> Descriptor:
         """The interrupt endpoints."""
         del intf, alt, config
-        return SimpleNamespace(
-            bLength=7,
-            bDescriptorType=5,
-            bEndpointAddress=_endpoints(dev.model)[ep],
+        return Descriptor(
+            bEndpointAddress=dev.model.endpoints[ep],
             bmAttributes=INTERRUPT,
             wMaxPacketSize=dev.model.packet_bytes,
-            bInterval=1,
-            bRefresh=0,
-            bSynchAddress=0,
             extra_descriptors=[],
         )
 
-    def open_device(self, dev: _Handle) -> _Handle:
+    def open_device(self, dev: UsbHandle) -> UsbHandle:
         """A handle; reports from before are not seen."""
         dev.check()
-        dev.model.num_open += 1
         dev.model.flush()
-        return _Handle(dev.model, dev.generation)
+        return dev
 
-    def close_device(self, dev_handle: _Handle) -> None:
-        """Give a handle back."""
-        dev_handle.model.num_open -= 1
+    def close_device(self, dev_handle: UsbHandle) -> None:
+        """Nothing is held."""
 
-    def set_configuration(self, dev_handle: _Handle, config_value: int) -> None:
-        """Configure."""
+    def get_configuration(self, dev_handle: UsbHandle) -> int:
+        """It is configured."""
         dev_handle.check()
-        dev_handle.model.is_configured = config_value == 1
+        return 1
 
-    def get_configuration(self, dev_handle: _Handle) -> int:
-        """1, or 0 while not configured."""
-        dev_handle.check()
-        return int(dev_handle.model.is_configured)
-
-    def claim_interface(self, dev_handle: _Handle, intf: int) -> None:
-        """Refused while the kernel's driver holds it."""
+    def claim_interface(self, dev_handle: UsbHandle, intf: int) -> None:
+        """Claim."""
         del intf
         dev_handle.check()
-        if dev_handle.model.kernel_driver:
-            raise USBError("Resource busy", -6, errno.EBUSY)
 
-    def release_interface(self, dev_handle: _Handle, intf: int) -> None:
+    def release_interface(self, dev_handle: UsbHandle, intf: int) -> None:
         """Release."""
         del intf
         dev_handle.check()
 
-    def is_kernel_driver_active(self, dev_handle: _Handle, intf: int) -> bool:
-        """Whether the kernel holds the interface."""
-        del intf
-        return dev_handle.model.kernel_driver
-
-    def detach_kernel_driver(self, dev_handle: _Handle, intf: int) -> None:
-        """Take it from the kernel."""
-        del intf
-        dev_handle.check()
-        dev_handle.model.kernel_driver = False
-
-    def attach_kernel_driver(self, dev_handle: _Handle, intf: int) -> None:
-        """Give it back to the kernel."""
-        del intf
-        dev_handle.check()
-        dev_handle.model.kernel_driver = True
-
     def intr_read(
-        self, dev_handle: _Handle, ep: int, intf: int, buff: "array[int]", timeout: int
+        self, dev_handle: UsbHandle, ep: int, intf: int, buff: "array[int]", timeout: int
     ) -> int:
         """One report, a timeout, or EIO."""
         del ep, intf
@@ -229,15 +180,15 @@ class MockUsbBackend(IBackend):
         return len(report)
 
     def intr_write(
-        self, dev_handle: _Handle, ep: int, intf: int, data: "array[int]", timeout: int
+        self, dev_handle: UsbHandle, ep: int, intf: int, data: "array[int]", timeout: int
     ) -> int:
         """A report to the device."""
         del ep, intf, timeout
-        return _deliver(dev_handle, data.tobytes())
+        return dev_handle.deliver(data)
 
     def ctrl_transfer(  # noqa: PLR0913, PLR0917 - pyusb's signature
         self,
-        dev_handle: _Handle,
+        dev_handle: UsbHandle,
         bmRequestType: int,
         bRequest: int,
         wValue: int,
@@ -245,11 +196,9 @@ class MockUsbBackend(IBackend):
         data: "array[int]",
         timeout: int,
     ) -> int:
-        """String descriptors, and output reports of devices without an OUT endpoint."""
+        """String descriptors."""
         del bmRequestType, wIndex, timeout
         dev_handle.check()
-        if bRequest == SET_REPORT:
-            return _deliver(dev_handle, data.tobytes())
         kind, index = divmod(wValue, 256)
         if bRequest != GET_DESCRIPTOR or kind != STRING_DESCRIPTOR:
             raise USBError("Pipe error", -9, errno.EPIPE)
@@ -268,16 +217,3 @@ class UsbPort(ReportPort):
         address = UsbAddress(device.vendor_id, device.product_id, name)
         transport = UsbTransport(address, backend=MockUsbBackend(device))
         super().__init__(device, transport, answer)
-
-
-def _endpoints(model: UsbDeviceModel) -> list[int]:
-    if not model.has_interrupt_endpoint:
-        return []
-    return [ENDPOINT_IN, ENDPOINT_OUT] if model.has_out_endpoint else [ENDPOINT_IN]
-
-
-def _deliver(handle: _Handle, data: bytes) -> int:
-    handle.check()
-    if handle.model.on_write is not None:
-        handle.model.on_write(data)
-    return len(data)

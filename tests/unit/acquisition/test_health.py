@@ -17,7 +17,7 @@ from services.acquisition.health.station import CalibrationJudge
 from services.acquisition.live import LiveView
 from services.acquisition.mocks.ports import HidPort, PtyPort
 from services.acquisition.supervisor import DeviceSupervisor
-from tests.unit.acquisition.health_blocks_made import block
+from tests.unit.acquisition.health_blocks_made import block, judged
 
 NOTHING = block([])
 DOCS = Path(__file__).parents[3] / "docs" / "health.md"
@@ -308,7 +308,7 @@ def test_calibration_that_is_missing_or_old_is_told():
 
     def found(calibration):
         judge = CalibrationJudge(descriptors, calibration, unix_s=lambda: 10 * day_s)
-        return [(f.code, f.level) for f in judge.judge(NOTHING, 0).findings]
+        return [(f.code, f.level) for f in judged(judge, NOTHING, 0).findings]
 
     K_head = ((1.0, 0.0, 0.0),) * 3
     assert found({}) == [("calibration_missing", "ERROR")]
@@ -326,7 +326,7 @@ def test_a_station_starts_with_half_a_calibration_of_a_glove(known):
     driver = Driver("g", transport=PtyPort("a").transport, decoder=decoder, clock=VirtualClock(1))
     live = LiveView([driver], calibration)
     assert live._gloves == {}
-    (finding,) = CalibrationJudge(driver.descriptors, calibration).judge(NOTHING, 0).findings
+    (finding,) = judged(CalibrationJudge(driver.descriptors, calibration), NOTHING, 0).findings
     assert finding.code == "calibration_missing"
     assert all(f"tactile_left_{name}" not in finding.message for name in known)
 
@@ -342,7 +342,7 @@ def test_the_disk_is_judged_by_the_time_it_lasts(bench, tmp_path, minutes, level
     )
     for _ in range(3):
         bench.second()
-        verdict = disk.judge(NOTHING, bench.clock.now_ns())
+        verdict = judged(disk, NOTHING, bench.clock.now_ns())
     assert verdict.figures["disk_left_seconds"] == pytest.approx(minutes * 60, rel=1e-3)
     assert [f.level for f in verdict.findings] == ([] if level is None else [level])
 

@@ -8,7 +8,7 @@ from services.acquisition.devices.justfloat_glove.driver import JustFloatGloveDe
 from services.acquisition.devices.wuji_glove.driver import WujiGloveDecoder
 from services.acquisition.drivers.base import CellLayout
 from services.acquisition.health.cells import CellJudge, cell_judge
-from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes
+from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes, judged
 
 
 class Sheet:
@@ -29,7 +29,7 @@ class Sheet:
         values[:, 5:8] = self.absent
         if change is not None:
             change(values)
-        return self.judge.judge(block(t_s, values), self.second * SECOND_NS)
+        return judged(self.judge, block(t_s, values), self.second * SECOND_NS)
 
 
 class GridSheet(Sheet):
@@ -50,7 +50,7 @@ class BareSheet(Sheet):
 def test_healthy_gloves_of_other_makers_raise_nothing(kind):
     sheet = kind()
     for second in range(20):
-        assert sheet(pressed=second % 4 != 0).findings == ()
+        assert sheet(pressed=second % 4 != 0).findings == []
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_a_cell_out_of_order_is_found_without_a_tare(kind, value, code, seconds)
     assert codes(verdicts[-1]) == {code: "WARN"}
     for _ in range(2):
         verdict = sheet()
-    assert verdict.findings == ()
+    assert verdict.findings == []
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0, np.nan])
@@ -126,4 +126,4 @@ def test_a_hand_that_holds_still_on_a_glove_of_unknown_layout_is_no_fault():
         values[:, :300] = first["row"]
 
     for _ in range(8):
-        assert sheet(held).findings == ()
+        assert sheet(held).findings == []

@@ -1,13 +1,14 @@
 """Clocks of devices as health judges them: skew, steps, and what a busy host must not feign."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.tactile_glove.driver import glove_descriptor
 from services.acquisition.health.clock import ClockJudge, CountingJudge
-from services.acquisition.health.samples import Block
-from tests.unit.acquisition.health_blocks_made import NONE, SECOND_NS, block, codes
+from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes, judged
 
 
 def stamped(second, *, skew_ppm=0.0, step_ns=0, rng=None, delay_ms=0.0):
@@ -23,7 +24,7 @@ def test_skew_is_found_within_two_seconds_and_later(skew_ppm, level, rng):
     judge = ClockJudge(glove_descriptor("left"))
     for second in range(15):
         arrived = stamped(second, skew_ppm=skew_ppm, rng=rng, delay_ms=0.5)
-        verdict = judge.judge(arrived, (second + 1) * SECOND_NS)
+        verdict = judged(judge, arrived, (second + 1) * SECOND_NS)
         if second >= 1:
             assert codes(verdict).get("clock_skew") == level, second
     assert verdict.figures["clock_skew_ratio"] * 1e6 == pytest.approx(skew_ppm, abs=30)
@@ -34,12 +35,12 @@ def test_steps_are_counted_once_and_three_in_an_hour_are_an_error():
     levels = []
     steps_ns = [0] * 4 + [-30_000_000] * 4 + [50_000_000] * 4 + [0] * 4
     for second, step_ns in enumerate(steps_ns):
-        verdict = judge.judge(stamped(second, step_ns=step_ns), (second + 1) * SECOND_NS)
+        verdict = judged(judge, stamped(second, step_ns=step_ns), (second + 1) * SECOND_NS)
         levels.append(codes(verdict).get("clock_step"))
     assert levels == [None] * 4 + ["WARN"] * 8 + ["ERROR"] * 4
     assert judge.num_steps == 3
-    quiet = judge.judge(block([]), 3700 * SECOND_NS)
-    assert quiet.findings == ()
+    quiet = judged(judge, block([]), 3700 * SECOND_NS)
+    assert quiet.findings == []
 
 
 def late_ms(load, t_s):
@@ -64,8 +65,8 @@ def test_late_arrivals_of_a_busy_host_are_no_finding_of_the_devices_clock(load, 
         t_host_ns = arrived.t_host_ns + np.rint(late_ms(load, t_s) * 1e6).astype(np.int64)
         t_host_ns = np.maximum.accumulate(t_host_ns)
         sequence = arrived.sequence if has_sequence else np.full(60, -1)
-        late = Block(t_host_ns, arrived.t_device_ns, sequence, NONE)
-        raised |= set(codes(judge.judge(late, (second + 1) * SECOND_NS)))
+        late = replace(arrived, t_host_ns=t_host_ns, sequence=sequence)
+        raised |= set(codes(judged(judge, late, (second + 1) * SECOND_NS)))
     assert raised <= {"clock_residual"}
 
 
@@ -80,8 +81,8 @@ def test_a_clock_that_wraps_is_no_step():
         arrived = stamped(second)
         device_ns = (arrived.t_device_ns - 10**12 + modulus_ns - 3 * SECOND_NS) % modulus_ns
         numbers = (arrived.sequence + 2**16 - 100) % 2**16
-        wrapped = Block(arrived.t_host_ns, device_ns, numbers, NONE)
-        assert judge.judge(wrapped, (second + 1) * SECOND_NS).findings == ()
+        wrapped = replace(arrived, t_device_ns=device_ns, sequence=numbers)
+        assert judged(judge, wrapped, (second + 1) * SECOND_NS).findings == []
     assert judge.num_steps == 0
 
 
@@ -110,7 +111,7 @@ def test_a_stream_without_stamps_is_judged_by_its_count(delay_ms, level, rng):
         numbers = second * 60 + np.arange(60)
         kept = numbers[rng.random(60) > 0.005]
         arrived = bare(kept, rng, delay_ms=delay_ms, skew_ppm=300.0)
-        verdict = judge.judge(arrived, (second + 1) * SECOND_NS)
+        verdict = judged(judge, arrived, (second + 1) * SECOND_NS)
     assert codes(verdict) == ({} if level is None else {"clock_residual": level})
     figures = verdict.figures
     if level is None:
@@ -118,7 +119,7 @@ def test_a_stream_without_stamps_is_judged_by_its_count(delay_ms, level, rng):
         assert figures["clock_residual_p95_seconds"] == pytest.approx(1.15e-3, abs=0.4e-3)
         assert figures["clock_resets"] == 0
     assert len(judge._undated) <= 10 * 6
-    assert codes(judge.judge(block([]), 16 * SECOND_NS)) == {}
+    assert codes(judged(judge, block([]), 16 * SECOND_NS)) == {}
 
 
 def test_a_restart_of_a_stream_without_stamps_is_counted_and_no_clock_is_guessed(rng):
@@ -126,9 +127,9 @@ def test_a_restart_of_a_stream_without_stamps_is_counted_and_no_clock_is_guessed
     for second in range(20):
         # It pauses for half a second and goes on between two of its former moments.
         numbers = second * 60 + np.arange(60) + (30.5 if second >= 10 else 0.0)
-        verdict = judge.judge(bare(numbers, rng, delay_ms=0.3), (second + 1) * SECOND_NS)
+        verdict = judged(judge, bare(numbers, rng, delay_ms=0.3), (second + 1) * SECOND_NS)
     assert verdict.figures["clock_resets"] == 1
     unsteady = CountingJudge(bare_descriptor())
     for second in range(5):
         arrived = block(second + np.sort(rng.random(40)))
-        assert unsteady.judge(arrived, (second + 1) * SECOND_NS).figures == {}
+        assert judged(unsteady, arrived, (second + 1) * SECOND_NS).figures == {}

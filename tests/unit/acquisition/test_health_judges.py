@@ -17,7 +17,7 @@ from services.acquisition.health.samples import SampleQueue
 from services.acquisition.health.values import CameraJudge, FiniteJudge, PoseJudge
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.supervisor import StreamCounters
-from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes
+from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes, judged
 
 TARE, GAIN = 120.0, 40.0
 
@@ -43,14 +43,14 @@ class Hand:
         if change is not None:
             change(taxels)
         raw = expand_taxels(taxels, side="left").astype(np.uint16)
-        return self.judge.judge(block(t_s, raw), round(self.second * 1e9))
+        return judged(self.judge, block(t_s, raw), round(self.second * 1e9))
 
 
 def test_a_healthy_hand_raises_nothing_whether_it_touches_or_rests():
     for pressed in (True, False):
         hand = Hand(pressed=pressed)
         for _ in range(12):
-            assert hand().findings == ()
+            assert hand().findings == []
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_a_taxel_that_does_not_follow_its_neighbours_is_named(value, code):
     assert codes(hand(change)) == {code: "WARN"}
     for _ in range(3):
         hand()
-    assert hand().findings == ()
+    assert hand().findings == []
 
 
 def test_five_per_cent_a_whole_pad_or_a_whole_line_is_an_error():
@@ -166,9 +166,9 @@ def test_jumps_are_seen_by_the_devices_clock():
     t_s = np.arange(100) / 100
     poses = np.zeros((100, 7))
     poses[:, 0] = 0.3 * t_s
-    assert judge.judge(block(t_s, poses), SECOND_NS).findings == ()
+    assert judged(judge, block(t_s, poses), SECOND_NS).findings == []
     poses[60:, 1] += 0.2
-    verdict = judge.judge(block(1 + t_s, poses), 2 * SECOND_NS)
+    verdict = judged(judge, block(1 + t_s, poses), 2 * SECOND_NS)
     assert codes(verdict) == {"jump": "WARN"}
 
 
@@ -179,11 +179,11 @@ def test_trembling_is_judged_at_rest_only(rng, tremble_m, level):
     poses = np.zeros((100, 7))
     poses[:, :3] = tremble_m / np.sqrt(3) * rng.standard_normal((100, 3))
     # Slower than 5 m/s from sample to sample, as a tracker's tremble is.
-    verdict = judge.judge(block(t_s, poses), SECOND_NS)
+    verdict = judged(judge, block(t_s, poses), SECOND_NS)
     assert codes(verdict).get("pose_jitter") == level
     assert verdict.figures["stationary_jitter_meters"] == pytest.approx(tremble_m, rel=0.15)
     poses[:, 0] += t_s
-    moving = PoseJudge(pose_descriptor("head")).judge(block(t_s, poses), SECOND_NS)
+    moving = judged(PoseJudge(pose_descriptor("head")), block(t_s, poses), SECOND_NS)
     assert "stationary_jitter_meters" not in moving.figures
 
 
@@ -207,16 +207,16 @@ def test_what_a_trackers_decoder_leaves_out_is_judged(kind, count, expected):
     decoder.statistics.packets += 1000
     for _ in range(count):
         decoder.tracking[kind] += 1
-    assert codes(judge.judge(block([]), SECOND_NS)) == expected
+    assert codes(judged(judge, block([]), SECOND_NS)) == expected
 
 
 def test_values_that_are_no_numbers_are_counted_where_numbers_were():
     judge = FiniteJudge("tracking", "nodes are not seen")
     values = np.zeros((100, 25, 3), dtype=np.float32)
     values[:, 24] = np.nan
-    assert judge.judge(block(np.arange(100) / 100, values), SECOND_NS).findings == ()
+    assert judged(judge, block(np.arange(100) / 100, values), SECOND_NS).findings == []
     values[:, :5] = np.nan
-    verdict = judge.judge(block(1 + np.arange(100) / 100, values), 2 * SECOND_NS)
+    verdict = judged(judge, block(1 + np.arange(100) / 100, values), 2 * SECOND_NS)
     assert codes(verdict) == {"tracking": "ERROR"}
     assert verdict.figures["missing_ratio"] == pytest.approx(5 / 24 / 2)
 
@@ -237,12 +237,12 @@ class CheckedDriver(Driver):
 def test_bad_images_warn_and_are_an_error_after_a_second(change, code):
     driver = driver_of(PoseTrackerDecoder("head"), CheckedDriver)
     judge = CameraJudge(driver)
-    assert judge.judge(block([]), 0).findings == ()
+    assert judged(judge, block([]), 0).findings == []
     driver.quality = ImageQuality(**change)
-    seen = [codes(judge.judge(block([]), t * SECOND_NS)) for t in (1, 2)]
+    seen = [codes(judged(judge, block([]), t * SECOND_NS)) for t in (1, 2)]
     assert seen == [{code: "WARN"}, {code: "ERROR"}]
     driver.quality = ImageQuality()
-    assert judge.judge(block([]), 3 * SECOND_NS).findings == ()
+    assert judged(judge, block([]), 3 * SECOND_NS).findings == []
 
 
 def test_blocks_are_bounded_and_count_what_they_lose():

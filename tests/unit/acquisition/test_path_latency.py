@@ -19,7 +19,8 @@ from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.path_latency import MAX_BACK_OFF, PathWatch, add_latencies
 from services.acquisition.recorder import Recorder
 from services.acquisition.supervisor import DeviceSupervisor
-from tests.unit.acquisition.health_blocks_made import block
+from services.acquisition.take import TakeOptions
+from tests.unit.acquisition.health_blocks_made import block, judged
 
 SECOND_NS = 1_000_000_000
 COUNTS = np.full(360, 100, np.uint16)
@@ -195,8 +196,8 @@ def test_a_take_gets_the_delay_at_its_start_and_a_better_one_at_its_end(tmp_path
         drivers=[SimulatedGlove(clock=clock)],
         clock=clock,
         calibration={"K_head": ((1.0,),)},
+        options=TakeOptions(latencies=lambda: latencies),
     )
-    recorder.measure_latencies(lambda: latencies)
     recorder.arm(TakePrompt(task="stand_bottle", instruction="stand it up", consent=True))
     recorder.record("take")
     attributes = SpoolReader(tmp_path / "take").attributes
@@ -220,7 +221,7 @@ def test_a_calibration_that_the_answers_contradict_is_a_finding(off_ns, is_found
         glove.live_a_second()
     calibrated = {NAME: ((float(glove.latency_ns + off_ns),),), SIGMA_NAME: ((2e5,),)}
     judge = PathJudge("tactile_left", glove.watch, calibrated)
-    verdict = judge.judge(block([]), 0)
+    verdict = judged(judge, block([]), 0)
     found = [(finding.code, finding.level) for finding in verdict.findings]
     assert found == ([("latency_calibration", "WARN")] if is_found else [])
     monitor = HealthMonitor(

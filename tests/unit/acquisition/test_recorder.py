@@ -141,7 +141,7 @@ def test_readers_make_their_bytes_before_they_hold_the_lock(recorder, clock, mon
 
     def noting(call):
         def call_and_note(*args):
-            held.append(running._lock.locked())
+            held.append(running._lock._is_owned())
             return call(*args)
 
         return call_and_note

@@ -10,12 +10,13 @@ from dextouch.schemas import (
     StreamHealth,
     TakeProblem,
 )
-from services.acquisition.take_findings import TakeFindings
+from services.acquisition.health import HealthMonitor
+from services.acquisition.take_check import TakeFindings
 
 START_NS = 10**10
 
 
-class FakeHealth:
+class FakeHealth(HealthMonitor):
     """A health whose findings a test raises."""
 
     def __init__(self):

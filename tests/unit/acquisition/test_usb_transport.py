@@ -6,21 +6,22 @@ import pytest
 import usb.core
 
 from dextouch.errors import DeviceError
-from services.acquisition.mocks.usb_backend import FIFO_REPORTS, MockUsbBackend, UsbDeviceModel
+from services.acquisition.mocks.usb_backend import ENDPOINT_IN, ENDPOINT_OUT, FIFO_REPORTS
 from services.acquisition.transports.usb import UsbAddress, UsbTransport
+from tests.unit.acquisition.usb_bus import OddUsbBus, OddUsbDevice
 
 REPORT = bytes(range(64))
 IDS = (0x28DE, 0x2300)
 
 
 def model(serial_number="A1", **settings):
-    device = UsbDeviceModel(*IDS, serial_number, **settings)
+    device = OddUsbDevice(*IDS, serial_number, **settings)
     device.set_plugged(plugged=True)
     return device
 
 
 def transport(*devices, serial_number="A1", interface=0):
-    backend = MockUsbBackend(*devices)
+    backend = OddUsbBus(*devices)
     return UsbTransport(UsbAddress(*IDS, serial_number), interface=interface, backend=backend)
 
 
@@ -88,7 +89,7 @@ def test_a_dead_handle_stays_dead_after_replugging(device, opened):
     assert opened.read() == REPORT
 
 
-class ContextWithoutEvents(MockUsbBackend):
+class ContextWithoutEvents(OddUsbBus):
     """A context of libusb that nobody tells of changes: it knows what it saw when it was made."""
 
     def __init__(self, lib):
@@ -149,10 +150,10 @@ def test_the_kernel_gets_its_interface_back(device):
     link.close()
 
 
-@pytest.mark.parametrize("has_out_endpoint", [True, False])
-def test_commands_reach_the_device(has_out_endpoint):
+@pytest.mark.parametrize("endpoints", [(ENDPOINT_IN, ENDPOINT_OUT), (ENDPOINT_IN,)])
+def test_commands_reach_the_device(endpoints):
     seen = []
-    device = model(has_out_endpoint=has_out_endpoint, on_write=seen.append)
+    device = model(endpoints=endpoints, on_write=seen.append)
     link = transport(device)
     link.open()
     link.write(REPORT)
@@ -169,9 +170,7 @@ def test_unconfigured_device_is_configured():
     assert device.is_configured
 
 
-@pytest.mark.parametrize(
-    ("settings", "interface"), [({"has_interrupt_endpoint": False}, 0), ({}, 1)]
-)
+@pytest.mark.parametrize(("settings", "interface"), [({"endpoints": ()}, 0), ({}, 1)])
 def test_device_without_the_endpoint_is_refused_and_released(settings, interface):
     device = model(**settings)
     with pytest.raises(DeviceError, match="no interrupt endpoint"):

@@ -1,0 +1,255 @@
+"""What is said of a take after its end: whether it is complete, its ledger and its quality.
+
+Completeness is judged by the take's own samples. What the station's health found meanwhile adds
+warnings to the check, entries to the ledger and figures to the quality.
+"""
+
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from dextouch.schemas import LedgerEntry, StreamTake, TakeCheck, TakeProblem
+from dextouch.streams import StreamDescriptor
+from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS
+from services.acquisition.health import CODES, HealthMonitor, count_taxels
+from services.acquisition.supervisor import StreamCounters
+
+# A take may lose more than a running station before it is not worth keeping.
+LOSS_ERROR = 0.05
+# Shorter takes say nothing about rates and loss ratios.
+MIN_JUDGED_S = 1.0
+MAX_GAP_S = {"image": 0.5}
+MAX_GAP_OTHERS_S = 0.2
+# What stands in the take's quality in a form of its own (`_rate_hz`), or counts from the
+# station's start.
+OTHER_FIGURES = {"rate_hz", "clock_resets"}
+# What the check of the take says in its own words, by the code that it has there.
+IN_THE_CHECK: dict[str, tuple[str, ...]] = {
+    "silent": ("gap", "missing_stream"),
+    "unplugged": ("gap", "missing_stream"),
+    "gap": ("gap", "missing_stream"),
+    "rate": ("rate", "missing_stream"),
+    "loss": ("loss",),
+    "taxels_dead": ("dead_taxels",),
+    "taxels_stuck": ("stuck_taxels",),
+    "taxels_saturated": ("saturated_taxels",),
+}
+Problem = tuple[str, Literal["WARN", "ERROR"], str]
+
+
+@dataclass(frozen=True)
+class StreamFacts:
+    """One stream of a take, with all that its device and its reader counted during the take.
+
+    `span_ns` are start and end of the take on the host's clock. `judged` names the events that are
+    figures of the take's quality, too.
+    """
+
+    descriptor: StreamDescriptor
+    counters: StreamCounters
+    events: Mapping[str, int]
+    span_ns: tuple[int, int]
+    judged: Collection[str] = ()
+
+    @property
+    def loss_ratio(self) -> float:
+        """Share of the packets that were lost."""
+        lost = self.events["lost"]
+        return lost / max(1, lost + self.events["packets"])
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Mean rate between the first and the last sample; None of less than two."""
+        first_ns, last_ns = self.counters.first_t_host_ns, self.counters.last_t_host_ns
+        if first_ns is None or last_ns is None or last_ns <= first_ns:
+            return None
+        return (self.counters.num_samples - 1) * 1e9 / (last_ns - first_ns)
+
+    @property
+    def largest_gap_s(self) -> float:
+        """Longest time without a sample, the take's ends included."""
+        start_ns, stop_ns = self.span_ns
+        first_ns, last_ns = self.counters.first_t_host_ns, self.counters.last_t_host_ns
+        if first_ns is None or last_ns is None:
+            return (stop_ns - start_ns) / 1e9
+        return max(self.counters.largest_gap_ns, first_ns - start_ns, stop_ns - last_ns) / 1e9
+
+    def taxels(self) -> dict[str, int]:
+        """Numbers of dead, stuck and saturated taxels; none for streams of other devices.
+
+        Cells of other gloves are checked by health monitoring, whose findings the check includes.
+        """
+        descriptor, low, high = (
+            self.descriptor,
+            self.counters.low_counts,
+            self.counters.high_counts,
+        )
+        is_ours = descriptor.kind == "tactile" and descriptor.shape == (NUM_RAW_TAXELS,)
+        if descriptor.side is None or low is None or high is None or not is_ours:
+            return {}
+        return count_taxels(low, high, side=descriptor.side)
+
+    def problems(self) -> Iterator[Problem]:
+        """What is wrong with the stream's samples: code, level and words."""
+        if self.counters.num_samples == 0:
+            yield "missing_stream", "ERROR", "no sample arrived; is it connected?"
+            return
+        max_gap_s = MAX_GAP_S.get(self.descriptor.kind, MAX_GAP_OTHERS_S)
+        if self.largest_gap_s > max_gap_s:
+            text = f"{self.largest_gap_s:.2f} s without a sample, expected at most {max_gap_s} s"
+            yield "gap", "ERROR", text
+        if self.span_ns[1] - self.span_ns[0] < MIN_JUDGED_S * 1e9:
+            return
+        rate_hz, nominal_hz = self.rate_hz or 0.0, self.descriptor.nominal_rate_hz
+        off = abs(rate_hz / nominal_hz - 1.0)
+        if off > CODES["rate"].warn:
+            text = f"{rate_hz:.1f} Hz, expected {nominal_hz:g} Hz"
+            yield "rate", "ERROR" if off > CODES["rate"].error else "WARN", text
+        loss = self.loss_ratio
+        if loss > CODES["loss"].warn:
+            lost, damaged = self.events["lost"], self.events["crc_errors"]
+            text = f"{lost} packets lost ({loss:.1%}), {damaged} corrupt"
+            yield "loss", "ERROR" if loss > LOSS_ERROR else "WARN", text
+        for event, count in self.taxels().items():
+            if count:
+                text = f"{count} {event.replace('_', ' ')} during the whole take"
+                is_error = count >= CODES["taxels_dead"].error * NUM_TAXELS
+                yield event, "ERROR" if is_error else "WARN", text
+
+
+class TakeFindings:
+    """Health findings in streams since this object was created.
+
+    A finding counts as often as its level was raised or changed during the take, and once more if
+    it was already raised when the take began. Findings that were not confirmed before the end are
+    not included.
+
+    Args:
+        health: of the station; without one there are no findings.
+        t_host_ns: start of the take.
+    """
+
+    def __init__(self, health: HealthMonitor | None, t_host_ns: int) -> None:
+        self._health = health
+        self._started_ns = t_host_ns
+        self._before = Counter(health.raised() if health else {})
+        standing = [
+            (stream.stream, finding.code)
+            for stream in (health.report().streams if health else ())
+            for finding in stream.findings
+        ]
+        # What was never raised is no finding yet: a stream that is about to begin.
+        self._first_ns = {key: t_host_ns for key in standing if key in self._before}
+        self._counts = Counter(self._first_ns.keys())
+        self._worst: dict[str, float] = {}
+
+    def look(self) -> None:
+        """Update the worst value of each figure; called repeatedly during the take."""
+        for stream in self._health.report().streams if self._health else ():
+            for figure, value in stream.figures.items():
+                name = f"{stream.stream}_worst_{figure}"
+                if figure not in OTHER_FIGURES and abs(value) >= abs(self._worst.get(name, 0.0)):
+                    self._worst[name] = value
+
+    def end(self) -> None:
+        """Count what was raised; what comes later is not of this take."""
+        if self._health is None:
+            return
+        self.look()
+        self._counts += Counter(self._health.raised()) - self._before
+        for event in self._health.events(self._started_ns).events:
+            if event.level != "OK":
+                self._first_ns.setdefault((event.stream, event.code), event.t_host_ns)
+        self._health = None
+
+    def entries(self, streams: Collection[str]) -> list[LedgerEntry]:
+        """One entry a finding of these streams, named by its code."""
+        return [
+            LedgerEntry(
+                stream=stream,
+                event=code,
+                count=count,
+                first_t_host_ns=self._first_ns.get((stream, code)),
+            )
+            for (stream, code), count in self._counts.items()
+            if stream in streams
+        ]
+
+    def quality(self) -> dict[str, float]:
+        """The worst of each figure of health during the take, as `STREAM_worst_FIGURE`."""
+        return dict(self._worst)
+
+    def problems(
+        self, streams: Collection[str], known: Collection[TakeProblem]
+    ) -> list[TakeProblem]:
+        """The findings of these streams in words, but for those that the check names already.
+
+        They are warnings: whether a take is complete is judged by its own samples.
+        """
+        told = {(problem.stream, problem.code) for problem in known}
+        found = []
+        for entry in self.entries(streams):
+            codes = IN_THE_CHECK.get(entry.event, (entry.event,))
+            if any((entry.stream, code) in told for code in codes):
+                continue
+            times = "once" if entry.count == 1 else f"{entry.count} times"
+            text = f"{entry.event} found {times}. {CODES[entry.event].advice}"
+            found.append(_problem(entry.stream, (entry.event, "WARN", text)))
+        return found
+
+
+def check_take(
+    facts: Sequence[StreamFacts], duration_s: float, findings: TakeFindings
+) -> TakeCheck:
+    """Judge a take: complete means no problem of level ERROR."""
+    own = [_problem(fact.descriptor.name, p) for fact in facts for p in fact.problems()]
+    streams = tuple(
+        StreamTake(
+            stream=fact.descriptor.name,
+            num_samples=fact.counters.num_samples,
+            rate_hz=fact.rate_hz,
+            largest_gap_s=fact.largest_gap_s,
+            lost=fact.events["lost"],
+            crc_errors=fact.events["crc_errors"],
+        )
+        for fact in facts
+    )
+    found = findings.problems([stream.stream for stream in streams], own)
+    return TakeCheck(
+        complete=all(problem.level != "ERROR" for problem in own),
+        duration_s=duration_s,
+        streams=streams,
+        problems=(*own, *found),
+    )
+
+
+def take_ledger(facts: Sequence[StreamFacts]) -> list[LedgerEntry]:
+    """Counted events of the take, for the recording's attributes."""
+    entries = []
+    for fact in facts:
+        counted = {**fact.events, **fact.taxels(), "packets": 0}
+        name = fact.descriptor.name
+        entries += [LedgerEntry(stream=name, event=e, count=n) for e, n in counted.items() if n]
+    return entries
+
+
+def take_quality(facts: Sequence[StreamFacts]) -> dict[str, float]:
+    """Figures of a take by stream, for the recording's `quality`; the episode takes them over."""
+    quality: dict[str, float] = {}
+    for fact in facts:
+        name, rate_hz = fact.descriptor.name, fact.rate_hz
+        quality[f"{name}_largest_gap_s"] = fact.largest_gap_s
+        if rate_hz is not None:
+            quality[f"{name}_rate_hz"] = rate_hz
+        if fact.descriptor.capabilities.sequence:
+            quality[f"{name}_loss_ratio"] = fact.loss_ratio
+        judged = {event: fact.events[event] for event in fact.judged}
+        for event, count in {**judged, **fact.taxels()}.items():
+            quality[f"{name}_num_{event}"] = float(count)
+    return quality
+
+
+def _problem(stream: str, problem: Problem) -> TakeProblem:
+    code, level, text = problem
+    return TakeProblem(stream=stream, code=code, level=level, message=f"{stream}: {text}")
