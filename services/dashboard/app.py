@@ -1,8 +1,7 @@
 """Application factory of the dashboard."""
 
-import asyncio
 from collections.abc import AsyncIterator, Mapping, Sequence
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -14,7 +13,7 @@ from services.dashboard.pages import page_router, refusal_page
 from services.dashboard.routes import api_router, live_router
 from services.dashboard.sessions import Sessions
 from services.dashboard.settings import DashboardSettings
-from services.dashboard.topics import run_topics
+from services.dashboard.topics import running
 from services.dashboard.upstream import Upstream
 
 STATIC = Path(__file__).parent / "static"
@@ -45,15 +44,11 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        stopped = asyncio.Event()
-        running = asyncio.create_task(run_topics(feeds.topics.values(), stopped))
-        try:
-            yield
-        finally:
-            stopped.set()
-            await running
+        async with AsyncExitStack() as held:
             for upstream in upstreams.values():
-                await upstream.close()
+                held.push_async_callback(upstream.close)
+            await held.enter_async_context(running(feeds.topics.values()))
+            yield
 
     app = create_service_app(
         name="dashboard",

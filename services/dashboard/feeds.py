@@ -1,31 +1,92 @@
-"""Data feeds of the page, polled from the other services and cached for all viewers."""
+"""Panels of the page: what each shows, polled from the other services for all viewers.
+
+A new panel is a topic here with the function that fetches it, a section in
+`templates/index.html`, and a function in `static/` that `static/main.js` calls with the data.
+"""
 
 import asyncio
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import structlog
+from pydantic import ValidationError
 
-from dextouch.errors import DexTouchError, NotFoundError
+from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError, UnknownNameError
+from dextouch.frozen_model import FrozenModel
+from dextouch.schemas import (
+    CameraList,
+    CameraLive,
+    EpisodeDetail,
+    EpisodeList,
+    HealthLevel,
+    RecorderStatus,
+    RecordingList,
+    SaveTake,
+    StationHealth,
+    TakeName,
+    TakePrompt,
+    UploadStatus,
+    first_problems,
+)
 from dextouch.streams import unpack
 from dextouch.tactile.layout import SIDES
-from services.dashboard import station_api, store_api
 from services.dashboard.settings import DashboardSettings
-from services.dashboard.topics import Message, Topic, topic_message
-from services.dashboard.upstream import Upstream
-from services.dashboard.views import (
-    RefusedView,
-    ServiceView,
+from services.dashboard.station_view import (
+    RecorderView,
     StationView,
-    TakesView,
-    taxel_message,
+    recorder_view,
+    station_view,
     unreachable_station,
 )
+from services.dashboard.topics import Message, Topic, topic_message
+from services.dashboard.touch import taxel_message
+from services.dashboard.upstream import Upstream
 
 logger = structlog.get_logger(__name__)
 
 MAX_TAXEL_BYTES = 64 * 1024
 NUM_TAKES = 6
+OUTCOMES = {True: "success", False: "failure", None: "not judged"}
+# Bodies of the station's recorder actions.
+ACTIONS: Mapping[str, type[FrozenModel]] = {
+    "arm": TakePrompt,
+    "record": TakeName,
+    "stop": TakeName,
+    "save": SaveTake,
+    "discard": TakeName,
+    "rerecord": TakeName,
+}
+Page = TypeVar("Page", EpisodeList, RecordingList)
+
+
+class ServiceView(FrozenModel):
+    """Readiness of a service."""
+
+    name: str
+    level: HealthLevel
+    message: str
+
+
+class TakeView(FrozenModel):
+    """A stored recording or episode; `consent` is None where unknown."""
+
+    kind: Literal["recording", "episode"]
+    name: str
+    task: str
+    domain: str
+    operator: str | None
+    consent: bool | None
+    outcome: str
+    size: str
+    clocks: str = ""
+
+
+class TakesView(FrozenModel):
+    """The newest takes; `note` explains an empty list. `refused` ones are still at the station."""
+
+    refused: tuple[UploadStatus, ...] = ()
+    takes: tuple[TakeView, ...] = ()
+    note: str = ""
 
 
 class Feeds:
@@ -35,11 +96,11 @@ class Feeds:
         self._upstreams = upstreams
         self._clocks: dict[str, str] = {}
         topics = [
-            Topic("station", settings.station_period_s, self._station_messages),
+            Topic.of_json("station", settings.station_period_s, self.station),
             Topic("taxels", settings.taxel_period_s, self._taxel_messages),
-            Topic("cameras", settings.station_period_s, self._camera_messages),
-            Topic("services", settings.list_period_s, self._service_messages),
-            Topic("takes", settings.list_period_s, self._take_messages),
+            Topic.of_json("cameras", settings.station_period_s, self._cameras),
+            Topic.of_json("services", settings.list_period_s, self.services),
+            Topic.of_json("takes", settings.list_period_s, self.takes),
         ]
         self.topics = {topic.name: topic for topic in topics}
 
@@ -61,12 +122,12 @@ class Feeds:
         try:
             acquisition = self.upstream("acquisition")
             health, recorder = await asyncio.gather(
-                acquisition.json("GET", station_api.HEALTH_PATH),
-                acquisition.json("GET", station_api.RECORDER_PATH),
+                acquisition.read(StationHealth, "/v1/health"),
+                acquisition.read(RecorderStatus, "/v1/recorder"),
             )
-            return station_api.station_view(health, recorder)
         except DexTouchError as error:
             return unreachable_station(error.message)
+        return station_view(health, recorder)
 
     async def services(self) -> list[ServiceView]:
         """Readiness of each service."""
@@ -82,10 +143,10 @@ class Feeds:
         stored, refused = await asyncio.gather(self._stored(), self._refused())
         return stored.model_copy(update={"refused": refused})
 
-    async def _refused(self) -> tuple[RefusedView, ...]:
+    async def _refused(self) -> tuple[UploadStatus, ...]:
         try:
-            answer = await self.upstream("acquisition").json("GET", station_api.REFUSED_PATH)
-            return station_api.refused_views(answer)
+            acquisition = self.upstream("acquisition")
+            return await acquisition.read(tuple[UploadStatus, ...], "/v1/uploads?refused=true")
         except DexTouchError:
             return ()  # reported by the station topic
 
@@ -98,66 +159,109 @@ class Feeds:
             )
         store = self._upstreams["episode_store"]
         try:
-            recordings = await store_api.newest_recordings(store, NUM_TAKES)
-            episodes = await store_api.newest_episodes(store, NUM_TAKES)
-            known = self._clocks
+            recordings = await _last_page(RecordingList, store, "/v1/recordings")
+            episodes = await _last_page(EpisodeList, store, "/v1/episodes")
             # Episodes are immutable: each is queried once.
             self._clocks = {
-                item.episode_id: known[item.episode_id]
-                if item.episode_id in known
-                else await store_api.clock_words(store, item.episode_id)
-                for item in episodes
+                item.episode_id: self._clocks[item.episode_id]
+                if item.episode_id in self._clocks
+                else await _clock_words(store, item.episode_id)
+                for item in episodes.episodes
             }
         except DexTouchError as error:
             logger.warning("takes_not_listed", error=error.message)
             return TakesView(note=f"The store does not list its takes: {error.message}")
-        takes = (
-            *(store_api.episode_view(item, self._clocks) for item in episodes),
-            *(store_api.recording_view(item) for item in recordings),
-        )
-        return TakesView(takes=takes, note="" if takes else "Nothing stored yet.")
+        takes = [
+            TakeView(
+                kind="episode",
+                name=item.episode_id,
+                task=item.task,
+                domain=item.domain,
+                operator=item.operator,
+                consent=None,
+                outcome=OUTCOMES[item.success],
+                size=f"{item.duration_s:.1f} s, {item.num_steps} steps",
+                clocks=self._clocks[item.episode_id],
+            )
+            for item in reversed(episodes.episodes)
+        ]
+        takes += [
+            TakeView(
+                kind="recording",
+                name=item.recording_id,
+                task=item.task,
+                domain=item.domain,
+                operator=item.operator,
+                consent=item.consent,
+                outcome=OUTCOMES[item.success],
+                size=f"{item.duration_s:.1f} s, {sum(item.num_samples.values())} samples, "
+                f"{len(item.num_samples)} streams",
+            )
+            for item in reversed(recordings.recordings)
+        ]
+        return TakesView(takes=tuple(takes), note="" if takes else "Nothing stored yet.")
 
-    async def operate(self, action: str, body: Mapping[str, Any]) -> dict[str, object]:
-        """Perform a recorder action and return the recorder's new state."""
-        path = station_api.action_path(action)
-        answer = await self.upstream("acquisition").json("POST", path, body=body)
-        return station_api.recorder_view(answer).model_dump()
+    async def operate(self, action: str, body: Mapping[str, Any]) -> RecorderView:
+        """Perform a recorder action and return the recorder's new state.
 
-    async def retry(self, recording_id: str) -> None:
-        """Make the station upload a refused take again."""
-        path = station_api.retry_path(recording_id)
-        await self.upstream("acquisition").json("POST", path)
-
-    async def camera_image(self, name: str) -> tuple[bytes, str]:
-        """The newest image of a camera and its media type."""
-        path = station_api.camera_path(name)
-        content, headers = await self.upstream("acquisition").content(path)
-        return content, headers.get("content-type", "image/jpeg")
-
-    async def _station_messages(self) -> list[Message]:
-        return [topic_message("station", (await self.station()).model_dump())]
-
-    async def _service_messages(self) -> list[Message]:
-        return [topic_message("services", [view.model_dump() for view in await self.services()])]
-
-    async def _take_messages(self) -> list[Message]:
-        return [topic_message("takes", (await self.takes()).model_dump())]
-
-    async def _camera_messages(self) -> list[Message]:
+        Raises:
+            UnknownNameError: no such action.
+            InvalidInputError: a body that the action does not take, or no outcome to save.
+        """
+        if action not in ACTIONS:
+            raise UnknownNameError("recorder action", action, list(ACTIONS))
         try:
-            answer = await self.upstream("acquisition").json("GET", station_api.CAMERAS_PATH)
-            views = [view.model_dump() for view in station_api.camera_views(answer)]
+            wanted = ACTIONS[action].model_validate(body)
+        except ValidationError as error:
+            raise InvalidInputError(f"recorder {action}: {first_problems(error)}") from error
+        if action == "save" and "success" not in wanted.model_fields_set:
+            raise InvalidInputError(
+                "save: got no outcome, expected success: true, false or null (not judged)"
+            )
+        status = await self.upstream("acquisition").read(
+            RecorderStatus,
+            f"/v1/recorder/{action}",
+            method="POST",
+            body=wanted.model_dump(exclude_unset=True),
+        )
+        return recorder_view(status)
+
+    async def _cameras(self) -> tuple[CameraLive, ...]:
+        try:
+            listed = await self.upstream("acquisition").read(CameraList, "/v1/live/cameras")
         except DexTouchError:
-            views = []  # reported by the station topic
-        return [topic_message("cameras", views)]
+            return ()  # reported by the station topic
+        return listed.cameras
 
     async def _taxel_messages(self) -> list[Message]:
         try:
-            content, _ = await self.upstream("acquisition").content(station_api.TAXELS_PATH)
-            _, arrays = unpack(content, max_bytes=MAX_TAXEL_BYTES)
+            answer = await self.upstream("acquisition").send("GET", "/v1/live/taxels")
+            _, arrays = unpack(answer.content, max_bytes=MAX_TAXEL_BYTES)
         except DexTouchError as error:
             return [topic_message("taxels_lost", error.message)]
         pressures = {side: arrays.get(f"tactile_{side}") for side in SIDES}
-        return [
-            taxel_message(side, array) for side, array in pressures.items() if array is not None
-        ]
+        return [taxel_message(side, kpa) for side, kpa in pressures.items() if kpa is not None]
+
+
+async def _last_page(form: type[Page], store: Upstream, path: str) -> Page:
+    """Last page of a list, which the store sorts by id in ascending order."""
+    first = await store.read(form, f"{path}?limit={NUM_TAKES}")
+    offset = first.num_matching - NUM_TAKES
+    if offset <= 0:
+        return first
+    return await store.read(form, f"{path}?limit={NUM_TAKES}&offset={offset}")
+
+
+async def _clock_words(store: Upstream, episode_id: str) -> str:
+    """Summary of an episode's clock fits; empty if there are none."""
+    clocks = (await store.read(EpisodeDetail, f"/v1/episodes/{episode_id}")).attributes.clocks
+    residuals_ms = [clock.residual_rms_ms for clock in clocks if clock.residual_rms_ms is not None]
+    skews_ppm = [abs(clock.skew_ppm) for clock in clocks if clock.skew_ppm is not None]
+    if not residuals_ms or not skews_ppm:
+        return ""
+    lost = sum(clock.num_dropped for clock in clocks)
+    doubted = ", ".join(clock.stream for clock in clocks if clock.warnings)
+    return (
+        f"skew to {max(skews_ppm):.0f} ppm, residual to {max(residuals_ms):.2f} ms, "
+        f"{lost} samples lost{f'; unreliable times: {doubted}' if doubted else ''}"
+    )

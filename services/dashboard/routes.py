@@ -1,9 +1,9 @@
 """HTTP and WebSocket routes of the page: data, live updates and recorder actions."""
 
 import asyncio
-import json
 from contextlib import suppress
-from typing import Annotated, Literal
+from typing import Annotated, Any
+from urllib.parse import quote
 
 from fastapi import (
     APIRouter,
@@ -16,19 +16,21 @@ from fastapi import (
     WebSocketDisconnect,
 )
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field, ValidationError
+from pydantic_core import to_jsonable_python
 from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketState
 
-from dextouch.errors import AccessDeniedError, InvalidInputError
+from dextouch.errors import AccessDeniedError
+from dextouch.frozen_model import FrozenModel
 from dextouch.serving import not_signed_in
 from services.dashboard.feeds import Feeds
 from services.dashboard.sessions import Sessions
 from services.dashboard.settings import DashboardSettings
+from services.dashboard.station_view import RecorderView
 from services.dashboard.topics import Message, Viewer
-from services.dashboard.views import heatmap_layout
+from services.dashboard.touch import heatmap_layout
 
-MAX_VIEW_CHARACTERS = 1000
 WEBSOCKET_REFUSED = 1008
 # Interval at which a WebSocket checks that its session is still valid.
 SESSION_CHECK_S = 1.0
@@ -36,23 +38,10 @@ SESSION_CHECK_S = 1.0
 CameraName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 
 
-class RecorderRequest(BaseModel):
-    """Body of a recorder action: a prompt for `arm`, an outcome for `save`.
+class Subscription(FrozenModel):
+    """Message of a page: the topics that are in view."""
 
-    `success` is true, false or null (not judged), and required for `save`. `recording_id` is the
-    take that the action refers to.
-    """
-
-    model_config = ConfigDict(extra="forbid")
-
-    recording_id: str | None = Field(default=None, max_length=128)
-    task: str | None = Field(default=None, min_length=1, max_length=128)
-    instruction: str | None = Field(default=None, min_length=1, max_length=2000)
-    domain: Literal["human", "robot"] | None = None
-    operator: str | None = Field(default=None, min_length=1, max_length=128)
-    consent: bool | None = None
-    success: bool | None = None
-    accept_incomplete: bool | None = None
+    view: tuple[Annotated[str, Field(max_length=64)], ...] = Field(max_length=16)
 
 
 def guard(connection: HTTPConnection) -> None:
@@ -79,41 +68,32 @@ def api_router(settings: DashboardSettings) -> APIRouter:
         station, services, takes = await asyncio.gather(
             feeds.station(), feeds.services(), feeds.takes()
         )
-        return JSONResponse(
-            {
-                "name": settings.station,
-                "station": station.model_dump(),
-                "services": [view.model_dump() for view in services],
-                "takes": [view.model_dump() for view in takes.takes],
-                "takes_note": takes.note,
-                "refused": [view.model_dump() for view in takes.refused],
-            }
-        )
+        shown = {"name": settings.station, "station": station, "services": services}
+        shown |= {"takes": takes.takes, "takes_note": takes.note, "refused": takes.refused}
+        return JSONResponse(to_jsonable_python(shown))
 
     @router.post("/recorder/{action}")
     async def operate(
-        action: str, request: Request, wanted: Annotated[RecorderRequest, Body()]
-    ) -> JSONResponse:
-        """Arm, record, stop, save or discard; returns the recorder's new state."""
-        if action == "save" and "success" not in wanted.model_fields_set:
-            raise InvalidInputError(
-                "save: got no outcome, expected success: true, false or null (not judged)"
-            )
+        action: str, request: Request, body: Annotated[dict[str, Any], Body()]
+    ) -> RecorderView:
+        """Arm, record, stop, save (`success` required) or discard; the recorder's new state."""
         feeds: Feeds = request.app.state.feeds
-        return JSONResponse(await feeds.operate(action, wanted.model_dump(exclude_unset=True)))
+        return await feeds.operate(action, body)
 
     @router.post("/uploads/{recording_id}/retry", status_code=204)
     async def retry(recording_id: str, request: Request) -> None:
         """Upload a refused take again."""
         feeds: Feeds = request.app.state.feeds
-        await feeds.retry(recording_id)
+        path = f"/v1/uploads/{quote(recording_id, safe='')}/retry"
+        await feeds.upstream("acquisition").send("POST", path)
 
     @router.get("/cameras/{name}.jpg")
     async def camera(name: CameraName, request: Request) -> Response:
         """The newest image of one camera."""
         feeds: Feeds = request.app.state.feeds
-        content, media_type = await feeds.camera_image(name)
-        return Response(content, media_type=media_type, headers={"cache-control": "no-store"})
+        image = await feeds.upstream("acquisition").send("GET", f"/v1/live/cameras/{name}")
+        media_type = image.headers.get("content-type", "image/jpeg")
+        return Response(image.content, media_type=media_type, headers={"cache-control": "no-store"})
 
     return router
 
@@ -163,13 +143,9 @@ async def _send_news(websocket: WebSocket, viewer: Viewer) -> None:
         await websocket.close(WEBSOCKET_REFUSED, error.message)
 
 
-def _view(text: str) -> list[str]:
-    """Parse the topics that a page subscribes to; invalid messages give none."""
-    if len(text) > MAX_VIEW_CHARACTERS:
-        return []
+def _view(text: str) -> tuple[str, ...]:
+    """Topics that a page subscribes to; invalid messages give none."""
     try:
-        wanted = json.loads(text)
-    except ValueError:
-        return []
-    names = wanted.get("view", []) if isinstance(wanted, dict) else []
-    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+        return Subscription.model_validate_json(text).view
+    except ValidationError:
+        return ()

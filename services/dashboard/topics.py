@@ -1,11 +1,11 @@
 """Live topics of the page, polled only while they have viewers."""
 
 import asyncio
-import json
-from collections.abc import Awaitable, Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
+from contextlib import asynccontextmanager
 
 import structlog
+from pydantic_core import to_json
 
 logger = structlog.get_logger(__name__)
 
@@ -15,8 +15,8 @@ Fetch = Callable[[], Awaitable[list[Message]]]
 
 
 def topic_message(topic: str, data: object) -> str:
-    """Encode a message of a topic as JSON."""
-    return json.dumps({"topic": topic, "data": data}, allow_nan=False, separators=(",", ":"))
+    """Encode a message of a topic as JSON; `data` may hold pydantic models."""
+    return to_json({"topic": topic, "data": data}, inf_nan_mode="null").decode()
 
 
 class Topic:
@@ -30,6 +30,15 @@ class Topic:
         self._fetch = fetch
         self._viewers: set[Viewer] = set()
         self._wanted = asyncio.Event()
+
+    @classmethod
+    def of_json(cls, name: str, period_s: float, read: Callable[[], Awaitable[object]]) -> "Topic":
+        """A topic with one message, the JSON of what `read` returns."""
+
+        async def fetch() -> list[Message]:
+            return [topic_message(name, await read())]
+
+        return cls(name, period_s, fetch)
 
     def add(self, viewer: "Viewer") -> None:
         """Add a viewer, which gets the current messages at once."""
@@ -99,14 +108,13 @@ class Viewer:
                 return messages
 
 
-async def run_topics(topics: Iterable[Topic], until_stopped: asyncio.Event) -> None:
-    """Run all topics until the event is set."""
+@asynccontextmanager
+async def running(topics: Iterable[Topic]) -> AsyncIterator[None]:
+    """Context manager that polls all topics meanwhile."""
     tasks = [asyncio.create_task(topic.run()) for topic in topics]
     try:
-        await until_stopped.wait()
+        yield
     finally:
         for task in tasks:
             task.cancel()
-        for task in tasks:
-            with suppress(asyncio.CancelledError):
-                await task
+        await asyncio.gather(*tasks, return_exceptions=True)

@@ -1,13 +1,15 @@
 """HTTP client of another service, whose failures become UnavailableError."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import httpx
-from pydantic import SecretStr, ValidationError
+from pydantic import SecretStr, TypeAdapter, ValidationError
 
 from dextouch.errors import UnavailableError
-from dextouch.schemas import Problem, error_from_problem
+from dextouch.schemas import Problem, error_from_problem, first_problems
+
+Form = TypeVar("Form")
 
 
 class Upstream:
@@ -27,42 +29,38 @@ class Upstream:
         )
         return Upstream(name, client)
 
-    async def json(self, method: str, path: str, *, body: Mapping[str, Any] | None = None) -> Any:  # noqa: ANN401 - another service's JSON; views.py checks it
-        """Send a request and return the JSON response.
+    async def read(
+        self,
+        form: type[Form],
+        path: str,
+        *,
+        method: str = "GET",
+        body: Mapping[str, Any] | None = None,
+    ) -> Form:
+        """Response to a request as this model, or tuple of models; `body` is sent as JSON.
 
         Raises:
-            UnavailableError: no response, or not JSON.
+            UnavailableError: no response, or one of another form.
             DexTouchError: a refusal of the service, as its own class.
         """
-        response = await self._send(method, path, body)
+        response = await self.send(method, path, body)
         try:
-            return response.json()
-        except ValueError as error:
+            return TypeAdapter(form).validate_json(response.content)
+        except ValidationError as error:
             raise UnavailableError(
-                f"{self.name}: {method} {path} did not answer with JSON", service=self.name
+                f"{self.name}: unexpected response to {method} {path} ({first_problems(error)})",
+                service=self.name,
             ) from error
 
-    async def content(self, path: str) -> tuple[bytes, Mapping[str, str]]:
-        """Body and headers of a GET request."""
-        response = await self._send("GET", path, None)
-        return response.content, response.headers
+    async def send(
+        self, method: str, path: str, body: Mapping[str, Any] | None = None
+    ) -> httpx.Response:
+        """Response to a request, with `body` as JSON.
 
-    async def ready(self) -> tuple[bool, str]:
-        """Readiness of the service, and what is missing otherwise."""
-        try:
-            response = await self._client.get("/readyz")
-            waiting = response.json().get("waiting_for", [])
-        except (httpx.HTTPError, ValueError, AttributeError) as error:
-            return False, f"no answer ({type(error).__name__})"
-        if response.is_success:
-            return True, ""
-        return False, "waiting for " + ", ".join(str(item) for item in waiting)
-
-    async def close(self) -> None:
-        """Close the connections."""
-        await self._client.aclose()
-
-    async def _send(self, method: str, path: str, body: Mapping[str, Any] | None) -> httpx.Response:
+        Raises:
+            UnavailableError: no response, or a refusal without a reason.
+            DexTouchError: a refusal of the service, as its own class.
+        """
         try:
             response = await self._client.request(method, path, json=body)
         except httpx.HTTPError as error:
@@ -81,3 +79,18 @@ class Upstream:
                 service=self.name,
             ) from error
         raise error_from_problem(problem)
+
+    async def ready(self) -> tuple[bool, str]:
+        """Readiness of the service, and what is missing otherwise."""
+        try:
+            response = await self._client.get("/readyz")
+            waiting = response.json().get("waiting_for", [])
+        except (httpx.HTTPError, ValueError, AttributeError) as error:
+            return False, f"no answer ({type(error).__name__})"
+        if response.is_success:
+            return True, ""
+        return False, "waiting for " + ", ".join(str(item) for item in waiting)
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._client.aclose()

@@ -6,7 +6,6 @@ from fastapi import FastAPI, Response
 from fastapi.responses import JSONResponse
 
 from dextouch.streams import pack
-from services.dashboard import station_api
 from services.dashboard.upstream import Upstream
 
 PRESSURES = {
@@ -52,19 +51,22 @@ class FakeServices:
 
     def __init__(self):
         self.stream = {"stream": "tactile_left", "device": "glove_left", "level": "OK"}
-        self.stream |= {"findings": [], "rate_hz": 59.9, "nominal_rate_hz": 60.0, "age_s": 0.01}
+        self.stream |= {"reasons": [], "rate_hz": 59.9, "nominal_rate_hz": 60.0, "age_s": 0.01}
         self.stream |= {"received": 998, "lost": 2}
-        self.device = {"device": "glove_left", "reconnects": 0, "last_error": None}
-        self.health = {"streams": [self.stream], "devices": [self.device]}
+        self.device = {"device": "glove_left", "connected": True, "address": "mock"}
+        counted = ("packets", "lost", "crc_errors", "length_errors", "resync_bytes", "refused")
+        self.device |= dict.fromkeys((*counted, "reconnects"), 0) | {"last_error": None}
+        self.health = {"station": "desk", "level": "OK"}
+        self.health |= {"streams": [self.stream], "devices": [self.device]}
         self.recorder = {"state": "idle", "actions": ["arm"]}
         self.asked = []
         self.app = FastAPI()
         self.app.middleware("http")(self._note)
         self.app.get("/readyz")(lambda: {"ready": True, "waiting_for": []})
-        self.app.get(station_api.HEALTH_PATH)(lambda: JSONResponse(self.health))
-        self.app.get(station_api.RECORDER_PATH)(lambda: self.recorder)
-        self.app.get(station_api.TAXELS_PATH)(self._taxels)
-        self.app.post(station_api.RECORDER_PATH + "/{action}")(self._act)
+        self.app.get("/v1/health")(lambda: JSONResponse(self.health))
+        self.app.get("/v1/recorder")(lambda: self.recorder)
+        self.app.get("/v1/live/taxels")(self._taxels)
+        self.app.post("/v1/recorder/{action}")(self._act)
         self.episodes = [EPISODE]
         self.app.get("/v1/episodes")(self._list_episodes)
         self.app.get("/v1/episodes/{episode_id}")(lambda: DETAIL)

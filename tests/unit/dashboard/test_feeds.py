@@ -38,6 +38,7 @@ async def test_worst_level_leads(feeds, services):
 async def test_what_ails_a_device_is_said(feeds, services):
     silent = {"code": "silent", "level": "STALE", "message": "no sample for 2.0 s"}
     loss = {"code": "loss", "level": "WARN", "message": "1 % lost", "advice": "Move."}
+    loss |= {"lasted_s": 1.0}
     services.stream |= {
         "level": "STALE",
         "findings": [silent | {"advice": "Switch it off and on.", "lasted_s": 2.0}, loss],
@@ -65,7 +66,7 @@ async def test_incomplete_take_is_shown(feeds, services):
         "actions": ["save", "discard"],
         "recording_id": "take-7",
         "duration_s": 5.5,
-        "check": {"complete": False, "problems": [problem]},
+        "check": {"complete": False, "duration_s": 5.5, "streams": [], "problems": [problem]},
     }
     recorder = (await feeds.station()).recorder
     assert (recorder.complete, recorder.level, recorder.elapsed_s) == (False, "ERROR", 5.5)
@@ -75,14 +76,15 @@ async def test_incomplete_take_is_shown(feeds, services):
 
 async def test_the_worst_of_a_take_leads(feeds, services):
     levels = {"b: 2 % lost": "WARN", "head: 0.4 s gap": "ERROR", "a: 1 % lost": "WARN"}
-    problems = [{"level": level, "message": text} for text, level in levels.items()]
+    about = {"stream": "head", "code": "gap"}
+    problems = [about | {"level": level, "message": text} for text, level in levels.items()]
     services.recorder = {
         "state": "checking",
         "actions": ["save", "discard"],
         "recording_id": "take-7",
         # The check's findings are repeated here, after what the recorder says itself.
         "problems": ["the disk is full", *levels],
-        "check": {"complete": False, "problems": problems},
+        "check": {"complete": False, "duration_s": 5.5, "streams": [], "problems": problems},
     }
     recorder = (await feeds.station()).recorder
     assert recorder.note == "take-7 · incomplete · 4 findings"
@@ -103,10 +105,10 @@ async def test_absent_station_shows_no_numbers():
 
 
 async def test_answer_of_another_form_is_named(feeds, services):
-    services.health = {"streams": [{"stream": "x", "device": "y", "level": "FINE"}]}
+    services.stream["level"] = "FINE"
     view = await feeds.station()
     assert not view.reachable
-    assert "unexpected response" in view.note
+    assert "unexpected response to GET /v1/health (streams.0.level: " in view.note
 
 
 async def test_services(upstreams):
@@ -181,7 +183,7 @@ async def test_a_recording_is_shown_with_its_labels(feeds, services):
 
 async def test_operate(feeds, services):
     answer = await feeds.operate("arm", {"task": "stack_bowls", "instruction": "stack"})
-    assert (answer["state"], answer["actions"]) == ("armed", ("record", "discard"))
+    assert (answer.state, answer.actions) == ("armed", ("record", "discard"))
     assert services.asked[-1] == {"task": "stack_bowls", "instruction": "stack"}
 
 

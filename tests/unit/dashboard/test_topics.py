@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from services.dashboard.topics import Topic, Viewer, run_topics
+from services.dashboard.topics import Topic, Viewer, running
 
 
 class Source:
@@ -59,28 +59,22 @@ async def test_what_is_out_of_view_is_not_sent(topic):
 
 
 async def test_fetching_rests_without_viewers(topic, source):
-    stopped = asyncio.Event()
-    running = asyncio.create_task(run_topics([topic], stopped))
     viewer = Viewer({"news": topic})
-    viewer.look_at(["news"])
-    assert await viewer.news() == ["1"]
-    viewer.look_at([])
-    for _ in range(5):  # one fetch may be under way
-        await asyncio.sleep(0)
-    resting = source.count
-    for _ in range(20):
-        await asyncio.sleep(0)
-    assert source.count == resting
-    stopped.set()
-    await running
+    async with running([topic]):
+        viewer.look_at(["news"])
+        assert await viewer.news() == ["1"]
+        viewer.look_at([])
+        for _ in range(5):  # one fetch may be under way
+            await asyncio.sleep(0)
+        resting = source.count
+        for _ in range(20):
+            await asyncio.sleep(0)
+        assert source.count == resting
 
 
 async def test_a_failed_fetch_does_not_end_the_news(topic, source):
     source.fails = True
-    stopped = asyncio.Event()
-    running = asyncio.create_task(run_topics([topic], stopped))
     viewer = Viewer({"news": topic})
-    viewer.look_at(["news"])
-    assert await viewer.news() == ["2"]
-    stopped.set()
-    await running
+    async with running([topic]):
+        viewer.look_at(["news"])
+        assert await viewer.news() == ["2"]
