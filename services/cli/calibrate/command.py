@@ -122,7 +122,7 @@ examples:
 # What each command measures, its longer help, and `module:function` that runs it.
 _COMMANDS = {
     "camera": ("photos of a board → K and distortion of a camera", _CAMERA, "live:calibrate"),
-    "hand-eye": ("photos and poses → camera on its tracker", _HAND_EYE, "hand_eye:calibrate"),
+    "hand-eye": ("photos and poses → camera on its tracker", _HAND_EYE, "mounts:calibrate_mount"),
     "glove": ("rest and known pressures → tare, gain, faults", _GLOVE, "glove:calibrate"),
     "wrist": (
         "flat hand → wrist axes of a glove's keypoints",
@@ -133,7 +133,7 @@ _COMMANDS = {
     "robot-base": (
         "pairs of poses → the robot's base in the world",
         _ROBOT_BASE,
-        "robot_base:calibrate",
+        "mounts:calibrate_base",
     ),
     "latency": ("common motion or taps → path delay", _LATENCY, "latency:calibrate"),
     "show": ("contents, age and accuracy of a calibration", _SHOW, "show:show"),

@@ -14,8 +14,13 @@ from services.alignment.calibration.tactile_glove_calibration import (
     calibrate_glove,
 )
 from services.alignment.calibration.tactile_tare import measure_tare
-from services.cli.calibrate import guided
-from services.cli.calibrate.glove_takes import PressRow, press_of, read_presses, read_take
+from services.cli.calibrate.glove_takes import (
+    PressRow,
+    press_of,
+    read_presses,
+    read_take,
+    record_takes,
+)
 from services.cli.calibrate.pictures import glove_picture
 from services.cli.calibrate.record import MATRICES_FILE, write_entry, write_picture
 
@@ -50,7 +55,7 @@ def _takes(options: argparse.Namespace) -> tuple[str, Sequence[PressRow]]:
                 "got --url and --rest or --presses, expected one of the two: a station records its "
                 "takes now, or takes are named that are there"
             )
-        return guided.walk(options, guided.station_takes(options))
+        return record_takes(options)
     if options.rest is None:
         raise InvalidInputError(
             "expected --url of a running station, which records what is needed, or --rest TAKE"

@@ -1,25 +1,49 @@
-"""Glove takes and the list of presses with known pressures."""
+"""Takes of a glove for its calibration: named ones, or those that a running station records now."""
 
 import argparse
 import csv
-from collections.abc import Sequence
+import json
+import re
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from dextouch.errors import InvalidInputError
+from dextouch.clients import HttpLink, Reply
+from dextouch.command_line import progress
+from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.streams import SampleBatch
-from services.alignment.calibration.tactile_gain import TaxelPress
-from services.alignment.calibration.tactile_glove_calibration import pad_taxels
-from services.cli.calibrate.poses import read_rows
-from services.cli.calibrate.takes import read_stream
+from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
+from services.alignment.calibration.tactile_glove_calibration import calibrate_glove, pad_taxels
+from services.alignment.calibration.tactile_tare import TaxelTare, measure_tare
+from services.cli.calibrate.files import read_rows, read_stream
 
 STANDARD_GRAVITY_M_S2 = 9.80665
+REST_S, PRESS_S, TICK_S = 10.0, 5.0, 0.1
+# Timeout of an upload.
+UPLOAD_S = 120.0
+TASK = "calibrate-glove"
+COLUMNS = ("take", "pressure_kpa", "sigma_kpa", "pads")
 EXPECTED = (
     "CSV with the columns take and pressure_kpa, or mass_kg and area_cm2; optional are sigma_kpa, "
     "pads, start_s, stop_s"
 )
+PRESS_HELP = "30, or 30 palm, or 30 thumb+index (kPa), or 2kg/90cm2 palm (a weight)"
+NEXT = "Next pressure (Enter alone: no more; drop: forget the last): "
+# Groups are named as the columns of the list of presses.
+_PRESS = re.compile(
+    r"(?:(?P<pressure_kpa>[0-9.]+)(?: ?kpa)?"
+    r"|(?P<mass_kg>[0-9.]+) ?kg ?/ ?(?P<area_cm2>[0-9.]+) ?cm2)(?: +(?P<pads>[a-z+]+))?"
+)
+
+Found = TypeVar("Found")
+Ask = Callable[[str], str]
 
 
 class PressRow(BaseModel):
@@ -49,8 +73,7 @@ class PressRow(BaseModel):
         if not (mass_kg > 0 and area_cm2 > 0):
             raise ValueError("expected mass_kg and area_cm2, both above 0")
         pressure_kpa = mass_kg * STANDARD_GRAVITY_M_S2 / (area_cm2 * 1e-4) / 1e3
-        others = {name: value for name, value in given.items() if name not in weight}
-        return {**others, "pressure_kpa": pressure_kpa}
+        return {n: v for n, v in given.items() if n not in weight} | {"pressure_kpa": pressure_kpa}
 
     def known_to(self, relative_sigma: float) -> "PressRow":
         """The row with a sigma; without one of its own, a share of the pressure."""
@@ -72,6 +95,35 @@ def read_presses(path: Path, relative_sigma: float) -> list[PressRow]:
         take = str(beside) if beside.is_dir() else row.take
         rows.append(row.known_to(relative_sigma).model_copy(update={"take": take}))
     return rows
+
+
+def write_presses(path: Path, rows: Sequence[PressRow]) -> None:
+    """Write the list for `read_presses`, so that a calibration can be repeated."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerows([COLUMNS, *([getattr(row, name) for name in COLUMNS] for row in rows)])
+
+
+def parse_press(words: str, relative_sigma: float) -> PressRow:
+    """Parse a pressure typed by the operator (`PRESS_HELP`), before its take.
+
+    Raises:
+        InvalidInputError: no pressure above 0.
+        UnknownNameError: no such pad.
+    """
+    matched = _PRESS.fullmatch(words.strip().lower())
+    groups = matched.groupdict() if matched else {}
+    try:
+        row = PressRow.model_validate(
+            {"take": ""} | {n: text for n, text in groups.items() if text}
+        )
+    except ValidationError as error:
+        raise InvalidInputError(
+            f"pressure: got {words!r}, expected {PRESS_HELP}, above 0"
+        ) from error
+    pad_taxels(row.pads)
+    return row.known_to(relative_sigma)
 
 
 def read_take(take: str, options: argparse.Namespace) -> SampleBatch:
@@ -107,10 +159,205 @@ def press_of(row: PressRow, options: argparse.Namespace) -> TaxelPress:
     return TaxelPress(row.pressure_kpa, row.sigma_kpa or 0.0, batch.values[wanted], taxels)
 
 
-def write_presses(path: Path, rows: Sequence[PressRow]) -> None:
-    """Write the list for `read_presses`, so that a calibration can be repeated."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["take", "pressure_kpa", "sigma_kpa", "pads"])
-        writer.writerows([row.take, row.pressure_kpa, row.sigma_kpa, row.pads] for row in rows)
+@dataclass(frozen=True)
+class StationTakes:
+    """Records takes with a running station and locates them.
+
+    Attributes:
+        request: sends a request to the station, as `HttpLink.request`.
+        spool: the station's spool, if accessible from this machine.
+        has_store: whether takes may be read from the store that the station uploads to.
+        wait: sleeps.
+    """
+
+    request: Callable[..., Reply]
+    spool: Path
+    has_store: bool
+    wait: Callable[[float], None] = time.sleep
+
+    def record(
+        self, name: str, words: str, seconds: float, check: Callable[[str], Found]
+    ) -> tuple[str, Found]:
+        """Record a valid take; interrupted and invalid ones are discarded.
+
+        Args:
+            name: id of the take.
+            words: description for the operator, also the take's instruction.
+            seconds: duration.
+            check: raises an error for an invalid take. If takes are only in the store, it runs
+                after the take is saved.
+
+        Returns:
+            The take's folder in the spool, or its id in the store; and the result of the check.
+
+        Raises:
+            ConflictError: the recorder is busy with another take; save or discard that.
+            UnavailableError: the station does not respond.
+            NotFoundError: neither spool nor store has the take.
+        """
+        self._act("arm", {"task": TASK, "instruction": words})
+        self._act("record", {"recording_id": name})
+        take, found = str((self.spool / name).resolve()), None
+        with ExitStack() as undo:
+            undo.callback(self._act, "discard", {"recording_id": name})
+            num_ticks = round(seconds / TICK_S)
+            for _ in progress(range(num_ticks), words, num_ticks):
+                self.wait(TICK_S)
+            self._act("stop", {"recording_id": name})
+            if Path(take).is_dir():
+                found = check(take)
+            undo.pop_all()
+        # Other devices may be absent; the presence of the glove shows in its readings.
+        self._act("save", {"recording_id": name, "accept_incomplete": True})
+        if found is None:
+            take = self._await_upload(name)
+            found = check(take)
+        return take, found
+
+    def _act(self, action: str, body: dict[str, object]) -> None:
+        self.request("POST", f"/v1/recorder/{action}", body=json.dumps(body).encode())
+
+    def _await_upload(self, name: str) -> str:
+        """Wait for the upload and return the take's id in the store."""
+        if not self.has_store:
+            raise NotFoundError(
+                f"take {name!r}: not in {self.spool.resolve()}; name the station's spool with "
+                "--spool, or on another machine its store with --store URL"
+            )
+        num_tries = round(UPLOAD_S)
+        for _ in progress(range(num_tries), "waiting for the upload", num_tries):
+            uploads = json.loads(self.request("GET", "/v1/uploads").body)
+            for take in uploads:
+                if take["recording_id"] == name and take["uploaded"]:
+                    return str(take.get("stored_as") or name)
+            self.wait(1.0)
+        raise NotFoundError(
+            f"take {name!r}: the station did not upload it within {UPLOAD_S:g} s; look at its "
+            "uploads, then calibrate with --rest and --presses"
+        )
+
+
+def station_takes(options: argparse.Namespace) -> StationTakes:
+    """Create the helper for the station of the options."""
+    link = HttpLink(options.url, api_key=options.key)
+    return StationTakes(link.request, options.spool, has_store=options.store is not None)
+
+
+@dataclass
+class Guide:
+    """Dialogue with an operator, who lays the glove down and presses it while takes are recorded.
+
+    An invalid take is explained and repeated.
+    """
+
+    options: argparse.Namespace
+    takes: StationTakes
+    ask: Ask
+    num_takes: int = 0
+
+    def __post_init__(self) -> None:
+        self._name = f"calibration-glove-{self.options.side}-{datetime.now(UTC):%Y%m%d-%H%M%S}"
+
+    def rest(self) -> tuple[str, TaxelTare]:
+        """Record a rest take with a valid tare."""
+        side = self.options.side
+        while True:
+            self._answer(
+                f"Lay the {side} glove down, untouched, and let it rest for a minute. "
+                f"Enter records {REST_S:g} s: "
+            )
+            try:
+                return self._record(
+                    f"{side} glove at rest, untouched",
+                    REST_S,
+                    lambda take: measure_tare(read_take(take, self.options).values, side=side),
+                )
+            except InvalidInputError as error:
+                print(f"Once more: {error.message}")
+
+    def presses(self, tare: TaxelTare) -> list[PressRow]:
+        """Record presses until the operator is done."""
+        print(f"Now two to four known pressures, the highest as high as work needs: {PRESS_HELP}.")
+        known: list[tuple[PressRow, TaxelPress]] = []
+        while words := self._answer(NEXT).strip():
+            if words == "drop":
+                known = known[:-1]
+                print(f"{len(known)} presses are left")
+                continue
+            try:
+                wanted = parse_press(words, self.options.pressure_sigma)
+            except (InvalidInputError, UnknownNameError) as error:
+                print(error.message)
+                continue
+            target = f"{wanted.pressure_kpa:.4g} kPa on {wanted.pads}"
+            self._answer(f"Put {target}. Enter records {PRESS_S:g} s, once it holds still: ")
+            try:
+                take, press = self._record(
+                    f"{target}, held still", PRESS_S, partial(self._press, tare, wanted)
+                )
+            except InvalidInputError as error:
+                print(f"Not used: {error.message}")
+                continue
+            known.append((wanted.model_copy(update={"take": take}), press))
+            print(self._known_so_far(tare, [press for _, press in known]))
+        return [row for row, _ in known]
+
+    def _known_so_far(self, tare: TaxelTare, presses: list[TaxelPress]) -> str:
+        try:
+            found = calibrate_glove(
+                tare, presses, full_scale_counts=self.options.full_scale
+            ).num_by_state()
+        except InvalidInputError as error:
+            return f"{len(presses)} presses, not enough yet: {error.message}"
+        others = ", ".join(f"{n} {state}" for state, n in found.items() if state != "ok")
+        return (
+            f"{len(presses)} presses: {found['ok']} of 320 taxels known"
+            f"{f' ({others})' if others else ''}; more pressures show bends"
+        )
+
+    def _press(self, tare: TaxelTare, wanted: PressRow, take: str) -> TaxelPress:
+        """The press of a take, if it determines a gain on its own."""
+        press = press_of(wanted.model_copy(update={"take": take}), self.options)
+        fit_gain(tare, [press], full_scale_counts=self.options.full_scale)
+        return press
+
+    def _record(
+        self, words: str, seconds: float, check: Callable[[str], Found]
+    ) -> tuple[str, Found]:
+        self.num_takes += 1
+        return self.takes.record(f"{self._name}-{self.num_takes}", words, seconds, check)
+
+    def _answer(self, question: str) -> str:
+        try:
+            return self.ask(question)
+        except EOFError as error:
+            raise InvalidInputError(
+                "calibrate glove --url: nobody answers; run it at a terminal, or name takes with "
+                "--rest and --presses"
+            ) from error
+
+
+def record_takes(
+    options: argparse.Namespace, takes: StationTakes | None = None, *, ask: Ask = input
+) -> tuple[str, list[PressRow]]:
+    """Lead an operator through rest and presses; returns the rest take and valid presses.
+
+    The list of presses is stored in the folder, so that the calibration can be repeated from the
+    same takes.
+
+    Raises:
+        InvalidInputError: no operator input.
+    """
+    if takes is None:
+        link = HttpLink(options.url, api_key=options.key)
+        takes = StationTakes(link.request, options.spool, has_store=options.store is not None)
+    guide = Guide(options, takes, ask)
+    rest, tare = guide.rest()
+    rows = guide.presses(tare)
+    again = f"dextouch station calibrate glove --side {options.side} --rest {rest}"
+    if rows:
+        path = options.to / f"presses_{options.side}.csv"
+        write_presses(path, rows)
+        again += f" --presses {path}"
+    print(f"The same takes again: {again} --to {options.to}")
+    return rest, rows

@@ -12,8 +12,8 @@ from services.alignment.retargeting.keypoint_axes import (
     hand_axes_check,
 )
 from services.alignment.retargeting.wrist_frame import calibrate_wrist
+from services.cli.calibrate.files import TakenStream, read_stream
 from services.cli.calibrate.record import MATRICES_FILE, read_matrices, write_entry
-from services.cli.calibrate.takes import TakenStream, read_stream
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 
@@ -57,7 +57,7 @@ def measure_person(options: argparse.Namespace) -> dict[str, object]:
     from services.alignment.retargeting.hand_retargeter import HandRetargeter
 
     taken = _keypoints(options)
-    calibration = taken.calibration
+    calibration = dict(taken.calibration)
     if (options.to / MATRICES_FILE).exists():
         calibration = calibration | read_matrices(options.to)
     axes = hand_axes_check(taken.batch.values, options.side, calibration)

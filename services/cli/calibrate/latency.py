@@ -17,8 +17,8 @@ from services.alignment.calibration.motion import DegenerateMotionError
 from services.alignment.calibration.tactile_baseline import TactileCalibration
 from services.alignment.calibration.tap_offset import estimate_tap_offset
 from services.alignment.calibration.time_offset import TimeOffset, estimate_time_offset
+from services.cli.calibrate.files import TakenStream, read_stream
 from services.cli.calibrate.record import write_entry
-from services.cli.calibrate.takes import TakenStream, read_stream
 
 # Quaternion norm below which a pose counts as lost, since trackers then send zeros.
 MIN_NORM = 0.5
@@ -50,13 +50,13 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
         )
     # The offset is added to the stream's times: the latency is its negative.
     name = f"{options.stream}_latency"
-    latency_ns = (stream.number(f"{name}_ns") or 0.0) - found.offset_ns
-    known_ns = reference.number(f"{options.reference}_latency_sigma_ns") or 0.0
+    latency_ns = stream.number(f"{name}_ns") - found.offset_ns
+    known_ns = reference.number(f"{options.reference}_latency_sigma_ns")
     sigma_ns = float(np.hypot(found.sigma_ns, known_ns))
     facts: dict[str, object] = {
         "stream": options.stream,
         "reference": options.reference,
-        "reference_latency_ms": (reference.number(f"{options.reference}_latency_ns") or 0.0) * 1e-6,
+        "reference_latency_ms": reference.number(f"{options.reference}_latency_ns") * 1e-6,
         "method": method,
         "take": options.take,
         "latency_ms": latency_ns * 1e-6,

@@ -9,10 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from dextouch.clients import HttpLink
-from dextouch.errors import InvalidInputError, NotFoundError, StaleDataError
+from dextouch.errors import InvalidInputError, StaleDataError
 from services.cli.calibrate import camera
-from services.cli.calibrate.boards import Board, BoardView, find_board, parse_board
-from services.cli.calibrate.photos import SUFFIXES, decode_photo
+from services.cli.calibrate.boards import (
+    Board,
+    BoardView,
+    decode_photo,
+    find_board,
+    parse_board,
+    photo_paths,
+)
 
 LIVE_PERIOD_S = 0.2
 WATCH_PERIOD_S = 1.0
@@ -29,13 +35,7 @@ Wait = Callable[[float], None]
 
 
 class Session:
-    """Growing set of views of one camera, with its coverage picture.
-
-    Args:
-        board: board to detect.
-        folder: calibration folder, also for the picture.
-        camera_name: name of the camera.
-    """
+    """Growing set of views of one camera, with its coverage picture in the calibration folder."""
 
     def __init__(self, board: Board, folder: Path, camera_name: str) -> None:
         self.views: list[BoardView] = []
@@ -49,8 +49,7 @@ class Session:
 
     def is_new(self, view: BoardView, photo: np.ndarray) -> bool:
         """Whether the view differs enough from all kept ones."""
-        height_px, width_px = photo.shape
-        needed_px = MIN_NEWS * float(np.hypot(width_px, height_px))
+        needed_px = MIN_NEWS * float(np.hypot(*photo.shape))
         return all(motion_px(view, kept) > needed_px for kept in self.views)
 
     def keep(self, view: BoardView, photo: np.ndarray) -> None:
@@ -65,16 +64,10 @@ class Session:
 
 def motion_px(a: BoardView, b: BoardView) -> float:
     """Mean displacement of common corners; infinity if there are none."""
-    places = {tuple(place): index for index, place in enumerate(b.points_board.tolist())}
-    pairs = [
-        (index, places[tuple(place)])
-        for index, place in enumerate(a.points_board.tolist())
-        if tuple(place) in places
-    ]
-    if not pairs:
-        return float("inf")
-    mine, other = (np.array(side) for side in zip(*pairs, strict=True))
-    return float(np.linalg.norm(a.pixels[mine] - b.pixels[other], axis=1).mean())
+    pixels_b = dict(zip(map(tuple, b.points_board.tolist()), b.pixels, strict=True))
+    pairs = zip(map(tuple, a.points_board.tolist()), a.pixels, strict=True)
+    moved = [np.linalg.norm(pixel - pixels_b[at]) for at, pixel in pairs if at in pixels_b]
+    return float(np.mean(moved)) if moved else float("inf")
 
 
 def follow_folder(session: Session, arrivals: Arrivals) -> None:
@@ -93,17 +86,11 @@ def follow_folder(session: Session, arrivals: Arrivals) -> None:
 
 
 def collect_live(session: Session, arrivals: Arrivals, photos: Path) -> int:
-    """Keep live images of a static board in new positions, and return their number.
-
-    Args:
-        session: views so far.
-        arrivals: images of the camera, JPEG.
-        photos: folder for the kept images.
-    """
+    """Keep JPEG images of a static board in new positions in a folder; returns their number."""
     photos.mkdir(parents=True, exist_ok=True)
     before: BoardView | None = None
-    num_kept = len(list(photos.glob("live_*.jpg")))
-    num_before, num_idle = num_kept, 0
+    first = len(list(photos.glob("live_*.jpg")))
+    num_kept = num_idle = 0
     for name, data in arrivals:
         photo = decode_photo(data, where=name)
         view = find_board(name, photo, session.board)
@@ -114,13 +101,12 @@ def collect_live(session: Session, arrivals: Arrivals, photos: Path) -> int:
             if num_idle % TELL_AFTER_IMAGES == 0:
                 print(_why_nothing_is_kept(view, still=still))
             continue
-        num_idle = 0
-        (photos / f"live_{num_kept:04d}.jpg").write_bytes(data)
-        num_kept += 1
+        (photos / f"live_{first + num_kept:04d}.jpg").write_bytes(data)
+        num_kept, num_idle = num_kept + 1, 0
         session.keep(view, photo)
         if session.is_enough:
             break
-    return num_kept - num_before
+    return num_kept
 
 
 def _why_nothing_is_kept(view: BoardView | None, *, still: bool) -> str:
@@ -137,23 +123,19 @@ def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:
     Raises:
         NotFoundError: no such folder.
     """
-    if not folder.is_dir():
-        raise NotFoundError(f"{folder}: no such folder of photos")
     seen: set[Path] = set()
     while True:
-        new = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p not in seen)
-        for path in new:
-            seen.add(path)
-            yield path.name, path.read_bytes()
+        for path in photo_paths(folder):
+            if path not in seen:
+                seen.add(path)
+                yield path.name, path.read_bytes()
         wait(WATCH_PERIOD_S)
 
 
 def station_arrivals(newest: Callable[[], bytes], *, wait: Wait = time.sleep) -> Arrivals:
     """Yield new images of a station's camera at 5 Hz, indefinitely, skipping repeated ones.
 
-    Args:
-        newest: requests the newest JPEG image.
-        wait: sleeps between requests.
+    `newest` requests the newest JPEG image, `wait` sleeps between requests.
     """
     last = b""
     for number in count():

@@ -7,7 +7,6 @@ them.
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeVar
@@ -23,39 +22,10 @@ from dextouch.schemas import Matrix, first_problems, matrix_rows
 MATRICES_FILE = "calibration.json"
 DETAILS_FILE = "calibration_details.json"
 PICTURES = "pictures"
-MAX_AGE_S = 7 * 86_400.0
 
 Named = TypeVar("Named")
-_MATRICES: TypeAdapter[dict[str, Matrix]] = TypeAdapter(dict[str, Matrix])
-_DETAILS: TypeAdapter[dict[str, object]] = TypeAdapter(dict[str, object])
-
-# Limits of sigma (relative or absolute) above which `show` warns.
-MAX_FOCAL_SIGMA = 0.003
-# Column of a hand profile that holds the sigma of the knuckles, in metres.
-PROFILE_SIGMA = 7
-# Degrees and millimetres.
-MOUNT_LIMITS = (0.06, 0.8)
-BASE_LIMITS = (0.2, 2.0)
-MAX_GAIN_SIGMA = 0.05
-MAX_TAXEL_FAULTS = (0.01, 0.05)
-# Matrices of a glove that are metadata, or that are added by an episode.
-_ABOUT_GLOVES = ("noise_counts", "taxel_state", "cells", "refused_taxels")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Assessment of one calibration: age and accuracy.
-
-    `level` is OK, WARN or ERROR; `reasons` explain a level other than OK and what to do.
-    """
-
-    name: str
-    shape: str
-    made_at: str | None
-    age_days: float | None
-    sigma: str
-    level: str
-    reasons: tuple[str, ...]
+_MATRICES = TypeAdapter(dict[str, Matrix]).validate_json
+_DETAILS = TypeAdapter(dict[str, object]).validate_json
 
 
 def write_entry(
@@ -83,18 +53,34 @@ def write_entry(
     # Whole seconds, which are exact in float64.
     now = datetime.now(UTC).replace(microsecond=0)
     old = read_matrices(folder) if (folder / MATRICES_FILE).exists() else {}
-    details = _read_details(folder)
+    details_path = folder / DETAILS_FILE
+    details = _read(details_path, _DETAILS, "details by entry") if details_path.is_file() else {}
     stamped = {**matrices, f"{entry}_calibrated_at_unix_s": now.timestamp()}
     new = {name: matrix_rows(np.atleast_2d(matrix)) for name, matrix in stamped.items()}
-    details[entry] = {
-        **facts,
-        "made_at": now.isoformat(timespec="seconds"),
-        "software": f"dextouch {__version__}",
-        "matrices": sorted(new),
-    }
+    made = {"made_at": now.isoformat(timespec="seconds"), "software": f"dextouch {__version__}"}
+    details[entry] = {**facts, **made, "matrices": sorted(new)}
     folder.mkdir(parents=True, exist_ok=True)
-    _write(folder / DETAILS_FILE, details)
-    _write(folder / MATRICES_FILE, {**old, **new})
+    for path, content in ((details_path, details), (folder / MATRICES_FILE, {**old, **new})):
+        text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        replace_file(path, text.encode())
+
+
+def write_pose(
+    folder: Path, name: str, T: np.ndarray, sigma: tuple[float, float], facts: dict[str, object]
+) -> str:
+    """Write a transform as an entry and say how well it is known.
+
+    Args:
+        folder: of the calibration.
+        name: of the transform.
+        T: [4, 4] transform.
+        sigma: of its rotation (rad) and translation (m); the facts are extended by it.
+        facts: as in `write_entry`.
+    """
+    rad, m = sigma
+    facts |= {"sigma_rotation_deg": float(np.rad2deg(rad)), "sigma_translation_mm": m * 1e3}
+    write_entry(folder, name, {name: T, f"{name}_sigma_rad": rad, f"{name}_sigma_m": m}, facts)
+    return f"{name}: known to {np.rad2deg(rad):.3f}° and {m * 1e3:.2f} mm"
 
 
 def read_matrices(folder: Path) -> dict[str, Matrix]:
@@ -109,12 +95,7 @@ def read_matrices(folder: Path) -> dict[str, Matrix]:
         raise NotFoundError(
             f"{path}: no calibration there; `dextouch station calibrate camera --help` begins one"
         )
-    return _read(path, _MATRICES.validate_json, "named matrices")
-
-
-def _read_details(folder: Path) -> dict[str, object]:
-    path = folder / DETAILS_FILE
-    return _read(path, _DETAILS.validate_json, "details by entry") if path.is_file() else {}
+    return _read(path, _MATRICES, "named matrices")
 
 
 def _read(path: Path, validate: Callable[[bytes], Named], what: str) -> Named:
@@ -147,132 +128,3 @@ def named_matrix(matrices: Mapping[str, Matrix], name: str, shape: tuple[int, in
     if matrix.shape != shape:
         raise InvalidInputError(f"calibration {name!r}: got {matrix.shape}, expected {shape}")
     return matrix
-
-
-def judge(matrices: Mapping[str, Matrix], *, now: datetime) -> list[Finding]:
-    """Assess age and sigma of every calibration among the matrices."""
-    return [
-        _judge_one(name, matrices, now)
-        for name in sorted(matrices)
-        if not _is_companion(name, matrices)
-    ]
-
-
-def _is_companion(name: str, matrices: Mapping[str, Matrix]) -> bool:
-    """Whether a matrix is metadata of another one."""
-    if name.endswith("calibrated_at_unix_s") or "_sigma_" in name:
-        return True
-    side = name.removeprefix("tactile_").split("_")[0]
-    if name in {f"tactile_{side}_{about}" for about in _ABOUT_GLOVES}:
-        return True
-    camera = name.removeprefix("distortion_").removeprefix("image_size_").removesuffix("_px")
-    return camera != name and f"K_{camera}" in matrices
-
-
-def entry_of(name: str) -> str:
-    """The entry that a matrix belongs to: its name without the unit."""
-    for unit in ("_counts_per_kpa", "_counts", "_ns"):
-        name = name.removesuffix(unit)
-    return name
-
-
-def _judge_one(name: str, matrices: Mapping[str, Matrix], now: datetime) -> Finding:
-    entry, reasons = entry_of(name), []
-    made_at = age_days = None
-    if f"{entry}_calibrated_at_unix_s" in matrices:
-        made = datetime.fromtimestamp(
-            float(matrices[f"{entry}_calibrated_at_unix_s"][0][0]), tz=UTC
-        )
-        made_at, age_s = made.isoformat(timespec="seconds"), (now - made).total_seconds()
-        age_days = age_s / 86_400
-        if age_s > MAX_AGE_S:
-            reasons.append(f"{age_days:.0f} days old, expected at most 7; calibrate again")
-        if age_s < -60:
-            reasons.append("made in the future; set the clock of one of the two machines")
-    else:
-        reasons.append(f"age unknown; {_where_from(name)}")
-    sigma, sigma_reasons = _sigma(name, matrices)
-    reasons += sigma_reasons
-    level = "WARN" if reasons else "OK"
-    if any(reason.startswith("ERROR ") for reason in reasons):
-        level = "ERROR"
-    shape = "x".join(str(n) for n in np.shape(matrices[name]))
-    stated = tuple(reason.removeprefix("ERROR ") for reason in reasons)
-    return Finding(name, shape, made_at, age_days, sigma, level, stated)
-
-
-def _where_from(name: str) -> str:
-    """Advice for a matrix of unknown age, which may not come from this command."""
-    if name.endswith("_latency_ns"):
-        return (
-            "measured by the station where the device answers time requests, a camera's is its "
-            "settings' latency_ms; else: dextouch station calibrate latency"
-        )
-    if name.startswith("T_tracker_") and "_wrist_" in name:
-        return "not of this command: measure where the wrist sits on its tracker"
-    return "calibrate again with this command"
-
-
-def _sigma(name: str, matrices: Mapping[str, Matrix]) -> tuple[str, list[str]]:
-    """Description of the sigma, and problems with it."""
-    found = {
-        suffix: np.array(matrices[f"{entry_of(name)}_sigma_{suffix}"])
-        for suffix in ("px", "rad", "m", "counts", "counts_per_kpa", "ns")
-        if f"{entry_of(name)}_sigma_{suffix}" in matrices
-    }
-    if name.startswith("hand_profile_"):
-        return f"knuckles {np.array(matrices[name])[:, PROFILE_SIGMA].max() * 1e3:.1f} mm", []
-    if not found:
-        return "unknown", ["sigma unknown"]
-    if "px" in found:
-        relative = float((found["px"][0, :2] / np.diag(matrices[name])[:2]).max())
-        limit = MAX_FOCAL_SIGMA
-        wrong = f"focal length known to {relative:.2%}, expected {limit:.1%}; add views"
-        return f"focal length {relative:.2%}", [wrong] if relative > limit else []
-    if "rad" in found and "m" in found:
-        limits = BASE_LIMITS if name == "T_world_base" else MOUNT_LIMITS
-        return _pose_sigma(float(found["rad"].max()), float(found["m"].max()), limits)
-    if "counts_per_kpa" in found:
-        return _gain_sigma(name, found["counts_per_kpa"], matrices)
-    return _plain_sigma(found), []
-
-
-def _plain_sigma(found: Mapping[str, np.ndarray]) -> str:
-    if "ns" in found:
-        return f"{found['ns'].max() * 1e-6:.2f} ms"
-    if "rad" in found:
-        return f"{np.rad2deg(found['rad'].max()):.2f}°"
-    return f"{np.median(found['counts']):.2f} counts"
-
-
-def _pose_sigma(
-    rotation_rad: float, translation_m: float, limits: tuple[float, float]
-) -> tuple[str, list[str]]:
-    stated = f"{np.rad2deg(rotation_rad):.3f}°, {translation_m * 1e3:.2f} mm"
-    max_deg, max_mm = limits
-    good = np.rad2deg(rotation_rad) <= max_deg and translation_m * 1e3 <= max_mm
-    reason = f"expected {max_deg:g}° and {max_mm:g} mm; add views, turned further"
-    return stated, [] if good else [reason]
-
-
-def _gain_sigma(
-    name: str, sigma: np.ndarray, matrices: Mapping[str, Matrix]
-) -> tuple[str, list[str]]:
-    known = sigma > 0
-    if not known.any():
-        return "unknown", ["sigma unknown"]
-    relative = float(np.median(sigma[known] / np.array(matrices[name])[known]))
-    reasons = []
-    if relative > MAX_GAIN_SIGMA:
-        reasons.append(f"gain known to {relative:.1%}, expected {MAX_GAIN_SIGMA:.0%}; press harder")
-    state = np.array(matrices.get(f"{entry_of(name).removesuffix('_gain')}_taxel_state", [[0.0]]))
-    share = np.count_nonzero(state) / 320
-    if share > MAX_TAXEL_FAULTS[0]:
-        worst = "ERROR " if share > MAX_TAXEL_FAULTS[1] else ""
-        reasons.append(f"{worst}{np.count_nonzero(state)} of 320 taxels faulty")
-    return f"gain {relative:.2%}", reasons
-
-
-def _write(path: Path, content: object) -> None:
-    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    replace_file(path, text.encode())

@@ -20,9 +20,8 @@ from services.acquisition.live import LiveView
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.recorder import Recorder
 from services.alignment.calibration.tactile_baseline import TactileCalibration
-from services.cli.calibrate import glove, guided
+from services.cli.calibrate import glove, glove_takes
 from services.cli.calibrate.command import main
-from services.cli.calibrate.glove_takes import read_presses
 
 TRUTH = GloveCalibration.seeded("left", 4)
 
@@ -71,8 +70,8 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path, monkeypatch):
-    monkeypatch.setattr(guided, "REST_S", 2.0)
-    monkeypatch.setattr(guided, "PRESS_S", 1.5)
+    monkeypatch.setattr(glove_takes, "REST_S", 2.0)
+    monkeypatch.setattr(glove_takes, "PRESS_S", 1.5)
     clock = VirtualClock(10**9)
     decoder = TactileGloveDecoder("left")
     driver = Driver("glove_left", transport=PtyPort("a").transport, decoder=decoder, clock=clock)
@@ -121,12 +120,11 @@ def guide(bench, tmp_path, script, monkeypatch, **changed):
     """The whole command with a fake link and operator."""
     ask, asked = operator(bench, script)
     given = options(tmp_path, **changed)
-    takes = guided.StationTakes(
+    takes = glove_takes.StationTakes(
         bench.request, spool=given.spool, has_store=given.store is not None, wait=bench.wait
     )
-    walk = guided.walk
-    monkeypatch.setattr(guided, "station_takes", lambda _: takes)
-    monkeypatch.setattr(guided, "walk", lambda o, t: walk(o, t, ask=ask))
+    record = glove_takes.record_takes
+    monkeypatch.setattr(glove, "record_takes", lambda o: record(o, takes, ask=ask))
     return glove.calibrate(given), asked
 
 
@@ -168,7 +166,7 @@ def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsy
     assert np.abs(gain_error).max() < 0.02
     # The good takes are there, the dropped one too; the kept list repeats the calibration.
     assert len(list((tmp_path / "spool").iterdir())) == 4
-    rows = read_presses(tmp_path / "to/presses_left.csv", 0.02)
+    rows = glove_takes.read_presses(tmp_path / "to/presses_left.csv", 0.02)
     assert [round(row.pressure_kpa, 2) for row in rows] == [10.0, 30.0]
     arguments = [
         "glove",
@@ -191,10 +189,10 @@ def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsy
 def test_a_glove_that_was_touched_rests_once_more(bench, tmp_path, monkeypatch, capsys):
     bench.creeps = True
     ask, _ = operator(bench, [("", 20.0), ("", 0.0), ("", None)])
-    takes = guided.StationTakes(
+    takes = glove_takes.StationTakes(
         bench.request, spool=tmp_path / "spool", has_store=False, wait=bench.wait
     )
-    rest, rows = guided.walk(options(tmp_path), takes, ask=ask)
+    rest, rows = glove_takes.record_takes(options(tmp_path), takes, ask=ask)
     assert rows == []
     assert rest.endswith("-2")
     assert "Once more: rest take" in capsys.readouterr().out
@@ -204,7 +202,7 @@ def test_a_glove_that_was_touched_rests_once_more(bench, tmp_path, monkeypatch, 
 
 def test_presses_that_do_not_hold_are_not_used(bench, tmp_path, capsys):
     ask, _ = operator(bench, [("", 0.0), ("20", None), ("", 20.0), ("", None)])
-    takes = guided.StationTakes(
+    takes = glove_takes.StationTakes(
         bench.request, spool=tmp_path / "spool", has_store=False, wait=bench.wait
     )
 
@@ -212,7 +210,7 @@ def test_presses_that_do_not_hold_are_not_used(bench, tmp_path, capsys):
         bench.creeps = "Put" in question
         return ask(question)
 
-    _, rows = guided.walk(options(tmp_path), takes, ask=creeping)
+    _, rows = glove_takes.record_takes(options(tmp_path), takes, ask=creeping)
     assert rows == []
     assert "changed while it lay" in capsys.readouterr().out
 
@@ -221,7 +219,7 @@ def test_interrupted_takes_are_discarded(bench, tmp_path):
     def interrupted(_):
         raise KeyboardInterrupt
 
-    takes = guided.StationTakes(
+    takes = glove_takes.StationTakes(
         bench.request, spool=tmp_path / "spool", has_store=False, wait=interrupted
     )
     with pytest.raises(KeyboardInterrupt):
@@ -233,7 +231,7 @@ def test_interrupted_takes_are_discarded(bench, tmp_path):
 def test_a_busy_recorder_is_left_alone(bench, tmp_path):
     bench.recorder.arm(TakePrompt(task="t", instruction="i"))
     bench.recorder.record("other")
-    takes = guided.StationTakes(
+    takes = glove_takes.StationTakes(
         bench.request, spool=tmp_path / "spool", has_store=False, wait=bench.wait
     )
     with pytest.raises(ConflictError, match="while recording"):
@@ -242,13 +240,13 @@ def test_a_busy_recorder_is_left_alone(bench, tmp_path):
 
 
 def test_takes_of_another_machine_come_from_the_store(bench, tmp_path):
-    takes = guided.StationTakes(
+    takes = glove_takes.StationTakes(
         bench.request, spool=tmp_path / "not-here", has_store=False, wait=bench.wait
     )
     with pytest.raises(NotFoundError, match=r"--spool.*--store"):
         takes.record("take-1", "rest", 1.0, str.upper)
     bench.uploaded = True
-    takes = guided.StationTakes(
+    takes = glove_takes.StationTakes(
         bench.request, spool=tmp_path / "not-here", has_store=True, wait=bench.wait
     )
     assert takes.record("take-2", "rest", 1.0, str.upper) == ("take-2", "TAKE-2")
@@ -256,11 +254,11 @@ def test_takes_of_another_machine_come_from_the_store(bench, tmp_path):
 
 
 def test_nobody_there_and_contradicting_options_are_refused(bench, tmp_path):
-    takes = guided.StationTakes(
+    takes = glove_takes.StationTakes(
         bench.request, spool=tmp_path / "spool", has_store=False, wait=bench.wait
     )
     with pytest.raises(InvalidInputError, match="nobody answers"):
-        guided.walk(options(tmp_path), takes, ask=operator(bench, [])[0])
+        glove_takes.record_takes(options(tmp_path), takes, ask=operator(bench, [])[0])
     with pytest.raises(InvalidInputError, match="one of the two"):
         glove.calibrate(options(tmp_path, rest="take"))
     with pytest.raises(InvalidInputError, match="--url of a running station"):
@@ -277,7 +275,7 @@ def test_nobody_there_and_contradicting_options_are_refused(bench, tmp_path):
     ],
 )
 def test_pressures_as_they_are_typed(words, kpa, pads):
-    row = guided.parse_press(words, 0.02)
+    row = glove_takes.parse_press(words, 0.02)
     assert row.pressure_kpa == pytest.approx(kpa)
     assert row.sigma_kpa == pytest.approx(0.02 * kpa)
     assert row.pads == pads
@@ -286,9 +284,9 @@ def test_pressures_as_they_are_typed(words, kpa, pads):
 @pytest.mark.parametrize("words", ["0", "-3", "3 3", "1.2.3", "2kg", "2kg/0cm2", "palm", "kpa"])
 def test_what_is_no_pressure_is_refused(words):
     with pytest.raises(InvalidInputError, match="pressure: got"):
-        guided.parse_press(words, 0.02)
+        glove_takes.parse_press(words, 0.02)
     with pytest.raises(UnknownNameError):
-        guided.parse_press("3 toe", 0.02)
+        glove_takes.parse_press("3 toe", 0.02)
 
 
 def test_a_station_starts_before_its_gloves_are_calibrated(bench):

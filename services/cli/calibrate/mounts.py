@@ -1,4 +1,4 @@
-"""Command `dextouch station calibrate hand-eye`: mount of a camera on its tracker."""
+"""Commands `hand-eye` and `robot-base` of `dextouch station calibrate`: transforms from poses."""
 
 import argparse
 from dataclasses import dataclass, replace
@@ -10,12 +10,13 @@ from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import invert
 from services.alignment.calibration.board_views import BoardViews
 from services.alignment.calibration.hand_eye import solve_hand_eye
+from services.alignment.calibration.robot_base import solve_robot_base
 from services.cli.calibrate.advice import turn_coverage
-from services.cli.calibrate.boards import board_pose, is_ambiguous, parse_board
-from services.cli.calibrate.camera import find_boards, read_lens, tell_left_out
+from services.cli.calibrate.boards import board_pose, is_ambiguous, parse_board, read_photos
+from services.cli.calibrate.camera import read_lens
+from services.cli.calibrate.files import pairs_of, poses_of_photos, read_json
 from services.cli.calibrate.pictures import turns_picture
-from services.cli.calibrate.poses import pairs_of, poses_of_photos, read_json
-from services.cli.calibrate.record import write_entry, write_picture
+from services.cli.calibrate.record import write_picture, write_pose
 
 # Tracker of each camera, by the stream names of recordings.
 TRACKERS = {"head": "head", "wrist_left": "left", "wrist_right": "right"}
@@ -24,6 +25,8 @@ POSES_HELP = (
     '[{"image": "a.jpg", "T_world_tracker": 4x4}, …], or without photos '
     "[[T_world_tracker, T_camera_board], …]"
 )
+PAIRS_HELP = "JSON: [[T_world_tracker, T_base_effector], …], each 4x4, both of the same moment"
+BASE_NAME = "T_world_base"
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class PosedViews:
     blurred: tuple[str, ...] = ()
 
 
-def calibrate(options: argparse.Namespace) -> dict[str, object]:
+def calibrate_mount(options: argparse.Namespace) -> dict[str, object]:
     """Calibrate the mount of one camera on its tracker.
 
     Raises:
@@ -49,80 +52,98 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
         InvalidInputError: poses and photos that do not match or contradict each other.
         NotFoundError: no photos, poses or intrinsics.
     """
-    views = read_views(options)
-    turns = turn_coverage(views.Ts_world_tracker)
+    views = _read_views(options)
+    trackers, boards = views.Ts_world_tracker, views.Ts_camera_board
+    turns = turn_coverage(trackers)
     picture = f"hand_eye_{options.camera}.svg"
     # Drawn before solving, so that it is available after a refusal.
     path = write_picture(options.to, picture, turns_picture(turns, views.names, None))
     print(f"{len(views.names)} views; turns of the tracker: {path}")
     for words in turns.todo:
         print(f"next: {words}")
-    report: dict[str, object] = {
+    facts: dict[str, object] = {
         "num_views": len(views.names),
         "spread_deg": np.rad2deg(turns.spread_rad).tolist(),
         "next": list(turns.todo),
     }
     if options.check:
-        return report
-    result = solve_hand_eye(views.Ts_world_tracker, views.Ts_camera_board, views=views.corners)
+        return facts
+    result = solve_hand_eye(trackers, boards, views=views.corners)
     X = result.T_tracker_camera
-    off_mm = board_scatter_mm(views, X)
+    # How far each view puts the board from its mean.
+    places_m = (trackers @ X @ boards)[:, :3, 3]
+    off_mm = np.linalg.norm(places_m - places_m.mean(axis=0), axis=1) * 1e3
     left_out = [views.names[index] for index in result.left_out_views]
     for view in left_out:
         print(f"  {view} is far off: left out; did the tracker stand still, and is it its pose?")
-    kept = np.delete(off_mm, result.left_out_views)
     write_picture(options.to, picture, turns_picture(turns, views.names, off_mm))
-    name = f"T_tracker_{TRACKERS[options.camera]}_camera_{options.camera}"
-    facts = report | {
+    rms_mm = float(np.sqrt(np.mean(np.delete(off_mm, result.left_out_views) ** 2)))
+    facts |= {
         "camera": options.camera,
-        "sigma_rotation_deg": float(np.rad2deg(result.sigma_rotation_rad)),
-        "sigma_translation_mm": result.sigma_translation_m * 1e3,
-        "board_scatter_rms_mm": float(np.sqrt(np.mean(kept**2))),
+        "board_scatter_rms_mm": rms_mm,
         "left_out": left_out,
         "blurred": list(views.blurred),
         "translation_mm": (X[:3, 3] * 1e3).tolist(),
     }
-    matrices: dict[str, np.ndarray | float] = {
-        name: X,
-        f"{name}_sigma_rad": result.sigma_rotation_rad,
-        f"{name}_sigma_m": result.sigma_translation_m,
+    name = f"T_tracker_{TRACKERS[options.camera]}_camera_{options.camera}"
+    sigma = (result.sigma_rotation_rad, result.sigma_translation_m)
+    known = write_pose(options.to, name, X, sigma, facts)
+    print(f"{known}; the board scatters by {rms_mm:.1f} mm RMS")
+    return facts
+
+
+def calibrate_base(options: argparse.Namespace) -> dict[str, object]:
+    """Estimate a robot's base from pairs of poses of a tracker on the effector and the effector.
+
+    Raises:
+        DegenerateMotionError: the effector was rotated or moved too little; the message names the
+            axes.
+        InvalidInputError: too few pairs, or pairs that contradict each other.
+        NotFoundError: no such file.
+    """
+    pairs = pairs_of(read_json(options.poses, PAIRS_HELP), options.poses, PAIRS_HELP)
+    mount = np.eye(4) if options.same_frame else None
+    result = solve_robot_base(pairs[:, 0], pairs[:, 1], T_effector_tracker=mount)
+    left_out = list(result.left_out_views)
+    for index in left_out:
+        print(f"  pair {index} is far off: left out; did the robot stand still?")
+    rms_deg, rms_mm = np.rad2deg(result.rotation_rms_rad), result.translation_rms_m * 1e3
+    facts: dict[str, object] = {
+        "num_pairs": len(pairs) - len(left_out),
+        "residual_rms_deg": float(rms_deg),
+        "residual_rms_mm": rms_mm,
+        "left_out": left_out,
+        "T_effector_tracker": result.T_effector_tracker.tolist(),
     }
-    write_entry(options.to, name, matrices, facts)
+    sigma = (result.sigma_rotation_rad, result.sigma_translation_m)
+    known = write_pose(options.to, BASE_NAME, result.T_world_base, sigma, facts)
     print(
-        f"{name}: known to {facts['sigma_rotation_deg']:.3f}° and "
-        f"{facts['sigma_translation_mm']:.2f} mm; the board scatters by "
-        f"{facts['board_scatter_rms_mm']:.1f} mm RMS"
+        f"{known} from {facts['num_pairs']} pairs; they scatter by {rms_deg:.3f}° and "
+        f"{rms_mm:.2f} mm RMS"
     )
     return facts
 
 
-def read_views(options: argparse.Namespace) -> PosedViews:
+def _read_views(options: argparse.Namespace) -> PosedViews:
     """Read poses from the file, and boards from the photos or from the same file."""
     path, entries = options.poses, None
     if path.suffix.lower() == ".json":
         entries = read_json(path, POSES_HELP)
     if entries is not None and all(isinstance(entry, list) for entry in entries):
-        pairs = pairs_of(entries, path, POSES_HELP)
-        names = tuple(f"view {index}" for index in range(len(pairs)))
-        views = PosedViews(names, pairs[:, 0], pairs[:, 1])
+        trackers, boards = np.swapaxes(pairs_of(entries, path, POSES_HELP), 0, 1)
+        names = tuple(f"view {index}" for index in range(len(trackers)))
+        views = PosedViews(names, trackers, invert(boards) if options.invert == "board" else boards)
     else:
         views = _with_photos(poses_of_photos(path, entries, POSES_HELP), options)
-    tracker, board = views.Ts_world_tracker, views.Ts_camera_board
-    if options.invert == "tracker":
-        tracker = invert(tracker)
-    if options.invert == "board" and views.corners is not None:
-        raise InvalidInputError("--invert board: the board's poses come from photos and are right")
-    if options.invert == "board":
-        board = invert(board)
+        if options.invert == "board":
+            raise InvalidInputError(
+                "--invert board: the board's poses come from photos and are right"
+            )
     if len(views.names) < 2:
         raise InvalidInputError(f"hand-eye: got {len(views.names)} views, expected at least 4")
-    return replace(views, Ts_world_tracker=tracker, Ts_camera_board=board)
-
-
-def board_scatter_mm(views: PosedViews, T_tracker_camera: np.ndarray) -> Float64[np.ndarray, " n"]:
-    """Distance of the board in each view from its mean over all views, in mm."""
-    places = (views.Ts_world_tracker @ T_tracker_camera @ views.Ts_camera_board)[:, :3, 3]
-    return np.linalg.norm(places - places.mean(axis=0), axis=1) * 1e3
+    if options.invert == "tracker":
+        views = replace(views, Ts_world_tracker=invert(views.Ts_world_tracker))
+    return views
 
 
 def _with_photos(poses: dict[str, np.ndarray], options: argparse.Namespace) -> PosedViews:
@@ -141,29 +162,28 @@ def _with_photos(poses: dict[str, np.ndarray], options: argparse.Namespace) -> P
     if absent:
         raise NotFoundError(f"{options.photos}: has no photo {', '.join(absent[:5])}")
     lens, calibrated_px = read_lens(options.intrinsics or options.to, options.camera)
-    found = find_boards(paths, board)
-    tell_left_out(found)
-    if calibrated_px != found.size_px:
+    photos = read_photos(paths, board)
+    photos.tell_left_out()
+    if calibrated_px != photos.size_px:
         raise InvalidInputError(
-            f"photos: got {found.size_px[0]} by {found.size_px[1]} px, but K was measured at "
+            f"photos: got {photos.size_px[0]} by {photos.size_px[1]} px, but K was measured at "
             f"{calibrated_px[0]} by {calibrated_px[1]}; take the photos in the same mode of the "
             "camera"
         )
-    names = tuple(view.name for view in found.views)
-    if not names:
+    if not photos.views:
         raise InvalidInputError(
             f"{options.photos}: none of {len(paths)} photos shows the board sharply "
-            f"({len(found.blurred)} are blurred)"
+            f"({len(photos.blurred)} are blurred)"
         )
     return PosedViews(
-        names,
-        np.stack([poses[name] for name in names]),
-        np.stack([board_pose(view, lens) for view in found.views]),
+        tuple(view.name for view in photos.views),
+        np.stack([poses[view.name] for view in photos.views]),
+        np.stack([board_pose(view, lens) for view in photos.views]),
         BoardViews(
-            [view.points_board.astype(np.float64) for view in found.views],
-            [view.pixels.astype(np.float64) for view in found.views],
+            [view.points_board.astype(np.float64) for view in photos.views],
+            [view.pixels.astype(np.float64) for view in photos.views],
             lens.K,
             lens.distortion,
         ),
-        found.blurred,
+        photos.blurred,
     )

@@ -1,17 +1,23 @@
-"""Files of poses for calibrations: pairs of matrices, or a pose for each photo."""
+"""Inputs of calibrations: rows of CSV files, poses, and streams of takes."""
 
 import csv
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64, Shaped
 from pydantic import BaseModel, ValidationError, field_validator, model_validator
 
+from dextouch.episodes import EpisodeStore, RecordingReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, NotFoundError, ShapeError
 from dextouch.geometry import transform_from_pose
 from dextouch.schemas import Matrix, first_problems, matrix_rows
+from dextouch.streams import SampleBatch, StreamDescriptor
+from services.alignment.synchronization.stream_clock import time_stream
 
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 
@@ -43,6 +49,58 @@ class PhotoPose(BaseModel):
         return rows
 
 
+@dataclass(frozen=True)
+class TakenStream:
+    """All samples of one stream of a take, with the take's calibration."""
+
+    take: str
+    descriptor: StreamDescriptor
+    batch: SampleBatch
+    calibration: Mapping[str, Matrix]
+
+    def number(self, name: str) -> float:
+        """Value of a 1 × 1 matrix of the calibration; 0 if missing."""
+        return float(self.calibration.get(name, ((0.0,),))[0][0])
+
+    def timed(self) -> tuple[Int64[np.ndarray, " n"], Shaped[np.ndarray, "n ..."]]:
+        """Times on the host's clock without the calibrated latency, and the values at them.
+
+        Raises:
+            ClockFitError: no clock can be fitted to the stamps.
+        """
+        latency_ns = round(self.number(f"{self.descriptor.name}_latency_ns"))
+        timing = time_stream(self.batch, self.descriptor, latency_ns=latency_ns)
+        return timing.t_host_ns, self.batch.values[timing.kept]
+
+
+def read_stream(take: str, name: str, store: str | None) -> TakenStream:
+    """Read one stream of a spool folder, or of a recording in a store.
+
+    Args:
+        take: path of a spool folder, or id of a recording.
+        name: name of the stream.
+        store: URL of the store that has the recording; None for folders only.
+
+    Raises:
+        NotFoundError: no such take, or none with this stream.
+    """
+    reader: SpoolReader | RecordingReader
+    if Path(take).is_dir():
+        reader = SpoolReader(Path(take))
+    elif store:
+        reader = EpisodeStore(store).recording(take)
+    else:
+        raise NotFoundError(
+            f"take {take!r}: no such folder; name a take of the station's spool, or add --store "
+            "URL for the id of a recording"
+        )
+    if name not in reader.streams:
+        raise NotFoundError(
+            f"take {take!r}: has no {name!r}, only {', '.join(sorted(reader.streams))}"
+        )
+    return TakenStream(take, reader.streams[name], reader.read(name), reader.attributes.calibration)
+
+
 def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row]:
     """Rows of a CSV file in UTF-8, at least one; empty cells count as absent.
 
@@ -56,11 +114,9 @@ def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row
         NotFoundError: no such file.
         InvalidInputError: not such a CSV; the message names the line.
     """
-    if not path.is_file():
-        raise NotFoundError(f"{path}: no such file; expected {expected}")
     rows = []
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with _existing(path, expected).open(encoding="utf-8", newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             for cells in reader:
                 given = {str(column): cell for column, cell in cells.items() if cell}
@@ -81,10 +137,8 @@ def read_json(path: Path, expected: str) -> list[object]:
         NotFoundError: no such file.
         InvalidInputError: not a JSON list, or empty.
     """
-    if not path.is_file():
-        raise NotFoundError(f"{path}: no such file of poses; expected {expected}")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(_existing(path, expected).read_text(encoding="utf-8"))
     except ValueError as error:
         raise InvalidInputError(f"{path}: no JSON ({error}); expected {expected}") from error
     if not isinstance(content, list) or not content:
@@ -129,6 +183,12 @@ def poses_of_photos(
             raise InvalidInputError(f"{path}: image {row.image!r} is named twice")
         poses[row.image] = np.array(row.T_world_tracker)
     return poses
+
+
+def _existing(path: Path, expected: str) -> Path:
+    if not path.is_file():
+        raise NotFoundError(f"{path}: no such file; expected {expected}")
+    return path
 
 
 def _checked(kind: type[Row], given: object, where: str, expected: str) -> Row:
