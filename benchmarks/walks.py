@@ -33,7 +33,7 @@ from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.uploader import Uploader
-from services.cli.demo.background import served
+from services.cli.servers import served
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.policies.asking import action_chunk, ask

@@ -19,7 +19,7 @@ from dextouch.clients import RolloutClient
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.cli.demo.background import served
+from services.cli.servers import served
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.generation.demonstrations import imagine_episode
 from services.world_model.checkpoints import default_checkpoint

@@ -1,11 +1,14 @@
-"""Several service applications served from one event loop until stopped."""
+"""Several service applications served from one event loop, or from a background thread."""
 
 import asyncio
 import signal
 import socket
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 
 import uvicorn
 from fastapi import FastAPI
@@ -14,6 +17,7 @@ from dextouch.errors import ConflictError, UnavailableError
 from dextouch.serving import server_options
 
 BACKLOG = 128
+START_TIMEOUT_S = 60.0
 
 
 class Server(uvicorn.Server):
@@ -133,3 +137,40 @@ async def _announce(servers: Sequence[Server], on_ready: Callable[[], None]) -> 
     for server in servers:
         await server.answers.wait()
     on_ready()
+
+
+@contextmanager
+def served(apps: Mapping[str, FastAPI]) -> Iterator[dict[str, str]]:
+    """Context manager that serves applications in a thread on loopback; yields URLs by name.
+
+    Raises:
+        UnavailableError: they did not start, or one terminated unexpectedly.
+    """
+    placed = [(bind(name, host="127.0.0.1", port=0), app) for name, app in apps.items()]
+    answering = threading.Event()
+    stopper: Future[Callable[[], object]] = Future()
+
+    async def serve() -> None:
+        stop = asyncio.Event()
+        stopper.set_result(partial(asyncio.get_running_loop().call_soon_threadsafe, stop.set))
+        await serve_all(placed, stop=stop, on_ready=answering.set)
+
+    with ThreadPoolExecutor(1, "services") as pool:
+        serving = pool.submit(asyncio.run, serve())
+        serving.add_done_callback(lambda _: answering.set())
+        has_begun = answering.wait(START_TIMEOUT_S) and not serving.done()
+        try:
+            if has_begun:
+                yield {place.name: place.url for place, _ in placed}
+        finally:
+            # The loop is closed where they ended by themselves.
+            with suppress(RuntimeError):
+                stopper.result()()
+            failure = serving.exception()
+            if has_begun and failure is not None:
+                raise UnavailableError("a service ended by itself") from failure
+    if not has_begun:
+        raise UnavailableError(
+            f"services {', '.join(apps)} did not start within {START_TIMEOUT_S:.0f} s; the log "
+            "above says why"
+        ) from failure

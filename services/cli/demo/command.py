@@ -1,10 +1,14 @@
 """Command line `dextouch demo`: runs all stages and writes report.json and report.html."""
 
+import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from fastapi import FastAPI
 
 from dextouch import __version__
@@ -16,31 +20,68 @@ from dextouch.serving import configure_logging
 from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, create_world_app
 from services.alignment.app import create_app as create_alignment
 from services.alignment.settings import AlignmentSettings
-from services.cli.demo.background import served
-from services.cli.demo.judging import BASELINE, MODEL, judge, ladder
-from services.cli.demo.models import committed_models, refuse_trained, train_models, use_one_thread
-from services.cli.demo.pictures import collect
 from services.cli.demo.prediction import measure_prediction, read_scene
 from services.cli.demo.recording import (
     Take,
     align,
     forget_take,
+    make_truth,
     measure,
     record_take,
     upload,
 )
+from services.cli.demo.scoring import (
+    BASELINE,
+    MODEL,
+    committed_models,
+    judge,
+    ladder,
+    refuse_trained,
+    train_models,
+    use_one_thread,
+)
 from services.cli.demo.settings import DemoPlan, parse
 from services.cli.demo.table import show
-from services.cli.demo.timing import Stages
-from services.cli.demo.truth import make_truth
+from services.cli.servers import served
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
-from services.evaluation.reporting import write_report
+from services.evaluation.reporting import (
+    ActionPicture,
+    EpisodePicture,
+    PredictionPicture,
+    ReportPictures,
+    write_report,
+)
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 
 # Errors of both takes; the report shows the worse one.
 COMMON_ERRORS = ("taxel_mae_kpa", "fingertip_error_mm", "wrist_error_mm", "wrist_error_deg")
+ERRORS_BY_STREAM = ("clock_rms_ms", "latency_ms", "latency_error_ms", "num_dropped")
+NUM_MOMENTS = 7
+CAMERA = "camera_head"
+
+
+class Stages:
+    """Wall time of the stages of a run, in order."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str, what: str) -> Iterator[None]:
+        """Context manager that times a stage and prints `what` at its start."""
+        print(f"{len(self.seconds) + 1}. {what} …", file=sys.stderr, flush=True)
+        begin_s = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = time.perf_counter() - begin_s
+        print(f"   {self.seconds[name]:.1f} s", file=sys.stderr, flush=True)
+
+    def rows(self) -> list[dict[str, object]]:
+        """Rows for `report.json`."""
+        return [{"name": name, "seconds": round(s, 3)} for name, s in self.seconds.items()]
 
 
 def main(argv: Sequence[str]) -> int:
@@ -68,12 +109,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
-    """Run all stages and return the contents of `report.json`.
-
-    Args:
-        plan: what to record, train and score.
-        folder: scratch folder.
-    """
+    """Run all stages and return the contents of `report.json`; `folder` is for scratch."""
     stages, truths = Stages(), EpisodeStore(folder / "truth")
     with stages.stage("truth", "recording the truth in the physics twin"):
         truth = make_truth(plan, folder / "truth")
@@ -97,7 +133,7 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
     report = {
         "about": {
             "version": __version__,
-            "world model": describe(models.world_model.description),
+            "world model": _described(models.world_model.description),
             "held-out seeds": f"{plan.seeds[0]} … {plan.seeds[-1]}",
         },
         "success_probe": models.probe.metadata.metrics,
@@ -115,7 +151,7 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
         **scores,
     }
     with stages.stage("report", "drawing the report"):
-        write_report(report, collect(takes, prediction.pictures), plan.output / "report.html")
+        write_report(report, _pictures(takes, prediction.pictures), plan.output / "report.html")
     return {**report, "stages": stages.rows()}
 
 
@@ -128,7 +164,7 @@ def _apps(jobs_folder: Path, world_model: World[Any]) -> dict[str, FastAPI]:
     alignment = AlignmentSettings(
         store_url=store, jobs_folder=jobs_folder, align_new=False, log_level="warning"
     )
-    twin = TwinWorld(TwinSettings(cameras=("camera_head",)))
+    twin = TwinWorld(TwinSettings(cameras=(CAMERA,)))
     imagined = {MODEL: world_model, BASELINE: CopyFirstWorld.beside(world_model.description)}
     served_worlds = WorldServiceSettings()
     return {
@@ -153,22 +189,48 @@ def _take(
         return measure(store, truth, recorded, job.alignment_id, devices=devices)
 
 
-def describe(world: WorldDescription) -> str:
-    """Short description of a world model: name, form and digest."""
+def _described(world: WorldDescription) -> str:
     form = "state model" if world.object_names else "paper's form"
     return f"{world.name}, {form}, {world.digest[:12]}"
 
 
 def worst_errors(takes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """The worse of the takes for every error; streams in both are prefixed by their take."""
-    errors: dict[str, Any] = {}
-    for name in ("clock_rms_ms", "latency_ms", "latency_error_ms", "num_dropped"):
-        errors[name] = {
-            f"{take_name}.{stream}": value
-            for take_name, errors_of_take in takes.items()
-            for stream, value in errors_of_take[name].items()
+    errors: dict[str, Any] = {
+        name: {
+            f"{t}.{stream}": e for t, found in takes.items() for stream, e in found[name].items()
         }
-    for name in COMMON_ERRORS:
-        errors[name] = max(found[name] for found in takes.values())
-    errors["taxel_iou"] = min(found["taxel_iou"] for found in takes.values())
-    return errors
+        for name in ERRORS_BY_STREAM
+    }
+    errors |= {name: max(found[name] for found in takes.values()) for name in COMMON_ERRORS}
+    return errors | {"taxel_iou": min(found["taxel_iou"] for found in takes.values())}
+
+
+def _pictures(
+    takes: Mapping[str, Take], predictions: tuple[PredictionPicture, ...]
+) -> ReportPictures:
+    robot = takes["robot"].episode
+    measured = robot.window(0, robot.num_steps, cameras=())
+    commanded = None
+    if "action_commanded" in robot.streams:
+        window = robot.window(0, robot.num_steps, cameras=(), action_kind="commanded")
+        commanded = window.actions
+    times_s = (measured.t_ref_ns - measured.t_ref_ns[0]) * 1e-9
+    return ReportPictures(
+        episodes=tuple(_strip(take.episode, name.capitalize()) for name, take in takes.items()),
+        clock_residuals_ms=takes["human"].clock_residuals_ms,
+        actions=ActionPicture(times_s, measured.actions, commanded),
+        predictions=predictions,
+    )
+
+
+def _strip(episode: EpisodeReader, name: str) -> EpisodePicture:
+    """Images and touch of a take at a few moments."""
+    steps = np.linspace(0, episode.num_steps - 1, NUM_MOMENTS).astype(int)
+    window = episode.window(0, episode.num_steps, cameras=(CAMERA,))
+    return EpisodePicture(
+        title=f"{name} take, as recorded and aligned: {episode.attributes.instruction}",
+        times_s=(window.t_ref_ns[steps] - window.t_ref_ns[0]) * 1e-9,
+        images=window.images[CAMERA][steps],
+        tactile_kpa=window.tactile_kpa[steps],
+    )

@@ -5,7 +5,7 @@ open-loop rollouts, from the first observed step to the last.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -71,21 +71,30 @@ def measure_prediction(world: World[Any], scenes: Sequence[Scene]) -> Prediction
     """
     if not scenes:
         raise InvalidInputError("prediction: got no scene, expected at least one")
-    imagined = [imagine(world, scene, scene.actions) for scene in scenes]
-    figures = _figures(imagined, scenes, "")
-    figures |= _figures([_copy(scene) for scene in scenes], scenes, "_copy")
-    for suffix, head_moves in (("_hold", False), ("_hands_still", True)):
-        still = [_still(scene.actions, head_moves=head_moves) for scene in scenes]
-        futures = [imagine(world, s, rows) for s, rows in zip(scenes, still, strict=True)]
-        figures |= _figures(futures, scenes, suffix)
-    others = [(scene, other) for scene in scenes if (other := _other(scene, scenes)) is not None]
-    if others:
-        wrong = [imagine(world, scene, other.actions) for scene, other in others]
-        figures |= _figures(wrong, [scene for scene, _ in others], "_other_take")
-    figures["psnr_warp"] = float(np.mean([_psnr(_warped(s), s.truth.images) for s in scenes]))
-    figures["tactile_mse_zero"] = _touch_error([_nothing(scene) for scene in scenes], scenes)
+    still = {"_hold": False, "_hands_still": True}
+    futures = {
+        "": [(one, imagine(world, one, one.actions)) for one in scenes],
+        "_copy": [(one, _copy(one)) for one in scenes],
+        "_other_take": [
+            (one, imagine(world, one, other.actions))
+            for one in scenes
+            if (other := _other(one, scenes)) is not None
+        ],
+    } | {
+        suffix: [(one, imagine(world, one, _still(one, head_moves=head_moves))) for one in scenes]
+        for suffix, head_moves in still.items()
+    }
+    figures: dict[str, float] = {}
+    for suffix, pairs in futures.items():
+        if pairs:
+            figures |= {f"{name}{suffix}": value for name, value in _errors(pairs).items()}
+    warped = [(one, replace(one.truth, images=_warped(one))) for one in scenes]
+    unfelt = np.zeros_like(scenes[0].truth.tactile_kpa)
+    nothing = [(one, replace(one.truth, tactile_kpa=unfelt)) for one in scenes]
+    figures["psnr_warp"] = _errors(warped)["psnr"]
+    figures["tactile_mse_zero"] = _errors(nothing)["tactile_mse"]
     figures["num_rollouts"] = float(len(scenes))
-    return PredictionResult(figures, _pictures(scenes, imagined))
+    return PredictionResult(figures, _pictures(futures[""]))
 
 
 def read_scene(reader: EpisodeReader) -> Scene:
@@ -140,10 +149,10 @@ def _other(scene: Scene, scenes: Sequence[Scene]) -> Scene | None:
     return next((one for one in turned if one.start.seed != scene.start.seed), None)
 
 
-def _still(actions: np.ndarray, *, head_moves: bool) -> Float64[np.ndarray, "steps 67"]:
-    rows = np.repeat(actions[:1], len(actions), axis=0)
+def _still(scene: Scene, *, head_moves: bool) -> Float64[np.ndarray, "steps 67"]:
+    rows = np.repeat(scene.actions[:1], len(scene.actions), axis=0)
     if head_moves:
-        rows[:, CAMERA_HEAD] = actions[:, CAMERA_HEAD]
+        rows[:, CAMERA_HEAD] = scene.actions[:, CAMERA_HEAD]
     return rows
 
 
@@ -161,10 +170,6 @@ def _copy(scene: Scene) -> Future:
     )
 
 
-def _nothing(scene: Scene) -> Future:
-    return Future(scene.truth.images, np.zeros_like(scene.truth.tactile_kpa))
-
-
 def _warped(scene: Scene) -> UInt8[np.ndarray, "chunks h w 3"]:
     anchor, K_head = scene.start.anchor, scene.start.K_head
     if anchor is None or K_head is None:
@@ -175,48 +180,36 @@ def _warped(scene: Scene) -> UInt8[np.ndarray, "chunks h w 3"]:
     return np.stack([warp_over_table(image, K_head, then, now) for now in ends])
 
 
-def _psnr(images: np.ndarray, truth: np.ndarray) -> float:
-    return float(image_metrics.psnr(predicted=images, true=truth))
-
-
-def _touch_error(futures: Sequence[Future], scenes: Sequence[Scene]) -> float:
-    return float(
-        tactile_metrics.mse(
-            predicted_kpa=np.stack([future.tactile_kpa for future in futures]),
-            true_kpa=np.stack([scene.truth.tactile_kpa for scene in scenes]),
-        )
-    )
-
-
-def _figures(futures: Sequence[Future], scenes: Sequence[Scene], suffix: str) -> dict[str, float]:
-    pairs = list(zip(futures, scenes, strict=True))
+def _errors(pairs: Sequence[tuple[Scene, Future]]) -> dict[str, float]:
+    """Errors of predicted futures, over all scenes together."""
+    touch = {
+        "predicted_kpa": np.stack([future.tactile_kpa for _, future in pairs]),
+        "true_kpa": np.stack([scene.truth.tactile_kpa for scene, _ in pairs]),
+    }
+    decibels = [
+        float(image_metrics.psnr(predicted=future.images, true=scene.truth.images))
+        for scene, future in pairs
+    ]
     return {
-        f"psnr{suffix}": float(np.mean([_psnr(f.images, s.truth.images) for f, s in pairs])),
-        f"tactile_mse{suffix}": _touch_error(futures, scenes),
-        f"contact_f1{suffix}": float(
-            tactile_metrics.contact_f1(
-                predicted_kpa=np.stack([future.tactile_kpa for future in futures]),
-                true_kpa=np.stack([scene.truth.tactile_kpa for scene in scenes]),
-            )
-        ),
+        "psnr": float(np.mean(decibels)),
+        "tactile_mse": float(tactile_metrics.mse(**touch)),
+        "contact_f1": float(tactile_metrics.contact_f1(**touch)),
     }
 
 
-def _pictures(scenes: Sequence[Scene], imagined: Sequence[Future]) -> tuple[PredictionPicture, ...]:
+def _pictures(rollouts: Sequence[tuple[Scene, Future]]) -> tuple[PredictionPicture, ...]:
     """The first scene of every task."""
-    firsts: dict[str, int] = {}
-    for index, scene in enumerate(scenes):
-        firsts.setdefault(scene.start.task, index)
-    return tuple(_picture(scenes[index], imagined[index]) for index in sorted(firsts.values()))
-
-
-def _picture(scene: Scene, imagined: Future) -> PredictionPicture:
-    ends = np.arange(CHUNK_STEPS, len(scene.actions) + 1, CHUNK_STEPS)
-    return PredictionPicture(
-        title=f"{scene.start.instruction} A whole rollout, from its first image and touch.",
-        times_s=ends / scene.model_rate_hz,
-        true_images=scene.truth.images,
-        predicted_images=imagined.images,
-        true_tactile_kpa=scene.truth.tactile_kpa[ends - 1],
-        predicted_tactile_kpa=imagined.tactile_kpa[ends - 1],
-    )
+    firsts: dict[str, PredictionPicture] = {}
+    for scene, imagined in rollouts:
+        if scene.start.task in firsts:
+            continue
+        ends = np.arange(CHUNK_STEPS, len(scene.actions) + 1, CHUNK_STEPS)
+        firsts[scene.start.task] = PredictionPicture(
+            title=f"{scene.start.instruction} A whole rollout, from its first image and touch.",
+            times_s=ends / scene.model_rate_hz,
+            true_images=scene.truth.images,
+            predicted_images=imagined.images,
+            true_tactile_kpa=scene.truth.tactile_kpa[ends - 1],
+            predicted_tactile_kpa=imagined.tactile_kpa[ends - 1],
+        )
+    return tuple(firsts.values())

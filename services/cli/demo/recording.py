@@ -1,38 +1,70 @@
-"""Recording and alignment of true episodes through mock devices, with end-to-end errors.
+"""The demo's takes: recorded in the twin, played through mock devices, aligned and compared.
 
 The path is the real one: mock devices send packets, real drivers decode them, the recorder spools,
-the uploader sends over HTTP, the alignment service creates the episode.
+the uploader sends over HTTP, the alignment service creates the episode. The mock gloves know their
+own tare and gain; they are measured all the same, by a rest take and known pressures, so that the
+errors contain those of a calibration.
 """
 
+import json
+import os
 import shutil
 import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
+from jaxtyping import Float64
 
-from dextouch.clients import EpisodeStoreClient
+from dextouch.clients import EpisodeStoreClient, HttpLink
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.episodes.care import UPLOADS
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
-from dextouch.schemas import Problem, RecordingAttributes, SaveTake, TakePrompt, error_from_problem
+from dextouch.schemas import Matrix, RecordingAttributes, SaveTake, TakePrompt, matrix_rows
+from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mock_station import MockStation, MockTake
 from services.acquisition.mocks.episode import replay_calibration, replay_streams
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Fate
+from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.uploader import Uploader
+from services.alignment.calibration.tactile_gain import TaxelPress
+from services.alignment.calibration.tactile_glove_calibration import calibrate_glove
+from services.alignment.calibration.tactile_tare import measure_tare
 from services.alignment.recording_error import NEAR_NS, compare_with_truth, match_samples
 from services.alignment.schemas import AlignmentJob
-from services.cli.demo.calibrating import measure_gloves
+from services.cli.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan
+from services.cli.training_data import Order, record_all
+from services.evaluation.progress import Progress
+from services.twin.cameras import CAMERAS
+from services.twin.hands import Domain
+from services.twin.take_options import TakeOptions
 
+# The human stands a bottle, the robot stacks bowls, to cover one-handed and bimanual tasks.
+RECORDED: dict[Domain, str] = {"human": "stand_bottle", "robot": "stack_bowls"}
+MAX_PROCESSES = 4
+STATION = "demo"
+UPLOAD_PERIOD_S = 1.0
 # The first alignment on a machine compiles the solver, which takes minutes where others use it too.
 ALIGNMENT_TIMEOUT_S = 1800.0
-UPLOAD_PERIOD_S = 1.0
-STATION = "demo"
+PRESSURES_KPA = (10.0, 20.0, 40.0)
+# A weight on an area is known to about this share.
+PRESSURE_SIGMA = 0.01
+PART_S = 2.0
+# Readings next to a change of pressure are left out.
+MARGIN_S = 0.2
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ids of the true episodes: the two takes, and demonstrations to predict."""
+
+    takes: dict[Domain, str]
+    demonstrations: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -43,6 +75,37 @@ class Take:
     errors: dict[str, Any]
     devices: list[dict[str, Any]]
     clock_residuals_ms: dict[str, np.ndarray]
+
+
+def make_truth(plan: DemoPlan, store_folder: Path) -> Truth:
+    """Record the true episodes in the twin, on all cores.
+
+    Raises:
+        InvalidInputError: the physics diverged.
+    """
+    store = str(store_folder)
+    takes = {
+        domain: Order(task, domain, plan.take_seed, TakeOptions(), store)
+        for domain, task in RECORDED.items()
+    }
+    # At least two scenes, so that the actions of another one are available.
+    scenes = range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + plan.num_predicted)
+    demonstrations = [
+        Order(task, "robot", seed, TakeOptions(noise_m, images=CAMERAS[:1]), store)
+        for noise_m in plan.predicted_noise_m
+        for task in TASKS
+        for seed in scenes
+    ]
+    orders = [*takes.values(), *demonstrations]
+    with Progress("episodes", len(orders)) as progress:
+        for answer in record_all(orders, min(MAX_PROCESSES, os.cpu_count() or 1)):
+            if answer.refusal is not None:
+                raise InvalidInputError(f"{answer.episode_id}: {answer.refusal}")
+            progress.advance()
+    return Truth(
+        {domain: order.episode_id for domain, order in takes.items()},
+        tuple(order.episode_id for order in demonstrations),
+    )
 
 
 def record_take(
@@ -142,21 +205,15 @@ def align(alignment_url: str, recording_id: str) -> AlignmentJob:
         DexTouchError: what the service refused, with its reason.
         UnavailableError: it does not answer.
     """
+    link = HttpLink(alignment_url, timeout_s=ALIGNMENT_TIMEOUT_S)
+    body = json.dumps({"recording_id": recording_id}).encode()
     try:
-        answer = httpx.post(
-            f"{alignment_url}/v1/alignments",
-            params={"wait": "true"},
-            json={"recording_id": recording_id},
-            timeout=ALIGNMENT_TIMEOUT_S,
-            trust_env=False,
-        )
-    except httpx.TransportError as error:
-        raise UnavailableError(
-            f"alignment of {recording_id}: no answer within {ALIGNMENT_TIMEOUT_S:.0f} s ({error!r})"
-        ) from error
-    if answer.is_error:
-        raise error_from_problem(Problem.model_validate_json(answer.content))
-    return AlignmentJob.model_validate_json(answer.content)
+        answer = link.request("POST", "/v1/alignments?wait=true", body=body)
+    except UnavailableError as error:
+        raise UnavailableError(f"alignment of {recording_id}: {error.message}") from error
+    finally:
+        link.close()
+    return AlignmentJob.model_validate_json(answer.body)
 
 
 def measure(
@@ -181,3 +238,60 @@ def measure(
         t_s = episode.read(name).t_ref_ns[match.index] * 1e-9
         residuals[name] = np.stack([t_s, (match.offset_ns - match.mean_offset_ns) * 1e-6])
     return Take(episode, errors, devices, residuals)
+
+
+def measure_gloves(
+    streams: Sequence[ReplayStream], spool_root: Path, *, seed: int
+) -> dict[str, Matrix]:
+    """Calibration matrices of the mock gloves that play these streams.
+
+    Args:
+        streams: of the take that follows; its gloves are calibrated.
+        spool_root: folder for the calibration take.
+        seed: of the mock station, whose gloves differ by seed, and of the errors of the pressures.
+    """
+    gloves = {side: s for s in streams for side in SIDES if s.descriptor.name == f"tactile_{side}"}
+    if not gloves:
+        return {}
+    errors = np.random.default_rng([seed, len(PRESSURES_KPA)]).normal(size=len(PRESSURES_KPA))
+    true_kpa = np.array([0.0, *(PRESSURES_KPA * (1 + PRESSURE_SIGMA * errors))])
+    with MockStation(
+        [_pressed(stream, true_kpa) for stream in gloves.values()],
+        FaultScript.first_light(),
+        seed,
+        VirtualClock(),
+        spool_root=spool_root,
+    ) as station:
+        take = station.run_take(TakePrompt(task="calibration", instruction="press all taxels"))
+    found: dict[str, Matrix] = {}
+    for side in gloves:
+        rest, *pressed = _parts(take, side)
+        tare = measure_tare(rest, side=side)
+        everywhere = np.ones(NUM_TAXELS, dtype=np.bool_)
+        presses = [
+            TaxelPress(kpa, PRESSURE_SIGMA * kpa, counts, everywhere)
+            for kpa, counts in zip(PRESSURES_KPA, pressed, strict=True)
+        ]
+        matrices = calibrate_glove(tare, presses).matrices()
+        found |= {name: matrix_rows(matrix) for name, matrix in matrices.items()}
+    return found
+
+
+def _pressed(stream: ReplayStream, true_kpa: Float64[np.ndarray, " parts"]) -> ReplayStream:
+    """The glove of a stream under one pressure after the other, the same on all taxels."""
+    period_ns = stream.descriptor.period_ns()
+    per_part = round(PART_S * 1e9 / period_ns)
+    values = np.repeat(true_kpa.astype(np.float32), per_part)[:, None]
+    t_ns = np.arange(len(values), dtype=np.int64) * period_ns
+    return ReplayStream(stream.descriptor, t_ns, np.repeat(values, NUM_TAXELS, axis=1))
+
+
+def _parts(take: MockTake, side: Side) -> Iterator[Float64[np.ndarray, "time 360"]]:
+    """Counts of the rest and of every press."""
+    spool = SpoolReader(take.spool_path)
+    batch = spool.read(f"tactile_{side}")
+    t_s = (batch.t_host_ns - take.ledger.start_host_ns) * 1e-9
+    for part in range(1 + len(PRESSURES_KPA)):
+        since_s = t_s - part * PART_S
+        inside = (since_s >= MARGIN_S) & (since_s <= PART_S - MARGIN_S)
+        yield batch.values[inside].astype(np.float64)

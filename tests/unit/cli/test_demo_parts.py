@@ -13,14 +13,12 @@ from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas import LineageEntry
-from services.cli.demo.background import served
-from services.cli.demo.command import worst_errors
-from services.cli.demo.judging import ladder
+from services.cli.demo.command import Stages, worst_errors
 from services.cli.demo.recording import align, forget_take
+from services.cli.demo.scoring import ladder
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, parse
 from services.cli.demo.table import rate, show
-from services.cli.demo.timing import Stages
-from services.cli.servers import bind
+from services.cli.servers import bind, served
 from tests.unit.bridges.takes import write_episode, write_recording
 from tests.unit.worlds.fakes import anchor, observation
 

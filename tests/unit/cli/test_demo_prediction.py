@@ -10,8 +10,8 @@ from dextouch.geometry import pinhole_matrix, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.schemas import EVERYTHING, Observation, RolloutStart
 from dextouch.worlds import CopyFirstWorld, SteppedRollout
-from services.cli.demo.models import refuse_trained
 from services.cli.demo.prediction import Future, Scene, measure_prediction
+from services.cli.demo.scoring import refuse_trained
 
 PX, NUM_STEPS = 8, 32
 DOWN = np.diag([1.0, -1.0, -1.0])

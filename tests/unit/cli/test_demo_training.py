@@ -3,7 +3,7 @@
 import pytest
 
 from dextouch.serving import load_settings
-from services.cli.demo import models
+from services.cli.demo import scoring
 from services.world_model.settings import TrainStateCommand
 
 
@@ -17,10 +17,10 @@ def load(*paths):
 
 def test_a_small_state_model_is_trained_before_its_endings_are_judged(tmp_path, monkeypatch):
     called = []
-    monkeypatch.setattr(models, "run_command", lambda words: called.append(list(words[1:])) or 0)
-    monkeypatch.setattr(models, "_load", load)
+    monkeypatch.setattr(scoring, "run_command", lambda words: called.append(list(words[1:])) or 0)
+    monkeypatch.setattr(scoring, "_load", load)
     with pytest.raises(LoadedError) as caught:
-        models.train_models(tmp_path)
+        scoring.train_models(tmp_path)
     world_model, _, probe = caught.value.args
     words = [word for word, *_ in called]
     assert words == ["data"] * 4 + ["state", "policy", "imagined", "probe"]

@@ -9,7 +9,6 @@ import pytest
 from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.cli.demo.background import served
 from services.cli.imagined_data import (
     WORLD,
     chosen_episodes,
@@ -18,6 +17,7 @@ from services.cli.imagined_data import (
     positive,
     seed_range,
 )
+from services.cli.servers import served
 from services.evaluation.endings import read_ending_episode
 from services.generation.demonstrations import imagine_episode
 from services.twin.episodes import TakeOptions, record, write_episode

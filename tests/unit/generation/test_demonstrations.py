@@ -10,7 +10,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import EVERYTHING
 from dextouch.worlds import CopyFirstWorld, SteppedRollout, WorldServiceSettings, create_world_app
-from services.cli.demo.background import served
+from services.cli.servers import served
 from services.evaluation.endings import read_ending_episode
 from services.generation.demonstrations import imagine_episode
 from services.twin.episodes import record, write_episode

@@ -1,0 +1,182 @@
+"""Networks of the demo, shipped or freshly trained, and the scoring of policies by them."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dextouch.clients import Policy, RolloutClient
+from dextouch.errors import ConflictError, DexTouchError
+from dextouch.worlds import BatchWorld
+from services.cli.demo.settings import TASKS, DemoPlan
+from services.cli.main import run_command
+from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
+from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
+from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
+from services.evaluation.success_probe import SuccessProbe
+from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name, scripted_actions
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+from services.twin.tasks import get_task
+from services.world_model.checkpoints import default_checkpoint
+from services.world_model.state_checkpoints import read_state_checkpoint
+from services.world_model.world import open_world
+
+MODEL = "world_model"
+BASELINE = "copy-first"
+DEMONSTRATIONS = ("--mix", "demonstrations")
+# Exact demonstrations for the policy: seeds that nothing else uses, no noise, no misses.
+EXACT_DATA = ("--first", "1000", "--count", "120", "--exact")
+# Endings near the boundary of success for world model and probe, and others for evaluation.
+ENDINGS = (
+    "--ladder", "--first", "2000", "--count", "315",
+    "--miss-fraction", "0.1", "--still-fraction", "0.1",
+)  # fmt: skip
+UNSEEN_ENDINGS = ("--ladder", "--first", "30000", "--count", "180")
+# A small state model: one ensemble member, few steps.
+SMALL_STATE_MODEL = (
+    "--num-members=1", "--jobs=1", "--reader.num-steps=2500", "--core.num-steps=1500",
+    "--drawing.cpu-budget-s=300",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Models:
+    """State model with the range of its training seeds by task, closed-loop policy and probe."""
+
+    world_model: BatchWorld[Any]
+    training_seeds: Mapping[str, tuple[int, int]]
+    policy: BehaviourCloningPolicy
+    probe: SuccessProbe
+
+
+def refuse_trained(training_seeds: Mapping[str, tuple[int, int]], seeds: Iterable[int]) -> None:
+    """Refuse to evaluate on seeds used in training.
+
+    Raises:
+        ConflictError: the world model was trained on some of these seeds.
+    """
+    wanted = list(seeds)
+    for task, (low, high) in training_seeds.items():
+        trained = [seed for seed in wanted if low <= seed <= high]
+        if trained:
+            raise ConflictError(
+                f"world model: trained on {task!r} with seeds {low} … {high}, and the demo "
+                f"evaluates on seed {trained[0]}; train it on seeds below 20000"
+            )
+
+
+def committed_models() -> Models:
+    """Load the networks shipped with the package.
+
+    Raises:
+        NotFoundError, CorruptDataError: a file is missing or damaged.
+    """
+    return _load(default_checkpoint(), DEFAULT_POLICY, DEFAULT_PROBE)
+
+
+def train_models(folder: Path) -> Models:
+    """Record training episodes and train a small state model, a policy and a success probe.
+
+    The probe is trained on true endings and on those imagined by the state model.
+
+    Args:
+        folder: folder of episodes and checkpoints; existing episodes are reused.
+    """
+    episodes, exact, endings, unseen, imagined = (
+        str(folder / name) for name in ("episodes", "exact", "endings", "unseen", "imagined")
+    )
+    world_model = folder / "state.safetensors"
+    policy, probe = folder / "behaviour_cloning.safetensors", folder / "success_probe.safetensors"
+    scenes = f"--tasks={','.join(TASKS)}"
+    for words in (
+        ("data", "--store", episodes, *DEMONSTRATIONS),
+        ("data", "--store", exact, *EXACT_DATA),
+        ("data", "--store", endings, *ENDINGS),
+        ("data", "--store", unseen, *UNSEEN_ENDINGS),
+        ("state", *_stores(episodes, endings, to=world_model), scenes, *SMALL_STATE_MODEL),
+        ("policy", *_stores(exact, episodes, to=policy)),
+        ("imagined", *_stores(endings), "--store", imagined, "--checkpoint", str(world_model)),
+        ("probe", "--held-out", unseen, *_stores(endings, imagined, to=probe)),
+    ):
+        run_command(["train", *words])
+    return _load(world_model, policy, probe)
+
+
+def _stores(*stores: str, to: Path | None = None) -> list[str]:
+    """Flags that name the stores to read, and the file to write."""
+    flags = [word for store in stores for word in ("--episodes", store)]
+    return flags if to is None else [*flags, "--output", str(to)]
+
+
+def use_one_thread() -> None:
+    """Limit torch to one thread; more slow down small networks beside busy services."""
+    torch.set_num_threads(1)
+
+
+def _load(world_model: Path, policy: Path, probe: Path) -> Models:
+    return Models(
+        open_world(world_model),
+        read_state_checkpoint(world_model).metadata.training_seeds,
+        BehaviourCloningPolicy.load(policy),
+        SuccessProbe.load(probe),
+    )
+
+
+def ladder(plan: DemoPlan) -> dict[str, Policy]:
+    """Open-loop policies of graded quality.
+
+    The scripted demonstrator with errors, and three that should fail: holding still, retreating,
+    and the actions of another scene. The twin only plans the demonstrator's commands, without
+    simulation.
+    """
+    stages = {task: Stage(task, "robot", TwinSettings()) for task in TASKS}
+    names = (*(script_name(level) for level in plan.levels_mm), HOLD, RETREAT, ELSEWHERE)
+    return {
+        name: ReplayPolicy(
+            {
+                (task, seed): scripted_actions(stage, seed, name, plan.levels_mm)
+                for task, stage in stages.items()
+                for seed in plan.seeds
+            }
+        )
+        for name in names
+    }
+
+
+def judge(
+    urls: Mapping[str, str], policies: Mapping[str, Policy], models: Models, plan: DemoPlan
+) -> dict[str, Any]:
+    """Roll out all policies from matched starts in the twin, the model and the copy baseline.
+
+    Returns:
+        `policies`, `agreement` and other entries of `report.json`.
+
+    Raises:
+        ConflictError: scenes that the world model was trained on.
+        DexTouchError: a rollout failed.
+    """
+    refuse_trained(models.training_seeds, plan.seeds)
+    twin, imagined = RolloutClient(urls["twin"]), RolloutClient(urls["imagined"])
+    tasks = EvaluationPlan(
+        instructions={task: get_task(task).instruction for task in TASKS},
+        seeds=list(plan.seeds),
+        trained_on={"the policy": models.policy.metadata.training_starts},
+    )
+    report = evaluate(
+        real=WorldAddress(twin, "twin"),
+        imagined={name: WorldAddress(imagined, name) for name in (MODEL, BASELINE)},
+        policies=policies,
+        plan=tasks,
+        probe=models.probe,
+    )
+    if report.failures:
+        first = report.failures[0]
+        raise DexTouchError(
+            f"{len(report.failures)} of {len(report.rollouts)} rollouts failed, first "
+            f"{first.policy!r} in {first.world!r}: {first.message}"
+        )
+    return report.to_report()
