@@ -3,19 +3,14 @@
 import argparse
 import shutil
 import uuid
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 from dextouch.command_line import CommandParser, add_json, progress, write_result
 from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
-from dextouch.errors import (
-    ConflictError,
-    InvalidInputError,
-    NotFoundError,
-)
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 
 Reader = EpisodeReader | RecordingReader
 Report = dict[str, object]
@@ -45,13 +40,6 @@ What each format keeps and loses: docs/bridges.md
 """
 
 
-class _Single(NamedTuple):
-    """A format with one file per episode or recording."""
-
-    suffix: str
-    export: Callable[[Reader, Path, argparse.Namespace], int]
-
-
 def _export_mcap(reader: Reader, path: Path, options: argparse.Namespace) -> int:
     from dextouch.bridges.mcap import export_mcap
 
@@ -78,7 +66,8 @@ def _export_lerobot(readers: Iterator[EpisodeReader], options: argparse.Namespac
         return export_lerobot(readers, options.to, repo_id=options.repo_id, options=chosen)
 
 
-_SINGLE = {"mcap": _Single(".mcap", _export_mcap), "rrd": _Single(".rrd", _export_rrd)}
+# Formats with one file per episode or recording, and those with all episodes together.
+_SINGLE = {"mcap": _export_mcap, "rrd": _export_rrd}
 _JOINT = {"umi": _export_umi, "lerobot": _export_lerobot}
 
 
@@ -98,13 +87,10 @@ def _replaced(folder: Path, *, force: bool) -> Iterator[None]:
         raise ConflictError(f"{folder}: is not a LeRobot data set, so --force does not remove it")
     aside = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.old")
     folder.rename(aside)
-    written = False
-    try:
+    with ExitStack() as undo:
+        undo.callback(aside.rename, folder)
         yield
-        written = True
-    finally:
-        if not written:
-            aside.rename(folder)
+        undo.pop_all()
     shutil.rmtree(aside)
 
 
@@ -115,8 +101,8 @@ def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
         InvalidInputError: both ids and filters, or an id twice.
         NotFoundError: nothing to export.
     """
-    wanted = {key: getattr(options, key) for key in ("task", "domain", "operator")}
-    wanted = {key: value for key, value in wanted.items() if value is not None}
+    given = ((key, getattr(options, key)) for key in ("task", "domain", "operator"))
+    wanted = {key: value for key, value in given if value is not None}
     if options.ids and wanted:
         raise InvalidInputError(f"got ids and filters {sorted(wanted)}; expected one of the two")
     if len(set(options.ids)) != len(options.ids):
@@ -141,47 +127,34 @@ def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
 
 
 def _export(options: argparse.Namespace) -> Report:
-    store = EpisodeStore(options.store)
-    if options.format in _JOINT and options.kind == "recording":
+    store, to, form = EpisodeStore(options.store), options.to, options.format
+    if form in _JOINT and options.kind == "recording":
         raise InvalidInputError(
-            f"format {options.format!r} holds episodes only; export recordings as mcap or rrd"
+            f"format {form!r} holds episodes only; export recordings as mcap or rrd"
         )
     ids = _ids(store, options)
-    report: Report = {"format": options.format, "kind": options.kind, "ids": ids}
-    if options.format in _SINGLE:
-        return report | {"files": _export_each(store, ids, options)}
-    readers = (
-        store.open(item_id) for item_id in progress(ids, f"export {options.format}", len(ids))
-    )
-    num_steps = _JOINT[options.format](readers, options)
-    print(f"{options.to}  {len(ids)} episodes  {num_steps} steps")
-    return report | {"path": str(options.to), "num_steps": num_steps}
-
-
-def _export_each(
-    store: EpisodeStore, ids: list[str], options: argparse.Namespace
-) -> list[dict[str, object]]:
-    form = _SINGLE[options.format]
-    paths = _paths(ids, options.to, form.suffix)
+    report: Report = {"format": form, "kind": options.kind, "ids": ids}
+    shown = progress(ids, f"export {form}", len(ids))
+    if form in _JOINT:
+        num_steps = _JOINT[form]((store.open(item_id) for item_id in shown), options)
+        print(f"{to}  {len(ids)} episodes  {num_steps} steps")
+        return report | {"path": str(to), "num_steps": num_steps}
+    # One file for one id, a folder of files otherwise.
+    paths = {item_id: to / f"{item_id}.{form}" for item_id in ids}
+    if to.suffix == f".{form}":
+        if len(ids) > 1:
+            raise InvalidInputError(f"--to {to}: got one file for {len(ids)} ids; name a folder")
+        paths = {ids[0]: to}
     taken = [path for path in paths.values() if path.exists()]
     if taken and not options.force:
         raise ConflictError(f"{taken[0]}: exists already; choose another path or add --force")
     files: list[dict[str, object]] = []
-    for item_id in progress(ids, f"export {options.format}", len(ids)):
+    for item_id in shown:
         path = paths[item_id]
-        count = form.export(_open(store, options.kind, item_id), path, options)
+        count = _SINGLE[form](_open(store, options.kind, item_id), path, options)
         files.append({"id": item_id, "path": str(path), "num_messages": count})
         print(f"{path}  {count} messages")
-    return files
-
-
-def _paths(ids: list[str], to: Path, suffix: str) -> dict[str, Path]:
-    """One file for one id, a folder of files otherwise."""
-    if to.suffix != suffix:
-        return {item_id: to / f"{item_id}{suffix}" for item_id in ids}
-    if len(ids) > 1:
-        raise InvalidInputError(f"--to {to}: got one file for {len(ids)} ids; name a folder")
-    return {ids[0]: to}
+    return report | {"files": files}
 
 
 def _import(options: argparse.Namespace) -> Report:

@@ -8,8 +8,7 @@ those of other seeds. A state model draws only the images that the probe uses.
 import argparse
 import os
 from collections.abc import Collection, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -20,6 +19,7 @@ from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli.servers import served
+from services.cli.training_data import in_processes
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.generation.demonstrations import imagine_episode
 from services.world_model.checkpoints import default_checkpoint
@@ -33,25 +33,22 @@ def chosen_episodes(
     store: EpisodeStore, tasks: Collection[str] | None, seeds: range | None
 ) -> list[str]:
     """Ids of the episodes of these tasks and seeds; None takes all."""
-    entries = ((episode_id, store.open(episode_id).attributes) for episode_id in store.list())
+    about = {episode_id: store.open(episode_id).attributes for episode_id in store.list()}
     return [
         episode_id
-        for episode_id, about in entries
-        if (tasks is None or about.task in tasks) and (seeds is None or about.seed in seeds)
+        for episode_id, one in about.items()
+        if (tasks is None or one.task in tasks) and (seeds is None or one.seed in seeds)
     ]
 
 
-def imagine_all(episodes: str, output: str, checkpoint: Path, episode_ids: Sequence[str]) -> int:
-    """Imagine robot episodes of a store; existing results are kept.
+def imagine_all(episode_ids: Sequence[str], *, episodes: str, output: str, checkpoint: Path) -> int:
+    """Imagine robot episodes of a store, and return their number; existing results are kept.
 
     Args:
+        episode_ids: episodes to imagine.
         episodes: store to read.
         output: store to write.
         checkpoint: checkpoint of a world model of either kind.
-        episode_ids: episodes to imagine.
-
-    Returns:
-        Number of episodes.
     """
     source, target = EpisodeStore(episodes), EpisodeStore(output)
     torch.set_num_threads(1)
@@ -65,21 +62,6 @@ def imagine_all(episodes: str, output: str, checkpoint: Path, episode_ids: Seque
     return len(episode_ids)
 
 
-def imagine_in_parts(
-    episodes: str, output: str, checkpoint: Path, episode_ids: Sequence[str], num_jobs: int
-) -> int:
-    """Imagine episodes in several processes; arguments and result as in `imagine_all`."""
-    if num_jobs == 1:
-        return imagine_all(episodes, output, checkpoint, episode_ids)
-    # Fresh interpreters: forked ones would share the threads of torch.
-    with ProcessPoolExecutor(num_jobs, mp_context=get_context("spawn")) as pool:
-        running = [
-            pool.submit(imagine_all, episodes, output, checkpoint, episode_ids[part::num_jobs])
-            for part in range(min(num_jobs, len(episode_ids)))
-        ]
-        return sum(done.result() for done in running)
-
-
 def judged_steps(episode: EpisodeReader) -> set[int]:
     """Steps of an episode whose images the success probe uses."""
     seed, last = episode.attributes.seed or 0, episode.num_steps - 1
@@ -88,11 +70,7 @@ def judged_steps(episode: EpisodeReader) -> set[int]:
 
 
 def seed_range(text: str) -> range:
-    """Parse seeds given as FIRST:LAST+1.
-
-    Raises:
-        ArgumentTypeError: invalid text.
-    """
+    """Parse seeds given as FIRST:LAST+1, for argparse."""
     first, _, stop = text.partition(":")
     if not (first.isdecimal() and stop.isdecimal() and int(first) < int(stop)):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected FIRST:LAST+1 such as 0:100")
@@ -100,11 +78,7 @@ def seed_range(text: str) -> range:
 
 
 def positive(text: str) -> int:
-    """Parse a number of processes.
-
-    Raises:
-        ArgumentTypeError: not a positive number.
-    """
+    """Parse a number of processes, for argparse."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a number of at least 1")
     return int(text)
@@ -137,9 +111,14 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_args(list(argv))
     tasks = tuple(arguments.tasks.split(",")) if arguments.tasks else None
     wanted = chosen_episodes(EpisodeStore(arguments.episodes), tasks, arguments.seeds)
-    count = imagine_in_parts(
-        arguments.episodes, arguments.store, arguments.checkpoint, wanted, arguments.jobs
+    imagine = partial(
+        imagine_all,
+        episodes=arguments.episodes,
+        output=arguments.store,
+        checkpoint=arguments.checkpoint,
     )
+    parts = [wanted[part :: arguments.jobs] for part in range(min(arguments.jobs, len(wanted)))]
+    count = sum(in_processes(imagine, parts, arguments.jobs))
     print(f"{count} imagined")
     write_result(arguments.json, {"imagined": count})
     return 0

@@ -7,32 +7,47 @@ the twin instead. Interrupted runs resume: existing episodes are kept.
 """
 
 import argparse
+import hashlib
 import json
 import multiprocessing
 import os
+import re
+import shlex
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from dextouch.clients import Policy, PolicyStart
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.schemas import RolloutStart
 from services.cli.data_mix import MIXES, Mix, options_of
-from services.cli.policy_takes import PolicyChoice, played_by
+from services.evaluation.policies.asking import action_chunk, ask
+from services.evaluation.policies.outside import PolicySource
 from services.evaluation.progress import Progress
+from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import episode_id, record, write_episode
 from services.twin.hands import DOMAINS, Domain
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
-from services.twin.take_options import STREAM_CHOICES, StreamChoice, TakeOptions
+from services.twin.take_options import STREAM_CHOICES, PlayedActions, StreamChoice, TakeOptions
 from services.twin.tasks import TASK_NAMES
+from services.twin.world import TwinWorld
 
 CAMERAS = ("camera_head",)
 DEFAULT_MIX = "evaluator"
+MAX_LABEL = 32
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -55,6 +70,31 @@ class Scope:
         for domain in self.domains:
             if domain not in DOMAINS:
                 raise UnknownNameError("domain", domain, list(DOMAINS))
+
+
+@dataclass(frozen=True)
+class PolicyChoice:
+    """A policy's address, as in `dextouch evaluate`, and its factory's arguments as JSON."""
+
+    address: str
+    arguments: str = "{}"
+
+    @classmethod
+    def parse(cls, address: str, arguments: Mapping[str, Any]) -> "PolicyChoice":
+        """Validate the address and create a choice.
+
+        Raises:
+            InvalidInputError: an invalid address.
+        """
+        PolicySource.parse(address)
+        return cls(address, json.dumps(arguments, sort_keys=True))
+
+    @property
+    def label(self) -> str:
+        """Name used in episode ids; it depends on the address and the arguments."""
+        name = re.sub(r"[^a-z0-9]+", "_", PolicySource.parse(self.address).name.lower()).strip("_")
+        digest = hashlib.sha256(f"{self.address} {self.arguments}".encode()).hexdigest()
+        return f"{name[:MAX_LABEL]}_{digest[:6]}"
 
 
 @dataclass(frozen=True)
@@ -86,17 +126,57 @@ class Answer:
 
 @lru_cache(maxsize=12)
 def _stage(task: str, domain: Domain) -> Stage:
-    """Stage of a task, compiled once per process."""
     return Stage(task, domain, TwinSettings())
 
 
+@lru_cache(maxsize=1)
+def _world() -> TwinWorld:
+    return TwinWorld(TwinSettings(cameras=CAMERAS))
+
+
+@lru_cache(maxsize=2)
+def _policy(choice: PolicyChoice) -> Policy:
+    return PolicySource.parse(choice.address).load(json.loads(choice.arguments))
+
+
+def _played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
+    """Closed-loop actions of a policy in the twin, from the start of a seed.
+
+    The twin is deterministic, so that an episode with these actions is the rollout.
+
+    Raises:
+        InvalidInputError, ShapeError, NonFiniteError: the policy failed; includes its traceback.
+    """
+    world, policy, task = _world(), _policy(choice), stage.task
+    start = RolloutStart(task=task.name, seed=seed, instruction=task.instruction)
+    begun = world.reset(start)
+    state, seen = begun.state, begun.observation
+    where = f"policy {choice.address!r}, task {task.name!r}, seed {seed}"
+    policy_start = PolicyStart(task.name, task.instruction, seed, begun.anchor, begun.K_head)
+    ask(policy.reset, policy_start, where=f"{where}: reset")
+    # Row 0 is the start.
+    rows = [seen.action_reached[:1]]
+    while (left := NUM_GRID_STEPS - sum(map(len, rows))) > 0:
+        chunk = action_chunk(ask(policy.act, seen, where=f"{where}: act"), world.description,
+                             where=f"{where}: act")[:left]  # fmt: skip
+        stepped = world.step(state, chunk, seed=0)
+        state, seen = stepped.state, stepped.observation
+        rows.append(chunk)
+    command = (
+        f"dextouch train data --policy {shlex.quote(choice.address)} --policy-arguments "
+        f"{shlex.quote(choice.arguments)} --tasks {task.name} --first {seed} --count 1"
+    )
+    return PlayedActions(choice.label, np.concatenate(rows), command)
+
+
 def _make(order: Order) -> Answer:
+    # Compiled once per process.
     stage = _stage(order.task, order.domain)
     try:
         if order.policy is None:
             episode = record(stage, order.seed, order.options)
         else:
-            played = played_by(order.policy, stage, order.seed)
+            played = _played_by(order.policy, stage, order.seed)
             episode = record(stage, order.seed, order.options, played=played)
         write_episode(EpisodeStore(order.store), episode)
     except ConflictError:
@@ -143,15 +223,20 @@ def make_training_data(
     target = EpisodeStore(store)
     # Remove partial episodes of killed runs; those of running writers are not touched.
     target.sweep()
-    present = set(target.list())
-    orders = list(_orders(store, seeds, mix, scope, policy))
+    present, orders = set(target.list()), []
+    for seed in seeds:
+        for task in scope.tasks:
+            made = TakeOptions() if policy is not None else options_of(task, seed, mix)
+            options = replace(
+                made, images=CAMERAS, image_every=scope.image_every, streams=scope.streams
+            )
+            orders += [Order(task, one, seed, options, store, policy) for one in scope.domains]
     missing = [order for order in orders if order.episode_id not in present]
     counts = {"made": 0, "kept": len(orders) - len(missing), "succeeded": 0, "refused": 0}
     started_s = time.monotonic()
     with Progress("twin episodes", len(missing)) as progress:
-        for done, answer in enumerate(
-            record_all(missing, num_jobs or os.cpu_count() or 1), start=1
-        ):
+        answers = record_all(missing, num_jobs or os.cpu_count() or 1)
+        for done, answer in enumerate(answers, start=1):
             if answer.refusal is not None:
                 counts["refused"] += 1
                 print(f"{answer.episode_id}: {answer.refusal}")
@@ -167,32 +252,26 @@ def make_training_data(
     return counts
 
 
-def _orders(
-    store: str, seeds: range, mix: Mix, scope: Scope, policy: PolicyChoice | None
-) -> Iterator[Order]:
-    for seed in seeds:
-        for task in scope.tasks:
-            made = TakeOptions() if policy is not None else options_of(task, seed, mix)
-            options = replace(
-                made, images=CAMERAS, image_every=scope.image_every, streams=scope.streams
-            )
-            for domain in scope.domains:
-                yield Order(task, domain, seed, options, store, policy)
-
-
 def record_all(orders: Sequence[Order], num_jobs: int) -> Iterator[Answer]:
     """Record episodes in processes of their own; yields their results as they are done."""
-    if num_jobs == 1 or len(orders) < 2:
-        yield from map(_make, orders)
+    return in_processes(_make, orders, num_jobs)
+
+
+def in_processes(
+    function: Callable[[Item], Result], items: Sequence[Item], num_jobs: int
+) -> Iterator[Result]:
+    """Results of a function of the items, as they are done; one job needs no other process."""
+    if num_jobs == 1 or len(items) < 2:
+        yield from map(function, items)
         return
     with ExitStack() as stack:
         # Spawned, not forked: threads and locks of the caller must not be copied half-way.
         pool = stack.enter_context(
-            ProcessPoolExecutor(min(num_jobs, len(orders)), multiprocessing.get_context("spawn"))
+            ProcessPoolExecutor(min(num_jobs, len(items)), multiprocessing.get_context("spawn"))
         )
-        # If the caller stops, pending orders are cancelled.
+        # If the caller stops, pending items are cancelled.
         stack.callback(pool.shutdown, wait=False, cancel_futures=True)
-        for future in as_completed([pool.submit(_make, order) for order in orders]):
+        for future in as_completed([pool.submit(function, item) for item in items]):
             yield future.result()
 
 
@@ -211,12 +290,9 @@ def _words(choices: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
 
 def _keywords(text: str) -> dict[str, Any]:
     try:
-        read = json.loads(text)
-    except json.JSONDecodeError as error:
+        return TypeAdapter(dict[str, Any]).validate_json(text)
+    except ValidationError as error:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a JSON object") from error
-    if not isinstance(read, dict):
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a JSON object")
-    return read
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -225,18 +301,17 @@ def _parser() -> argparse.ArgumentParser:
         description=__doc__,
         epilog="example:\n  dextouch train data --store runs/episodes --count 20 --images 4",
     )
-    parser.add_argument("--store", required=True, help="folder of the episode store")
-    parser.add_argument("--first", type=int, default=0, help="first seed (%(default)s)")
-    parser.add_argument("--count", type=int, default=130, help="seeds per task (%(default)s)")
-    parser.add_argument(
+    add = parser.add_argument
+    add("--store", required=True, help="folder of the episode store")
+    add("--first", type=int, default=0, help="first seed (%(default)s)")
+    add("--count", type=int, default=130, help="seeds per task (%(default)s)")
+    add(
         "--tasks",
         type=_words(TASK_NAMES),
         default=TASK_NAMES,
         help="comma-separated (default: all)",
     )
-    parser.add_argument(
-        "--domains", type=_words(DOMAINS), default=("robot",), help="robot,human (robot)"
-    )
+    add("--domains", type=_words(DOMAINS), default=("robot",), help="robot,human (robot)")
     mixes = parser.add_mutually_exclusive_group()
     mixes.add_argument(
         "--mix", choices=list(MIXES), default=DEFAULT_MIX, help="kinds of takes (%(default)s)"
@@ -249,26 +324,20 @@ def _parser() -> argparse.ArgumentParser:
             const=name,
             help=f"{effect}, no other kinds",
         )
-    parser.add_argument("--miss-fraction", type=float, help="share of misses (default: the mix's)")
-    parser.add_argument(
-        "--still-fraction", type=float, help="share of takes that stop or never start"
-    )
-    parser.add_argument(
-        "--policy", metavar="[NAME=]MODULE:FACTORY", help="record rollouts of this policy instead"
-    )
-    parser.add_argument(
+    add("--miss-fraction", type=float, help="share of misses (default: the mix's)")
+    add("--still-fraction", type=float, help="share of takes that stop or never start")
+    add("--policy", metavar="[NAME=]MODULE:FACTORY", help="record rollouts of this policy instead")
+    add(
         "--policy-arguments",
         type=_keywords,
         default={},
         help="arguments of the factory, as a JSON object",
     )
-    parser.add_argument(
+    add(
         "--images", type=int, default=1, metavar="N", help="images of every N-th step (%(default)s)"
     )
-    parser.add_argument(
-        "--streams", choices=STREAM_CHOICES, default="training", help="(%(default)s)"
-    )
-    parser.add_argument("--jobs", type=int, help="processes (default: one per core)")
+    add("--streams", choices=STREAM_CHOICES, default="training", help="(%(default)s)")
+    add("--jobs", type=int, help="processes (default: one per core)")
     add_json(parser)
     return parser
 

@@ -10,8 +10,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
 from services.cli import training_data
 from services.cli.data_mix import MIXES, Mix, options_of
-from services.cli.policy_takes import PolicyChoice
-from services.cli.training_data import Scope, make_training_data
+from services.cli.training_data import PolicyChoice, Scope, make_training_data
 
 
 def drawn(mix, seeds=2000, task="stand_bottle"):
