@@ -12,91 +12,79 @@ from services.cli.extras import missing_package
 
 
 class Command(NamedTuple):
-    """A command: its summary, and `module:function` that runs it; a bare group has none."""
+    """A command: its summary, and `module:function` of `services`; a bare group has none."""
 
     does: str
     target: str = ""
 
 
 COMMANDS = {
-    "demo": Command("record, align, imagine and score on this machine", "services.cli.demo:main"),
-    "up": Command("run every service in one process, with a dashboard", "services.cli.up:main"),
-    "doctor": Command(
-        "check what this machine can do and what is missing", "services.cli.doctor:main"
-    ),
+    "demo": Command("record, align, imagine and score on this machine", "cli.demo:main"),
+    "up": Command("run every service in one process, with a dashboard", "cli.up:main"),
+    "doctor": Command("check what this machine can do and what is missing", "cli.doctor:main"),
     "twin": Command(
-        "record true episodes in the physics twin, or serve it", "services.twin.command_line:main"
+        "record true episodes in the physics twin, or serve it", "twin.command_line:main"
     ),
-    "twin serve": Command("serve the twin as a world", "services.twin.serving:serve"),
+    "twin serve": Command("serve the twin as a world", "twin.serving:serve"),
     "station": Command("record and calibrate a station's devices"),
-    "station serve": Command(
-        "record gloves, trackers and cameras", "services.acquisition.app:main"
-    ),
-    "station calibrate": Command(
-        "measure tare and gain, lenses and mounts", "services.cli.calibrate:main"
-    ),
+    "station serve": Command("record gloves, trackers and cameras", "acquisition.app:main"),
+    "station calibrate": Command("measure tare and gain, lenses and mounts", "cli.calibrate:main"),
     "store": Command(
         "list, show, verify, repair, migrate, delete, restore, purge, serve",
-        "services.episode_store.command_line:main",
+        "episode_store.command_line:main",
     ),
-    "store serve": Command("serve the store over HTTP", "services.episode_store.app:main"),
+    "store serve": Command("serve the store over HTTP", "episode_store.app:main"),
     "export": Command(
-        "write LeRobot, MCAP, Rerun or UMI files from a store", "services.cli.exports:export_main"
+        "write LeRobot, MCAP, Rerun or UMI files from a store", "cli.exports:export_main"
     ),
-    "import": Command(
-        "read LeRobot, MCAP or UMI files into a store", "services.cli.exports:import_main"
-    ),
-    "align": Command(
-        "turn recordings into synchronized episodes", "services.alignment.command_line:main"
-    ),
-    "align serve": Command("serve alignment over HTTP", "services.alignment.app:main"),
+    "import": Command("read LeRobot, MCAP or UMI files into a store", "cli.exports:import_main"),
+    "align": Command("turn recordings into synchronized episodes", "alignment.command_line:main"),
+    "align serve": Command("serve alignment over HTTP", "alignment.app:main"),
     "train": Command("train the world model, a policy or the success probe"),
     "train data": Command(
-        "record the twin episodes that all training uses", "services.cli.training_data:main"
+        "record the twin episodes that all training uses", "cli.training_data:main"
     ),
     "train world-model": Command(
         "train the joint visuo-tactile flow-matching model",
-        "services.world_model.command_line:run_train",
+        "world_model.command_line:run_train",
     ),
     "train state": Command(
         "train the state model: start readers and recurrent cores",
-        "services.world_model.command_line:run_train_state",
+        "world_model.command_line:run_train_state",
     ),
     "train imagined": Command(
-        "imagine these episodes with the world model", "services.cli.imagined_data:main"
+        "imagine these episodes with the world model", "cli.imagined_data:main"
     ),
     "train policy": Command(
         "train a closed-loop policy on the demonstrations",
-        "services.evaluation.command_line:run_train_policy",
+        "evaluation.command_line:run_train_policy",
     ),
     "train probe": Command(
         "train the success probe on true and imagined episodes",
-        "services.evaluation.command_line:run_train_probe",
+        "evaluation.command_line:run_train_probe",
     ),
     "train direct-judge": Command(
         "train its baseline, for `python -m benchmarks evaluator --direct`",
-        "services.evaluation.command_line:run_train_direct_judge",
+        "evaluation.command_line:run_train_direct_judge",
     ),
     "checkpoint": Command(
         "show the provenance and accuracy of a world model",
-        "services.world_model.command_line:run_show",
+        "world_model.command_line:run_show",
     ),
-    "serve": Command(
-        "serve the world model's rollouts", "services.world_model.command_line:run_serve"
-    ),
+    "serve": Command("serve the world model's rollouts", "world_model.command_line:run_serve"),
     "evaluate": Command(
         "score policies in real and imagined worlds",
-        "services.evaluation.command_line:run_evaluation",
+        "evaluation.command_line:run_evaluation",
     ),
     "rate": Command("score rollouts by people: a page for raters, and their agreement"),
     "rate serve": Command(
-        "serve the page on which raters mark rollouts", "services.evaluation.rating.app:main"
+        "serve the page on which raters mark rollouts", "evaluation.rating.app:main"
     ),
     "rate report": Command(
         "print scores and how far raters agree",
-        "services.evaluation.rating.command_line:report_main",
+        "evaluation.rating.command_line:report_main",
     ),
-    "dashboard": Command("serve the operators' page", "services.dashboard.app:main"),
+    "dashboard": Command("serve the operators' page", "dashboard.app:main"),
 }
 
 # Groups that serve when no command is named, as earlier versions did.
@@ -105,47 +93,34 @@ EXIT_USAGE = 2
 EXIT_REFUSED = 3
 
 
-def usage() -> str:
-    """The text of `dextouch --help`."""
-    rows = [f"  {name:<19}{command.does}" for name, command in COMMANDS.items() if " " not in name]
-    return "\n".join(
-        [
-            "usage: dextouch COMMAND [options]",
-            "       dextouch GROUP COMMAND [options]",
-            "",
-            "Collect human and robot touch, train a world model on it, evaluate policies in it.",
-            "",
-            *rows,
-            "",
-            "Every command has --help; commands that terminate write their result with",
-            "--json PATH, or --json - for standard output. A service (serve, station serve, …)",
-            "takes its flags as variables too. All commands: docs/command_line.md",
-            "",
-            "example:",
-            "  dextouch demo",
-        ]
-    )
+USAGE = """\
+usage: dextouch COMMAND [options]
+       dextouch GROUP COMMAND [options]
+
+Collect human and robot touch, train a world model on it, evaluate policies in it.
+
+{rows}
+
+Every command has --help; commands that terminate write their result with
+--json PATH, or --json - for standard output. A service (serve, station serve, …)
+takes its flags as variables too. All commands: docs/command_line.md
+
+example:
+  dextouch demo"""
 
 
 def commands_of(group: str) -> dict[str, Command]:
     """The commands of a group that have a row in `COMMANDS`, by their last word."""
-    names = {name: name.partition(" ") for name in COMMANDS}
-    return {
-        word: COMMANDS[name] for name, (first, _, word) in names.items() if first == group and word
-    }
+    prefix = f"{group} "
+    return {name.removeprefix(prefix): c for name, c in COMMANDS.items() if name.startswith(prefix)}
 
 
-def group_usage(group: str) -> str:
-    """The help of a group whose commands all have a row in `COMMANDS`."""
+def _group_usage(group: str) -> str:
     inner = commands_of(group)
-    return "\n".join(
-        [
-            f"usage: dextouch {group} COMMAND [options]",
-            "",
-            *(f"  {word:<14}{command.does}" for word, command in inner.items()),
-            "",
-            f"Help for one of them: dextouch {group} {next(iter(inner))} --help",
-        ]
+    rows = "\n".join(f"  {word:<14}{command.does}" for word, command in inner.items())
+    return (
+        f"usage: dextouch {group} COMMAND [options]\n\n{rows}\n\n"
+        f"Help for one of them: dextouch {group} {next(iter(inner))} --help"
     )
 
 
@@ -178,9 +153,11 @@ def run_command(words: Sequence[str]) -> int:
     name, arguments = find_command(words)
     module, _, function = COMMANDS[name].target.partition(":")
     if not module:
-        print(group_usage(name))
+        print(_group_usage(name))
         return 0
-    command: Callable[[list[str]], int | None] = getattr(importlib.import_module(module), function)
+    command: Callable[[list[str]], int | None] = getattr(
+        importlib.import_module(f"services.{module}"), function
+    )
     return command(arguments) or 0
 
 
@@ -192,7 +169,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or words[0] in {"-h", "--help", "help"}:
-        print(usage())
+        shown = {name: command.does for name, command in COMMANDS.items() if " " not in name}
+        print(USAGE.format(rows="\n".join(f"  {name:<19}{does}" for name, does in shown.items())))
         return 0
     if words[0] == "--version":
         print(f"dextouch {__version__}")

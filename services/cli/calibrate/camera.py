@@ -28,12 +28,7 @@ PIXEL_SHIFT_PX = 0.5
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, object]:
-    """Calibrate from the photos of a folder; coverage and advice are written in any case.
-
-    Raises:
-        InvalidInputError: too few photos with the board, or insufficient coverage.
-        NotFoundError, CorruptDataError: missing or damaged photos.
-    """
+    """Calibrate from the photos of a folder; coverage and advice are written in any case."""
     paths = photo_paths(options.photos)
     if not paths:
         raise NotFoundError(f"{options.photos}: holds no photo; expected {', '.join(SUFFIXES)}")

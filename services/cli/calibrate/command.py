@@ -2,8 +2,9 @@
 
 import argparse
 import importlib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.data_folder import default_spool
@@ -124,11 +125,7 @@ _COMMANDS = {
     "camera": ("photos of a board → K and distortion of a camera", _CAMERA, "live:calibrate"),
     "hand-eye": ("photos and poses → camera on its tracker", _HAND_EYE, "mounts:calibrate_mount"),
     "glove": ("rest and known pressures → tare, gain, faults", _GLOVE, "glove:calibrate"),
-    "wrist": (
-        "flat hand → wrist axes of a glove's keypoints",
-        _WRIST,
-        "hands:calibrate_wrist_axes",
-    ),
+    "wrist": ("flat hand → wrist axes of a glove's keypoints", _WRIST, "hands:measure_wrist"),
     "profile": ("moving hand → the person's bones and knuckles", _PROFILE, "hands:measure_person"),
     "robot-base": (
         "pairs of poses → the robot's base in the world",
@@ -161,94 +158,59 @@ def _parser() -> argparse.ArgumentParser:
         name: words.add_parser(name, help=does, description=does, epilog=more)
         for name, (does, more, _) in _COMMANDS.items()
     }
-    for name, command in of.items():
+
+    def add(names: str, flag: str, **how: Any) -> None:  # noqa: ANN401 - argparse's own
+        for name in names.split():
+            of[name].add_argument(flag, **how)
+
+    for command in of.values():
         add_json(command)
-        if name != "show":
-            command.add_argument(
-                "--to",
-                type=Path,
-                required=True,
-                metavar="FOLDER",
-                help="calibration folder; created if new",
-            )
-    of["show"].add_argument(
-        "folder", type=Path, metavar="PATH", help="calibration folder or file, or a spooled take"
-    )
-    for name in ("glove", "wrist", "profile"):
-        of[name].add_argument("--side", required=True, choices=("left", "right"), help="hand")
-    for name in ("wrist", "profile", "latency"):
-        of[name].add_argument(
-            "--take", required=True, metavar="TAKE", help="spool folder, or id of a recording"
-        )
-    for name in ("glove", "wrist", "profile", "latency"):
-        of[name].add_argument("--store", metavar="URL", help="store of recordings given by id")
-    _add_cameras(of["camera"], of["hand-eye"])
-    _add_glove(of["glove"])
-    of["robot-base"].add_argument(
-        "--poses", type=Path, required=True, metavar="FILE", help="JSON of pairs"
-    )
-    of["robot-base"].add_argument(
-        "--same-frame", action="store_true", help="tracker and effector are the same frame"
-    )
+    measuring = " ".join(name for name in of if name != "show")
+    folder = {"type": Path, "metavar": "FOLDER"}
+    add(measuring, "--to", required=True, help="calibration folder; created if new", **folder)
+    shown = "calibration folder or file, or a spooled take"
+    add("show", "folder", type=Path, metavar="PATH", help=shown)
+    add("glove wrist profile", "--side", required=True, choices=("left", "right"), help="hand")
+    take = "spool folder, or id of a recording"
+    add("wrist profile latency", "--take", required=True, metavar="TAKE", help=take)
+    store = "store of recordings given by id"
+    add("glove wrist profile latency", "--store", metavar="URL", help=store)
+    _add_cameras(add, folder)
+    _add_glove(add, folder)
+    add("robot-base", "--poses", type=Path, required=True, metavar="FILE", help="JSON of pairs")
+    same = "tracker and effector are the same frame"
+    add("robot-base", "--same-frame", action="store_true", help=same)
     for flag, what in (
         ("--stream", "stream to calibrate"),
         ("--reference", "stream of known latency, or of latency 0 by definition"),
     ):
-        of["latency"].add_argument(flag, required=True, metavar="STREAM", help=what)
+        add("latency", flag, required=True, metavar="STREAM", help=what)
     return parser
 
 
-def _add_cameras(camera: argparse.ArgumentParser, hand_eye: argparse.ArgumentParser) -> None:
-    for parser in (camera, hand_eye):
-        parser.add_argument(
-            "--camera",
-            required=True,
-            choices=("head", "wrist_left", "wrist_right"),
-            help="camera to calibrate",
-        )
-        parser.add_argument("--check", action="store_true", help="only report what is missing")
-        is_camera = parser is camera
-        parser.add_argument(
-            "--photos",
-            type=Path,
-            required=is_camera,
-            metavar="FOLDER",
-            help="folder of photos" if is_camera else "photos that FILE names",
-        )
-        parser.add_argument("--board", required=is_camera, metavar="BOARD", help=BOARD_HELP)
-    camera.add_argument("--watch", action="store_true", help="watch the folder for new photos")
-    camera.add_argument("--url", metavar="URL", help="take photos from this running station")
-    camera.add_argument("--key", metavar="KEY", help="API key of the station")
-    hand_eye.add_argument("--poses", type=Path, required=True, metavar="FILE", help="CSV or JSON")
-    hand_eye.add_argument(
-        "--intrinsics", type=Path, metavar="FOLDER", help="calibration with K (default: --to)"
-    )
-    hand_eye.add_argument("--invert", choices=("tracker", "board"), help="invert these poses")
+def _add_cameras(add: Callable[..., None], folder: Mapping[str, Any]) -> None:
+    cameras = {"required": True, "choices": ("head", "wrist_left", "wrist_right")}
+    add("camera hand-eye", "--camera", help="camera to calibrate", **cameras)
+    add("camera hand-eye", "--check", action="store_true", help="only report what is missing")
+    add("camera", "--photos", required=True, help="folder of photos", **folder)
+    add("hand-eye", "--photos", help="photos that FILE names", **folder)
+    add("camera", "--board", required=True, metavar="BOARD", help=BOARD_HELP)
+    add("hand-eye", "--board", metavar="BOARD", help=BOARD_HELP)
+    add("camera", "--watch", action="store_true", help="watch the folder for new photos")
+    add("camera", "--url", metavar="URL", help="take photos from this running station")
+    add("camera glove", "--key", metavar="KEY", help="API key of the station")
+    add("hand-eye", "--poses", type=Path, required=True, metavar="FILE", help="CSV or JSON")
+    add("hand-eye", "--intrinsics", help="calibration with K (default: --to)", **folder)
+    add("hand-eye", "--invert", choices=("tracker", "board"), help="invert these poses")
 
 
-def _add_glove(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--url", metavar="URL", help="running station that records the takes")
-    parser.add_argument("--key", metavar="KEY", help="API key of the station")
-    parser.add_argument(
-        "--spool",
-        type=Path,
-        default=default_spool(),
-        metavar="FOLDER",
-        help="spool of the station, with --url (%(default)s)",
-    )
-    parser.add_argument("--rest", metavar="TAKE", help="take of 10 s without contact")
-    parser.add_argument("--presses", type=Path, metavar="CSV", help="list of takes under pressure")
-    parser.add_argument(
-        "--pressure-sigma",
-        type=float,
-        default=0.02,
-        metavar="RATIO",
-        help="relative sigma of pressures without sigma_kpa (%(default)s)",
-    )
-    parser.add_argument(
-        "--full-scale",
-        type=float,
-        default=65535.0,
-        metavar="COUNTS",
-        help="largest count of the glove (%(default)g)",
-    )
+def _add_glove(add: Callable[..., None], folder: Mapping[str, Any]) -> None:
+    add("glove", "--url", metavar="URL", help="running station that records the takes")
+    spool = "spool of the station, with --url (%(default)s)"
+    add("glove", "--spool", default=default_spool(), help=spool, **folder)
+    add("glove", "--rest", metavar="TAKE", help="take of 10 s without contact")
+    add("glove", "--presses", type=Path, metavar="CSV", help="list of takes under pressure")
+    ratio = "relative sigma of pressures without sigma_kpa (%(default)s)"
+    add("glove", "--pressure-sigma", type=float, default=0.02, metavar="RATIO", help=ratio)
+    counts = "largest count of the glove (%(default)g)"
+    add("glove", "--full-scale", type=float, default=65535.0, metavar="COUNTS", help=counts)

@@ -2,18 +2,15 @@
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from dextouch.command_line import progress
 from dextouch.errors import InvalidInputError
 from services.alignment.calibration.tactile_faults import OK, STATES
-from services.alignment.calibration.tactile_glove_calibration import (
-    GloveCalibration,
-    calibrate_glove,
-)
-from services.alignment.calibration.tactile_tare import measure_tare
+from services.alignment.calibration.tactile_gain import TaxelGain
+from services.alignment.calibration.tactile_glove_calibration import calibrate_glove
+from services.alignment.calibration.tactile_tare import TaxelTare, measure_tare
 from services.cli.calibrate.glove_takes import (
     PressRow,
     press_of,
@@ -30,7 +27,6 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
 
     Raises:
         InvalidInputError: unsuitable takes or pressures; the message says what to do.
-        NotFoundError: no such take, or it has no readings of this glove.
     """
     side = options.side
     rest, rows = _takes(options)
@@ -38,13 +34,24 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
     presses = [press_of(row, options) for row in progress(rows, "reading presses", len(rows))]
     found = calibrate_glove(tare, presses, full_scale_counts=options.full_scale)
     picture = write_picture(options.to, f"glove_{side}.svg", glove_picture(found))
-    report = _facts(found, rest, rows)
-    _keep(found, options.to, report)
-    _tell(report, picture)
+    facts: dict[str, object] = {"side": side, "rest_take": rest, **_tare_facts(tare)}
+    if found.gain is not None:
+        facts["presses"] = [[row.take, row.pressure_kpa, row.sigma_kpa, row.pads] for row in rows]
+        facts |= {"num_by_state": found.num_by_state(), **_gain_facts(found.gain)}
+    else:
+        print("no presses: the gain, if there is one, stays as it was")
+    # Tare and gain are separate entries, so that a daily tare keeps the gain.
+    matrices = found.matrices()
+    zero = {name: m for name, m in matrices.items() if "_tare_" in name or "_noise_" in name}
+    write_entry(options.to, f"tactile_{side}_tare", zero, facts)
+    rest_of_all = {name: m for name, m in matrices.items() if name not in zero}
+    if rest_of_all:
+        write_entry(options.to, f"tactile_{side}_gain", rest_of_all, facts)
+    print(f"picture: {picture}")
     if options.url is not None:
         path = (options.to / MATRICES_FILE).resolve()
         print(f"Restart the station with DEXTOUCH_ACQUISITION_CALIBRATION={path}")
-    return report
+    return facts
 
 
 def _takes(options: argparse.Namespace) -> tuple[str, Sequence[PressRow]]:
@@ -64,60 +71,45 @@ def _takes(options: argparse.Namespace) -> tuple[str, Sequence[PressRow]]:
     return options.rest, rows
 
 
-def _facts(found: GloveCalibration, rest: str, rows: Sequence[PressRow]) -> dict[str, object]:
-    level = found.tare.level
-    facts: dict[str, object] = {
-        "side": found.tare.side,
-        "rest_take": rest,
-        "num_rest_readings": found.tare.num_samples,
-        "tare_median_counts": float(np.median(level.mean_counts)),
-        "tare_sigma_median_counts": float(np.median(level.sigma_counts)),
-        "noise_median_counts": float(np.median(level.noise_counts)),
-        "restless_taxels": np.flatnonzero(found.tare.restless).tolist(),
-    }
-    if found.gain is None:
-        return facts
-    gain, good = found.gain, found.gain.state == OK
-    relative = gain.sigma_counts_per_kpa[good] / gain.gain_counts_per_kpa[good]
-    return facts | {
-        "presses": [[row.take, row.pressure_kpa, row.sigma_kpa, row.pads] for row in rows],
-        "gain_median_counts_per_kpa": float(np.median(gain.gain_counts_per_kpa[good])),
-        "gain_sigma_median_ratio": float(np.median(relative)),
-        "residual_rms_kpa": float(np.sqrt(np.mean(gain.residual_kpa[:, good] ** 2))),
-        "num_by_state": found.num_by_state(),
-        "taxels_by_state": {
-            STATES[state]: np.flatnonzero(gain.state == state).tolist()
-            for state in np.unique(gain.state)
-            if state != OK
-        },
-    }
-
-
-def _keep(found: GloveCalibration, folder: Path, facts: dict[str, object]) -> None:
-    """Write tare and gain as separate entries, so that a daily tare keeps the gain."""
-    side, matrices = found.tare.side, found.matrices()
-    zero = {name: m for name, m in matrices.items() if "_tare_" in name or "_noise_" in name}
-    write_entry(folder, f"tactile_{side}_tare", zero, facts)
-    rest = {name: m for name, m in matrices.items() if name not in zero}
-    if rest:
-        write_entry(folder, f"tactile_{side}_gain", rest, facts)
-
-
-def _tell(report: dict[str, object], picture: Path) -> None:
-    print(
-        f"tare of the {report['side']} glove: median {report['tare_median_counts']:.1f} ± "
-        f"{report['tare_sigma_median_counts']:.2f} counts, noise of a reading "
-        f"{report['noise_median_counts']:.1f} counts, {report['num_rest_readings']} readings"
+def _tare_facts(tare: TaxelTare) -> dict[str, object]:
+    """Print and return what a tare says."""
+    level = tare.level
+    median, sigma, noise = (
+        float(np.median(counts))
+        for counts in (level.mean_counts, level.sigma_counts, level.noise_counts)
     )
-    if "gain_median_counts_per_kpa" in report:
-        print(
-            f"gain: median {report['gain_median_counts_per_kpa']:.2f} counts/kPa, each known to "
-            f"{report['gain_sigma_median_ratio']:.1%}; presses fit to "
-            f"{report['residual_rms_kpa']:.2f} kPa RMS"
-        )
-        faulty = report["taxels_by_state"]
-        for state, taxels in faulty.items() if isinstance(faulty, dict) else ():
-            print(f"  {state}: {len(taxels)} taxels ({', '.join(str(t) for t in taxels[:12])} …)")
-    else:
-        print("no presses: the gain, if there is one, stays as it was")
-    print(f"picture: {picture}")
+    print(
+        f"tare of the {tare.side} glove: median {median:.1f} ± {sigma:.2f} counts, noise of a "
+        f"reading {noise:.1f} counts, {tare.num_samples} readings"
+    )
+    return {
+        "num_rest_readings": tare.num_samples,
+        "tare_median_counts": median,
+        "tare_sigma_median_counts": sigma,
+        "noise_median_counts": noise,
+        "restless_taxels": np.flatnonzero(tare.restless).tolist(),
+    }
+
+
+def _gain_facts(gain: TaxelGain) -> dict[str, object]:
+    """Print and return what a gain says."""
+    good = gain.state == OK
+    median = float(np.median(gain.gain_counts_per_kpa[good]))
+    ratio = float(np.median(gain.sigma_counts_per_kpa[good] / gain.gain_counts_per_kpa[good]))
+    rms_kpa = float(np.sqrt(np.mean(gain.residual_kpa[:, good] ** 2)))
+    faulty = {
+        STATES[state]: np.flatnonzero(gain.state == state).tolist()
+        for state in np.unique(gain.state[~good])
+    }
+    print(
+        f"gain: median {median:.2f} counts/kPa, each known to {ratio:.1%}; presses fit to "
+        f"{rms_kpa:.2f} kPa RMS"
+    )
+    for state, taxels in faulty.items():
+        print(f"  {state}: {len(taxels)} taxels ({', '.join(str(t) for t in taxels[:12])} …)")
+    return {
+        "gain_median_counts_per_kpa": median,
+        "gain_sigma_median_ratio": ratio,
+        "residual_rms_kpa": rms_kpa,
+        "taxels_by_state": faulty,
+    }

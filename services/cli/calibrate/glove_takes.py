@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -83,12 +83,7 @@ class PressRow(BaseModel):
 
 
 def read_presses(path: Path, relative_sigma: float) -> list[PressRow]:
-    """Read the list of presses; takes beside the file may be named by their folder alone.
-
-    Raises:
-        NotFoundError: no such file.
-        InvalidInputError: invalid columns or numbers.
-    """
+    """Read the list of presses; takes beside the file may be named by their folder alone."""
     rows = []
     for row in read_rows(path, PressRow, "press", EXPECTED):
         beside = path.parent / row.take
@@ -127,12 +122,7 @@ def parse_press(words: str, relative_sigma: float) -> PressRow:
 
 
 def read_take(take: str, options: argparse.Namespace) -> SampleBatch:
-    """Readings of one glove from a spool folder, or from a recording of the store.
-
-    Raises:
-        NotFoundError: no such take, or without this glove.
-        InvalidInputError: the stream holds pressures, not counts.
-    """
+    """Raw counts of one glove from a spool folder, or from a recording of the store."""
     taken = read_stream(take, f"tactile_{options.side}", options.store)
     if taken.descriptor.unit != "counts":
         raise InvalidInputError(
@@ -143,13 +133,7 @@ def read_take(take: str, options: argparse.Namespace) -> SampleBatch:
 
 
 def press_of(row: PressRow, options: argparse.Namespace) -> TaxelPress:
-    """The readings of one press.
-
-    Raises:
-        NotFoundError: no such take, or without this glove.
-        UnknownNameError: no such pad.
-        InvalidInputError: pressures instead of counts.
-    """
+    """The readings of one press."""
     batch = read_take(row.take, options)
     t_s = (batch.t_host_ns - batch.t_host_ns[:1]) * 1e-9
     wanted = t_s >= row.start_s
@@ -192,8 +176,6 @@ class StationTakes:
 
         Raises:
             ConflictError: the recorder is busy with another take; save or discard that.
-            UnavailableError: the station does not respond.
-            NotFoundError: neither spool nor store has the take.
         """
         self._act("arm", {"task": TASK, "instruction": words})
         self._act("record", {"recording_id": name})
@@ -237,40 +219,31 @@ class StationTakes:
         )
 
 
-def station_takes(options: argparse.Namespace) -> StationTakes:
-    """Create the helper for the station of the options."""
-    link = HttpLink(options.url, api_key=options.key)
-    return StationTakes(link.request, options.spool, has_store=options.store is not None)
-
-
-@dataclass
 class Guide:
     """Dialogue with an operator, who lays the glove down and presses it while takes are recorded.
 
     An invalid take is explained and repeated.
     """
 
-    options: argparse.Namespace
-    takes: StationTakes
-    ask: Ask
-    num_takes: int = 0
-
-    def __post_init__(self) -> None:
-        self._name = f"calibration-glove-{self.options.side}-{datetime.now(UTC):%Y%m%d-%H%M%S}"
+    def __init__(self, options: argparse.Namespace, takes: StationTakes, ask: Ask) -> None:
+        self._options, self._takes, self._ask = options, takes, ask
+        started = f"calibration-glove-{options.side}-{datetime.now(UTC):%Y%m%d-%H%M%S}"
+        self._names = (f"{started}-{number}" for number in count(1))
 
     def rest(self) -> tuple[str, TaxelTare]:
         """Record a rest take with a valid tare."""
-        side = self.options.side
+        side = self._options.side
         while True:
             self._answer(
                 f"Lay the {side} glove down, untouched, and let it rest for a minute. "
                 f"Enter records {REST_S:g} s: "
             )
             try:
-                return self._record(
+                return self._takes.record(
+                    next(self._names),
                     f"{side} glove at rest, untouched",
                     REST_S,
-                    lambda take: measure_tare(read_take(take, self.options).values, side=side),
+                    lambda take: measure_tare(read_take(take, self._options).values, side=side),
                 )
             except InvalidInputError as error:
                 print(f"Once more: {error.message}")
@@ -285,27 +258,35 @@ class Guide:
                 print(f"{len(known)} presses are left")
                 continue
             try:
-                wanted = parse_press(words, self.options.pressure_sigma)
+                wanted = parse_press(words, self._options.pressure_sigma)
             except (InvalidInputError, UnknownNameError) as error:
                 print(error.message)
                 continue
-            target = f"{wanted.pressure_kpa:.4g} kPa on {wanted.pads}"
-            self._answer(f"Put {target}. Enter records {PRESS_S:g} s, once it holds still: ")
             try:
-                take, press = self._record(
-                    f"{target}, held still", PRESS_S, partial(self._press, tare, wanted)
-                )
+                known.append(self._press(wanted, tare))
             except InvalidInputError as error:
                 print(f"Not used: {error.message}")
                 continue
-            known.append((wanted.model_copy(update={"take": take}), press))
             print(self._known_so_far(tare, [press for _, press in known]))
         return [row for row, _ in known]
+
+    def _press(self, wanted: PressRow, tare: TaxelTare) -> tuple[PressRow, TaxelPress]:
+        """Record a press that determines a gain on its own."""
+        target = f"{wanted.pressure_kpa:.4g} kPa on {wanted.pads}"
+        self._answer(f"Put {target}. Enter records {PRESS_S:g} s, once it holds still: ")
+
+        def check(take: str) -> tuple[PressRow, TaxelPress]:
+            row = wanted.model_copy(update={"take": take})
+            press = press_of(row, self._options)
+            fit_gain(tare, [press], full_scale_counts=self._options.full_scale)
+            return row, press
+
+        return self._takes.record(next(self._names), f"{target}, held still", PRESS_S, check)[1]
 
     def _known_so_far(self, tare: TaxelTare, presses: list[TaxelPress]) -> str:
         try:
             found = calibrate_glove(
-                tare, presses, full_scale_counts=self.options.full_scale
+                tare, presses, full_scale_counts=self._options.full_scale
             ).num_by_state()
         except InvalidInputError as error:
             return f"{len(presses)} presses, not enough yet: {error.message}"
@@ -315,21 +296,9 @@ class Guide:
             f"{f' ({others})' if others else ''}; more pressures show bends"
         )
 
-    def _press(self, tare: TaxelTare, wanted: PressRow, take: str) -> TaxelPress:
-        """The press of a take, if it determines a gain on its own."""
-        press = press_of(wanted.model_copy(update={"take": take}), self.options)
-        fit_gain(tare, [press], full_scale_counts=self.options.full_scale)
-        return press
-
-    def _record(
-        self, words: str, seconds: float, check: Callable[[str], Found]
-    ) -> tuple[str, Found]:
-        self.num_takes += 1
-        return self.takes.record(f"{self._name}-{self.num_takes}", words, seconds, check)
-
     def _answer(self, question: str) -> str:
         try:
-            return self.ask(question)
+            return self._ask(question)
         except EOFError as error:
             raise InvalidInputError(
                 "calibrate glove --url: nobody answers; run it at a terminal, or name takes with "
@@ -344,9 +313,6 @@ def record_takes(
 
     The list of presses is stored in the folder, so that the calibration can be repeated from the
     same takes.
-
-    Raises:
-        InvalidInputError: no operator input.
     """
     if takes is None:
         link = HttpLink(options.url, api_key=options.key)

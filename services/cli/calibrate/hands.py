@@ -18,29 +18,24 @@ from services.cli.calibrate.record import MATRICES_FILE, read_matrices, write_en
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
-def calibrate_wrist_axes(options: argparse.Namespace) -> dict[str, object]:
-    """Measure the wrist frame in the axes of a glove's keypoints, from a take of the flat hand.
-
-    Raises:
-        NotFoundError: no such take, or it has no keypoints of this hand.
-        InvalidInputError: the hand is not flat, of the other side, or its nodes are not a hand.
-    """
-    taken = _keypoints(options)
-    frame = calibrate_wrist(taken.batch.values, options.side, where=f"take {options.take!r}")
-    name = calibration_name(options.side)
+def measure_wrist(options: argparse.Namespace) -> dict[str, object]:
+    """Measure the wrist frame in the axes of a glove's keypoints, from a take of the flat hand."""
+    taken, side = _keypoints(options), options.side
+    frame = calibrate_wrist(taken.batch.values, side, where=f"take {options.take!r}")
+    name, sigma_deg = calibration_name(side), float(np.rad2deg(frame.sigma_rad))
     facts: dict[str, object] = {
-        "side": options.side,
+        "side": side,
         "take": options.take,
-        "sigma_deg": float(np.rad2deg(frame.sigma_rad)),
+        "sigma_deg": sigma_deg,
         "hand_size": frame.size,
         "misfit_mm": frame.misfit_m * 1e3,
         "num_samples": frame.num_samples,
     }
-    record = calibration_record(frame, options.side)
+    record = calibration_record(frame, side)
     write_entry(options.to, name, {key: np.array(m) for key, m in record.items()}, facts)
     print(
-        f"{name}: known to {facts['sigma_deg']:.1f}°; hand of size {frame.size:.2f} (1 is the mean "
-        f"adult), nodes {facts['misfit_mm']:.1f} mm off the mean hand"
+        f"{name}: known to {sigma_deg:.1f}°; hand of size {frame.size:.2f} (1 is the mean adult), "
+        f"nodes {facts['misfit_mm']:.1f} mm off the mean hand"
     )
     return facts
 
@@ -49,23 +44,19 @@ def measure_person(options: argparse.Namespace) -> dict[str, object]:
     """Measure bones and knuckles of the person who wears a glove, from a take of moving fingers.
 
     Keypoints are rotated to wrist axes by the calibration in `--to`, or else by the take's own.
-
-    Raises:
-        NotFoundError: no such take, or it has no keypoints of this hand.
-        InvalidInputError: keypoints in other axes than the wrist's, or a finger that is never seen.
     """
     from services.alignment.retargeting.hand_retargeter import HandRetargeter
 
-    taken = _keypoints(options)
+    taken, side = _keypoints(options), options.side
     calibration = dict(taken.calibration)
     if (options.to / MATRICES_FILE).exists():
-        calibration = calibration | read_matrices(options.to)
-    axes = hand_axes_check(taken.batch.values, options.side, calibration)
-    profile = HandRetargeter(options.side).measure(axes.keypoints_m)
-    name = profile_name(options.side)
+        calibration |= read_matrices(options.to)
+    axes = hand_axes_check(taken.batch.values, side, calibration)
+    profile = HandRetargeter(side).measure(axes.keypoints_m)
+    name = profile_name(side)
     bones_mm = dict(zip(FINGERS, (profile.bone_m * 1e3).round(1).tolist(), strict=True))
     facts: dict[str, object] = {
-        "side": options.side,
+        "side": side,
         "take": options.take,
         "bones_mm": bones_mm,
         "is_rigid": profile.is_rigid,

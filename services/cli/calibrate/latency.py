@@ -7,12 +7,11 @@ tracker record a hand that taps a table.
 import argparse
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import transform_from_pose
 from dextouch.geometry.rotations import vector_from_rotation
-from dextouch.tactile.layout import Side
 from services.alignment.calibration.motion import DegenerateMotionError
 from services.alignment.calibration.tactile_baseline import TactileCalibration
 from services.alignment.calibration.tap_offset import estimate_tap_offset
@@ -31,32 +30,30 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
     Raises:
         DegenerateMotionError: too little, too slow or too regular motion, or no taps.
         InvalidInputError: two streams that share no motion.
-        NotFoundError: no such take or stream.
     """
     stream = read_stream(options.take, options.stream, options.store)
     reference = read_stream(options.take, options.reference, options.store)
-    kinds = (reference.descriptor.kind, stream.descriptor.kind)
+    kinds, method = (reference.descriptor.kind, stream.descriptor.kind), "taps"
     if kinds == ("pose", "pose"):
         found, method = _from_motion(reference, stream), "motion"
     elif kinds == ("tactile", "pose"):
-        found, method = _from_taps(reference, stream), "taps"
+        found = _from_taps(reference, stream)
     elif kinds == ("pose", "tactile"):
         reverse = _from_taps(stream, reference)
-        found, method = TimeOffset(-reverse.offset_ns, reverse.sigma_ns), "taps"
+        found = TimeOffset(-reverse.offset_ns, reverse.sigma_ns)
     else:
         raise InvalidInputError(
             f"latency of {options.stream!r} against {options.reference!r}: got streams of kind "
             f"{kinds[1]} and {kinds[0]}, expected two poses, or a pose and a glove"
         )
     # The offset is added to the stream's times: the latency is its negative.
-    name = f"{options.stream}_latency"
+    name, of_reference = f"{options.stream}_latency", f"{options.reference}_latency"
     latency_ns = stream.number(f"{name}_ns") - found.offset_ns
-    known_ns = reference.number(f"{options.reference}_latency_sigma_ns")
-    sigma_ns = float(np.hypot(found.sigma_ns, known_ns))
+    sigma_ns = float(np.hypot(found.sigma_ns, reference.number(f"{of_reference}_sigma_ns")))
     facts: dict[str, object] = {
         "stream": options.stream,
         "reference": options.reference,
-        "reference_latency_ms": reference.number(f"{options.reference}_latency_ns") * 1e-6,
+        "reference_latency_ms": reference.number(f"{of_reference}_ns") * 1e-6,
         "method": method,
         "take": options.take,
         "latency_ms": latency_ns * 1e-6,
@@ -82,46 +79,35 @@ def _from_motion(a: TakenStream, b: TakenStream) -> TimeOffset:
 
 
 def _from_taps(glove: TakenStream, tracker: TakenStream) -> TimeOffset:
-    t_ns, readings = glove.timed()
-    side = glove.descriptor.side
-    if side is None:
-        raise InvalidInputError(f"stream {glove.descriptor.name!r}: has no side")
-    pressure_kpa = readings.astype(np.float64)
-    if glove.descriptor.unit != "kPa":
-        pressure_kpa = _calibrated(glove, side).to_kpa(readings).astype(np.float64)
-    whole = np.isfinite(pressure_kpa).all(axis=1)
-    t_pose_ns, poses, seen = _poses(tracker)
-    return estimate_tap_offset(
-        t_ns[whole], pressure_kpa[whole].max(axis=1), t_pose_ns[seen], poses[seen, HEIGHT]
-    )
-
-
-def _calibrated(glove: TakenStream, side: Side) -> TactileCalibration:
     stream = glove.descriptor
-    return TactileCalibration.from_record(
-        glove.calibration, side, num_cells=stream.shape[0], stream=stream.name
-    )
+    t_ns, readings = glove.timed()
+    if stream.side is None:
+        raise InvalidInputError(f"stream {stream.name!r}: has no side")
+    if stream.unit != "kPa":
+        known = TactileCalibration.from_record(
+            glove.calibration, stream.side, num_cells=stream.shape[0], stream=stream.name
+        )
+        readings = known.to_kpa(readings)
+    pressure_kpa = readings.astype(np.float64)
+    whole = np.isfinite(pressure_kpa).all(axis=1)
+    t_pose_ns, poses = _poses(tracker)
+    peaks_kpa = pressure_kpa[whole].max(axis=1)
+    return estimate_tap_offset(t_ns[whole], peaks_kpa, t_pose_ns, poses[:, HEIGHT])
 
 
 def _angular_velocity(
     stream: TakenStream,
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
     """Angular velocity in the world (rad/s), which is the same for all parts of a rigid body."""
-    t_ns, poses, seen = _poses(stream)
-    t_ns, Rs = t_ns[seen], transform_from_pose(poses[seen])[:, :3, :3]
+    t_ns, poses = _poses(stream)
+    Rs = transform_from_pose(poses)[:, :3, :3]
     turns_rad = vector_from_rotation(Rs[1:] @ np.swapaxes(Rs[:-1], -1, -2))
     steps_ns = np.diff(t_ns)
     return t_ns[:-1] + steps_ns // 2, turns_rad / (steps_ns[:, None] * 1e-9)
 
 
-def _poses(
-    stream: TakenStream,
-) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"], Bool[np.ndarray, " n"]]:
-    """Times, poses, and a mask of valid tracking.
-
-    Raises:
-        InvalidInputError: too few valid poses.
-    """
+def _poses(stream: TakenStream) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"]]:
+    """Times and poses of valid tracking."""
     t_ns, values = stream.timed()
     poses = values.astype(np.float64)
     seen = np.isfinite(poses).all(axis=1) & (np.linalg.norm(poses[:, 3:], axis=1) > MIN_NORM)
@@ -130,4 +116,4 @@ def _poses(
             f"take {stream.take!r}: {stream.descriptor.name} has {np.count_nonzero(seen)} valid "
             "poses, expected two seconds of them; was the tracker visible?"
         )
-    return t_ns, poses, seen
+    return t_ns[seen], poses[seen]

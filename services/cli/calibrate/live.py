@@ -118,11 +118,7 @@ def _why_nothing_is_kept(view: BoardView | None, *, still: bool) -> str:
 
 
 def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:
-    """Yield the photos of a folder, then new ones, indefinitely.
-
-    Raises:
-        NotFoundError: no such folder.
-    """
+    """Yield the photos of a folder, then new ones, indefinitely."""
     seen: set[Path] = set()
     while True:
         for path in photo_paths(folder):
@@ -151,12 +147,7 @@ def station_arrivals(newest: Callable[[], bytes], *, wait: Wait = time.sleep) ->
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, object]:
-    """Calibrate a camera; with `--url` or `--watch` photos are collected first.
-
-    Raises:
-        InvalidInputError: both of them, or what `camera.calibrate` refuses.
-        UnavailableError: the station does not respond.
-    """
+    """Calibrate a camera; with `--url` or `--watch` photos are collected first."""
     board = parse_board(options.board)
     if options.watch and options.url is not None:
         raise InvalidInputError("got --watch and --url, expected one of the two")

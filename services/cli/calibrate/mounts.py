@@ -50,7 +50,6 @@ def calibrate_mount(options: argparse.Namespace) -> dict[str, object]:
     Raises:
         DegenerateMotionError: the tracker was rotated too little; the message names the axis.
         InvalidInputError: poses and photos that do not match or contradict each other.
-        NotFoundError: no photos, poses or intrinsics.
     """
     views = _read_views(options)
     trackers, boards = views.Ts_world_tracker, views.Ts_camera_board
@@ -99,7 +98,6 @@ def calibrate_base(options: argparse.Namespace) -> dict[str, object]:
         DegenerateMotionError: the effector was rotated or moved too little; the message names the
             axes.
         InvalidInputError: too few pairs, or pairs that contradict each other.
-        NotFoundError: no such file.
     """
     pairs = pairs_of(read_json(options.poses, PAIRS_HELP), options.poses, PAIRS_HELP)
     mount = np.eye(4) if options.same_frame else None

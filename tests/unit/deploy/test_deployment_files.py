@@ -70,7 +70,7 @@ def test_commands_and_variables_exist(name):
     program, *words = OURS[name]["command"]
     assert program == "dextouch"
     command, _ = find_command(words)
-    module = COMMANDS[command].target.partition(":")[0].rpartition(".")[0]
+    module = "services." + COMMANDS[command].target.partition(":")[0].rpartition(".")[0]
     folder = Path(importlib.import_module(module).__file__).parent
     prefix = f"DEXTOUCH_{module.removeprefix('services.').upper()}_"
     # Settings stand in settings.py; those of serving a world may stand beside the serving.
