@@ -163,13 +163,15 @@ class PathWatch:
             if isinstance(supervisor.driver, AnswersTime) and not isinstance(clock, VirtualClock)
         ]
         self._paths = {stream.name: stream for d in self._devices for stream in d.streams}
+        # Whether there is anybody to ask; without one nobody needs to tell of samples either.
+        self.asks = bool(self._devices)
         # Replaced as a whole, never changed: whoever reads it needs no lock.
         self._latencies: dict[str, PathLatency] = {}
         self._looks = PeriodicCall(self.look, period_ns=PERIOD_NS, clock=clock, name="path-latency")
 
     def start(self) -> None:
         """Start asking, if there is anybody to ask."""
-        if self._devices:
+        if self.asks:
             self._looks.start()
 
     def stop(self) -> None:

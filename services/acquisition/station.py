@@ -1,21 +1,27 @@
-"""A running station: supervisors of its devices, recorder, health and live views."""
+"""A running station: supervisors of its devices, recorder, health and what viewers see."""
 
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from dextouch.errors import DeviceError
-from dextouch.schemas import Matrix
+import numpy as np
+from jaxtyping import Float32
+
+from dextouch.errors import DeviceError, NotFoundError, StaleDataError
+from dextouch.schemas import CameraLive, Matrix
+from dextouch.streams import H264_UNIT, Sample
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.image_encoding import GroupPreview
+from services.acquisition.glove_record import NO_CELL, glove_record
 from services.acquisition.health import HealthMonitor
-from services.acquisition.live import LiveView
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.recorder import Recorder
 from services.acquisition.supervisor import DeviceSupervisor, SpoolSafety
 from services.acquisition.take import DeviceEvents, TakeOptions
 
 CONNECT_TIMEOUT_S = 10.0
+MAX_AGE_NS = 500_000_000
 
 
 class Station:
@@ -101,4 +107,88 @@ class Station:
         self.recorder.accept(readings)
         self.live.accept(readings)
         self.health.accept(readings)
-        self.paths.accept(readings)
+        if self.paths.asks:
+            self.paths.accept(readings)
+
+
+class LiveView:
+    """Keeps the newest sample of each stream; nothing is computed until it is requested."""
+
+    def __init__(self, drivers: Sequence[Driver], calibration: Mapping[str, Matrix]) -> None:
+        self._descriptors = {d.name: d for driver in drivers for d in driver.descriptors}
+        self._newest: dict[str, Sample] = {}
+        self._num_images: dict[str, int] = {}
+        self._previews = {
+            name: GroupPreview((d.shape[0], d.shape[1]))
+            for name, d in self._descriptors.items()
+            if d.unit == H264_UNIT
+        }
+        # Without a calibration the station starts all the same: it records the takes for one.
+        self._gloves = {
+            name: glove
+            for name, descriptor in self._descriptors.items()
+            if (glove := glove_record(descriptor, calibration)) is not None
+        }
+
+    def accept(self, readings: Readings) -> None:
+        """Remember (called by the reader threads)."""
+        for name, samples in readings.items():
+            if name in self._previews:
+                for sample in samples:
+                    self._previews[name].add(bytes(sample.values.item()))
+            self._newest[name] = samples[-1]
+            self._num_images[name] = self._num_images.get(name, 0) + len(samples)
+
+    def pressures_kpa(self, now_ns: int) -> dict[str, Float32[np.ndarray, "320"]]:
+        """Newest pressures by stream, of gloves heard within the last 0.5 s; never older ones.
+
+        Taxels that the glove has not, or from which it has no reading, are 0.
+        """
+        pressures: dict[str, np.ndarray] = {}
+        for name, glove in self._gloves.items():
+            sample = self._newest.get(name)
+            if sample is None or now_ns - sample.t_host_ns > MAX_AGE_NS:
+                continue
+            cells_kpa = (sample.values.ravel() - glove.tare_counts) / glove.gain_counts_per_kpa
+            taxels = np.where(glove.cells == NO_CELL, 0.0, cells_kpa[glove.cells])
+            pressures[name] = np.maximum(np.nan_to_num(taxels), 0.0).astype(np.float32)
+        return pressures
+
+    def cameras(self, now_ns: int) -> list[CameraLive]:
+        """Cameras that have sent an image."""
+        found = []
+        for name, descriptor in sorted(self._descriptors.items()):
+            sample = self._newest.get(name)
+            if descriptor.kind == "image" and sample is not None:
+                found.append(
+                    CameraLive(
+                        name=name,
+                        image_index=self._num_images[name],
+                        age_s=(now_ns - sample.t_host_ns) / 1e9,
+                        height_px=descriptor.shape[0],
+                        width_px=descriptor.shape[1],
+                    )
+                )
+        return found
+
+    def jpeg(self, camera: str, now_ns: int) -> bytes:
+        """Newest image of a camera as JPEG.
+
+        Raises:
+            NotFoundError: no such camera, or no image yet (of H.264: no key frame yet).
+            StaleDataError: the newest image is older than 0.5 s.
+        """
+        from dextouch.images import encode_jpeg
+
+        descriptor = self._descriptors.get(camera)
+        sample = self._newest.get(camera)
+        if descriptor is None or descriptor.kind != "image" or sample is None:
+            raise NotFoundError(f"camera {camera!r}: not there, or no image yet")
+        age_s = (now_ns - sample.t_host_ns) / 1e9
+        if age_s * 1e9 > MAX_AGE_NS:
+            raise StaleDataError(f"camera {camera!r}: the newest image is {age_s:.1f} s old")
+        if descriptor.unit == "jpeg":
+            return bytes(sample.values.item())
+        if camera in self._previews:
+            return encode_jpeg(self._previews[camera].image())
+        return encode_jpeg(sample.values)

@@ -4,7 +4,6 @@ The bytes are documented in docs/device_packets.md, "Bridges".
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Final, Literal
 
 import numpy as np
@@ -13,7 +12,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from dextouch.errors import DeviceError, StaleDataError
 from dextouch.frozen_model import FrozenModel
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings, StreamDecoder, check_packet
 from services.acquisition.drivers.packets import Packet, PacketDecoder
@@ -163,145 +162,66 @@ class FreshnessGate:
         return delay_ns - self._offset_ns <= MAX_AGE_NS
 
 
-class BridgeConnection:
-    """Hello and packets of one connection, for one of the bridge's devices.
+class BridgeDecoder(StreamDecoder[Packet]):
+    """Base of the decoders of one device behind a bridge: its hello, and which packets are new.
 
     Args:
         kind: what the bridge must be.
-        device: our name of the device, for messages.
+        descriptor: of the stream.
         source: where the wanted device sits.
         serial_number: of the wanted device; the only one of its source if None.
-        packets: finds the packets; an empty payload must be allowed, as it is a heartbeat.
+        magic: of its packets; those without a payload are heartbeats.
         payload_bytes: of a packet with a sample.
 
     Attributes:
-        on_hello: takes the hello of a new connection.
-        statistics: what was seen so far; `refused` counts packets of a wrong size too.
+        hello: of this connection; None before it came.
+        order: counts repeated and late packets.
+        tracking: counts of packets that became no sample, by the reason.
+        statistics: of all devices of the bridge; `refused` counts packets of a wrong size too.
     """
-
-    on_hello: Callable[[BridgeHello], None] | None = None
 
     def __init__(
         self,
         kind: BridgeKind,
+        descriptor: StreamDescriptor,
         *,
-        device: str,
         source: str,
         serial_number: str | None,
-        packets: PacketDecoder,
+        magic: bytes,
         payload_bytes: int,
     ) -> None:
-        self.order = OrderFilter()
-        self.statistics = packets.statistics
+        packets = PacketDecoder(magic, min_payload=0, max_payload=payload_bytes)
+        super().__init__(descriptor, packets)
         self.hello: BridgeHello | None = None
-        self.chosen: BridgedDevice | None = None
-        self._kind = kind
-        self._device = device
-        self._source = source
-        self._serial_number = serial_number
-        self._packets = packets
+        self.order = OrderFilter()
+        self.tracking = dict.fromkeys(DROPPED, 0)
+        self._kind, self._device = kind, descriptor.device or descriptor.name
+        self._source, self._serial_number = source, serial_number
         self._payload_bytes = payload_bytes
         self._line = bytearray()
+        self._freshness = FreshnessGate()
+
+    def events(self) -> dict[str, int]:
+        """Packets left out so far, by the reason."""
+        return {**self.tracking, **self.order.counts()}
 
     def reset(self) -> None:
         """The connection was lost: the next one begins with a hello."""
-        self.hello = self.chosen = None
+        super().reset()
+        self.hello = None
         self._line.clear()
-        self._packets.reset()
         self.order.reset()
+        self._freshness.reset()
 
-    def feed(self, data: bytes) -> list[Packet]:
-        """New packets with a sample, of any device of the bridge.
+    def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
+        """New samples.
 
         Raises:
             DeviceError: no hello, another version, or a bridge without the wanted device.
         """
         if self.hello is None:
-            self._line += data
-            line, found, rest = self._line.partition(b"\n")
-            if not found or len(line) > MAX_HELLO_BYTES:
-                self._refuse_endless(len(line))
-                return []
-            self._line = bytearray()
-            hello = parse_hello(bytes(line), device=self._device)
-            self.chosen = self._choose(hello)
-            self.hello, data = hello, bytes(rest)
-            if self.on_hello is not None:
-                self.on_hello(hello)
-        return [packet for packet in self._packets.feed(data) if self._is_new(packet)]
-
-    def _is_new(self, packet: Packet) -> bool:
-        check_packet(packet, device=self._device, source=None)
-        if not self.order.admits(packet.sequence) or not packet.payload:
-            return False
-        if len(packet.payload) != self._payload_bytes:
-            self.statistics.refused += 1
-            return False
-        return True
-
-    def _refuse_endless(self, num_bytes: int) -> None:
-        if num_bytes > MAX_HELLO_BYTES:
-            raise DeviceError(
-                f"{self._device}: the bridge sent {num_bytes} bytes without a hello line, expected "
-                f"at most {MAX_HELLO_BYTES}; is this the address of a bridge?",
-                device=self._device,
-                event="wrong_hello",
-            )
-
-    def _choose(self, hello: BridgeHello) -> BridgedDevice:
-        present = ", ".join(f"{d.serial_number} ({d.source})" for d in hello.devices)
-        if hello.kind != self._kind:
-            raise DeviceError(
-                f"{self._device}: the bridge is a {hello.kind}, expected a {self._kind}",
-                device=self._device,
-                event="wrong_hello",
-            )
-        wanted = self._serial_number
-        if wanted is not None:
-            found = [d for d in hello.devices if d.serial_number == wanted]
-        else:
-            found = [d for d in hello.devices if d.source == self._source]
-        if len(found) > 1:
-            raise DeviceError(
-                f"{self._device}: several devices are {self._source!r}; set serial_number to one "
-                f"of: {present}",
-                device=self._device,
-                event="ambiguous_device",
-            )
-        if not found and wanted is not None:
-            raise DeviceError(
-                f"{self._device}: the bridge has no device {wanted!r}; present: {present}",
-                device=self._device,
-                event="absent_device",
-            )
-        if not found or found[0].source != self._source:
-            raise DeviceError(
-                f"{self._device}: the bridge has {present}, expected {self._source!r}; is the "
-                "wrong one connected?",
-                device=self._device,
-                event="wrong_side",
-            )
-        return found[0]
-
-
-class BridgeDecoder(StreamDecoder[Packet]):
-    """Base of the decoders of one device behind a bridge.
-
-    Args:
-        descriptor: of the stream.
-        connection: the bridge's hello and packets; `statistics` are of all devices of the bridge.
-    """
-
-    def __init__(self, descriptor: StreamDescriptor, connection: BridgeConnection) -> None:
-        super().__init__(descriptor, connection)
-        connection.on_hello = self._learn
-        self.connection = connection
-        self.tracking = dict.fromkeys(DROPPED, 0)
-        self._freshness = FreshnessGate()
-
-    def events(self) -> dict[str, int]:
-        """Packets left out so far, by the reason."""
-        return {**self.tracking, **self.connection.order.counts()}
+            data = self._hear_hello(data)
+        return super().feed(data, t_host_ns)
 
     def is_fresh(self, t_device_ns: int, t_host_ns: int) -> bool:
         """Whether a sample is new; one that is not counts as stale."""
@@ -309,14 +229,71 @@ class BridgeDecoder(StreamDecoder[Packet]):
         self.tracking["stale"] += not is_new
         return is_new
 
-    def reset(self) -> None:
-        """The connection was lost."""
-        super().reset()
-        self._freshness.reset()
+    @abstractmethod
+    def _learn(self, hello: BridgeHello, chosen: BridgedDevice) -> None:
+        """Take in what a new connection's hello says of the sender and of the wanted device."""
 
     @abstractmethod
-    def _learn(self, hello: BridgeHello) -> None:
-        """Take in what a new connection's hello says of the sender."""
+    def _new_sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
+        """The sample of a new packet of any device of the bridge; None where it gives none."""
+
+    def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
+        check_packet(packet, device=self._device, source=None)
+        if not self.order.admits(packet.sequence) or not packet.payload:
+            return None
+        if len(packet.payload) != self._payload_bytes:
+            self.statistics.refused += 1
+            return None
+        return self._new_sample(packet, t_host_ns)
+
+    def _hear_hello(self, data: bytes) -> bytes:
+        """What follows the hello; nothing while the hello is not whole."""
+        self._line += data
+        line, found, rest = self._line.partition(b"\n")
+        if len(line) > MAX_HELLO_BYTES:
+            raise self._error(
+                f"the bridge sent {len(line)} bytes without a hello line, expected at most "
+                f"{MAX_HELLO_BYTES}; is this the address of a bridge?",
+                "wrong_hello",
+            )
+        if not found:
+            return b""
+        self._line = bytearray()
+        hello = parse_hello(bytes(line), device=self._device)
+        chosen = self._choose(hello)
+        self.hello = hello
+        self._learn(hello, chosen)
+        return bytes(rest)
+
+    def _choose(self, hello: BridgeHello) -> BridgedDevice:
+        present = ", ".join(f"{d.serial_number} ({d.source})" for d in hello.devices)
+        if hello.kind != self._kind:
+            raise self._error(
+                f"the bridge is a {hello.kind}, expected a {self._kind}", "wrong_hello"
+            )
+        wanted = self._serial_number
+        if wanted is not None:
+            found = [d for d in hello.devices if d.serial_number == wanted]
+        else:
+            found = [d for d in hello.devices if d.source == self._source]
+        if len(found) > 1:
+            raise self._error(
+                f"several devices are {self._source!r}; set serial_number to one of: {present}",
+                "ambiguous_device",
+            )
+        if not found and wanted is not None:
+            raise self._error(
+                f"the bridge has no device {wanted!r}; present: {present}", "absent_device"
+            )
+        if not found or found[0].source != self._source:
+            raise self._error(
+                f"the bridge has {present}, expected {self._source!r}; is the wrong one connected?",
+                "wrong_side",
+            )
+        return found[0]
+
+    def _error(self, text: str, event: str) -> DeviceError:
+        return DeviceError(f"{self._device}: {text}", device=self._device, event=event)
 
 
 class BridgeDriver(Driver):
@@ -330,7 +307,7 @@ class BridgeDriver(Driver):
         self, name: str, *, transport: Transport, decoder: BridgeDecoder, clock: StationClock
     ) -> None:
         super().__init__(name, transport=transport, decoder=decoder, clock=clock)
-        self._connection = decoder.connection
+        self._link = decoder
         self._t_heard_ns = 0
         self._first: Readings = {}
 
@@ -344,7 +321,7 @@ class BridgeDriver(Driver):
         self._t_heard_ns = self._clock.now_ns()
         for _ in range(HELLO_READS):
             self._first = super().read()
-            if self._connection.hello is not None:
+            if self._link.hello is not None:
                 self._t_heard_ns = self._clock.now_ns()
                 return
         raise DeviceError(

@@ -8,7 +8,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
 import structlog
 
@@ -75,9 +75,14 @@ class Transport(Protocol):
 class HandleTransport(ABC, Generic[Handle]):
     """Base of transports over what a library opens: a port, a device, a socket, a camera.
 
+    An OSError of the library is the loss of the device.
+
     Args:
         info: where it leads.
     """
+
+    # What to look at where it cannot be opened.
+    advice: ClassVar = "is it plugged in, and allowed by udev?"
 
     def __init__(self, info: TransportInfo) -> None:
         self.info = info
@@ -90,7 +95,32 @@ class HandleTransport(ABC, Generic[Handle]):
             DeviceError: absent, taken by another process, not permitted, or not to be opened.
         """
         self.close()
-        self._handle = self._connect()
+        try:
+            self._handle = self._connect()
+        except OSError as error:
+            raise DeviceError(f"{self.info}: cannot be opened ({error}); {self.advice}") from error
+
+    def read(self) -> bytes:
+        """All that has arrived, or one report, waiting up to 0.1 s; b"" means: nothing yet.
+
+        Raises:
+            DeviceError: not open, or the device is gone.
+        """
+        try:
+            return self._receive(self._opened())
+        except OSError as error:
+            raise DeviceError(f"{self.info}: unplugged while reading ({error})") from error
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes; of devices of reports one report, whose first byte is its id.
+
+        Raises:
+            DeviceError: not open, or the device is gone or takes no such data.
+        """
+        try:
+            self._send(self._opened(), data)
+        except OSError as error:
+            raise DeviceError(f"{self.info}: lost while writing ({error})") from error
 
     def close(self) -> None:
         """Give the device back; closing twice is fine."""
@@ -106,6 +136,14 @@ class HandleTransport(ABC, Generic[Handle]):
     @abstractmethod
     def _connect(self) -> Handle:
         """Open the device anew."""
+
+    @abstractmethod
+    def _receive(self, handle: Handle) -> bytes:
+        """See `read`."""
+
+    @abstractmethod
+    def _send(self, handle: Handle, data: bytes) -> None:
+        """See `write`."""
 
     @abstractmethod
     def _release(self, handle: Handle) -> None:
@@ -139,13 +177,15 @@ def find_port(serial_number: str) -> str:
 
 
 class SerialTransport(HandleTransport["serial.Serial"]):
-    """One serial port, held exclusively.
+    """One serial port, held exclusively; a write takes 0.5 s at most.
 
     Args:
         find: gives the port's name at every opening, so that a replugged device is found again.
         baud_rate: bits per second (USB devices ignore it).
         serial_number: of the device, for messages.
     """
+
+    advice = "is it in use?"
 
     def __init__(
         self,
@@ -159,38 +199,6 @@ class SerialTransport(HandleTransport["serial.Serial"]):
         self._baud_rate = baud_rate
         self._closing: threading.Thread | None = None
         self._poll = select.poll()
-
-    def read(self) -> bytes:
-        """All that has arrived, waiting up to 0.1 s for the first byte.
-
-        Raises:
-            DeviceError: the port is closed or the device is gone.
-        """
-        port = self._opened()
-        # The wait has its own bound: one left to the line ends only if nobody changes its settings.
-        if not self._poll.poll(READ_TIMEOUT_S * 1e3):
-            return b""
-        try:
-            data = os.read(port.fileno(), SERIAL_READ_BYTES)
-        except BlockingIOError:
-            return b""
-        except OSError as error:
-            raise DeviceError(f"{self.info}: unplugged while reading ({error})") from error
-        if not data:
-            raise DeviceError(f"{self.info}: unplugged while reading (end of file)")
-        return data
-
-    def write(self, data: bytes) -> None:
-        """Send all bytes, within 0.5 s.
-
-        Raises:
-            DeviceError: the port is closed, the device is gone or takes nothing in.
-        """
-        try:
-            self._opened().write(data)
-        except (OSError, TypeError, ValueError) as error:
-            # pyserial fails with the latter two where another thread closes the port meanwhile.
-            raise DeviceError(f"{self.info}: lost while writing ({error})") from error
 
     def _connect(self) -> "serial.Serial":
         """Find and open the port; its input buffer is cleared."""
@@ -211,8 +219,8 @@ class SerialTransport(HandleTransport["serial.Serial"]):
                 write_timeout=WRITE_TIMEOUT_S,
                 exclusive=True,
             )
-        except (OSError, ValueError) as error:  # SerialException is an OSError
-            raise DeviceError(f"{self.info}: cannot be opened ({error}); is it in use?") from error
+        except ValueError as error:
+            raise OSError(error) from error
         # USB bridges of one maker hold bytes back for 16 ms unless told otherwise; now is the time,
         # since doing it in full flow stalls them. Ports without such a timer refuse.
         with contextlib.suppress(OSError, ValueError):
@@ -220,6 +228,25 @@ class SerialTransport(HandleTransport["serial.Serial"]):
         self._poll = select.poll()
         self._poll.register(port.fileno(), select.POLLIN)
         return port
+
+    def _receive(self, handle: "serial.Serial") -> bytes:
+        # The wait has its own bound: one left to the line ends only if nobody changes its settings.
+        if not self._poll.poll(READ_TIMEOUT_S * 1e3):
+            return b""
+        try:
+            data = os.read(handle.fileno(), SERIAL_READ_BYTES)
+        except BlockingIOError:
+            return b""
+        if not data:
+            raise OSError("end of file")
+        return data
+
+    def _send(self, handle: "serial.Serial", data: bytes) -> None:
+        try:
+            handle.write(data)
+        except (TypeError, ValueError) as error:
+            # pyserial fails with these where another thread closes the port meanwhile.
+            raise OSError(error) from error
 
     def _release(self, handle: "serial.Serial") -> None:
         """Close the port; what takes longer than 1 s goes on by itself, and is said."""
@@ -283,37 +310,16 @@ class HidTransport(HandleTransport[HidDevice]):
         super().__init__(TransportInfo("hid", address, serial_number))
         self._open_device = open_device
 
-    def read(self) -> bytes:
-        """One report, waiting up to 0.1 s.
+    def _connect(self) -> HidDevice:
+        return self._open_device()
 
-        Raises:
-            DeviceError: the device is gone.
-        """
-        try:
-            return bytes(self._opened().read(MAX_REPORT_BYTES, round(READ_TIMEOUT_S * 1e3)))
-        except OSError as error:
-            raise DeviceError(f"{self.info}: unplugged while reading ({error})") from error
+    def _receive(self, handle: HidDevice) -> bytes:
+        return bytes(handle.read(MAX_REPORT_BYTES, round(READ_TIMEOUT_S * 1e3)))
 
-    def write(self, data: bytes) -> None:
-        """Send one report; its first byte is the report id.
-
-        Raises:
-            DeviceError: the device is gone or takes no such report.
-        """
-        try:
-            written = self._opened().write(data)
-        except OSError as error:
-            raise DeviceError(f"{self.info}: unplugged while writing ({error})") from error
+    def _send(self, handle: HidDevice, data: bytes) -> None:
+        written = handle.write(data)
         if written < len(data):
             raise DeviceError(f"{self.info}: wrote {written} bytes, expected at least {len(data)}")
-
-    def _connect(self) -> HidDevice:
-        try:
-            return self._open_device()
-        except OSError as error:
-            raise DeviceError(
-                f"{self.info}: cannot be opened ({error}); plugged in, and allowed by udev?"
-            ) from error
 
     def _release(self, handle: HidDevice) -> None:
         handle.close()
@@ -322,44 +328,28 @@ class HidTransport(HandleTransport[HidDevice]):
 class SocketTransport(HandleTransport[socket.socket]):
     """One stream socket, reconnected at every opening."""
 
+    advice = "is the device or bridge there, and does it listen?"
+
     def __init__(self, connect: Callable[[], socket.socket], *, address: str) -> None:
         super().__init__(TransportInfo("socket", address))
         self._dial = connect
 
-    def read(self) -> bytes:
-        """All that has arrived, waiting up to 0.1 s for the first byte.
+    def _connect(self) -> socket.socket:
+        link = self._dial()
+        link.settimeout(READ_TIMEOUT_S)
+        return link
 
-        Raises:
-            DeviceError: the far end is gone.
-        """
+    def _receive(self, handle: socket.socket) -> bytes:
         try:
-            data = self._opened().recv(READ_BYTES)
+            data = handle.recv(READ_BYTES)
         except TimeoutError:
             return b""
-        except OSError as error:
-            raise DeviceError(f"{self.info}: lost while reading ({error})") from error
         if not data:
             raise DeviceError(f"{self.info}: closed by the device")
         return data
 
-    def write(self, data: bytes) -> None:
-        """Send all bytes.
-
-        Raises:
-            DeviceError: the far end is gone.
-        """
-        try:
-            self._opened().sendall(data)
-        except OSError as error:
-            raise DeviceError(f"{self.info}: lost while writing ({error})") from error
-
-    def _connect(self) -> socket.socket:
-        try:
-            link = self._dial()
-        except OSError as error:
-            raise DeviceError(f"{self.info}: cannot connect ({error})") from error
-        link.settimeout(READ_TIMEOUT_S)
-        return link
+    def _send(self, handle: socket.socket, data: bytes) -> None:
+        handle.sendall(data)
 
     def _release(self, handle: socket.socket) -> None:
         handle.close()

@@ -66,65 +66,46 @@ class UsbTransport(HandleTransport[_Opened]):
         self._context: IBackend | None = None
         self._detached = False
 
-    def read(self) -> bytes:
-        """One report, waiting up to 0.1 s.
-
-        Raises:
-            DeviceError: the device is gone.
-        """
-        import usb.core
-
-        opened = self._opened()
-        try:
-            data = opened.device.read(opened.endpoint_in, opened.read_bytes, READ_TIMEOUT_MS)
-        except OSError as error:
-            # Not every backend has the class for it.
-            if isinstance(error, usb.core.USBTimeoutError) or error.errno == errno.ETIMEDOUT:
-                return b""
-            raise DeviceError(f"{self.info}: unplugged while reading ({error})") from error
-        return data.tobytes()
-
-    def write(self, data: bytes) -> None:
-        """Send one report; its first byte is the report id.
-
-        Raises:
-            DeviceError: the device is gone or takes no such report.
-        """
-        opened = self._opened()
-        try:
-            if opened.endpoint_out is not None:
-                written = opened.device.write(opened.endpoint_out, data, WRITE_TIMEOUT_MS)
-            else:
-                written = opened.device.ctrl_transfer(
-                    SET_REPORT_TYPE,
-                    SET_REPORT_REQUEST,
-                    OUTPUT_REPORT | data[0],
-                    opened.interface,
-                    data,
-                    WRITE_TIMEOUT_MS,
-                )
-        except OSError as error:
-            raise DeviceError(f"{self.info}: lost while writing ({error})") from error
-        if written != len(data):
-            raise DeviceError(f"{self.info}: wrote {written} bytes, expected {len(data)}")
-
     def _connect(self) -> _Opened:
         import usb.core
 
         try:
             self._context = self._backend or _new_context()
             device = self._find()
-            try:
-                return self._take(device)
-            except (OSError, DeviceError):
-                self._give_back(device)
-                raise
         except usb.core.NoBackendError as error:
             raise DeviceError(f"{self.info}: libusb-1.0 is not installed ({error})") from error
-        except OSError as error:  # USBError is an OSError
-            raise DeviceError(
-                f"{self.info}: cannot be opened ({error}); plugged in, and allowed by udev?"
-            ) from error
+        try:
+            return self._take(device)
+        except (OSError, DeviceError):
+            self._give_back(device)
+            raise
+
+    def _receive(self, handle: _Opened) -> bytes:
+        import usb.core
+
+        try:
+            data = handle.device.read(handle.endpoint_in, handle.read_bytes, READ_TIMEOUT_MS)
+        except OSError as error:
+            # Not every backend has the class for it.
+            if isinstance(error, usb.core.USBTimeoutError) or error.errno == errno.ETIMEDOUT:
+                return b""
+            raise
+        return data.tobytes()
+
+    def _send(self, handle: _Opened, data: bytes) -> None:
+        if handle.endpoint_out is not None:
+            written = handle.device.write(handle.endpoint_out, data, WRITE_TIMEOUT_MS)
+        else:
+            written = handle.device.ctrl_transfer(
+                SET_REPORT_TYPE,
+                SET_REPORT_REQUEST,
+                OUTPUT_REPORT | data[0],
+                handle.interface,
+                data,
+                WRITE_TIMEOUT_MS,
+            )
+        if written != len(data):
+            raise DeviceError(f"{self.info}: wrote {written} bytes, expected {len(data)}")
 
     def _release(self, handle: _Opened) -> None:
         """Release the interface; a device that is gone is only forgotten."""

@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from dextouch.errors import DeviceError
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
-from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder, encode_packet
+from services.acquisition.devices.pose_tracker.poses import pose_descriptor
+from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
 from services.acquisition.drivers.sdk_link import (
     MAX_HELLO_BYTES,
-    BridgeConnection,
+    BridgeDecoder,
     FrameConvention,
     FreshnessGate,
     parse_hello,
@@ -47,13 +48,25 @@ def line(**changes):
     return json.dumps({**HELLO, **changes}).encode() + b"\n"
 
 
+class Listener(BridgeDecoder):
+    """Gives a sample for every new packet, and remembers which device was chosen."""
+
+    chosen = None
+
+    def _learn(self, hello, chosen):
+        self.chosen = chosen
+
+    def _new_sample(self, packet, t_host_ns):
+        return Sample(t_host_ns, np.zeros(7), packet.t_device_ns, packet.sequence)
+
+
 def connection(source="left", serial_number=None):
-    return BridgeConnection(
+    return Listener(
         "pose_tracker",
-        device="pose_tracker_wrist_left",
+        pose_descriptor("wrist_left"),
         source=source,
         serial_number=serial_number,
-        packets=PacketDecoder(MAGIC, min_payload=0, max_payload=4),
+        magic=MAGIC,
         payload_bytes=4,
     )
 

@@ -14,8 +14,8 @@ from services.acquisition.health import CODES, DiskJudge, HealthCollector, Healt
 from services.acquisition.health.codes import table
 from services.acquisition.health.levels import Board, Finding, Hysteresis
 from services.acquisition.health.station import CalibrationJudge
-from services.acquisition.live import LiveView
 from services.acquisition.mocks.ports import HidPort, PtyPort
+from services.acquisition.station import LiveView
 from services.acquisition.supervisor import DeviceSupervisor
 from tests.unit.acquisition.health_blocks_made import block, judged
 

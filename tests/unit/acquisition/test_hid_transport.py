@@ -67,7 +67,7 @@ def test_what_was_not_written_whole_is_an_error(written):
 
 
 def test_a_write_error_is_loss():
-    with pytest.raises(DeviceError, match="unplugged while writing"):
+    with pytest.raises(DeviceError, match="lost while writing"):
         opened(ScriptedHid(written=OSError("write error"))).write(REPORT)
 
 

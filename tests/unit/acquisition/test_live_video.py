@@ -10,7 +10,7 @@ from dextouch.streams import Sample, encoded_values
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.devices.camera.driver import CameraSettings
-from services.acquisition.live import LiveView
+from services.acquisition.station import LiveView
 
 CAMERA = CameraSettings(stream="camera_head", port=1, height_px=48, width_px=64, encoding="h264")
 

@@ -12,8 +12,8 @@ from services.acquisition.devices.pose_tracker.driver import MAGIC, PAYLOAD, Pos
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
 from services.acquisition.glove_record import is_ours
-from services.acquisition.live import LiveView
 from services.acquisition.settings import AcquisitionSettings
+from services.acquisition.station import LiveView
 
 IDS = {"vendor_id": 1, "product_id": 2}
 

@@ -57,5 +57,5 @@ def test_an_absent_bridge_is_a_device_error(link, tmp_path, unused_tcp_port):
     where = {"path": str(tmp_path / "none.sock")} if "path" in link else {"port": unused_tcp_port}
     device = {**DEVICES[0], "link": "bridge", **where}
     (driver,) = build_drivers(AcquisitionSettings(devices=(device,)).devices, RealClock())
-    with pytest.raises(DeviceError, match="cannot connect"):
+    with pytest.raises(DeviceError, match="cannot be opened"):
         driver.open()

@@ -16,9 +16,9 @@ from services.acquisition.devices import load_calibration
 from services.acquisition.devices.tactile_glove.driver import TactileGloveDecoder
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration
 from services.acquisition.drivers.base import Driver
-from services.acquisition.live import LiveView
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.recorder import Recorder
+from services.acquisition.station import LiveView
 from services.alignment.calibration.tactile_baseline import TactileCalibration
 from services.cli.calibrate import glove, glove_takes
 from services.cli.calibrate.command import main

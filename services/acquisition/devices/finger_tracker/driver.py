@@ -25,7 +25,7 @@ from services.acquisition.drivers.reports import (
     ReportDecoder,
 )
 from services.acquisition.drivers.sdk_link import (
-    BridgeConnection,
+    BridgedDevice,
     BridgeDecoder,
     BridgeDriver,
     BridgeHello,
@@ -206,18 +206,16 @@ class BridgeFingerTrackerDecoder(BridgeDecoder):
     """
 
     def __init__(self, side: Side, *, serial_number: str | None = None) -> None:
-        self._side = side
-        self._device = f"finger_tracker_{side}"
-        connection = BridgeConnection(
+        super().__init__(
             "finger_tracker",
-            device=self._device,
+            keypoints_descriptor(side),
             source=side,
             serial_number=serial_number,
-            packets=PacketDecoder(MAGIC, min_payload=0, max_payload=PAYLOAD_BYTES),
+            magic=MAGIC,
             payload_bytes=PAYLOAD_BYTES,
         )
-        super().__init__(keypoints_descriptor(side), connection)
-        self._order: Int64[np.ndarray, 25] | None = None
+        self._announced: list[int] = []
+        self._order: Int64[np.ndarray, 25] = np.arange(NUM_KEYPOINTS)
         self._ours_m = np.eye(3)
         self.unseen_nodes = 0
 
@@ -225,38 +223,25 @@ class BridgeFingerTrackerDecoder(BridgeDecoder):
         """Packets left out so far, by the reason, and nodes that were not seen."""
         return {**super().events(), "unseen_nodes": self.unseen_nodes}
 
-    def reset(self) -> None:
-        """The connection was lost."""
-        super().reset()
-        self._order = None
-
-    def _learn(self, hello: BridgeHello) -> None:
-        """The order of the nodes and the frame.
-
-        Raises:
-            DeviceError: nodes we do not know.
-        """
+    def _learn(self, hello: BridgeHello, chosen: BridgedDevice) -> None:
+        """The order of the nodes and the frame."""
+        del chosen
         try:
             self._order = np.array(resolve_nodes(hello.nodes or ()))
         except PacketError as error:
-            raise DeviceError(
-                f"{self._device}: {error.message}", device=self._device, event="wrong_nodes"
-            ) from error
+            raise self._error(error.message, "wrong_nodes") from error
+        self._announced = [SOURCES[device.source] for device in hello.devices]
         self._ours_m = hello.scale_m() * hello.frame.ours_from_theirs()
 
-    def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
-        hello, order = self.connection.hello, self._order
-        if hello is None or order is None:
-            return None
-        if packet.source != SOURCES[self._side]:
+    def _new_sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
+        if packet.source != SOURCES[self._source]:
             # The other hand of the same bridge is none of ours; one it did not announce is a fault.
-            announced = [SOURCES[device.source] for device in hello.devices]
-            if packet.source not in announced:
-                check_packet(packet, device=self._device, source=self._side)
+            if packet.source not in self._announced:
+                check_packet(packet, device=self._device, source=self._source)
             return None
         if not self.is_fresh(packet.t_device_ns, t_host_ns):
             return None
-        theirs, num_unseen = unpack_keypoints(packet.payload, order)
+        theirs, num_unseen = unpack_keypoints(packet.payload, self._order)
         self.unseen_nodes += num_unseen
         keypoints = (theirs.astype(np.float64) @ self._ours_m.T).astype(np.float32)
         return Sample(t_host_ns, keypoints, packet.t_device_ns, packet.sequence)

@@ -30,7 +30,7 @@ from services.acquisition.drivers.packets import Packet, PacketDecoder
 from services.acquisition.drivers.reports import ReportDecoder
 from services.acquisition.drivers.sdk_link import (
     DROPPED,
-    BridgeConnection,
+    BridgedDevice,
     BridgeDecoder,
     BridgeDriver,
     BridgeHello,
@@ -117,17 +117,17 @@ class BridgePoseTrackerDecoder(BridgeDecoder):
     """
 
     def __init__(self, stream: str, *, serial_number: str | None = None) -> None:
-        self._device = f"pose_tracker_{stream}"
-        connection = BridgeConnection(
+        super().__init__(
             "pose_tracker",
-            device=self._device,
+            pose_descriptor(stream),
             source=source_of(stream),
             serial_number=serial_number,
-            packets=PacketDecoder(POSE_MAGIC, min_payload=0, max_payload=POSE_PAYLOAD.size),
+            magic=POSE_MAGIC,
             payload_bytes=POSE_PAYLOAD.size,
         )
-        super().__init__(pose_descriptor(stream), connection)
         self._gate = PoseGate(self.tracking)
+        # Index and frame of the wanted device, told by the hello.
+        self._index: int | None = None
         self._frame: SenderFrame | None = None
 
     def reset(self) -> None:
@@ -135,15 +135,15 @@ class BridgePoseTrackerDecoder(BridgeDecoder):
         super().reset()
         self._gate.reset()
 
-    def _learn(self, hello: BridgeHello) -> None:
-        self._frame = SenderFrame(hello.frame, hello.scale_m())
+    def _learn(self, hello: BridgeHello, chosen: BridgedDevice) -> None:
+        self._index, self._frame = chosen.index, SenderFrame(hello.frame, hello.scale_m())
 
-    def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
-        chosen, frame = self.connection.chosen, self._frame
+    def _new_sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
+        frame = self._frame
         index, flag, result, seconds, *numbers = POSE_PAYLOAD.unpack(packet.payload)
-        if chosen is None or frame is None or index != chosen.index:
+        if frame is None or index != self._index:
             return None
-        check_packet(packet, device=self._device, source=chosen.source)
+        check_packet(packet, device=self._device, source=self._source)
         if not (math.isfinite(seconds) and 0 <= seconds < MAX_SECONDS):
             self.statistics.refused += 1
             return None

@@ -142,12 +142,10 @@ class CaptureLink(HandleTransport[Capture]):
         """
         return self._opened()
 
-    def read(self) -> bytes:
-        """Refused: a camera gives images (`capture`), not bytes."""
+    def _receive(self, handle: Capture) -> bytes:
         raise DeviceError(f"{self.info}: provides images, not bytes; read it through its capture")
 
-    def write(self, data: bytes) -> None:
-        """Refused: a camera takes no bytes."""
+    def _send(self, handle: Capture, data: bytes) -> None:
         raise DeviceError(f"{self.info}: accepts no data, got {len(data)}")
 
     def _connect(self) -> Capture:
