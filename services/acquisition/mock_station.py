@@ -1,7 +1,7 @@
 """A station whose devices are simulated and play one episode, through the real drivers."""
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
@@ -27,13 +27,13 @@ from services.acquisition.devices.registry import (
 from services.acquisition.devices.robot_state.driver import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.devices.robot_state.mock import RobotStateSource
 from services.acquisition.devices.station_camera.mock import video_camera
-from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.base import Decoder, Driver
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Ledger
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.place import MockPlace
-from services.acquisition.mocks.ports import MockPort, SocketPort
+from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import (
     MockDevice,
     PacketSource,
@@ -52,38 +52,34 @@ LEAD_NS = 20_000_000
 LIVE_LEAD_NS = 200_000_000
 
 
-def mock_of(name: str) -> Callable[[MockPlace], MockPair]:
-    """What makes a simulated device of the kind of this name.
+def mock_glove_of(kind_name: str, place: MockPlace) -> MockPair:
+    """A simulated glove of a kind of this package or another one.
 
     Raises:
         UnknownNameError: no package brings the kind.
-        InvalidInputError: the kind has no mock, or it cannot be imported.
+        InvalidInputError: the kind has no mock, it cannot be imported, or it gives something else.
     """
-    kind = device_kind(name)
+    kind = device_kind(kind_name)
     if kind.mock is None:
         raise InvalidInputError(
-            f"kind of device {name!r}: got no mock, expected one to simulate it; choose another "
-            f"kind for the mock station ({', '.join(kind_names())}) or write its mock"
+            f"kind of device {kind_name!r}: got no mock, expected one to simulate it; choose "
+            f"another kind for the mock station ({', '.join(kind_names())}) or write its mock"
         )
-    point = EntryPoint(name=name, value=kind.mock, group=ENTRY_POINT_GROUP)
+    where = f"mock of kind {kind_name!r} ({kind.mock})"
     try:
-        make = point.load()
+        make = EntryPoint(kind_name, kind.mock, ENTRY_POINT_GROUP).load()
     except IMPORT_FAILURES as error:
         raise InvalidInputError(
-            f"mock of kind {name!r} ({kind.mock}): got {type(error).__name__}: {error}, expected "
-            "a function 'module:function' of a MockPlace; fix the package that provides the kind"
+            f"{where}: got {type(error).__name__}: {error}, expected a function 'module:function' "
+            "of a MockPlace; fix the package that provides the kind"
         ) from error
-
-    def checked(place: MockPlace) -> MockPair:
-        pair: object = make(place)
-        if not isinstance(pair, MockPair):
-            raise InvalidInputError(
-                f"mock of kind {name!r} ({kind.mock}): gave {type(pair).__name__}, expected a "
-                "services.acquisition.mocks.MockPair; fix the package that provides the kind"
-            )
-        return pair
-
-    return checked
+    pair: object = make(place)
+    if not isinstance(pair, MockPair):
+        raise InvalidInputError(
+            f"{where}: gave {type(pair).__name__}, expected a services.acquisition.mocks.MockPair; "
+            "fix the package that provides the kind"
+        )
+    return pair
 
 
 class MockFactory:
@@ -113,7 +109,6 @@ class MockFactory:
         self._seed = seed
         self._clock = clock
         self._links = links or MockLinks()
-        self._make_glove = mock_of(self._links.gloves)
 
     def build(self) -> list[MockPair]:
         """One pair a device.
@@ -122,17 +117,11 @@ class MockFactory:
             InvalidInputError: no stream that any device sends.
         """
         pairs = [pair for side in SIDES for pair in self._hand(side)]
+        trackers = [*WRISTS, "head"]
         if "joints_measured" in self._streams:
-            parts = {name: s for name, s in self._streams.items() if name in STREAM_SIZES}
-            port, decoder = SocketPort("robot"), RobotStateDecoder(self._robot_streams())
-            driver = Driver(
-                "robot_state", transport=port.transport, decoder=decoder, clock=self._clock
-            )
-            device = self._device("robot_state", RobotStateSource(parts), port)
-            pairs.append(MockPair(device, driver))
-            trackers = ["head", *(name for name in WRISTS if name not in self._robot_streams())]
-        else:
-            trackers = [*WRISTS, "head"]
+            by_trackers = WRISTS if self._links.wrists == "trackers" else ()
+            pairs.append(self._robot([name for name in STREAM_SIZES if name not in by_trackers]))
+            trackers = ["head", *by_trackers]
         pairs += [
             mock_pose_tracker(self._streams[name], self._place(f"pose_tracker_{name}"))
             for name in trackers
@@ -145,10 +134,6 @@ class MockFactory:
                 "keypoints_…, wrist_…, head, camera_… or joints_…"
             )
         return pairs
-
-    def _robot_streams(self) -> list[str]:
-        by_trackers = self._links.wrists == "trackers"
-        return [name for name in STREAM_SIZES if not (by_trackers and name in WRISTS)]
 
     def calibration(self, pairs: Sequence[MockPair]) -> dict[str, Matrix]:
         """What a calibrated station knows of these devices, as each of them says."""
@@ -168,22 +153,22 @@ class MockFactory:
                 record[f"{descriptor.name}_latency_sigma_ns"] = ((sigma_ns,),)
         return record
 
-    def _hand(self, side: Side) -> list[MockPair]:
-        pairs = []
-        if f"tactile_{side}" in self._streams:
-            pairs.append(self._glove(side))
-        if f"keypoints_{side}" in self._streams:
-            place = self._place(f"finger_tracker_{side}")
-            pairs.append(mock_finger_tracker(side, self._streams[f"keypoints_{side}"], place))
-        return pairs
+    def _hand(self, side: Side) -> Iterator[MockPair]:
+        tactile = self._streams.get(f"tactile_{side}")
+        if tactile is not None:
+            faults = self._faults.of(f"glove_{side}")
+            place = MockPlace(side, tactile, faults, self._seed, self._clock)
+            yield mock_glove_of(self._links.gloves, place)
+        keypoints = self._streams.get(f"keypoints_{side}")
+        if keypoints is not None:
+            yield mock_finger_tracker(side, keypoints, self._place(f"finger_tracker_{side}"))
 
     def _place(self, name: str) -> TrackerPlace:
         return TrackerPlace(self._links.trackers, self._faults.of(name), self._seed, self._clock)
 
-    def _glove(self, side: Side) -> MockPair:
-        stream, faults = self._streams[f"tactile_{side}"], self._faults.of(f"glove_{side}")
-        place = MockPlace(side, stream, faults, self._seed, self._clock)
-        return self._make_glove(place)
+    def _robot(self, recorded: Sequence[str]) -> MockPair:
+        source = RobotStateSource({n: s for n, s in self._streams.items() if n in STREAM_SIZES})
+        return self._on_socket("robot_state", source, Driver, RobotStateDecoder(recorded))
 
     def _camera(self, stream: str) -> MockPair:
         replay, images = self._streams[stream], self._links.images
@@ -197,18 +182,16 @@ class MockFactory:
             )
         height_px, width_px = replay.descriptor.shape[:2]
         decoder = CameraDecoder(stream, height_px=height_px, width_px=width_px, encoding=images)
-        port = SocketPort(stream)
-        driver = CameraDriver(stream, transport=port.transport, decoder=decoder, clock=self._clock)
-        return MockPair(self._device(stream, CameraSource(replay, encoding=images), port), driver)
+        return self._on_socket(stream, CameraSource(replay, encoding=images), CameraDriver, decoder)
 
-    def _device(self, name: str, source: PacketSource, port: MockPort) -> MockDevice:
-        faults = self._faults.of(name)
-        return MockDevice(name, source=source, port=port, faults=faults, seed=self._seed)
-
-
-def duration_ns(streams: Mapping[str, ReplayStream]) -> int:
-    """Length of one round of all streams: the last sample and one period of its stream."""
-    return max(int(s.t_ns[-1]) + s.descriptor.period_ns() for s in streams.values())
+    def _on_socket(
+        self, name: str, source: PacketSource, driver: Callable[..., Driver], decoder: Decoder
+    ) -> MockPair:
+        port, faults = SocketPort(name), self._faults.of(name)
+        return MockPair(
+            MockDevice(name, source=source, port=port, faults=faults, seed=self._seed),
+            driver(name, transport=port.transport, decoder=decoder, clock=self._clock),
+        )
 
 
 @dataclass(frozen=True)
@@ -254,7 +237,8 @@ class MockStation:
         self.pairs = factory.build()
         self._clock = clock
         self._seed = seed
-        self._lap_ns = duration_ns({s.descriptor.name: s for s in streams})
+        # One round of all streams: the last sample and one period of its stream.
+        self._lap_ns = max(int(s.t_ns[-1]) + s.descriptor.period_ns() for s in streams)
         self.station = Station(
             name=name,
             drivers=[pair.driver for pair in self.pairs],

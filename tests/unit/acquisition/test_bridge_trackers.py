@@ -27,8 +27,6 @@ from services.acquisition.devices.pose_tracker.driver import (
 from services.acquisition.devices.pose_tracker.mock import (
     POSE_INDEX,
     BridgePoseSource,
-    Jump,
-    Occlusion,
 )
 from services.acquisition.devices.pose_tracker.poses import (
     SenderFrame,
@@ -213,8 +211,8 @@ def test_hands_arrive_as_they_are(seed, frame):
 
 
 def test_only_the_running_result_counts():
-    tracking = [Occlusion(0.5, 0.8)]
-    source, decoder = poses(tracking=tracking), BridgePoseTrackerDecoder("wrist_left")
+    source, decoder = poses(), BridgePoseTrackerDecoder("wrist_left")
+    source.lose(0.5, 0.8)
     samples = play(source, decoder)
     # The flag was set all the time.
     assert [s.sequence for s in samples] == np.flatnonzero(source.labels == "").tolist()
@@ -267,7 +265,8 @@ def test_other_devices_of_the_bridge_are_not_ours():
 
 
 def test_jumps_are_marked():
-    source = poses(tracking=[Jump(1.0, 1.02, offset_m=(0.0, 0.3, 0.0))])
+    source = poses()
+    source.move(1.0, 1.02, offset_m=(0.0, 0.3, 0.0))
     decoder = BridgePoseTrackerDecoder("wrist_left")
     samples = play(source, decoder)
     assert [s.sequence for s in samples] == np.flatnonzero(source.labels == "").tolist()

@@ -1,7 +1,7 @@
 """Simulated finger tracker with its own node order, connected by HID, USB or a bridge."""
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from dextouch.hands import NODES, NUM_KEYPOINTS, chain_indices
 from dextouch.tactile.layout import Side
@@ -65,7 +65,12 @@ class TrackedFingers:
         self.t_ns = stream.t_ns
         self._side = side
         self._order = rng.permutation(NUM_KEYPOINTS)
-        self._seen = seen_nodes(stream.t_ns, self._order, faults)
+        # For each sample one bit a node, in the device's order: whether the device sees it.
+        hidden = sum(1 << int(place) for place in np.flatnonzero(np.isin(self._order, _HIDDEN)))
+        self._seen = np.full(len(stream.t_ns), ALL_SEEN, dtype=np.int64)
+        for start_s, stop_s in faults.occluded_s:
+            during = (stream.t_ns >= start_s * 1e9) & (stream.t_ns < stop_s * 1e9)
+            self._seen[during] &= ~hidden
         noise_m = faults.position_noise_m * rng.standard_normal(stream.values.shape)
         self._points_m = (stream.values + noise_m)[:, self._order]
 
@@ -103,23 +108,6 @@ class FingerTrackerSource(TrackedFingers):
         )
         packet = Packet(VERSION, SOURCES[self._side], 0, 0, payload)
         return split_into_reports(DESCRIPTOR_REPORT, 0, encode_packet(DESCRIPTOR_MAGIC, packet))
-
-
-def seen_nodes(
-    t_ns: np.ndarray, order: np.ndarray, faults: DeviceFaults
-) -> Int64[np.ndarray, " n"]:
-    """For each sample one bit a node, in the device's order: whether the device sees it.
-
-    Args:
-        t_ns: of the samples, from the start of the stream.
-        order: our index of each of the device's nodes.
-        faults: when the thumb is hidden.
-    """
-    hidden = sum(1 << int(place) for place in np.flatnonzero(np.isin(order, _HIDDEN)))
-    seen = np.full(len(t_ns), ALL_SEEN, dtype=np.int64)
-    for start_s, stop_s in faults.occluded_s:
-        seen[(t_ns >= start_s * 1e9) & (t_ns < stop_s * 1e9)] &= ~hidden
-    return seen
 
 
 class BridgeFingerTrackerSource(TrackedFingers):

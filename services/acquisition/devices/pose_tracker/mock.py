@@ -1,10 +1,9 @@
 """A simulated pose tracker by HID, USB or a bridge, with occlusions, jumps and noise."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from dextouch.geometry.rotations import (
     quaternion_from_rotation,
@@ -55,37 +54,6 @@ DRIFT_M_PER_S = 0.5
 JUMP_M = (1.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class Occlusion:
-    """The tracker is not seen in [start_s, stop_s): another state, and a pose that drifts away."""
-
-    start_s: float
-    stop_s: float
-    state: TrackingState = TrackingState.OUT_OF_RANGE
-
-
-@dataclass(frozen=True)
-class Jump:
-    """The tracker says it runs in [start_s, stop_s), but its pose is elsewhere by this much."""
-
-    start_s: float
-    stop_s: float
-    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-TrackingFault = Occlusion | Jump
-
-
-def tracking_faults(faults: DeviceFaults) -> list[TrackingFault]:
-    """The occlusions and jumps of a device's script."""
-    return [
-        *(Occlusion(*window_s) for window_s in faults.occluded_s),
-        *(Occlusion(*window_s, TrackingState.UNINITIALIZED) for window_s in faults.not_running_s),
-        *(Jump(*window_s, JUMP_M) for window_s in faults.jumped_s),
-    ]
-
-
 class TrackedPoses:
     """What a tracker says of a body: poses with noise and tracking faults, and the truth of these.
 
@@ -93,8 +61,6 @@ class TrackedPoses:
         stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
         faults: position and rotation noise, per axis; occlusions and jumps.
         rng: of the noise.
-        tracking: occlusions and jumps besides those of `faults`; times count from the start of
-            the stream.
     """
 
     def __init__(
@@ -103,7 +69,6 @@ class TrackedPoses:
         *,
         faults: DeviceFaults,
         rng: np.random.Generator,
-        tracking: Sequence[TrackingFault] = (),
     ) -> None:
         self.t_ns = stream.t_ns
         self.source = source_of(stream.descriptor.name)
@@ -111,19 +76,40 @@ class TrackedPoses:
         self.states = np.full(len(self.t_ns), int(TrackingState.RUNNING_OK))
         # The ledger of this source: the fault of each sample, "" if it has none.
         self.labels = np.full(len(self.t_ns), "", dtype="<U8")
-        for fault in (*tracking_faults(faults), *tracking):
-            during = (self.t_ns >= fault.start_s * 1e9) & (self.t_ns < fault.stop_s * 1e9)
-            if isinstance(fault, Occlusion):
-                self.states[during] = int(fault.state)
-                self.labels[during] = "occluded"
-                drift_s = (self.t_ns[during] - fault.start_s * 1e9) / 1e9
-                self.poses[during, 0] += DRIFT_M_PER_S * drift_s
-            else:
-                self.labels[during] = "jumped"
-                self.poses[during, :3] += np.array(fault.offset_m)
-                R_world_body = rotation_from_quaternion(self.poses[during, 3:])
-                turned = rotation_from_vector(np.array(fault.turn_rad)) @ R_world_body
-                self.poses[during, 3:] = quaternion_from_rotation(turned)
+        for window_s in faults.occluded_s:
+            self.lose(*window_s)
+        for window_s in faults.not_running_s:
+            self.lose(*window_s, TrackingState.UNINITIALIZED)
+        for window_s in faults.jumped_s:
+            self.move(*window_s, JUMP_M)
+
+    def lose(
+        self, start_s: float, stop_s: float, state: TrackingState = TrackingState.OUT_OF_RANGE
+    ) -> None:
+        """The tracker is not seen for a while: another state, and a pose that drifts away."""
+        during = self._labelled(start_s, stop_s, "occluded")
+        self.states[during] = int(state)
+        drift_s = (self.t_ns[during] - start_s * 1e9) / 1e9
+        self.poses[during, 0] += DRIFT_M_PER_S * drift_s
+
+    def move(
+        self,
+        start_s: float,
+        stop_s: float,
+        offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """The tracker says it runs for a while, but its pose is elsewhere by this much."""
+        during = self._labelled(start_s, stop_s, "jumped")
+        self.poses[during, :3] += np.array(offset_m)
+        R_world_body = rotation_from_quaternion(self.poses[during, 3:])
+        turned = rotation_from_vector(np.array(turn_rad)) @ R_world_body
+        self.poses[during, 3:] = quaternion_from_rotation(turned)
+
+    def _labelled(self, start_s: float, stop_s: float, label: str) -> Bool[np.ndarray, " n"]:
+        during = (self.t_ns >= start_s * 1e9) & (self.t_ns < stop_s * 1e9)
+        self.labels[during] = label
+        return during
 
     def fate(self, index: int) -> Fate:
         """What becomes of one sample if its packet arrives."""
@@ -159,7 +145,6 @@ class BridgePoseSource(TrackedPoses):
         stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
         faults: position and rotation noise, per axis; occlusions and jumps.
         rng: of the noise.
-        tracking: occlusions and jumps.
         frame: the source's coordinates.
     """
 
@@ -171,11 +156,10 @@ class BridgePoseSource(TrackedPoses):
         *,
         faults: DeviceFaults,
         rng: np.random.Generator,
-        tracking: Sequence[TrackingFault] = (),
         frame: FrameConvention = Y_UP,
     ) -> None:
-        super().__init__(stream, faults=faults, rng=rng, tracking=tracking)
-        self._matrices = _matrices(self.poses, frame.ours_from_theirs().T)
+        super().__init__(stream, faults=faults, rng=rng)
+        self._theirs_from_ours = frame.ours_from_theirs().T
         number = f"LHR-{self.source}"
         device = {"index": POSE_INDEX, "serial_number": number, "source": self.source}
         self._hello = BridgeHello(
@@ -200,13 +184,11 @@ class BridgePoseSource(TrackedPoses):
         packet = Packet(VERSION, SOURCES[self.source], sequence, t_device_ns, payload)
         return [encode_packet(POSE_MAGIC, packet)]
 
-
-def _matrices(
-    poses: np.ndarray, theirs_from_ours: Float64[np.ndarray, "3 3"]
-) -> Float64[np.ndarray, "n 3 4"]:
-    R = theirs_from_ours @ rotation_from_quaternion(poses[:, 3:]) @ theirs_from_ours.T
-    t = poses[:, :3] @ theirs_from_ours.T
-    return np.concatenate([R, t[:, :, None]], axis=2)
+    @cached_property
+    def _matrices(self) -> Float64[np.ndarray, "n 3 4"]:
+        M = self._theirs_from_ours
+        R = M @ rotation_from_quaternion(self.poses[:, 3:]) @ M.T
+        return np.concatenate([R, (self.poses[:, :3] @ M.T)[:, :, None]], axis=2)
 
 
 def mock_pose_tracker(stream: ReplayStream, place: TrackerPlace) -> MockPair:
