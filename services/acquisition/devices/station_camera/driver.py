@@ -50,21 +50,27 @@ MAX_AHEAD_NS = 100_000
 MAX_BAD_STAMPS = 10
 
 
-class _CaptureDecoder:
-    """The decoder's part of a camera that gives images and no bytes."""
+class DriverStamps:
+    """The decoder's part of a camera that gives images and no bytes: judges its driver's stamps.
+
+    Gives each image its device time and number, or refuses it and counts that. The number counts
+    the images that must have been there, by the stamps: what got lost before us leaves a gap in it.
+    """
 
     def __init__(self, settings: StationCameraSettings) -> None:
         self.statistics = DecoderStatistics()
-        self.stamps = DriverStamps(
-            settings.stream, period_ns=settings.period_ns, statistics=self.statistics
-        )
+        self.usable: bool | None = None
+        self.least_delay_ns: int | None = None
         self._settings = settings
+        self._last_ns: int | None = None
+        self._number = 0
+        self._num_bad = 0
 
     @property
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
         """The image stream; without device time once the driver's stamps proved useless."""
         settings = self._settings
-        has_time = self.stamps.usable is not False
+        has_time = self.usable is not False
         descriptor = StreamDescriptor(
             name=settings.stream,
             kind="image",
@@ -89,6 +95,51 @@ class _CaptureDecoder:
             f"{self._settings.stream}: got {len(data)} bytes at {t_host_ns}, no image"
         )
 
+    def accept(self, t_driver_ns: int | None, t_host_ns: int) -> tuple[int, int] | None:
+        """Stamp and number of an image; without a usable clock the values for "none".
+
+        Returns:
+            None if the image must be dropped: repeated, or with a stamp that cannot be.
+
+        Raises:
+            DeviceError: the stamps have left the host's clock; they are not used any more.
+        """
+        if self.usable is None:
+            self.usable = _is_plausible(t_driver_ns, t_host_ns, MAX_FIRST_AGE_NS)
+        if not self.usable:
+            return NO_DEVICE_TIME, NO_SEQUENCE
+        if t_driver_ns is None or not _is_plausible(t_driver_ns, t_host_ns, MAX_AGE_NS):
+            self._refuse()
+            return None
+        if self._last_ns is not None and t_driver_ns == self._last_ns:
+            self.statistics.repeated += 1
+            return None
+        if self._last_ns is not None and t_driver_ns < self._last_ns:
+            self._refuse()
+            return None
+        self._num_bad = 0
+        if self._last_ns is not None:
+            steps = max(1, round((t_driver_ns - self._last_ns) / self._settings.period_ns))
+            self.statistics.lost += steps - 1
+            self._number += steps
+        self._last_ns = t_driver_ns
+        delay_ns = t_host_ns - t_driver_ns
+        if self.least_delay_ns is None or delay_ns < self.least_delay_ns:
+            self.least_delay_ns = delay_ns
+        return t_driver_ns, self._number
+
+    def _refuse(self) -> None:
+        self.statistics.refused += 1
+        self._num_bad += 1
+        if self._num_bad >= MAX_BAD_STAMPS:
+            self.usable = False
+            raise DeviceError(
+                f"{self._settings.stream}: {self._num_bad} timestamps in a row are "
+                "not on this host's clock, unlike the first ones; from now on its images have "
+                "arrival timestamps only",
+                device=self._settings.stream,
+            )
+
 
 class StationCamera(Driver):
     """A camera on this host; encodes in a separate thread.
@@ -112,13 +163,12 @@ class StationCamera(Driver):
         clock: StationClock,
         max_encode_wait_s: float | None = None,
     ) -> None:
-        decoder = _CaptureDecoder(settings)
-        super().__init__(settings.stream, transport=link, decoder=decoder, clock=clock)
+        self._stamps = DriverStamps(settings)
+        super().__init__(settings.stream, transport=link, decoder=self._stamps, clock=clock)
         self._link, self._settings = link, settings
         encoder = ImageEncoder(settings.encoding, settings.size_px, rate_hz=settings.rate_hz)
         self._queue = EncodingQueue(encoder, name=settings.stream)
         self._checker = ImageChecker(period_ns=settings.period_ns)
-        self._stamps = decoder.stamps
         period_s = settings.period_ns / 1e9
         self._encode_wait_s = period_s / 2 if max_encode_wait_s is None else max_encode_wait_s
         self._exposure_ns = settings.exposure_ns
@@ -226,72 +276,6 @@ class StationCamera(Driver):
                 f"{self.name}: no image for {silent_ns / NS_PER_MS:.0f} ms from {self.info}, "
                 f"expected one every {self._settings.period_ns / NS_PER_MS:.0f} ms",
                 device=self.name,
-            )
-
-
-class DriverStamps:
-    """Gives each image its device time and number, or refuses it and counts that.
-
-    The number counts the images that must have been there, by the stamps: what got lost before
-    us leaves a gap in it.
-
-    Args:
-        camera: for messages.
-        period_ns: nominal distance of two images.
-        statistics: where repeated, refused and lost images are counted.
-    """
-
-    def __init__(self, camera: str, *, period_ns: int, statistics: DecoderStatistics) -> None:
-        self.usable: bool | None = None
-        self.least_delay_ns: int | None = None
-        self._camera, self._period_ns, self._statistics = camera, period_ns, statistics
-        self._last_ns: int | None = None
-        self._number = 0
-        self._num_bad = 0
-
-    def accept(self, t_driver_ns: int | None, t_host_ns: int) -> tuple[int, int] | None:
-        """Stamp and number of an image; without a usable clock the values for "none".
-
-        Returns:
-            None if the image must be dropped: repeated, or with a stamp that cannot be.
-
-        Raises:
-            DeviceError: the stamps have left the host's clock; they are not used any more.
-        """
-        if self.usable is None:
-            self.usable = _is_plausible(t_driver_ns, t_host_ns, MAX_FIRST_AGE_NS)
-        if not self.usable:
-            return NO_DEVICE_TIME, NO_SEQUENCE
-        if t_driver_ns is None or not _is_plausible(t_driver_ns, t_host_ns, MAX_AGE_NS):
-            self._refuse()
-            return None
-        if self._last_ns is not None and t_driver_ns == self._last_ns:
-            self._statistics.repeated += 1
-            return None
-        if self._last_ns is not None and t_driver_ns < self._last_ns:
-            self._refuse()
-            return None
-        self._num_bad = 0
-        if self._last_ns is not None:
-            steps = max(1, round((t_driver_ns - self._last_ns) / self._period_ns))
-            self._statistics.lost += steps - 1
-            self._number += steps
-        self._last_ns = t_driver_ns
-        delay_ns = t_host_ns - t_driver_ns
-        if self.least_delay_ns is None or delay_ns < self.least_delay_ns:
-            self.least_delay_ns = delay_ns
-        return t_driver_ns, self._number
-
-    def _refuse(self) -> None:
-        self._statistics.refused += 1
-        self._num_bad += 1
-        if self._num_bad >= MAX_BAD_STAMPS:
-            self.usable = False
-            raise DeviceError(
-                f"{self._camera}: {self._num_bad} timestamps in a row are "
-                "not on this host's clock, unlike the first ones; from now on its images have "
-                "arrival timestamps only",
-                device=self._camera,
             )
 
 

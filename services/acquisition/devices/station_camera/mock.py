@@ -5,8 +5,6 @@ with the kernel's stamps, four buffers, an error when it is pulled out.
 """
 
 import struct
-import threading
-from collections import deque
 
 import numpy as np
 
@@ -21,88 +19,80 @@ from services.acquisition.devices.station_camera.driver import StationCamera
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.link import Link
 from services.acquisition.mocks.pair import MockPair
+from services.acquisition.mocks.ports import ReportDevice
 from services.acquisition.mocks.replay import MockDevice, ReplayStream
 
-# V4L2 drivers fill their buffers and lose later images.
-NUM_BUFFERS = 4
 UNIT_HEADER = struct.Struct("<qHH")
 # With a virtual clock, time must not go on while an image is being encoded.
 LOCKSTEP_WAIT_S = 20.0
 
 
-class VideoPort:
+class VideoPort(ReportDevice):
     """The device's end of a camera; each opening of the host gets a new capture."""
 
+    # V4L2 drivers fill their buffers and lose later images.
+    max_reports = 4
     has_bit_errors = False
 
-    def __init__(self, name: str, *, exposure_ns: int | None = None) -> None:
+    def __init__(self, name: str) -> None:
+        super().__init__()
         self.link = Link()
-        self.exposure_ns = exposure_ns
+        # What the camera states, if anything.
+        self.exposure_ns: int | None = None
         self._name = name
-        self._changed = threading.Condition()
-        self._buffers: deque[bytes] = deque()
-        self._is_plugged = False
         self.transport = CaptureLink(self._open, address=f"mock:{name}", serial_number=name)
 
     def plug(self) -> None:
         """Plug in."""
-        with self._changed:
-            self._is_plugged = True
+        self.set_plugged(plugged=True)
 
     def unplug(self) -> None:
         """Pull out: a waiting host notices at once."""
-        with self._changed:
-            self._is_plugged = False
-            self._buffers.clear()
-            self._changed.notify_all()
+        self.flush()
+        self.set_plugged(plugged=False)
 
     def send(self, unit: bytes) -> bool:
         """An image is there; False when all buffers were full."""
-        with self._changed:
-            if not self._is_plugged or len(self._buffers) >= NUM_BUFFERS:
-                return False
-            self.link.add_sent(len(unit))
-            self._buffers.append(unit)
-            self._changed.notify_all()
-        return True
+        self.link.add_sent(len(unit))
+        taken = self.is_plugged and self.push(unit)
+        if not taken:
+            self.link.add_sent(-len(unit))
+        return taken
 
-    def take(self, timeout_s: float) -> bytes | None:
-        """The oldest image; None when none comes in time.
+    def take(self, timeout_s: float) -> bytes:
+        """The oldest image; b"" when none comes in time.
 
         Raises:
             DeviceError: unplugged.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._buffers or not self._is_plugged, timeout_s)
-            if not self._is_plugged:
-                raise DeviceError(f"camera mock:{self._name}: unplugged while reading")
-            return self._buffers.popleft() if self._buffers else None
+            self._changed.wait_for(lambda: self._reports or not self.is_plugged, timeout_s)
+            self._check("unplugged while reading")
+            return self._reports.popleft() if self._reports else b""
 
     def _open(self) -> "MockCapture":
-        with self._changed:
-            if not self._is_plugged:
-                raise DeviceError(f"camera mock:{self._name}: is not plugged in")
-            self._buffers.clear()
+        self._check("is not plugged in")
+        self.flush()
         self.link.set_open(is_open=True)
         return MockCapture(self)
+
+    def _check(self, otherwise: str) -> None:
+        if not self.is_plugged:
+            raise DeviceError(f"camera mock:{self._name}: {otherwise}")
 
 
 class MockCapture:
     """The host's end of a mock camera."""
 
     def __init__(self, port: VideoPort) -> None:
+        self.exposure_ns = port.exposure_ns
         self._port = port
         self._unit = b""
-
-    @property
-    def exposure_ns(self) -> int | None:
-        """What the mock states."""
-        return self._port.exposure_ns
 
     def wait(self, timeout_s: float) -> bool:
         """Fetch the next image; images fetched before have been processed by now."""
         self._port.link.add_consumed(len(self._unit))
-        self._unit = self._port.take(timeout_s) or b""
+        self._unit = self._port.take(timeout_s)
         return bool(self._unit)
 
     def retrieve(self) -> CapturedImage | None:
