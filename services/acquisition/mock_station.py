@@ -1,7 +1,7 @@
 """A station whose devices are simulated and play one episode, through the real drivers."""
 
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
@@ -14,7 +14,7 @@ from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.schemas import Matrix, SaveTake, TakeCheck, TakePrompt
 from dextouch.tactile.layout import SIDES, Side
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
-from services.acquisition.devices.camera.driver import CameraDecoder, CameraDriver
+from services.acquisition.devices.camera.driver import CameraDecoder
 from services.acquisition.devices.camera.mock import CameraSource
 from services.acquisition.devices.finger_tracker.mock import mock_finger_tracker
 from services.acquisition.devices.pose_tracker.mock import mock_pose_tracker
@@ -168,7 +168,7 @@ class MockFactory:
 
     def _robot(self, recorded: Sequence[str]) -> MockPair:
         source = RobotStateSource({n: s for n, s in self._streams.items() if n in STREAM_SIZES})
-        return self._on_socket("robot_state", source, Driver, RobotStateDecoder(recorded))
+        return self._on_socket("robot_state", source, RobotStateDecoder(recorded))
 
     def _camera(self, stream: str) -> MockPair:
         replay, images = self._streams[stream], self._links.images
@@ -182,15 +182,13 @@ class MockFactory:
             )
         height_px, width_px = replay.descriptor.shape[:2]
         decoder = CameraDecoder(stream, height_px=height_px, width_px=width_px, encoding=images)
-        return self._on_socket(stream, CameraSource(replay, encoding=images), CameraDriver, decoder)
+        return self._on_socket(stream, CameraSource(replay, encoding=images), decoder)
 
-    def _on_socket(
-        self, name: str, source: PacketSource, driver: Callable[..., Driver], decoder: Decoder
-    ) -> MockPair:
+    def _on_socket(self, name: str, source: PacketSource, decoder: Decoder) -> MockPair:
         port, faults = SocketPort(name), self._faults.of(name)
         return MockPair(
             MockDevice(name, source=source, port=port, faults=faults, seed=self._seed),
-            driver(name, transport=port.transport, decoder=decoder, clock=self._clock),
+            Driver(name, transport=port.transport, decoder=decoder, clock=self._clock),
         )
 
 

@@ -25,7 +25,6 @@ from dextouch.schemas import (
 )
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
-from services.acquisition.drivers.image_encoding import begin_take
 from services.acquisition.memory import give_back_free_memory
 from services.acquisition.path_latency import add_latencies
 from services.acquisition.supervisor import check_free_space
@@ -265,7 +264,9 @@ class Recorder:
         if prompt is None:
             raise ConflictError("record: nothing was armed; arm first")
         now = datetime.now(UTC)
-        stated = self._calibration | begin_take(self._drivers.values())
+        stated = dict(self._calibration)
+        for driver in self._drivers.values():
+            stated |= driver.begin_take()
         self._stated = frozenset(stated)
         return RecordingAttributes(
             recording_id=recording_id or f"{now:%Y%m%d-%H%M%S}-{token_hex(3)}",

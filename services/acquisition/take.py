@@ -10,10 +10,10 @@ from dextouch.clocks import PathLatency
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import StorageError
 from dextouch.schemas import LedgerEntry, TakeCheck
-from dextouch.streams import EncodedBatch, Sample, SampleBatch
+from dextouch.streams import H264_UNIT, EncodedBatch, Sample, SampleBatch
 from services.acquisition.clock import HostWatch, StationClock
 from services.acquisition.drivers.base import Driver, Readings
-from services.acquisition.drivers.image_encoding import take_gates
+from services.acquisition.drivers.image_encoding import GroupGate
 from services.acquisition.health import HealthMonitor
 from services.acquisition.supervisor import SpoolFlusher, SpoolSafety, StreamCounters
 from services.acquisition.take_check import (
@@ -80,7 +80,7 @@ class Take:
         self._watch = HostWatch(clock)
         self._findings = TakeFindings(options.health, self._started_ns)
         self._lock = threading.RLock()
-        self._gates = take_gates(spool.attributes.streams)
+        self._gates = {s.name: GroupGate() for s in spool.attributes.streams if s.unit == H264_UNIT}
         self._flusher = SpoolFlusher(
             spool.path,
             safety=options.safety,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Generic, Protocol, runtime_checkable
 
 from dextouch.errors import DeviceError
+from dextouch.schemas import Matrix
 from dextouch.streams import Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
@@ -16,7 +17,7 @@ from services.acquisition.drivers.packets import (
     DecoderStatistics,
     Found,
     Packet,
-    PacketFinder,
+    PortionedSearch,
 )
 from services.acquisition.transports.ports import Transport, TransportInfo
 
@@ -54,7 +55,7 @@ class StreamDecoder(ABC, Generic[Found]):
         packets: finds the packets in the bytes.
     """
 
-    def __init__(self, descriptor: StreamDescriptor, packets: PacketFinder[Found]) -> None:
+    def __init__(self, descriptor: StreamDescriptor, packets: PortionedSearch[Found]) -> None:
         self.descriptors: tuple[StreamDescriptor, ...] = (descriptor,)
         self.statistics = packets.statistics
         self._packets = packets
@@ -121,14 +122,21 @@ class TellsCells(Protocol):
 
 
 @runtime_checkable
+class TellsQuality(Protocol):
+    """A decoder of images that looks at them."""
+
+    @property
+    def quality(self) -> ImageQuality:
+        """What they are like."""
+        ...
+
+
+@runtime_checkable
 class CountsEvents(Protocol):
     """A decoder that counts more than its statistics, such as a tracker's poses left out."""
 
     def events(self) -> Mapping[str, int]:
-        """Counts since the start by name; the ledger of a take lists them so.
-
-        `repeated` and `late` are packets that its order filter dropped.
-        """
+        """Counts since the start by name; the ledger of a take lists them so."""
         ...
 
 
@@ -159,7 +167,15 @@ class Driver:
     @property
     def quality(self) -> ImageQuality | None:
         """What a camera's images are like; None of other devices."""
-        return None
+        return self.decoder.quality if isinstance(self.decoder, TellsQuality) else None
+
+    def begin_take(self) -> Mapping[str, Matrix]:
+        """A take begins: what comes from now on must be readable without what came before.
+
+        Returns:
+            What the driver knows of its streams' calibration at this moment.
+        """
+        return {}
 
     @property
     def info(self) -> TransportInfo:
@@ -167,14 +183,10 @@ class Driver:
         return self.transport.info
 
     def events(self) -> dict[str, int]:
-        """All that the decoder and this driver counted since the start, by name.
-
-        What several counters see (a packet that comes twice) counts once.
-        """
+        """All that the decoder and this driver counted since the start, by name."""
         events: dict[str, int] = dict(vars(self.statistics))
         if isinstance(self.decoder, CountsEvents):
-            for name, count in self.decoder.events().items():
-                events[name] = max(count, events.get(name, 0))
+            events.update(self.decoder.events())
         return events if self.quality is None else {**events, **self.quality.events()}
 
     def open(self) -> None:

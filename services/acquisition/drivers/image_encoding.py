@@ -8,9 +8,9 @@ on with its group over a gap and over a reopened device; and a take begins with 
 import concurrent.futures
 import threading
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import numpy as np
 from jaxtyping import UInt8
@@ -26,29 +26,13 @@ from dextouch.episodes import (
 )
 from dextouch.errors import NotFoundError
 from dextouch.images import encode_jpeg
-from dextouch.schemas import Matrix
 from dextouch.streams import (
-    H264_UNIT,
     Sample,
-    StreamDescriptor,
     encoded_values,
 )
 
 ImageEncoding = Literal["rgb8", "jpeg", "h264"]
 MAX_WAITING_IMAGES = 8
-
-
-@runtime_checkable
-class TakeAware(Protocol):
-    """A driver that prepares for a take."""
-
-    def begin_take(self) -> Mapping[str, Matrix]:
-        """A take begins: what comes from now on must be readable without what came before.
-
-        Returns:
-            What the driver knows of its streams' calibration at this moment.
-        """
-        ...
 
 
 class ImageEncoder:
@@ -175,7 +159,6 @@ class GroupGate:
     """Lets the H.264 samples of one take pass from the first one that begins a group."""
 
     def __init__(self) -> None:
-        self.num_left_out = 0
         self._is_open = False
 
     def admit(self, samples: Sequence[Sample]) -> list[Sample]:
@@ -185,20 +168,7 @@ class GroupGate:
             self._is_open = self._is_open or is_keyframe(sample.values.item())
             if self._is_open:
                 admitted.append(sample)
-            else:
-                self.num_left_out += 1
         return admitted
-
-
-def begin_take(drivers: Iterable[object]) -> dict[str, Matrix]:
-    """Notify drivers that a take begins; what they know of their streams."""
-    aware = [driver for driver in drivers if isinstance(driver, TakeAware)]
-    return {name: matrix for driver in aware for name, matrix in driver.begin_take().items()}
-
-
-def take_gates(streams: Iterable[StreamDescriptor]) -> dict[str, GroupGate]:
-    """A gate for every stream of a take that needs one, by name."""
-    return {stream.name: GroupGate() for stream in streams if stream.unit == H264_UNIT}
 
 
 class GroupPreview:

@@ -1,11 +1,11 @@
-"""Search for frames in a byte stream split into arbitrary reads, and its counters."""
+"""Packets in a byte stream that comes in arbitrary reads: search, order, and our own frame."""
 
 import struct
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from typing import Generic, TypeVar
 
 from dextouch.errors import InvalidInputError
 
@@ -58,32 +58,45 @@ class SequenceCounter:
         self._last: int | None = None
         # Numbers behind the last one that have not come, and whether they are counted as lost.
         self._missing: dict[int, bool] = {}
+        self._is_cut = False
 
-    def count(self, sequence: int, *, is_restarted: bool = False) -> None:
+    def reset(self) -> None:
+        """The link was lost: what was overtaken or repeated cannot come any more."""
+        self._missing.clear()
+        self._is_cut = True
+
+    def count(self, sequence: int, *, is_restarted: bool = False) -> bool:
         """One packet came.
 
         Args:
             sequence: its number.
             is_restarted: the device's clock says that it started anew, so the number may be any.
+
+        Returns:
+            Whether it is new: neither late nor repeated.
         """
         statistics = self._statistics
         statistics.packets += 1
         if self._last is None:
             self._begin(sequence)
-            return
+            return True
         step = (sequence - self._last) % self._modulus
         if sequence in self._missing:
             # Its clock steps back, too, which alone would look like a restart.
             statistics.late += 1
             statistics.lost -= self._missing.pop(sequence)
-        elif step == 0 and not is_restarted:
+            return False
+        if step == 0 and not (is_restarted or self._is_cut):
             statistics.repeated += 1
-        elif step < self._modulus // 2 and not is_restarted:
+            return False
+        if 0 < step < self._modulus // 2 and not is_restarted:
             statistics.lost += step - 1
             self._go_on(sequence, step)
         else:
             statistics.restarts += 1
             self._begin(sequence)
+        self._is_cut = False
+        return True
 
     def _begin(self, sequence: int) -> None:
         """The first packet of a run; those that it overtook nobody missed."""
@@ -102,21 +115,6 @@ class SequenceCounter:
             if (sequence - oldest) % self._modulus <= LATE_PACKETS:
                 break
             del self._missing[oldest]
-
-
-@runtime_checkable
-class PacketFinder(Protocol[Found]):
-    """Finds the packets of one device in its bytes."""
-
-    statistics: DecoderStatistics
-
-    def reset(self) -> None:
-        """Forget half a packet, since the link was lost."""
-        ...
-
-    def feed(self, data: bytes, /) -> list[Found]:
-        """Packets completed by `data`."""
-        ...
 
 
 class PortionedSearch(ABC, Generic[Found]):
@@ -181,8 +179,10 @@ class FrameSearch(PortionedSearch[Found]):
             self.statistics.resync_bytes += start - position
             taken = self._take(data, start)
             if taken is not None:
-                found.append(taken[0])
-                position = start + taken[1]
+                packet, size = taken
+                if packet is not None:
+                    found.append(packet)
+                position = start + size
             elif self._needed:
                 return found, start
             else:
@@ -194,10 +194,11 @@ class FrameSearch(PortionedSearch[Found]):
         return found, rest
 
     @abstractmethod
-    def _take(self, data: bytes, position: int) -> tuple[Found, int] | None:
+    def _take(self, data: bytes, position: int) -> tuple[Found | None, int] | None:
         """The frame at `position` and its size; None when there is none, or not yet.
 
-        In the latter case `_needed` is set to the length that `data` must have first.
+        A frame that carries nothing new may be given as None. Where there is none yet, `_needed` is
+        set to the length that `data` must have first.
         """
 
 
@@ -232,7 +233,7 @@ def encode_packet(magic: bytes, packet: Packet) -> bytes:
 
 
 class PacketDecoder(FrameSearch[Packet]):
-    """Finds packets of our documented devices.
+    """Finds packets of our documented devices; late and repeated ones are counted and left out.
 
     Args:
         magic: of the kind whose sequence is counted.
@@ -255,7 +256,12 @@ class PacketDecoder(FrameSearch[Packet]):
         self._magic = magic
         self._sequence = SequenceCounter(self.statistics, bits=SEQUENCE_BITS)
 
-    def _take(self, data: bytes, position: int) -> tuple[Packet, int] | None:
+    def reset(self) -> None:
+        """Forget half a packet (the link was lost); the next number may be any."""
+        super().reset()
+        self._sequence.reset()
+
+    def _take(self, data: bytes, position: int) -> tuple[Packet | None, int] | None:
         start = position + HEADER.size
         if len(data) < start:
             self._needed = start
@@ -275,9 +281,9 @@ class PacketDecoder(FrameSearch[Packet]):
         if CRC.unpack_from(data, end)[0] != zlib.crc32(memoryview(data)[position:end]):
             self.statistics.crc_errors += 1
             return None
-        if magic == self._magic:
-            self._sequence.count(sequence)
-        packet = Packet(version, source, sequence, t_device_ns, data[start:end], magic)
+        packet = None
+        if magic != self._magic or self._sequence.count(sequence):
+            packet = Packet(version, source, sequence, t_device_ns, data[start:end], magic)
         return packet, OVERHEAD + length
 
 

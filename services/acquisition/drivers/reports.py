@@ -1,4 +1,4 @@
-"""Trackers whose packets come in numbered 64-byte reports, and which of their packets are new."""
+"""Numbered 64-byte reports ↔ a packet's bytes, and the decoders of trackers that send them."""
 
 import struct
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from dextouch.errors import InvalidInputError
 from dextouch.streams import StreamDescriptor
 from services.acquisition.drivers.base import Readings, StreamDecoder
-from services.acquisition.drivers.packets import SEQUENCE_MODULUS, Packet, PacketDecoder
+from services.acquisition.drivers.packets import Packet, PacketDecoder
 
 REPORT_BYTES = 64
 DATA_REPORT = 0x01
@@ -15,9 +15,6 @@ DESCRIPTOR_REPORT = 0x02
 REPORT_HEADER = struct.Struct("<BBBBB")
 PART_BYTES = REPORT_BYTES - REPORT_HEADER.size
 MAX_PARTS = 255
-
-# A step back of more than this is a restart of the device, not a packet that came late.
-LATE_PACKETS = 8
 
 
 def split_into_reports(report_id: int, counter: int, data: bytes) -> list[bytes]:
@@ -86,40 +83,6 @@ class ReportReassembler:
         return report_id, message
 
 
-class OrderFilter:
-    """Lets each packet through once and in order; duplicate and late packets are dropped.
-
-    Repetitions and late packets carry nothing that may become a sample behind a newer one. A larger
-    step back is a restart of the device, whose packets are new.
-    """
-
-    def __init__(self) -> None:
-        self.repeated = 0
-        self.late = 0
-        self._last: int | None = None
-
-    def reset(self) -> None:
-        """Another device, or the same one from the start, may follow."""
-        self._last = None
-
-    def counts(self) -> dict[str, int]:
-        """Packets dropped so far, by the reason."""
-        return {"repeated": self.repeated, "late": self.late}
-
-    def admits(self, sequence: int) -> bool:
-        """Whether the packet with this number is newer than those before."""
-        if self._last is not None:
-            back = (self._last - sequence) % SEQUENCE_MODULUS
-            if back == 0:
-                self.repeated += 1
-                return False
-            if back <= LATE_PACKETS:
-                self.late += 1
-                return False
-        self._last = sequence
-        return True
-
-
 class ReportDecoder(StreamDecoder[Packet]):
     """Base of the decoders of trackers by HID or USB, whose packets come in reports.
 
@@ -131,17 +94,11 @@ class ReportDecoder(StreamDecoder[Packet]):
     def __init__(self, descriptor: StreamDescriptor, packets: PacketDecoder) -> None:
         super().__init__(descriptor, packets)
         self.reports = ReportReassembler()
-        self.order = OrderFilter()
-
-    def events(self) -> dict[str, int]:
-        """Packets dropped so far, by the reason."""
-        return self.order.counts()
 
     def reset(self) -> None:
         """Forget half a message; another device may answer now."""
         super().reset()
         self.reports.reset()
-        self.order.reset()
 
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """Samples completed by one report.

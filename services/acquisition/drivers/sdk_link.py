@@ -16,7 +16,6 @@ from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings, StreamDecoder, check_packet
 from services.acquisition.drivers.packets import Packet, PacketDecoder
-from services.acquisition.drivers.reports import OrderFilter
 from services.acquisition.transports.ports import Transport
 
 PROTOCOL: Final = "dextouch-bridge"
@@ -175,7 +174,6 @@ class BridgeDecoder(StreamDecoder[Packet]):
 
     Attributes:
         hello: of this connection; None before it came.
-        order: counts repeated and late packets.
         tracking: counts of packets that became no sample, by the reason.
         statistics: of all devices of the bridge; `refused` counts packets of a wrong size too.
     """
@@ -193,7 +191,6 @@ class BridgeDecoder(StreamDecoder[Packet]):
         packets = PacketDecoder(magic, min_payload=0, max_payload=payload_bytes)
         super().__init__(descriptor, packets)
         self.hello: BridgeHello | None = None
-        self.order = OrderFilter()
         self.tracking = dict.fromkeys(DROPPED, 0)
         self._kind, self._device = kind, descriptor.device or descriptor.name
         self._source, self._serial_number = source, serial_number
@@ -203,14 +200,13 @@ class BridgeDecoder(StreamDecoder[Packet]):
 
     def events(self) -> dict[str, int]:
         """Packets left out so far, by the reason."""
-        return {**self.tracking, **self.order.counts()}
+        return dict(self.tracking)
 
     def reset(self) -> None:
         """The connection was lost: the next one begins with a hello."""
         super().reset()
         self.hello = None
         self._line.clear()
-        self.order.reset()
         self._freshness.reset()
 
     def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
@@ -239,7 +235,7 @@ class BridgeDecoder(StreamDecoder[Packet]):
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
         check_packet(packet, device=self._device, source=None)
-        if not self.order.admits(packet.sequence) or not packet.payload:
+        if not packet.payload:
             return None
         if len(packet.payload) != self._payload_bytes:
             self.statistics.refused += 1

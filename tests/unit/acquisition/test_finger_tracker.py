@@ -150,4 +150,4 @@ def test_repeated_and_late_packets_become_no_sample():
         for report in packets.units(sequence, sequence, sequence):
             found += decoder.decode(report, 0).get("keypoints_left", [])
     assert [sample.sequence for sample in found] == [0, 1, 3, 4]
-    assert (decoder.order.repeated, decoder.order.late) == (1, 1)
+    assert (decoder.statistics.repeated, decoder.statistics.late) == (1, 1)

@@ -15,7 +15,6 @@ from services.acquisition.drivers.image_encoding import (
     GroupPreview,
     ImageEncoder,
     WholeGroups,
-    take_gates,
 )
 
 SIZE_PX = (32, 48)
@@ -142,12 +141,6 @@ def test_the_gate_opens_at_a_group():
     assert gate.admit(samples[3:6]) == []
     assert gate.admit(samples[6:12]) == samples[8:12]
     assert gate.admit(samples[12:]) == samples[12:]
-    assert gate.num_left_out == 5
-
-
-def test_only_h264_streams_have_gates():
-    streams = [decoder_of(unit).descriptors[0] for unit in ("rgb8", "jpeg", "h264")]
-    assert [list(take_gates([stream])) for stream in streams] == [[], [], ["camera_head"]]
 
 
 def test_the_newest_image_can_be_looked_at():

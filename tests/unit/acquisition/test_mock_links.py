@@ -8,7 +8,7 @@ from dextouch.errors import DeviceError
 from dextouch.schemas import TakePrompt
 from services.acquisition.app import create_app
 from services.acquisition.clock import RealClock, VirtualClock
-from services.acquisition.devices.camera.driver import CameraDriver
+from services.acquisition.devices.camera.driver import CameraDecoder
 from services.acquisition.devices.finger_tracker.driver import FingerTracker
 from services.acquisition.devices.station_camera.driver import StationCamera
 from services.acquisition.drivers.sdk_link import BridgeDriver
@@ -44,7 +44,7 @@ def build(names, clock=None, **links):
 def test_by_default_they_are_linked_as_ever():
     _, drivers = build(("tactile_left", "keypoints_left", "head", "camera_head"))
     kinds = [type(driver).__name__ for driver in drivers]
-    assert kinds == ["TactileGlove", "FingerTracker", "Driver", "CameraDriver"]
+    assert kinds == ["TactileGlove", "FingerTracker", "Driver", "Driver"]
 
 
 def test_each_link_has_the_driver_of_a_real_station():
@@ -55,7 +55,7 @@ def test_each_link_has_the_driver_of_a_real_station():
     assert isinstance(drivers[0], FingerTracker)
     assert all(isinstance(d.transport._transport, UsbTransport) for d in drivers)
     _, (camera,) = build(("camera_head",), images="h264")
-    assert (type(camera), camera.descriptors[0].unit) == (CameraDriver, "h264")
+    assert (type(camera.decoder), camera.descriptors[0].unit) == (CameraDecoder, "h264")
     _, (camera,) = build(("camera_head",), cameras="station", images="jpeg")
     assert (type(camera), camera.descriptors[0].unit) == (StationCamera, "jpeg")
 

@@ -164,8 +164,8 @@ def test_reordering_and_loss_are_told_apart(seed, start, is_told_by_clock):
 
 def test_magic_inside_the_payload_is_payload():
     payload = (MAGIC * PAYLOAD_BYTES)[:PAYLOAD_BYTES]
-    data = encode_packet(MAGIC, Packet(1, 1, 0, 0, payload))
-    samples, statistics = decode(data * 3, [5])
+    data = b"".join(encode_packet(MAGIC, Packet(1, 1, number, 0, payload)) for number in range(3))
+    samples, statistics = decode(data, [5])
     assert len(samples) == 3
     assert statistics.resync_bytes == 0
 

@@ -143,7 +143,7 @@ def test_repeated_and_late_packets_become_no_sample():
     order = [0, 1, 1, 2, 4, 3, 5, *range(6, 50)]
     _, decoder, samples = play(order=order)
     assert [s.sequence for s in samples] == [0, 1, 2, 4, 5, *range(6, 50)]
-    assert (decoder.order.repeated, decoder.order.late) == (1, 1)
+    assert (decoder.statistics.repeated, decoder.statistics.late) == (1, 1)
 
 
 def test_a_restarted_tracker_goes_on():

@@ -22,9 +22,7 @@ from services.acquisition.drivers.base import Driver, StreamDecoder, check_packe
 from services.acquisition.drivers.image_encoding import ImageEncoding, WholeGroups
 from services.acquisition.drivers.image_quality import ImageChecker, ImageQuality
 from services.acquisition.drivers.packets import Packet, PacketDecoder
-from services.acquisition.transports.ports import Transport, tcp_transport
-
-__all__ = ["CameraDecoder", "CameraDriver", "ImageEncoding", "camera_descriptor"]
+from services.acquisition.transports.ports import tcp_transport
 
 MAGIC = b"DXCI"
 # height and width in pixels, encoding, three bytes of padding; then the image
@@ -171,21 +169,6 @@ class CameraDecoder(StreamDecoder[Packet]):
         self._num_images += 1
 
 
-class CameraDriver(Driver):
-    """Driver of a camera bridge."""
-
-    def __init__(
-        self, name: str, *, transport: Transport, decoder: CameraDecoder, clock: StationClock
-    ) -> None:
-        super().__init__(name, transport=transport, decoder=decoder, clock=clock)
-        self._images = decoder
-
-    @property
-    def quality(self) -> ImageQuality:
-        """What the images are like."""
-        return self._images.quality
-
-
 class CameraSettings(TcpSettings):
     """A camera bridge at a TCP address."""
 
@@ -196,7 +179,7 @@ class CameraSettings(TcpSettings):
     encoding: Literal["rgb8", "jpeg", "h264"] = "jpeg"
 
 
-def build(settings: CameraSettings, clock: StationClock) -> CameraDriver:
+def build(settings: CameraSettings, clock: StationClock) -> Driver:
     """The driver of one bridge."""
     decoder = CameraDecoder(
         settings.stream,
@@ -204,7 +187,7 @@ def build(settings: CameraSettings, clock: StationClock) -> CameraDriver:
         width_px=settings.width_px,
         encoding=settings.encoding,
     )
-    return CameraDriver(
+    return Driver(
         settings.stream,
         transport=tcp_transport(settings.host, settings.port),
         decoder=decoder,

@@ -141,8 +141,8 @@ class FingerTrackerDecoder(ReportDecoder):
         return self._order is not None
 
     def events(self) -> dict[str, int]:
-        """Packets dropped so far, and nodes that were not seen."""
-        return {**super().events(), "unseen_nodes": self.unseen_nodes}
+        """Nodes that were not seen so far."""
+        return {"unseen_nodes": self.unseen_nodes}
 
     def reset(self) -> None:
         """Forget half a message and the node order (another device may answer now)."""
@@ -157,8 +157,6 @@ class FingerTrackerDecoder(ReportDecoder):
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
         check_packet(packet, device=self._device, source=self._side)
-        if not self.order.admits(packet.sequence):
-            return None
         if self._order is None:
             self.undescribed += 1
             return None

@@ -64,7 +64,7 @@ class PoseTrackerDecoder(ReportDecoder):
 
     def events(self) -> dict[str, int]:
         """Packets left out so far, by the reason."""
-        return {**self.tracking, **super().events()}
+        return dict(self.tracking)
 
     def reset(self) -> None:
         """Forget half a message and the last pose."""
@@ -73,8 +73,6 @@ class PoseTrackerDecoder(ReportDecoder):
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
         check_packet(packet, device=self._device, source=self._source)
-        if not self.order.admits(packet.sequence):
-            return None
         state, *numbers = PAYLOAD.unpack(packet.payload)
         sequence, t_device_ns = packet.sequence, packet.t_device_ns
         if state != TrackingState.RUNNING_OK:
