@@ -14,7 +14,6 @@ from dextouch.hands import NUM_KEYPOINTS
 from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.camera.driver import (
     CameraDecoder,
-    ImageEncoding,
     camera_descriptor,
 )
 from services.acquisition.devices.camera.mock import CameraSource
@@ -40,6 +39,7 @@ from services.acquisition.devices.robot_state.driver import (
 )
 from services.acquisition.devices.robot_state.mock import RobotStateSource
 from services.acquisition.drivers.base import Decoder
+from services.acquisition.drivers.image_encoding import ImageEncoding
 from services.acquisition.drivers.reports import DESCRIPTOR_REPORT
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
