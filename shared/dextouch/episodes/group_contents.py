@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -24,23 +24,27 @@ from dextouch.episodes.format import (
     stream_arrays,
     with_rows,
 )
+from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.episodes.journal import log_paths, part_path, read_rows
-from dextouch.episodes.shard_reader import ShardReader
-from dextouch.episodes.sources import GroupFiles, LocalFile, LocalGroup
+from dextouch.episodes.shard_reader import ShardReader, decode_rows
+from dextouch.episodes.sources import ByteSource, GroupFiles, LocalFile, LocalGroup
 from dextouch.episodes.staged_group import read_stage
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError
-from dextouch.schemas import EpisodeAttributes, RecordingAttributes, Verification
+from dextouch.images import jpeg_size
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 
 A = TypeVar("A", EpisodeAttributes, RecordingAttributes)
-VERIFY_BYTES = 1 << 24
 MAX_METADATA_BYTES = 1 << 24
 # The largest picture of H.264 (level 6.2): 139,264 macroblocks.
 MAX_IMAGE_PIXELS = 139_264 * 256
 
 
 @dataclass
-class CommittedGroup(Generic[A]):
-    """A group with a commit record; created by `read_group`."""
+class GroupContents(Generic[A]):
+    """A committed group, or the `stage` of one that is being written.
+
+    A stage has no content hash; `indexes` are the offset and length of its storage chunks.
+    """
 
     files: GroupFiles
     kind: Kind
@@ -48,43 +52,76 @@ class CommittedGroup(Generic[A]):
     entries: dict[str, ArrayEntry]
     content_sha256: str
     what: str
+    stage: Path | None = None
+    indexes: Mapping[str, np.ndarray] = field(default_factory=dict)
     _shards: dict[str, ShardReader] = field(default_factory=dict)
 
     def shard(self, name: str) -> ShardReader:
         """Reader of one array; its shard index is cached."""
         if name not in self._shards:
-            entry = self.entries[name]
-            path = f"{name}/{shard_path(len(entry.shape))}"
-            refuse_links(self.files, path, what=self.what)
-            source = self.files.source(path)
-            self._shards[name] = ShardReader(source, entry, what=f"{self.what}: array {name!r}")
+            entry, what = self.entries[name], f"{self.what}: array {name!r}"
+            if self.stage is not None:
+                source: ByteSource = _GrowingFile(part_path(self.stage, name))
+            else:
+                path = f"{name}/{shard_path(len(entry.shape))}"
+                refuse_links(self.files, path, what=self.what)
+                source = self.files.source(path)
+            index = self.indexes.get(name)
+            self._shards[name] = ShardReader(source, entry, what=what, index=index)
         return self._shards[name]
 
-    def verify(self) -> Verification:
-        """Read everything and compare it with the commit record."""
-        num_bytes = sum(self._verify_array(name, entry) for name, entry in self.entries.items())
-        return Verification(
-            num_arrays=len(self.entries), num_bytes=num_bytes, content_sha256=self.content_sha256
-        )
+    def inspect_array(
+        self, name: str, *, progress: Callable[[int], None] = lambda _: None
+    ) -> Iterator[tuple[int | None, str]]:
+        """Read an array of a committed group and iterate over its damage.
 
-    def _verify_array(self, name: str, entry: ArrayEntry) -> int:
-        if get_metadata(self.files, f"{name}/{METADATA_FILE}", self.what) != array_metadata(entry):
-            raise CorruptDataError(f"{self.what}: {METADATA_FILE} of {name!r} is damaged")
-        shard, digest, num_bytes = self.shard(name), hashlib.sha256(), 0
-        shard.check_index()
-        rows = entry.chunk_rows
-        row_bytes = np.dtype(entry.dtype).itemsize * math.prod(entry.shape[1:])
-        # Image codecs are hashed in encoded form, one storage chunk at a time.
-        plain = entry.codec == "zstd"
-        step = max(1, VERIFY_BYTES // max(1, row_bytes * rows)) * rows if plain else rows
-        for start in range(0, entry.shape[0], step):
-            stop = min(start + step, entry.shape[0])
-            data = shard.read(start, stop).tobytes() if plain else shard.payload(start // rows)
-            digest.update(data)
-            num_bytes += len(data)
-        if digest.hexdigest() != entry.sha256:
-            raise CorruptDataError(f"{self.what}: sha256 of array {name!r} does not match")
-        return num_bytes
+        Damage is the number of a storage chunk, None for the whole array, and a message. `progress`
+        gets the size of every intact storage chunk, encoded, in bytes.
+        """
+        entry, what = self.entries[name], f"{self.what}: array {name!r}"
+        digest, is_whole = hashlib.sha256(), True
+        try:
+            metadata = get_metadata(self.files, f"{name}/{METADATA_FILE}", self.what)
+            if metadata != array_metadata(entry):
+                is_whole = False
+                yield None, f"{what}: {METADATA_FILE} is damaged"
+            num_chunks = len(self.shard(name).check_index())
+        except StorageError as error:
+            yield None, error.message
+            return
+        for number in range(num_chunks):
+            try:
+                payload = self.shard(name).payload(number)
+                digest.update(hashed_bytes(payload, entry, number, what))
+            except StorageError as error:
+                is_whole = False
+                yield number, error.message
+            else:
+                progress(len(payload))
+        # Also detects damage for which a forger has adapted the checksums.
+        if is_whole and digest.hexdigest() != entry.sha256:
+            yield None, f"{what}: sha256 does not match"
+
+
+def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> bytes:
+    """Bytes of a storage chunk that enter its array's hash.
+
+    For images only their number and headers are checked, not the pixels.
+
+    Raises:
+        CorruptDataError: it does not contain the expected rows.
+    """
+    where = f"{what}: storage chunk {number}"
+    num_rows = min(entry.chunk_rows, entry.shape[0] - number * entry.chunk_rows)
+    if entry.codec == "zstd":
+        return decode_rows(payload, entry, what=where)[:num_rows].tobytes()
+    chunks = ImageChunks(entry.codec, entry.shape[1:], entry.chunk_rows, what)
+    images = chunks.unpack(payload, number)
+    if len(images) != num_rows:
+        raise CorruptDataError(f"{where} holds {len(images)} images, expected {num_rows}")
+    if entry.codec == "jpeg" and (size := jpeg_size(payload, where=where)) != entry.shape[1:3]:
+        raise CorruptDataError(f"{where} is {size} pixels, expected {entry.shape[1:3]}")
+    return payload
 
 
 class _GrowingFile(LocalFile):
@@ -102,33 +139,7 @@ class _GrowingFile(LocalFile):
         return data
 
 
-@dataclass
-class LiveGroup(Generic[A]):
-    """Snapshot of a group that is being written, up to the rows of its journals."""
-
-    stage: Path
-    kind: Kind
-    attributes: A
-    entries: dict[str, ArrayEntry]
-    indexes: dict[str, np.ndarray]
-    what: str
-    content_sha256: str = ""
-
-    def shard(self, name: str) -> ShardReader:
-        """One array."""
-        return ShardReader(
-            _GrowingFile(part_path(self.stage, name)),
-            self.entries[name],
-            what=f"{self.what}: array {name!r}",
-            index=self.indexes[name],
-        )
-
-
-# Either kind of group.
-GroupContents = CommittedGroup[A] | LiveGroup[A]
-
-
-def read_group(files: GroupFiles, kind: Kind, model: type[A]) -> CommittedGroup[A]:
+def read_group(files: GroupFiles, kind: Kind, model: type[A]) -> GroupContents[A]:
     """Open a committed group; arrays are read lazily.
 
     Raises:
@@ -152,7 +163,7 @@ def read_group(files: GroupFiles, kind: Kind, model: type[A]) -> CommittedGroup[
     except MALFORMED as error:
         raise StorageError(f"{what}: attributes are invalid ({error})") from error
     _check_arrays(expected, record.arrays, what)
-    return CommittedGroup(files, kind, attributes, record.arrays, content_sha256, what)
+    return GroupContents(files, kind, attributes, record.arrays, content_sha256, what)
 
 
 def _check_arrays(
@@ -225,7 +236,7 @@ def refuse_links(files: GroupFiles, name: str, *, what: str) -> None:
             )
 
 
-def read_live(stage: Path, kind: Kind, model: type[A]) -> LiveGroup[A]:
+def read_live(stage: Path, kind: Kind, model: type[A]) -> GroupContents[A]:
     """Snapshot of a stage: storage chunks that are complete in all arrays of a stream.
 
     Raises:
@@ -252,4 +263,5 @@ def read_live(stage: Path, kind: Kind, model: type[A]) -> LiveGroup[A]:
             entries[name] = with_rows(entry, count)
             columns = (rows[name]["offset"], rows[name]["length"]) if count else ((), ())
             indexes[name] = np.stack([np.asarray(c, dtype=np.uint64) for c in columns], axis=1)
-    return LiveGroup(stage, kind, attributes, entries, indexes, f"{kind} {stage.name}")
+    what = f"{kind} {stage.name}"
+    return GroupContents(LocalGroup(stage), kind, attributes, entries, "", what, stage, indexes)

@@ -5,7 +5,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from dextouch.episodes.format import STAMPS, codec_of
-from dextouch.episodes.group_contents import CommittedGroup, GroupContents
+from dextouch.episodes.group_contents import GroupContents
 from dextouch.episodes.image_codecs import ImageChunks, transform_pixels
 from dextouch.episodes.video import FULL_FORM, ImageForm
 from dextouch.errors import CorruptDataError, InvalidInputError, ShapeError, UnknownNameError
@@ -125,9 +125,18 @@ class GroupReader(Generic[A]):
             CorruptDataError: the first damaged array, by name.
             InvalidInputError: a group that is still being written.
         """
-        if not isinstance(self._contents, CommittedGroup):
+        contents = self._contents
+        if contents.stage is not None:
             raise InvalidInputError(f"{self._what}: is still being written")
-        return self._contents.verify()
+        sizes: list[int] = []
+        for name in contents.entries:
+            for _, message in contents.inspect_array(name, progress=sizes.append):
+                raise CorruptDataError(message)
+        return Verification(
+            num_arrays=len(contents.entries),
+            num_bytes=sum(sizes),
+            content_sha256=self.content_sha256,
+        )
 
     def array_sha256(self, name: str) -> str:
         """The content hash of one array."""

@@ -48,6 +48,11 @@ class DeletionRequest:
                 "expected exactly one of them"
             )
 
+    @property
+    def name(self) -> str:
+        """The operator or the recording."""
+        return self.operator or self.recording or ""
+
 
 @dataclass(frozen=True)
 class Victim:
@@ -119,47 +124,42 @@ def plan_deletion(
     while grown:
         grown = False
         for facts in list(waiting):
-            reason = _reason(facts, request, names, hashes)
+            reason = _reason(facts, request) or _reason_of_kin(facts, request, names, hashes)
             if reason is None:
                 continue
             waiting.remove(facts)
-            name, sha256 = facts.folder.name, facts.content_sha256
+            name, sha256 = facts.folder.name, facts.sha256
             found.append(Victim(facts.kind, facts.item_id, facts.place, name, sha256, reason))
             if spreads:
                 grown = True
-                names.add((facts.kind, facts.item_id))
-                hashes |= {sha256} - {None}
-                # Earlier versions, left behind by a repair or a migration.
-                names |= {(k, i) for k, i, _ in facts.lineage if _is_version(facts, k, i)}
-                hashes |= {h for k, i, h in facts.lineage if h and _is_version(facts, k, i)}
+                # And earlier versions, left behind by a repair or a migration.
+                versions = [(k, i, h) for k, i, h in facts.lineage if _is_version(facts, k, i)]
+                names |= {(facts.kind, facts.item_id), *((k, i) for k, i, _ in versions)}
+                hashes |= {sha256, *(h for _, _, h in versions)} - {None}
     return found
 
 
-def _reason(
-    facts: Facts, request: DeletionRequest, names: set[tuple[str, str]], hashes: set[str | None]
-) -> str | None:
-    if request.operator is not None:
-        if facts.operator == request.operator:
-            return "operator"
-        wanted = Wanted({request.operator})
-        files = ((path.name, path) for path in small_files(facts.folder))
-        if not facts.readable and _references(wanted, files):
-            return "damaged, names the operator"
-    elif (facts.kind, facts.item_id) == ("recording", request.recording):
-        return "recording"
-    return _reason_of_kin(facts, names, hashes, request.operator)
+def _reason(facts: Facts, request: DeletionRequest) -> str | None:
+    if request.operator is None:
+        is_it = (facts.kind, facts.item_id) == ("recording", request.recording)
+        return "recording" if is_it else None
+    if facts.operator == request.operator:
+        return "operator"
+    files = ((path.name, path) for path in small_files(facts.folder))
+    named = not facts.readable and _references(Wanted({request.operator}), files)
+    return "damaged, names the operator" if named else None
 
 
 def _reason_of_kin(
-    facts: Facts, names: set[tuple[str, str]], hashes: set[str | None], operator: str | None
+    facts: Facts, request: DeletionRequest, names: set[tuple[str, str]], hashes: set[str | None]
 ) -> str | None:
     for kind, item_id, sha256 in facts.lineage:
         if (kind, item_id) in names or (sha256 is not None and sha256 in hashes):
             return f"made from {kind} {item_id}"
-    if facts.content_sha256 is not None and facts.content_sha256 in hashes:
+    if facts.sha256 is not None and facts.sha256 in hashes:
         return "same content"
     # An id that was reused by another operator is a different item.
-    if (facts.kind, facts.item_id) in names and facts.operator in {None, operator}:
+    if (facts.kind, facts.item_id) in names and facts.operator in {None, request.operator}:
         return "same id"
     return None
 
@@ -203,25 +203,27 @@ def delete_for_good(
     for _ in range(_MAX_ROUNDS):
         known += [v for v in plan_deletion(root, request, known=known) if v not in known]
         if not known:
-            raise NotFoundError(f"deletion: nothing in {root} stems from {_asked(request)!r}")
-        _write_intent(path, intent)
-        went = [victim for victim in known if _remove(root, victim)]
-        if not went:
+            raise NotFoundError(f"deletion: nothing in {root} stems from {request.name!r}")
+        with disk_errors("write down what is to be deleted"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            replace_file(path, json.dumps(intent.model_dump()).encode())
+        went = [_remove(root, victim) for victim in known]
+        if not any(went):
             break
-    words = {v.id for v in known} | {v.sha256 for v in known if v.sha256} | {_asked(request)}
-    remaining, unreadable, num_files = search(root, words, skip=path)
+    words = {v.id for v in known} | {v.sha256 for v in known if v.sha256} | {request.name}
+    wanted = Wanted(words)
+    remaining, unreadable, num_files = _search(root, wanted, skip=path)
     if checkpoints is not None:
-        more, num_more = search_checkpoints(checkpoints, words)
+        more, num_more = _search_checkpoints(checkpoints, wanted)
         remaining, num_files = remaining + more, num_files + num_more
-    left = {(v.place, v.folder) for v in known if (root / v.place / v.folder).exists()}
-    deleted = tuple(v for v in known if (v.place, v.folder) not in left)
+    deleted = [v for v in known if not (root / v.place / v.folder).exists()]
     receipt = DeletionReceipt(
         request=request,
         started_at=intent.started_at,
         finished_at=_now(),
         before=intent.before,
         after=_listing(root),
-        deleted=deleted,
+        deleted=tuple(deleted),
         remaining=tuple(remaining),
         unreadable=tuple(unreadable),
         num_files_searched=num_files,
@@ -229,22 +231,19 @@ def delete_for_good(
     )
     with disk_errors(f"write {receipt_path}"):
         replace_file(receipt_path, json.dumps(asdict(receipt), indent=2).encode() + b"\n")
-        if not left:
+        if len(deleted) == len(known):
             path.unlink()
             with suppress(OSError):
                 path.parent.rmdir()
     return receipt
 
 
-def search(
-    root: Path, words: set[str], *, skip: Path | None = None
-) -> tuple[list[Reference], list[str], int]:
-    """Find remaining references to identifiers, in every attributes file and in folder names.
+def _search(root: Path, wanted: Wanted, *, skip: Path) -> tuple[list[Reference], list[str], int]:
+    """What still refers to identifiers, what cannot be read, and the number of files searched.
 
-    Returns:
-        The references, the unreadable files, and the number of files searched.
+    Searched are all attributes files and the names of folders.
     """
-    wanted, found, num_files = Wanted(words), [], 0
+    found, num_files = [], 0
     facts = all_facts(root)
     for item in facts:
         where = f"{item.place}/{item.folder.name}"
@@ -259,12 +258,12 @@ def search(
     return found, unreadable, num_files
 
 
-def search_checkpoints(folder: Path, words: set[str]) -> tuple[list[Reference], int]:
-    """Find references to identifiers in checkpoints: safetensors headers and JSON beside them."""
+def _search_checkpoints(folder: Path, wanted: Wanted) -> tuple[list[Reference], int]:
+    """What refers to identifiers in safetensors headers and the JSON beside them."""
     with disk_errors(f"search {folder}"):
         paths = [p for p in sorted(folder.rglob("*")) if p.suffix in {".safetensors", ".json"}]
         files = [(str(path), path) for path in paths if path.is_file()]
-        return _references(Wanted(words), files, read=_header), len(files)
+        return _references(wanted, files, read=_header), len(files)
 
 
 def _header(path: Path) -> bytes:
@@ -275,19 +274,19 @@ def _header(path: Path) -> bytes:
         return file.read(min(size, _MAX_HEADER_BYTES))
 
 
-def _contents(path: Path) -> bytes:
-    with disk_errors(f"search {path.name}"):
-        return path.read_bytes()
-
-
 def _references(
     wanted: Wanted,
     files: Iterable[tuple[str, Path]],
     *,
-    read: Callable[[Path], bytes] = _contents,
+    read: Callable[[Path], bytes] = Path.read_bytes,
 ) -> list[Reference]:
-    names = ((where, tuple(wanted.found_in(read(path)))) for where, path in files)
-    return [Reference(where, found) for where, found in names if found]
+    found = []
+    for where, path in files:
+        with disk_errors(f"search {path.name}"):
+            data = read(path)
+        if named := wanted.found_in(data):
+            found.append(Reference(where, tuple(named)))
+    return found
 
 
 def _remove(root: Path, victim: Victim) -> bool:
@@ -311,10 +310,6 @@ def _remove(root: Path, victim: Victim) -> bool:
     finally:
         os.close(lock)
     return True
-
-
-def _asked(request: DeletionRequest) -> str:
-    return request.operator or request.recording or ""
 
 
 def _listing(root: Path) -> dict[str, list[str]]:
@@ -344,9 +339,3 @@ def _read_intent(path: Path, root: Path, request: DeletionRequest) -> _Intent:
         raise CorruptDataError(
             f"deletion: {path} is damaged ({error}); remove it and repeat the deletion"
         ) from error
-
-
-def _write_intent(path: Path, intent: _Intent) -> None:
-    with disk_errors("write down what is to be deleted"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, json.dumps(intent.model_dump()).encode())

@@ -3,7 +3,6 @@
 A reader stops at the first damage; an inspection continues and lists all of it.
 """
 
-import hashlib
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,27 +17,23 @@ from dextouch.episodes.format import (
     STAMPS,
     ArrayEntry,
     Kind,
-    array_metadata,
     attributes_id,
     kind_of,
     shard_path,
     stream_arrays,
 )
-from dextouch.episodes.group_contents import CommittedGroup, get_metadata, read_group
-from dextouch.episodes.image_codecs import ImageChunks
+from dextouch.episodes.group_contents import GroupContents, read_group
 from dextouch.episodes.journal import damaged_payload, log_paths, part_path, read_rows, scan_rows
-from dextouch.episodes.shard_reader import decode_rows
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.spool_log import body_at, find_records, open_log
 from dextouch.episodes.spool_reader import RECORDING_FILE, read_attributes
 from dextouch.episodes.staged_group import STAGE_FILE, STAGING, read_stage
 from dextouch.episodes.trash import HOMES
-from dextouch.errors import CorruptDataError, StorageError
-from dextouch.images import jpeg_size
+from dextouch.errors import StorageError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 
 UPLOADS = HOMES["upload"]
-Group = CommittedGroup[EpisodeAttributes] | CommittedGroup[RecordingAttributes]
+Group = GroupContents[EpisodeAttributes] | GroupContents[RecordingAttributes]
 # Called after every storage chunk with the number of bytes read.
 Progress = Callable[[int], None]
 
@@ -85,12 +80,17 @@ def inspect_group(
         contents = open_contents(files, kind)
     except StorageError as error:
         return ItemReport(kind, files.item_id, findings=(Finding(error.message),))
-    findings: list[Finding] = []
-    num_bytes = 0
-    for name in contents.entries:
-        found, size = _inspect_array(contents, name, progress)
-        findings += found
-        num_bytes += size
+    sizes: list[int] = []
+
+    def count(size: int) -> None:
+        sizes.append(size)
+        progress(size)
+
+    findings = [
+        Finding(message, name, number)
+        for name in contents.entries
+        for number, message in contents.inspect_array(name, progress=count)
+    ]
     if not findings:
         findings += _stamp_findings(contents)
     if isinstance(files, LocalGroup):
@@ -98,55 +98,7 @@ def inspect_group(
             Finding(f"{contents.what}: {path} belongs to no array; move it away", foreign=True)
             for path in foreign_paths(files.folder, contents.entries)
         ]
-    return ItemReport(kind, files.item_id, len(contents.entries), num_bytes, tuple(findings))
-
-
-def _inspect_array(contents: Group, name: str, progress: Progress) -> tuple[list[Finding], int]:
-    what, num_bytes = f"{contents.what}: array {name!r}", 0
-    findings = []
-    try:
-        metadata = get_metadata(contents.files, f"{name}/{METADATA_FILE}", contents.what)
-        if metadata != array_metadata(contents.entries[name]):
-            findings.append(Finding(f"{what}: {METADATA_FILE} is damaged", name))
-        shard = contents.shard(name)
-        num_chunks = len(shard.check_index())
-    except StorageError as error:
-        return [*findings, Finding(error.message, name)], 0
-    digest = hashlib.sha256()
-    for number in range(num_chunks):
-        try:
-            payload = shard.payload(number)
-            digest.update(hashed_bytes(payload, contents.entries[name], number, what))
-        except StorageError as error:
-            findings.append(Finding(error.message, name, number))
-        else:
-            num_bytes += len(payload)
-            progress(len(payload))
-    # Also detects damage for which a forger has adapted the checksums.
-    if not findings and digest.hexdigest() != contents.entries[name].sha256:
-        findings.append(Finding(f"{what}: sha256 does not match", name))
-    return findings, num_bytes
-
-
-def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> bytes:
-    """Bytes of a storage chunk that enter its array's hash.
-
-    For images only their number and headers are checked, not the pixels.
-
-    Raises:
-        CorruptDataError: it does not contain the expected rows.
-    """
-    where = f"{what}: storage chunk {number}"
-    num_rows = min(entry.chunk_rows, entry.shape[0] - number * entry.chunk_rows)
-    if entry.codec == "zstd":
-        return decode_rows(payload, entry, what=where)[:num_rows].tobytes()
-    chunks = ImageChunks(entry.codec, entry.shape[1:], entry.chunk_rows, what)
-    images = chunks.unpack(payload, number)
-    if len(images) != num_rows:
-        raise CorruptDataError(f"{where} holds {len(images)} images, expected {num_rows}")
-    if entry.codec == "jpeg" and (size := jpeg_size(payload, where=where)) != entry.shape[1:3]:
-        raise CorruptDataError(f"{where} is {size} pixels, expected {entry.shape[1:3]}")
-    return payload
+    return ItemReport(kind, files.item_id, len(contents.entries), sum(sizes), tuple(findings))
 
 
 def _stamp_findings(contents: Group) -> list[Finding]:

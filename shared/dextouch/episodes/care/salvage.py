@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dextouch.episodes.care.inspection import hashed_bytes
 from dextouch.episodes.format import (
     GOP_IMAGES,
     STAMPS,
@@ -24,6 +23,7 @@ from dextouch.episodes.format import (
     with_counts,
     with_rows,
 )
+from dextouch.episodes.group_contents import hashed_bytes
 from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.episodes.journal import part_path, scan_rows
 from dextouch.episodes.shard_index import salvaged_index

@@ -25,22 +25,24 @@ PLACES: dict[str, str] = {
     STAGING: "",
     TRASH: "",
 }
+MAX_BYTES = 16 << 20
 # Files with attributes, and the keys under which they lie.
 _ATTRIBUTES = {
     METADATA_FILE: ("attributes", ATTRIBUTES_KEY),
     STAGE_FILE: ("attributes",),
     RECORDING_FILE: (),
 }
-MAX_BYTES = 16 << 20
 _SAMPLES = (".part", ".journal", ".log")
 _WORD = "A-Za-z0-9_-"
-_AROUND_STAGE = re.compile(r"(episode|recording|migrated|old|deleted)-(.+)-[0-9a-f]{32}")
-_AROUND_TRASH = re.compile(r"(episode|recording|upload|stage)\.(.+)\.[0-9]+")
+_AROUND = {
+    STAGING: re.compile(r"(episode|recording|migrated|old|deleted)-(.+)-[0-9a-f]{32}"),
+    TRASH: re.compile(r"(episode|recording|upload|stage)\.(.+)\.[0-9]+"),
+}
 
 
 @dataclass(frozen=True)
 class Facts:
-    """Identity of one folder of a store.
+    """Identity of one folder of a store, even a damaged or unfinished one.
 
     `item_id` and `kind` are those of its (intended) group; `lineage` the kinds, ids and hashes of
     its sources; `readable` is false where nothing could be parsed.
@@ -52,7 +54,7 @@ class Facts:
     item_id: str
     operator: str | None
     lineage: tuple[tuple[str, str, str | None], ...]
-    content_sha256: str | None
+    sha256: str | None
     readable: bool
 
 
@@ -60,9 +62,8 @@ def all_facts(root: Path) -> list[Facts]:
     """Facts of every group, upload, stage and trash entry below a store's folder."""
     found = []
     for place in PLACES:
-        folder = root / place
         with disk_errors(f"list {place}"):
-            paths = sorted(folder.iterdir()) if folder.is_dir() else []
+            paths = sorted((root / place).iterdir()) if (root / place).is_dir() else []
         found += [_facts(path, place) for path in paths]
     return found
 
@@ -73,27 +74,20 @@ def _facts(folder: Path, place: str) -> Facts:
     for known in ("episode", "recording"):
         if isinstance(attributes.get(f"{known}_id"), str):
             kind, item_id = known, attributes[f"{known}_id"]
-    lineage = attributes.get("lineage")
-    return Facts(
-        folder=folder,
-        place=place,
-        kind=kind,
-        item_id=item_id,
-        operator=_text(attributes.get("operator")),
-        lineage=tuple(
-            (str(entry.get("kind")), str(entry.get("id")), _text(entry.get("sha256")))
-            for entry in (lineage if isinstance(lineage, list) else [])
-            if isinstance(entry, dict)
-        ),
-        content_sha256=_text(_dict(folder / COMMIT_FILE).get("sha256")),
-        readable=bool(attributes) or not any(small_files(folder)),
+    entries = attributes.get("lineage")
+    lineage = tuple(
+        (str(entry.get("kind")), str(entry.get("id")), _text(entry.get("sha256")))
+        for entry in (entries if isinstance(entries, list) else [])
+        if isinstance(entry, dict)
     )
+    operator, sha256 = attributes.get("operator"), _dict(folder / COMMIT_FILE).get("sha256")
+    readable = bool(attributes) or not any(small_files(folder))
+    return Facts(folder, place, kind, item_id, _text(operator), lineage, _text(sha256), readable)
 
 
 def _named(name: str, place: str) -> tuple[str, str]:
     """Kind and id from the name of a folder."""
-    pattern = {STAGING: _AROUND_STAGE, TRASH: _AROUND_TRASH}.get(place)
-    match = pattern.fullmatch(name) if pattern else None
+    match = _AROUND[place].fullmatch(name) if place in _AROUND else None
     if match is None:
         return PLACES[place], name.removesuffix(".new")
     if match[1] == "stage":
@@ -129,27 +123,27 @@ def _text(value: object) -> str | None:
 
 
 class Wanted:
-    """Search for identifiers (a pseudonym, ids, hashes) as whole words."""
+    """Search for identifiers (a pseudonym, ids, hashes), at least one, as whole words."""
 
     def __init__(self, words: set[str]) -> None:
         self._words = words
         # Longest first, so that of two words with a common prefix the longer one matches.
         either = "|".join(re.escape(word) for word in sorted(words, key=len, reverse=True))
-        self._pattern = re.compile(rf"(?<![{_WORD}])(?:{either})(?![{_WORD}])") if words else None
+        self._pattern = re.compile(rf"(?<![{_WORD}])(?:{either})(?![{_WORD}])")
 
     def found_in(self, data: bytes) -> list[str]:
         """Identifiers in bytes of JSON or text."""
         try:
-            texts = list(_strings(json.loads(data)))
+            texts = "\0".join(_strings(json.loads(data)))
         except (ValueError, RecursionError):
             text = data.decode(errors="replace")
             escaped = {word for word in self._words if json.dumps(word)[1:-1] in text}
-            return sorted(escaped | set(self.in_text(text)))
-        return sorted({word for text in texts for word in self.in_text(text)})
+            return sorted(escaped.union(self.in_text(text)))
+        return self.in_text(texts)
 
     def in_text(self, text: str) -> list[str]:
         """Identifiers in a text."""
-        return sorted(set(self._pattern.findall(text))) if self._pattern else []
+        return sorted(set(self._pattern.findall(text)))
 
 
 def _strings(value: object) -> Iterator[str]:
