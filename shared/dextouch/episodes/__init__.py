@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from dextouch.episodes.format import check_id as check_id
     from dextouch.episodes.format import shard_path as shard_path
     from dextouch.episodes.format import stream_arrays as stream_arrays
-    from dextouch.episodes.local_storage import local_folder as local_folder
     from dextouch.episodes.reader import EpisodeReader as EpisodeReader
     from dextouch.episodes.reader import RecordingReader as RecordingReader
     from dextouch.episodes.sources import GroupFiles as GroupFiles
     from dextouch.episodes.sources import LocalGroup as LocalGroup
     from dextouch.episodes.store import EpisodeStore as EpisodeStore
+    from dextouch.episodes.store import local_folder as local_folder
     from dextouch.episodes.trash import TRASH_KINDS as TRASH_KINDS
     from dextouch.episodes.trash import TrashKind as TrashKind
     from dextouch.episodes.video import FULL_FORM as FULL_FORM
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
     from dextouch.episodes.window import NativeWindow as NativeWindow
     from dextouch.episodes.window import StreamData as StreamData
     from dextouch.episodes.window import Window as Window
+    from dextouch.episodes.window import decode_window as decode_window
+    from dextouch.episodes.window import encode_window as encode_window
     from dextouch.episodes.window import mean_over_ranges as mean_over_ranges
     from dextouch.episodes.window import nearest_indices as nearest_indices
     from dextouch.episodes.window import step_ranges as step_ranges
-    from dextouch.episodes.window_codec import decode_window as decode_window
-    from dextouch.episodes.window_codec import encode_window as encode_window
     from dextouch.episodes.write_options import WriteOptions as WriteOptions
     from dextouch.episodes.writer import EpisodeWriter as EpisodeWriter
 else:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts
-from dextouch.episodes.object_files import (
+from dextouch.episodes.object_storage import (
     BLOCK_BYTES,
     MAX_READ_AHEAD,
     TAIL_BYTES,

@@ -14,9 +14,8 @@ from obstore.store import S3Store
 from zarr.storage import ObjectStore
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.object_address import ObjectOptions, parse_address
-from dextouch.episodes.object_bucket import Bucket
-from dextouch.episodes.object_files import BLOCK_BYTES
+from dextouch.episodes.object_bucket import Bucket, ObjectOptions, parse_address
+from dextouch.episodes.object_storage import BLOCK_BYTES
 from dextouch.episodes.uploads import ORPHAN_AGE, sweep_orphans
 from dextouch.errors import (
     ConflictError,

@@ -96,7 +96,7 @@ def inspect_group(
     if isinstance(files, LocalGroup):
         findings += [
             Finding(f"{contents.what}: {path} belongs to no array; move it away", foreign=True)
-            for path in foreign_paths(files.folder, contents.entries)
+            for path in _foreign_paths(files.folder, contents.entries)
         ]
     return ItemReport(kind, files.item_id, len(contents.entries), sum(sizes), tuple(findings))
 
@@ -115,7 +115,7 @@ def _stamp_findings(contents: Group) -> list[Finding]:
     return findings
 
 
-def foreign_paths(folder: Path, entries: dict[str, ArrayEntry]) -> list[str]:
+def _foreign_paths(folder: Path, entries: dict[str, ArrayEntry]) -> list[str]:
     """Files, folders and links in a group's folder that belong to no array."""
     wanted = {COMMIT_FILE, METADATA_FILE}
     for name, entry in entries.items():
@@ -223,15 +223,13 @@ def interrupted_takes(root: Path) -> Iterator[tuple[str, str]]:
     A damaged one has kind "stage" and the name of its folder.
     """
     for what, folder in unfinished_folders(root):
-        if what == "stage" and (folder / STAGE_FILE).is_file() and not is_held(folder):
-            yield _take_in(folder)
-
-
-def _take_in(stage: Path) -> tuple[str, str]:
-    try:
-        attributes = read_stage(stage)
-    except StorageError:
-        attributes = None
-    if attributes is None:
-        return "stage", stage.name
-    return kind_of(attributes), attributes_id(attributes)
+        if what != "stage" or not (folder / STAGE_FILE).is_file() or is_held(folder):
+            continue
+        try:
+            attributes = read_stage(folder)
+        except StorageError:
+            attributes = None
+        if attributes is None:
+            yield "stage", folder.name
+        else:
+            yield kind_of(attributes), attributes_id(attributes)

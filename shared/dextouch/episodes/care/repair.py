@@ -10,8 +10,6 @@ from pathlib import Path
 
 from dextouch.episodes.care.inspection import (
     UPLOADS,
-    Group,
-    ItemReport,
     inspect_group,
     inspect_upload,
     open_contents,
@@ -49,12 +47,7 @@ from dextouch.episodes.spool_reader import read_attributes
 from dextouch.episodes.staged_group import STAGING, read_stage, unheld_folders
 from dextouch.episodes.staging_recovery import recover_stage
 from dextouch.episodes.trash import TrashKind, put_into_trash
-from dextouch.errors import (
-    ConflictError,
-    CorruptDataError,
-    DexTouchError,
-    StorageError,
-)
+from dextouch.errors import ConflictError, CorruptDataError, DexTouchError, StorageError
 from dextouch.schemas import LineageEntry
 
 WHOLE, MENDED, SALVAGED, RECOVERED, LEFT = "whole", "mended", "salvaged", "recovered", "left"
@@ -86,21 +79,19 @@ def repair_group(
     Raises:
         ConflictError: a copy of other content.
     """
-    folder = root / f"{kind}s" / item_id
-    files = LocalGroup(folder)
-    report = inspect_group(files, kind)
-    if not report.damaged:
+    files = LocalGroup(root / f"{kind}s" / item_id)
+    findings = inspect_group(files, kind).findings
+    if not findings:
         return RepairReport(kind, item_id, WHOLE)
-    notes = _messages(report)
-    if all(finding.foreign for finding in report.findings):
+    notes = tuple(finding.message for finding in findings)
+    if all(finding.foreign for finding in findings):
         return RepairReport(kind, item_id, LEFT, notes=notes)
     if copy is not None:
-        _repair_from(folder, kind, copy)
+        _repair_from(files, kind, copy)
     _rewrite_metadata(files, kind)
-    report = inspect_group(files, kind)
-    if all(finding.foreign for finding in report.findings):
+    if all(finding.foreign for finding in inspect_group(files, kind).findings):
         return RepairReport(kind, item_id, MENDED, notes=notes)
-    return _salvage(root, kind, folder, notes)
+    return _salvage(root, kind, files.folder, notes)
 
 
 def repair_unfinished(root: Path) -> list[RepairReport]:
@@ -109,25 +100,18 @@ def repair_unfinished(root: Path) -> list[RepairReport]:
     Intact uploads are unchanged, since their station continues them. The readable samples of
     damaged ones become a recording `ID-salvaged-N`, so that the station can send everything again.
     """
-    stages = (_repair_stage(root, stage) for stage in unheld_folders(root / STAGING))
-    reports = [report for report in stages if report is not None]
+    reports = []
+    for stage in unheld_folders(root / STAGING):
+        try:
+            if group := recover_stage(stage, root):
+                reports.append(RepairReport(group.kind, group.item_id, RECOVERED))
+        except CorruptDataError as error:
+            reports.append(_salvage(root, "stage", stage, (error.message,)))
     for spool in unheld_folders(root / UPLOADS):
-        found = inspect_upload(spool)
-        if found.damaged:
-            reports.append(_salvage(root, "upload", spool, _messages(found)))
+        if findings := inspect_upload(spool).findings:
+            notes = tuple(finding.message for finding in findings)
+            reports.append(_salvage(root, "upload", spool, notes))
     return reports
-
-
-def _messages(report: ItemReport) -> tuple[str, ...]:
-    return tuple(finding.message for finding in report.findings)
-
-
-def _repair_stage(root: Path, stage: Path) -> RepairReport | None:
-    try:
-        group = recover_stage(stage, root)
-    except CorruptDataError as error:
-        return _salvage(root, "stage", stage, (error.message,))
-    return None if group is None else RepairReport(group.kind, group.item_id, RECOVERED)
 
 
 def _salvage(root: Path, kind: TrashKind, folder: Path, notes: tuple[str, ...]) -> RepairReport:
@@ -196,45 +180,36 @@ def _put(folder: Path, name: str, data: bytes) -> None:
         replace_file(place, data)
 
 
-def _repair_from(folder: Path, kind: Kind, copy: GroupFiles) -> None:
+def _repair_from(files: LocalGroup, kind: Kind, copy: GroupFiles) -> None:
     """Copy all files that differ or are damaged here and are intact in the copy."""
-    theirs = open_contents(copy, kind)
-    what = f"{kind} {folder.name}"
-    _check_same_content(LocalGroup(folder), theirs, what)
+    theirs, record = open_contents(copy, kind), _commit_of(files, kind)
+    if record is not None:
+        same = record[1] == theirs.content_sha256
+    else:
+        # The attributes name the streams and their lineage, which identifies the content.
+        same = files.get(METADATA_FILE) == copy.get(METADATA_FILE)
+    if not same:
+        raise ConflictError(
+            f"{kind} {files.item_id}: the copy holds content {theirs.content_sha256[:12]}, which "
+            f"is not proven to be ours ({record[1][:12] if record else f'{COMMIT_FILE} is damaged'}"
+            "); name a copy of the same content"
+        )
     for name in (METADATA_FILE, COMMIT_FILE):
-        data = copy.get(name)
-        if data is not None:
-            _put(folder, name, data)
-    _rewrite_metadata(LocalGroup(folder), kind)
-    bad_here = _damaged_arrays(LocalGroup(folder), kind)
-    bad_there = _damaged_arrays(copy, kind)
-    for name in sorted(bad_here - bad_there):
+        if (data := copy.get(name)) is not None:
+            _put(files.folder, name, data)
+    _rewrite_metadata(files, kind)
+    for name in sorted(_damaged_arrays(files, kind) - _damaged_arrays(copy, kind)):
         path = f"{name}/{shard_path(len(theirs.entries[name].shape))}"
         source = copy.source(path)
-        _put(folder, path, bytes(source.read(0, source.size() or 0)))
+        _put(files.folder, path, bytes(source.read(0, source.size() or 0)))
 
 
 def _damaged_arrays(files: GroupFiles, kind: Kind) -> set[str]:
     return {f.array for f in inspect_group(files, kind).findings if f.array is not None}
 
 
-def _check_same_content(ours: LocalGroup, theirs: Group, what: str) -> None:
-    record = _commit_of(ours, what)
-    if record is not None:
-        same = record[1] == theirs.content_sha256
-    else:
-        # The attributes name the streams and their lineage, which identifies the content.
-        group, other = ours.get(METADATA_FILE), theirs.files.get(METADATA_FILE)
-        same = group is not None and group == other
-    if not same:
-        raise ConflictError(
-            f"{what}: the copy holds content {theirs.content_sha256[:12]}, which is not proven to "
-            f"be ours ({record[1][:12] if record else f'{COMMIT_FILE} is damaged'}); "
-            "name a copy of the same content"
-        )
-
-
-def _commit_of(files: LocalGroup, what: str) -> tuple[CommitRecord, str] | None:
+def _commit_of(files: LocalGroup, kind: Kind) -> tuple[CommitRecord, str] | None:
+    what = f"{kind} {files.item_id}"
     try:
         data = get_metadata(files, COMMIT_FILE, what)
         return None if data is None else decode_commit(data, what=what)
@@ -251,7 +226,7 @@ def _known(
         StorageError: another version, or attributes that are damaged.
     """
     what = f"{kind} {files.item_id}"
-    record, group = _commit_of(files, what), get_metadata(files, METADATA_FILE, what)
+    record, group = _commit_of(files, kind), get_metadata(files, METADATA_FILE, what)
     if group is None or (record and sha256_hex(group) != record[0].attributes_sha256):
         raise CorruptDataError(
             f"{what}: attributes are damaged, and samples cannot be interpreted without them; "

@@ -4,10 +4,13 @@ Nothing is filled in: a damaged storage chunk or sample is dropped with its stam
 `lost_to_damage`.
 """
 
+import math
+import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import google_crc32c
 import numpy as np
 
 from dextouch.episodes.format import (
@@ -26,14 +29,19 @@ from dextouch.episodes.format import (
 from dextouch.episodes.group_contents import hashed_bytes
 from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.episodes.journal import part_path, scan_rows
-from dextouch.episodes.shard_index import salvaged_index
-from dextouch.episodes.shard_reader import ShardReader, decode_rows
+from dextouch.episodes.shard_reader import (
+    CRC_BYTES,
+    INDEX_ENTRY_BYTES,
+    ShardReader,
+    decode_rows,
+)
 from dextouch.episodes.sources import LocalFile
 from dextouch.episodes.spool_log import body_at, find_records, open_log
 from dextouch.episodes.spool_reader import body_of, read_batch
 from dextouch.episodes.staged_group import new_stage
 from dextouch.episodes.staging_recovery import free_id, ids_below
 from dextouch.episodes.writer import Block, write_blocks
+from dextouch.episodes.zstd import frame_bytes
 from dextouch.errors import CorruptDataError, InvalidInputError
 from dextouch.schemas import LineageEntry
 from dextouch.streams import StreamDescriptor, check_batch, decode_body, encoded_values
@@ -42,6 +50,9 @@ LOST = "lost_to_damage"
 # The rows of these streams correspond by index: the steps of the model grid.
 GRID_STREAMS = ("action", "action_commanded")
 BLOCK_SAMPLES = 256
+# One day of 30 images per second, each a storage chunk.
+_MAX_CHUNKS = 86_400 * 30
+_JPEG_END = b"\xff\xd9"
 
 
 @dataclass(frozen=True)
@@ -113,7 +124,7 @@ def group_streams(
     def array(name: str) -> _SalvagedArray:
         entry = entries[name]
         path = folder / name / shard_path(len(entry.shape))
-        return _SalvagedArray(path, entry, salvaged_index(LocalFile(path), entry))
+        return _SalvagedArray(path, entry, _salvaged_index(LocalFile(path), entry))
 
     return _streams(attributes, array)
 
@@ -276,3 +287,67 @@ def _spooled(
         return batch.values[chosen], stamps
 
     return SalvagedStream(descriptor, kept, read)
+
+
+def _salvaged_index(source: LocalFile, entry: ArrayEntry) -> np.ndarray:
+    """(offset, length) of each intact storage chunk of a shard, (0, 0) of the others.
+
+    Offsets come from the index where it is right, otherwise from the end of the chunk before, since
+    storage chunks are contiguous, and lengths then from the chunks' own headers.
+    """
+    num_chunks = -(-entry.shape[0] // entry.chunk_rows)
+    if num_chunks > _MAX_CHUNKS:
+        raise CorruptDataError(
+            f"shard: got {num_chunks} storage chunks to look for, expected at most {_MAX_CHUNKS}"
+        )
+    data = bytes(source.read(0, source.size() or 0))
+    limit = len(data) - num_chunks * INDEX_ENTRY_BYTES - CRC_BYTES
+    places = [[0, 0]] * num_chunks
+    if limit >= 0:
+        places = np.frombuffer(data, "<u8", 2 * num_chunks, limit).reshape(-1, 2).tolist()
+    found, end, stuck = [], 0, -1
+    for offset, length in places:
+        place, is_inside = (offset, length), offset + length <= limit
+        if not is_inside or not _is_intact(data[offset : offset + length]):
+            place = (end, _chunk_bytes(data, end, entry) if end != stuck else 0)
+        if place[1]:
+            end = sum(place)
+        else:
+            # Never back, so that no chunk is found twice.
+            place, stuck, end = (0, 0), end, max(end, offset + length if is_inside else 0)
+        found.append(place)
+    return np.array(found, dtype=np.uint64).reshape(-1, 2)
+
+
+def _is_intact(chunk: bytes) -> bool:
+    if len(chunk) <= CRC_BYTES:
+        return False
+    crc = int.from_bytes(chunk[-CRC_BYTES:], "little")
+    return google_crc32c.value(chunk[:-CRC_BYTES]) == crc
+
+
+def _chunk_bytes(data: bytes, start: int, entry: ArrayEntry) -> int:
+    """Length of the storage chunk at an offset, checksum included; 0 if there is none."""
+    if entry.codec == "jpeg":
+        # No image takes twice the bytes of its pixels.
+        end = start + 2 * math.prod(entry.shape[1:]) + 65_536
+        stop = data.find(_JPEG_END, start, end)
+        # An end marker inside a thumbnail is ruled out by the checksum.
+        while stop >= 0 and not _is_intact(data[start : stop + 2 + CRC_BYTES]):
+            stop = data.find(_JPEG_END, stop + 1, end)
+        return stop + 2 + CRC_BYTES - start if stop >= 0 else 0
+    length = _encoded_bytes(data, start, entry) + CRC_BYTES
+    return length if _is_intact(data[start : start + length]) else 0
+
+
+def _encoded_bytes(data: bytes, start: int, entry: ArrayEntry) -> int:
+    """Length declared by a zstd frame or a group of pictures; 0 if there is none."""
+    if entry.codec == "zstd":
+        # Only block headers are parsed, which is far less than is copied.
+        longest = entry.chunk_rows * math.prod(entry.shape[1:]) * np.dtype(entry.dtype).itemsize
+        return frame_bytes(data[start : start + longest + longest // 8 + 1024]) or 0
+    count = int.from_bytes(data[start : start + 4], "little")
+    head = 4 * (1 + count)
+    if not 1 <= count <= entry.chunk_rows or len(data) < start + head:
+        return 0
+    return head + sum(struct.unpack_from(f"<{count}I", data, start + 4))
