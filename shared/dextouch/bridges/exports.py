@@ -37,12 +37,7 @@ class Block:
 
 
 def blocks(reader: Reader, name: str) -> Iterator[Block]:
-    """Iterate over a stream in order, about one second per block; encoded images stay encoded.
-
-    Args:
-        reader: of the episode or recording.
-        name: of the stream.
-    """
+    """Iterate over a stream in order, about one second per block; encoded images stay encoded."""
     descriptor, t_ns = reader.streams[name], reader.stamps_ns(name)
     t_device_ns, sequence = np.full_like(t_ns, NO_DEVICE_TIME), np.full_like(t_ns, NO_SEQUENCE)
     if isinstance(reader, RecordingReader):

@@ -102,8 +102,7 @@ class GroupReader(Generic[A]):
             raise InvalidInputError(
                 f"{self._what}: {name!r} has the unit {descriptor.unit!r}, not 'jpeg' or 'h264'"
             )
-        if not 0 <= start <= stop <= self.num_samples(name):
-            raise InvalidInputError(f"{self._what}: {name!r} has no images {start} … {stop}")
+        self._check_span("images", name, start, stop)
         chunks, shard = self._image_chunks(descriptor), self._contents.shard(name)
         first = start // chunks.rows
         images: list[bytes] = []

@@ -7,6 +7,7 @@ crc32c, so a flipped bit or a truncated file is always detected.
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import google_crc32c
 import numpy as np
@@ -65,7 +66,8 @@ class ShardReader:
         self, source: ByteSource, entry: ArrayEntry, *, what: str, index: np.ndarray | None = None
     ) -> None:
         self._source, self._entry, self._what = source, entry, what
-        self._layout = _ChunkLayout(entry)
+        self._dtype, self._row_bytes = _row_layout(entry)
+        self._chunk_bytes = entry.chunk_rows * self._row_bytes
         self._num_rows, self._rows_each = entry.shape[0], entry.chunk_rows
         self._num_chunks = -(-entry.shape[0] // entry.chunk_rows)
         self._index = index
@@ -85,12 +87,11 @@ class ShardReader:
             )
         first = start // rows_each
         places = self.check_index()[first : -(-stop // rows_each) if stop > start else first]
-        layout = self._layout
-        rows = np.empty((stop - start) * layout.row_bytes, dtype=np.uint8)
+        rows = np.empty((stop - start) * self._row_bytes, dtype=np.uint8)
         # As plain bytes, which are cheaper to copy than rows for small windows.
-        wanted, skip = rows.data, start % rows_each * layout.row_bytes
+        wanted, skip = rows.data, start % rows_each * self._row_bytes
         for what, payload in self._payloads(first, places.tolist()):
-            data = decompress(payload, size=layout.num_bytes, what=what)
+            data = decompress(payload, size=self._chunk_bytes, what=what)
             part = memoryview(data)[skip : skip + len(wanted)]
             wanted[: len(part)] = part
             wanted, skip = wanted[len(part) :], 0
@@ -99,7 +100,7 @@ class ShardReader:
                 f"{self._what}: its index names {len(places)} storage chunks of rows {start} … "
                 f"{stop}, expected all of them; the last {len(wanted)} bytes are missing"
             )
-        return rows.view(layout.dtype).reshape(stop - start, *layout.row_shape)
+        return rows.view(self._dtype).reshape(stop - start, *self._entry.shape[1:])
 
     def payload(self, number: int) -> bytes:
         """The encoded bytes of one storage chunk, verified, without the checksum.
@@ -163,7 +164,7 @@ class ShardReader:
             return
         bound = int(lengths.min())
         if entry.codec == "zstd":
-            claimed = -(-self._layout.num_bytes // _ZSTD_MAX_RATIO)
+            claimed = -(-self._chunk_bytes // _ZSTD_MAX_RATIO)
         elif entry.codec == "h264":
             full = lengths[: entry.shape[0] // entry.chunk_rows]
             bound = int(full.min()) if len(full) else int(lengths[-1])
@@ -186,14 +187,10 @@ class ShardReader:
         return np.frombuffer(body, dtype="<u8").reshape(-1, 2)
 
 
-class _ChunkLayout:
-    """Memory layout of the rows of a `zstd` storage chunk, computed once per array."""
-
-    def __init__(self, entry: ArrayEntry) -> None:
-        self.dtype = np.dtype(entry.dtype).newbyteorder("<")
-        self.row_shape = entry.shape[1:]
-        self.row_bytes = math.prod(self.row_shape) * self.dtype.itemsize
-        self.num_bytes = entry.chunk_rows * self.row_bytes
+def _row_layout(entry: ArrayEntry) -> tuple[np.dtype[Any], int]:
+    """Type and number of bytes of a row of a `zstd` array."""
+    dtype = np.dtype(entry.dtype).newbyteorder("<")
+    return dtype, math.prod(entry.shape[1:]) * dtype.itemsize
 
 
 def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.ndarray, "n ..."]:
@@ -202,6 +199,6 @@ def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.nd
     Raises:
         CorruptDataError: another number of rows.
     """
-    layout = _ChunkLayout(entry)
-    data = decompress(payload, size=layout.num_bytes, what=what)
-    return np.frombuffer(data, dtype=layout.dtype).reshape(entry.chunk_rows, *layout.row_shape)
+    dtype, row_bytes = _row_layout(entry)
+    data = decompress(payload, size=entry.chunk_rows * row_bytes, what=what)
+    return np.frombuffer(data, dtype=dtype).reshape(entry.chunk_rows, *entry.shape[1:])

@@ -200,7 +200,7 @@ def test_damage_and_tricks_are_refused(change, error, store, other, tmp_path):
 def test_an_episode_without_end_is_refused(store, other, tmp_path, monkeypatch):
     path = tmp_path / "take.zip"
     export_umi([write_episode(store, "all", num_steps=5)], path)
-    monkeypatch.setattr("dextouch.bridges.umi.reading.MAX_STEPS", 4)
+    monkeypatch.setattr("dextouch.bridges.umi.replay_buffer.MAX_STEPS", 4)
     with pytest.raises(LimitExceededError, match="5 steps"):
         import_umi(path, other)
 

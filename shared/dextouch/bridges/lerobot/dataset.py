@@ -67,14 +67,10 @@ class _ParquetFiles:
 
 
 class DatasetWriter:
-    """Writes one dataset episode by episode; `finish` writes the metadata.
+    """Writes a new dataset episode by episode; `finish` writes the metadata.
 
-    Args:
-        folder: of the dataset, new.
-        cameras: shape [height, width, 3] of each camera's images.
-        fps: frames a second.
-        has_measured: actions are commanded ones, and measured ones are stored beside them.
-        robot_type: as the dataset names it.
+    `cameras` holds the shape [height, width, 3] of each camera's images; with `has_measured`
+    actions are commanded ones, and measured ones are stored beside them.
 
     Raises:
         InvalidInputError: a rate outside 1 … 1000.
@@ -113,13 +109,7 @@ class DatasetWriter:
         image_statistics: Mapping[str, Statistics],
         sidecar: layout.Sidecar,
     ) -> None:
-        """Write one episode.
-
-        Args:
-            frames: of the episode.
-            videos: access units of each camera, one a frame.
-            image_statistics: of each camera's feature.
-            sidecar: DexTouch attributes that LeRobot has no field for.
+        """Write one episode, with an access unit of each camera a frame.
 
         Raises:
             InvalidInputError: an episode that is inconsistent with those before it.
@@ -167,23 +157,15 @@ class DatasetWriter:
         self.num_episodes += 1
 
     def _columns(self, frames: EpisodeFrames, task_index: int) -> dict[str, np.ndarray]:
-        count = len(frames)
-        frame_index = np.arange(count, dtype=np.int64)
-        columns = {
-            layout.STATE: frames.state,
-            layout.TACTILE: frames.tactile_kpa,
-            layout.ACTION: frames.action,
-            layout.MEASURED: frames.measured,
-            layout.VALID: frames.tactile_valid,
-            layout.STAMP: frames.t_ref_ns,
-            layout.IMAGE_DT: frames.image_dt_ns,
+        frame_index = np.arange(len(frames), dtype=np.int64)
+        columns = frames.columns | {
             "timestamp": (frame_index / self.fps).astype(np.float32),
             "frame_index": frame_index,
-            "episode_index": np.full(count, self.num_episodes, dtype=np.int64),
+            "episode_index": np.full_like(frame_index, self.num_episodes),
             "index": self.num_frames + frame_index,
-            "task_index": np.full(count, task_index, dtype=np.int64),
+            "task_index": np.full_like(frame_index, task_index),
         }
-        return {name: column for name, column in columns.items() if name in self._features}
+        return {name: columns[name] for name in self._features if name in columns}
 
     def close(self) -> None:
         """Complete the data, video and episode files."""
@@ -199,10 +181,7 @@ class DatasetWriter:
             self._rows = []
 
     def finish(self, repo_id: str) -> None:
-        """Complete the files and write the metadata.
-
-        Args:
-            repo_id: name of the dataset, for its card.
+        """Complete the files and write the metadata; `repo_id` is the dataset's name.
 
         Raises:
             StorageError: the write failed.

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
+from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.layout import Grid
 from dextouch.bridges.model_grid import BLOCK_IMAGES
 from dextouch.episodes import EpisodeReader, mean_over_ranges, nearest_indices, step_ranges
@@ -29,23 +30,19 @@ WORLD = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
 class EpisodeFrames:
     """One row per frame; `image_indices` gives the stored image of each camera in a frame.
 
-    `state` holds absolute measured poses and joints; `action` and `measured` are relative to the
-    measured poses of the episode's step 0. `image_dt_ns` is the image's stamp minus the frame's.
+    `columns` [n, …] are those of the features of `layout`: STATE float32 [67] holds absolute
+    measured poses and joints; ACTION and MEASURED float32 [67] are relative to the measured poses
+    of the episode's step 0; TACTILE float32 [2, 320] in kPa, VALID bool [2], STAMP int64 and
+    IMAGE_DT int64 [cameras], the image's stamp minus the frame's, in ns.
     """
 
     grid: Grid
     action_kind: ActionKind
-    t_ref_ns: Int64[np.ndarray, " n"]
-    state: Float32[np.ndarray, "n 67"]
-    action: Float32[np.ndarray, "n 67"]
-    measured: Float32[np.ndarray, "n 67"]
-    tactile_kpa: Float32[np.ndarray, "n 2 320"]
-    tactile_valid: Bool[np.ndarray, "n 2"]
+    columns: dict[str, np.ndarray]
     image_indices: dict[str, Int64[np.ndarray, " n"]]
-    image_dt_ns: Int64[np.ndarray, "n cameras"]
 
     def __len__(self) -> int:
-        return len(self.t_ref_ns)
+        return len(self.columns[layout.STAMP])
 
 
 def frames_of(reader: EpisodeReader, cameras: Sequence[str], fps: int) -> EpisodeFrames:
@@ -73,26 +70,23 @@ def frames_of(reader: EpisodeReader, cameras: Sequence[str], fps: int) -> Episod
     if kind == "commanded":
         sent = reader.read("action_commanded")
         action = _at(reader, sent.values, sent.t_ref_ns, t_ns)
-    anchor = reader.attributes.anchor.to_poses()
-    state = actions_from_poses(poses_from_actions(measured, anchor), WORLD)
+    state = actions_from_poses(
+        poses_from_actions(measured, reader.attributes.anchor.to_poses()), WORLD
+    )
     kpa, valid = _tactile(reader, t_ns)
-    indices, offsets = {}, np.zeros((len(t_ns), len(cameras)), dtype=np.int64)
+    indices, offsets_ns = {}, np.zeros((len(t_ns), len(cameras)), dtype=np.int64)
     for column, camera in enumerate(cameras):
         stamps = _image_stamps(reader, camera)
         indices[camera] = nearest_indices(stamps, t_ns)
-        offsets[:, column] = stamps[indices[camera]] - t_ns
-    return EpisodeFrames(
-        grid=grid,
-        action_kind=kind,
-        t_ref_ns=t_ns,
-        state=state.astype(np.float32),
-        action=action.astype(np.float32),
-        measured=measured.astype(np.float32),
-        tactile_kpa=kpa,
-        tactile_valid=valid,
-        image_indices=indices,
-        image_dt_ns=offsets,
-    )
+        offsets_ns[:, column] = stamps[indices[camera]] - t_ns
+    numbers = {layout.STATE: state, layout.ACTION: action, layout.MEASURED: measured}
+    columns = {name: values.astype(np.float32) for name, values in numbers.items()} | {
+        layout.TACTILE: kpa,
+        layout.VALID: valid,
+        layout.STAMP: t_ns,
+        layout.IMAGE_DT: offsets_ns,
+    }
+    return EpisodeFrames(grid, kind, columns, indices)
 
 
 def _image_stamps(reader: EpisodeReader, camera: str) -> Int64[np.ndarray, " n"]:

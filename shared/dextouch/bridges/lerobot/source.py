@@ -78,9 +78,6 @@ class EpisodeEntry:
 class LeRobotFolder:
     """A dataset on disk; only its metadata is read up front.
 
-    Args:
-        folder: root of the dataset.
-
     Raises:
         NotFoundError: a file of the metadata is missing.
         InvalidInputError: another version of the format.

@@ -35,15 +35,9 @@ class VideoPlace:
 class CameraVideo:
     """The mp4 files of one camera, one episode after the other.
 
-    Access units are muxed unchanged. A new file starts when the next episode would make the file
-    too large, or was encoded with other parameter sets than the file's header holds.
-
-    Args:
-        folder: root of the dataset.
-        key: feature of the camera.
-        fps: images a second of the dataset.
-        shape: [height, width, 3] of the images.
-        file_bytes: size that a file should not exceed; one episode is never split.
+    Access units are muxed unchanged. A new file starts when the next episode, which is never split,
+    would make the file larger than `file_bytes`, or was encoded with other parameter sets than the
+    file's header holds. `shape` is [height, width, 3].
     """
 
     def __init__(
@@ -63,11 +57,7 @@ class CameraVideo:
         self._file: tuple[OutputContainer, VideoStream] | None = None
 
     def append(self, access_units: Sequence[bytes], *, where: str) -> VideoPlace:
-        """Mux one episode.
-
-        Args:
-            access_units: one per image, the first an entry point; without B-frames.
-            where: names the episode and camera in errors.
+        """Mux the access units of one episode, one per image, without B-frames.
 
         Raises:
             CorruptDataError: the first image is not an entry point.

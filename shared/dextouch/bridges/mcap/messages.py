@@ -73,11 +73,7 @@ class Sent:
 
 
 class MessageCodec:
-    """Encodes and decodes the samples of one stream.
-
-    Args:
-        descriptor: of the stream.
-    """
+    """Encodes and decodes the samples of one stream."""
 
     def __init__(self, descriptor: StreamDescriptor) -> None:
         self.descriptor, self.message = descriptor, _message_of(descriptor)
@@ -227,14 +223,10 @@ def _set_pose(translation: Any, rotation: Any, pose: np.ndarray) -> None:  # noq
 def calibration_message(
     K: np.ndarray, distortion: np.ndarray, *, t_ns: int, frame: str, shape_px: tuple[int, int]
 ) -> bytes:
-    """A foxglove.CameraCalibration for unrectified images.
+    """A foxglove.CameraCalibration for unrectified images of height and width `shape_px`.
 
-    Args:
-        K: camera matrix in pixels, 3×3.
-        distortion: k1 k2 p1 p2 k3; zeros for a pinhole.
-        t_ns: start of its validity.
-        frame: of the camera.
-        shape_px: height and width of its images.
+    `K` is the camera matrix in pixels, 3×3; `distortion` is k1 k2 p1 p2 k3, zeros for a pinhole;
+    `t_ns` the start of its validity.
     """
     K = np.asarray(K, dtype=np.float64)
     message = _new_message(CALIBRATION)

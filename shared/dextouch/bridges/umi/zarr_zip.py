@@ -92,11 +92,7 @@ class _NewArray:
 
 
 class ZarrZipWriter:
-    """Appends rows to the arrays of a new group; buffers one storage chunk per array.
-
-    Args:
-        path: of the new zip file.
-    """
+    """Appends rows to the arrays of a new zip file; buffers one storage chunk per array."""
 
     def __init__(self, path: Path) -> None:
         self._zip = zipfile.ZipFile(path, "x", zipfile.ZIP_STORED)
@@ -171,9 +167,6 @@ def zip_errors(path: Path) -> Iterator[None]:
 
 class ZarrZipReader:
     """Reads rows of arrays of a Zarr v2 group in an untrusted zip file.
-
-    Args:
-        path: of the zip file.
 
     Raises:
         NotFoundError: no such file.

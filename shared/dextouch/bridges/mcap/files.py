@@ -1,0 +1,334 @@
+"""MCAP files that Foxglove displays: export of an episode or recording, and its exact import."""
+
+import heapq
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.writer import CompressionType, Writer
+from pydantic import ValidationError
+
+from dextouch import __version__
+from dextouch.bridges.exports import Reader, blocks, new_file
+from dextouch.bridges.mcap.messages import (
+    CALIBRATION,
+    MessageCodec,
+    Sent,
+    calibration_message,
+    descriptor_set,
+    raw_encoding,
+)
+from dextouch.bridges.mcap.records import records
+from dextouch.episodes import EpisodeReader, EpisodeStore, EpisodeWriter, Kind, WriteOptions
+from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
+from dextouch.images import encode_jpeg
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes, json_ready
+from dextouch.streams import ENCODED_UNITS, StreamDescriptor, encoded_values
+
+PROFILE: Final = "dextouch"
+BRIDGE_VERSION: Final = "1"
+ABOUT: Final = "dextouch"
+COUNTS: Final = "dextouch.num_samples"
+ATTRIBUTES_FILE: Final = "attributes.json"
+CALIBRATION_FILE: Final = "calibration.json"
+CHUNK_BYTES: Final = 1 << 20
+HEAD_CAMERA: Final = "camera_head"
+_SEQUENCE_BITS = 0xFFFF_FFFF
+MAX_ATTRIBUTES_BYTES: Final = 1 << 24
+_BLOCK_BYTES: Final = 1 << 24
+Attributes = EpisodeAttributes | RecordingAttributes
+
+
+def export_mcap(
+    reader: Reader, path: Path, *, overwrite: bool = False, jpeg_quality: int | None = None
+) -> int:
+    """Write one episode or recording as MCAP.
+
+    `log_time` is t_ref_ns (episode) or t_host_ns (recording), `publish_time` the device's stamp
+    where there is one. Encoded images are copied unchanged.
+
+    Args:
+        reader: of the episode or recording.
+        path: of the new file.
+        overwrite: whether an existing file is replaced.
+        jpeg_quality: 1 … 100 encodes `rgb8` images as JPEG, which is lossy; None keeps raw pixels.
+
+    Returns:
+        Number of messages.
+
+    Raises:
+        ConflictError: the file exists.
+        InvalidInputError: a quality outside 1 … 100.
+        StorageError: the write failed.
+    """
+    if jpeg_quality is not None and not 1 <= jpeg_quality <= 100:
+        raise InvalidInputError(f"JPEG quality: got {jpeg_quality}, expected 1 … 100")
+    with new_file(path, overwrite=overwrite) as partial, partial.open("wb") as file:
+        writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        return _Export(reader, writer, jpeg_quality).run()
+
+
+class _Export:
+    """One file that is being written."""
+
+    def __init__(self, reader: Reader, writer: Writer, jpeg_quality: int | None) -> None:
+        self._reader, self._writer, self._quality = reader, writer, jpeg_quality
+        self._is_episode = isinstance(reader, EpisodeReader)
+        self._sources = list(reader.attributes.streams)
+        self._streams = [self._as_sent(stream) for stream in self._sources]
+        counts = {stream.name: reader.num_samples(stream.name) for stream in self._streams}
+        self._counts = counts
+        firsts = [int(reader.stamps_ns(name)[0]) for name, count in counts.items() if count]
+        # MCAP's times cannot be negative; the messages' own stamps are unchanged.
+        self._zero_ns = min([0, *firsts])
+        self._schema_ids: dict[str, int] = {}
+        self._channel_ids: list[int] = []
+
+    def _as_sent(self, stream: StreamDescriptor) -> StreamDescriptor:
+        is_raw = stream.kind == "image" and stream.unit not in ENCODED_UNITS
+        if self._quality is None or not is_raw or raw_encoding(stream) != "rgb8":
+            return stream
+        return stream.model_copy(update={"unit": "jpeg"})
+
+    def run(self) -> int:
+        """Write schemas, channels, attachments and messages, in this order."""
+        self._writer.start(profile=PROFILE, library=f"dextouch {__version__}")
+        self._write_about()
+        sources = [self._messages(order) for order in range(len(self._streams))]
+        num_messages = self._write_calibration()
+        for log_time, order, publish_time, sequence, data in heapq.merge(*sources):
+            self._writer.add_message(
+                channel_id=self._channel_ids[order],
+                log_time=log_time,
+                publish_time=publish_time,
+                sequence=sequence,
+                data=data,
+            )
+            num_messages += 1
+        finish: Callable[[], None] = self._writer.finish
+        finish()
+        return num_messages
+
+    def _write_about(self) -> None:
+        reader, attributes = self._reader, self._reader.attributes
+        kept = attributes.model_copy(update={"streams": tuple(self._streams)})
+        for name, value in (
+            (ATTRIBUTES_FILE, json_ready(kept)),
+            (CALIBRATION_FILE, self._calibration()),
+        ):
+            self._writer.add_attachment(
+                create_time=0,
+                log_time=0,
+                name=name,
+                media_type="application/json",
+                data=json.dumps(value, sort_keys=True, indent=1).encode(),
+            )
+        about = {
+            "bridge_version": BRIDGE_VERSION,
+            "kind": "episode" if self._is_episode else "recording",
+            "content_sha256": reader.content_sha256,
+            "log_time_zero_ns": str(self._zero_ns),
+            "task": attributes.task,
+            "instruction": attributes.instruction,
+        }
+        self._writer.add_metadata(ABOUT, about)
+        self._writer.add_metadata(COUNTS, {n: str(count) for n, count in self._counts.items()})
+        for stream in self._streams:
+            message = MessageCodec(stream).message
+            metadata = {"stream": stream.name, "unit": stream.unit, "kind": stream.kind}
+            self._channel_ids.append(self._channel(f"/{stream.name}", message, metadata))
+
+    def _calibration(self) -> dict[str, object]:
+        matrices: dict[str, object] = dict(self._reader.attributes.calibration)
+        if isinstance(self._reader, EpisodeReader):
+            matrices["K_head"] = self._reader.attributes.K_head
+        return matrices
+
+    def _channel(self, topic: str, message: str, metadata: dict[str, str]) -> int:
+        if message not in self._schema_ids:
+            self._schema_ids[message] = self._writer.register_schema(
+                name=message, encoding="protobuf", data=descriptor_set(message)
+            )
+        return self._writer.register_channel(
+            topic=topic,
+            message_encoding="protobuf",
+            schema_id=self._schema_ids[message],
+            metadata=metadata,
+        )
+
+    def _write_calibration(self) -> int:
+        K = self._calibration().get("K_head")
+        camera = self._reader.streams.get(HEAD_CAMERA)
+        if K is None or camera is None or not self._counts[HEAD_CAMERA]:
+            return 0
+        first_ns = int(self._reader.stamps_ns(HEAD_CAMERA)[0])
+        height_px, width_px = camera.shape[:2]
+        distortion = self._calibration().get("distortion_head", np.zeros((1, 5)))
+        data = calibration_message(
+            np.array(K),
+            np.array(distortion, dtype=np.float64).ravel(),
+            t_ns=first_ns,
+            frame=camera.frame or HEAD_CAMERA,
+            shape_px=(height_px, width_px),
+        )
+        log_time = first_ns - self._zero_ns
+        self._writer.add_message(
+            channel_id=self._channel(f"/{HEAD_CAMERA}/calibration", CALIBRATION, {}),
+            log_time=log_time,
+            publish_time=log_time,
+            data=data,
+        )
+        return 1
+
+    def _messages(self, order: int) -> Iterator[tuple[int, int, int, int, bytes]]:
+        """Log time, order of the channel among equal ones, publish time, counter and bytes."""
+        stream = self._streams[order]
+        codec = MessageCodec(stream)
+        to_jpeg = stream.unit != self._sources[order].unit
+        for block in blocks(self._reader, stream.name):
+            columns = (block.t_ns.tolist(), block.t_device_ns.tolist(), block.sequence.tolist())
+            for t_ns, t_device_ns, number, value in zip(*columns, block.values, strict=True):
+                if to_jpeg:
+                    value = encode_jpeg(value, quality=self._quality or 1)  # noqa: PLW2901
+                sent = Sent(t_ns, t_device_ns, number, value)
+                log_time = t_ns - self._zero_ns
+                publish_time = t_device_ns if t_device_ns >= 0 else log_time
+                sequence = number & _SEQUENCE_BITS if number >= 0 else 0
+                data = codec.encode(sent, with_device=not self._is_episode)
+                yield log_time, order, publish_time, sequence, data
+
+
+def import_mcap(path: Path, store: EpisodeStore) -> str:
+    """Import an MCAP file written by `export_mcap` into a store.
+
+    Args:
+        path: of the file; it may come from anywhere.
+        store: where the episode or recording appears under the id that it had.
+
+    Returns:
+        The id.
+
+    Raises:
+        NotFoundError: no such file.
+        InvalidInputError: not an MCAP file, or not written by DexTouch.
+        CorruptDataError: truncated or damaged; the store is unchanged.
+        LimitExceededError: a record exceeds the size limit.
+        ConflictError: the id is in the store already.
+    """
+    attributes, counts = _about(path)
+    kind: Kind = "episode" if isinstance(attributes, EpisodeAttributes) else "recording"
+    # A killed import is repeated from its file; a partial one must not look like a recovered take.
+    options = WriteOptions(recoverable=False)
+    with store.writer(kind=kind, attributes=attributes, options=options) as writer:
+        streams = {
+            f"/{stream.name}": _Stream(MessageCodec(stream), writer, is_episode=kind == "episode")
+            for stream in attributes.streams
+        }
+        _read_messages(path, streams)
+        for topic, stream in streams.items():
+            stream.flush()
+            expected = counts.get(stream.codec.descriptor.name)
+            if stream.num_samples != expected:
+                raise CorruptDataError(
+                    f"{path}: {topic} holds {stream.num_samples} messages, expected {expected}; "
+                    "the file was cut or filtered after the export"
+                )
+    if isinstance(attributes, EpisodeAttributes):
+        return attributes.episode_id
+    return attributes.recording_id
+
+
+def _about(path: Path) -> tuple[Attributes, dict[str, int]]:
+    """What is needed before the samples: attributes, and the number of samples of each stream."""
+    kind, text, counts = "", None, {}
+    for record in records(path):
+        if isinstance(record, Metadata) and record.name == ABOUT:
+            version = record.metadata.get("bridge_version")
+            if version != BRIDGE_VERSION:
+                raise StorageError(
+                    f"{path}: got bridge version {version!r}, expected {BRIDGE_VERSION!r}; "
+                    "read it with the release that wrote it"
+                )
+            kind = record.metadata.get("kind", "")
+        elif isinstance(record, Metadata) and record.name == COUNTS:
+            counts = {name: _count(path, n) for name, n in record.metadata.items()}
+        elif isinstance(record, Attachment) and record.name == ATTRIBUTES_FILE:
+            text = record.data
+    if text is None or kind not in {"episode", "recording"}:
+        raise InvalidInputError(
+            f"{path}: holds no attachment {ATTRIBUTES_FILE!r} of DexTouch; only files that "
+            "`dextouch export --format mcap` wrote can be imported"
+        )
+    if len(text) > MAX_ATTRIBUTES_BYTES:
+        raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} has {len(text)} bytes")
+    model = EpisodeAttributes if kind == "episode" else RecordingAttributes
+    try:
+        return model.model_validate_json(text), counts
+    except ValidationError as error:
+        raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} is invalid ({error})") from error
+
+
+def _count(path: Path, text: str) -> int:
+    if not text.isdecimal() or len(text) > 18:
+        raise CorruptDataError(f"{path}: metadata {COUNTS!r} says {text!r}, expected a number")
+    return int(text)
+
+
+class _Stream:
+    """One stream of an import, with samples that are written together."""
+
+    def __init__(self, codec: MessageCodec, writer: EpisodeWriter, *, is_episode: bool) -> None:
+        self.codec, self._writer, self._is_episode = codec, writer, is_episode
+        self.num_samples = self._num_bytes = 0
+        self._sent: list[Sent] = []
+
+    def add(self, data: bytes) -> None:
+        """Add one message."""
+        self._sent.append(self.codec.decode(data))
+        self.num_samples += 1
+        self._num_bytes += len(data)
+        if self._num_bytes >= _BLOCK_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the buffered samples."""
+        sent, descriptor = self._sent, self.codec.descriptor
+        self._sent, self._num_bytes = [], 0
+        if not sent:
+            return
+        if descriptor.unit in ENCODED_UNITS:
+            values = encoded_values([s.value for s in sent if isinstance(s.value, bytes)])
+        else:
+            values = np.stack([np.asarray(s.value) for s in sent])
+        stamps = np.array([(s.t_ns, s.t_device_ns, s.sequence) for s in sent], dtype=np.int64)
+        names = ("t_ref_ns",) if self._is_episode else ("t_host_ns", "t_device_ns", "sequence")
+        columns = dict(zip(names, stamps.T, strict=False))
+        self._writer.append(descriptor.name, values=values, **columns)
+
+
+def _read_messages(path: Path, streams: Mapping[str, _Stream]) -> None:
+    schemas: dict[int, str] = {}
+    # None: channels added by other tools.
+    channels: dict[int, _Stream | None] = {}
+    for record in records(path):
+        if isinstance(record, Schema):
+            schemas[record.id] = record.name
+        elif isinstance(record, Channel):
+            stream = channels[record.id] = streams.get(record.topic)
+            got = (record.message_encoding, schemas.get(record.schema_id))
+            if stream is not None and got != ("protobuf", stream.codec.message):
+                raise CorruptDataError(
+                    f"{path}: {record.topic} has messages {got[0]!r} {got[1]!r}, "
+                    f"expected 'protobuf' {stream.codec.message!r}"
+                )
+        elif isinstance(record, Message):
+            if record.channel_id not in channels:
+                raise CorruptDataError(
+                    f"{path}: a message of channel {record.channel_id}, which does not exist"
+                )
+            stream = channels[record.channel_id]
+            if stream is not None:
+                stream.add(record.data)
