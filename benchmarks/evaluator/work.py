@@ -13,7 +13,7 @@ from benchmarks.evaluator.playing import start_in_twin
 from benchmarks.evaluator.rollouts import DEPENDS_ON, PolicyRollout
 from dextouch.clients import Policy
 from dextouch.errors import DexTouchError
-from services.evaluation.closed_loop import first_digest
+from services.evaluation.matched_starts import first_digest
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.starts import refuse_training_starts
 from services.twin.scripted_actions import ELSEWHERE, HOLD, Actions, script_name, scripted_actions
@@ -145,7 +145,7 @@ class Study:
         """A policy that looks, or the actions of one that does not."""
         if policy in self.actors:
             return self.actors[policy]
-        return scripted_actions(self.twin.stage(task), seed, policy, self.plan.levels_mm)
+        return scripted_actions(self.twin.stage(task), seed, policy)
 
 
 @lru_cache(maxsize=1)

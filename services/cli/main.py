@@ -76,6 +76,10 @@ COMMANDS = {
         "score policies in real and imagined worlds",
         "evaluation.command_line:run_evaluation",
     ),
+    "study": Command(
+        "score policies in several worlds, defined in a file and resumable",
+        "services.cli.study:main",
+    ),
     "rate": Command("score rollouts by people: a page for raters, and their agreement"),
     "rate serve": Command(
         "serve the page on which raters mark rollouts", "evaluation.rating.app:main"

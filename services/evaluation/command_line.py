@@ -13,7 +13,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.serving import load_settings
 from services.evaluation.checkpoints import Checkpoint, save_checkpoint
-from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
+from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.direct_data import read_attempts
 from services.evaluation.direct_training import train_direct_judge
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
@@ -35,6 +35,7 @@ from services.evaluation.settings import (
     TrainProbeSettings,
     command_line,
 )
+from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_probe import SuccessProbe
 from services.evaluation.success_probe_training import train_success_probe
 
@@ -123,8 +124,8 @@ def run_evaluation(arguments: list[str]) -> int:
     write_result(settings.json_path, figures, allow_nan=False)
     if settings.html is not None:
         write_report(figures, ReportPictures(), settings.html)
-    _print_scores(figures)
-    _print_failures(figures, log.path)
+    print_scores(figures)
+    print_failures(figures, log.path)
     return EXIT_FAILED if report.failures else 0
 
 
@@ -175,7 +176,8 @@ def _address(world: ServedWorld, connections: ExitStack) -> WorldAddress:
     return WorldAddress(client, world.world)
 
 
-def _print_scores(report: Mapping[str, Any]) -> None:
+def print_scores(report: Mapping[str, Any]) -> None:
+    """Print success rates and agreement of a report."""
     worlds = ["real"] if report["imagined_world"] is None else ["real", "imagined"]
     print(f"{'task':<16}{'policy':<22}" + "".join(f"{world:>10}" for world in worlds))
     for row in report["policies"]:
@@ -190,7 +192,7 @@ def _print_scores(report: Mapping[str, Any]) -> None:
             print(f"  {comment}")
 
 
-def _print_failures(report: Mapping[str, Any], results: Path) -> None:
+def print_failures(report: Mapping[str, Any], results: Path) -> None:
     """Print the failed rollouts to standard error, with one example of each kind."""
     rows = failure_rows(report)
     if rows:

@@ -40,7 +40,8 @@ class RolloutScore:
 
     `success` is reported by the real world and decided by the probe elsewhere; `probability` is
     always the probe's, so that the probe itself can be evaluated. `cannot_tell` is the reason why
-    the probe abstains on an imagined rollout; `success` is then the more likely outcome.
+    the probe abstains on an imagined rollout; `success` is then the more likely outcome. `repeat`
+    numbers imagined rollouts that differ by their noise alone.
     """
 
     world: str
@@ -51,6 +52,7 @@ class RolloutScore:
     success: bool
     probability: float
     cannot_tell: str | None = None
+    repeat: int = 0
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class RolloutFailure:
     error: str
     message: str
     traceback: str | None = None
+    repeat: int = 0
 
 
 @dataclass(frozen=True)
@@ -94,19 +97,23 @@ class ClosedLoopReport:
     def outcomes(self, world: str, task: str) -> Float64[np.ndarray, "policies starts"]:
         """Success (1 or 0) of every policy from every start; NaN for failed rollouts.
 
+        Rollouts that were repeated count with their share of successes.
+
         Raises:
             InvalidInputError: policies have different starts.
         """
-        scores = {(s.policy, s.seed): s for s in self._of(world, task)}
+        scores: dict[tuple[str, int], list[RolloutScore]] = {}
+        for score in self._of(world, task):
+            scores.setdefault((score.policy, score.seed), []).append(score)
         failed = {(f.policy, f.seed) for f in self._failed(world, task)}
         seeds = list(dict.fromkeys(r.seed for r in self.rollouts if r.task == task))
         expected = {(policy, seed) for policy in self.policies for seed in seeds}
-        digests = {(s.seed, s.start_digest) for s in scores.values()}
+        digests = {(s.seed, s.start_digest) for found in scores.values() for s in found}
         if set(scores) | failed != expected or len(digests) != len(dict(digests)):
             raise InvalidInputError(
                 f"scores of {world!r} in {task!r}: the policies began from different starts"
             )
-        success = {key: float(score.success) for key, score in scores.items()}
+        success = {key: _success_share(found) for key, found in scores.items()}
         rows = [[success.get((p, seed), math.nan) for seed in seeds] for p in self.policies]
         return np.array(rows)
 
@@ -139,10 +146,14 @@ class ClosedLoopReport:
         counts = {f"{name}_rollouts": len(mine), f"{name}_failed": num_failed}
         if not mine:
             return {name: UNDEFINED, f"{name}_probability": UNDEFINED, **counts}
-        successes = sum(s.success for s in mine)
-        interval = wilson_interval(successes, len(mine))
+        # Repeats of one start are one observation of the policy.
+        starts: dict[int, list[RolloutScore]] = {}
+        for score in mine:
+            starts.setdefault(score.seed, []).append(score)
+        successes = sum(map(_success_share, starts.values()))
+        interval = wilson_interval(successes, len(starts))
         return {
-            name: successes / len(mine),
+            name: successes / len(starts),
             f"{name}_interval": [interval.low, interval.high],
             f"{name}_probability": float(np.mean([s.probability for s in mine])),
             f"{name}_undecided": sum(s.cannot_tell is not None for s in mine),
@@ -235,6 +246,10 @@ class ClosedLoopReport:
             "rollouts": [asdict(score) for score in self.scores],
             "failures": [asdict(failure) for failure in self.failures],
         }
+
+
+def _success_share(scores: Sequence[RolloutScore]) -> float:
+    return sum(score.success for score in scores) / len(scores)
 
 
 def matched(

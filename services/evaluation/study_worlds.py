@@ -50,6 +50,11 @@ class StudyWorlds:
             if all(camera in cameras for cameras in others)
         )
 
+    @property
+    def digests(self) -> dict[str, str]:
+        """Digest of every world, by name."""
+        return {f"world {name}": one.digest for name, one in self.descriptions.items()}
+
     def check(self, tasks: Sequence[str], num_steps: int, image_size_px: int) -> None:
         """Reject incompatible worlds before the first rollout.
 

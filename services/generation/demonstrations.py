@@ -2,22 +2,18 @@
 
 import hashlib
 from collections.abc import Collection
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from dextouch.clients import RolloutClient
-from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore, write_rollout
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import EpisodeAttributes, LineageEntry, Observation, ReturnSelector
-from dextouch.streams import StreamDescriptor
-from dextouch.tactile.layout import SIDES
+from dextouch.schemas import LineageEntry, Observation, ReturnSelector
 
 CAMERA: Final = "camera_head"
 CHUNK_STEPS: Final = 16
 SHORT_CHUNK_STEPS: Final = 4
-NS_PER_S: Final = 1_000_000_000
-Kind = Literal["tactile", "image", "robot_state", "pose"]
 
 
 def imagine_episode(
@@ -79,7 +75,7 @@ def imagine_episode(
             "streams": (),
         }
     )
-    _write(store, imagined, seen, commanded)
+    write_rollout(store, imagined, seen, commanded)
     return name
 
 
@@ -142,47 +138,3 @@ def imagined_id(episode_id: str, world_digest: str) -> str:
 
 def _sha256(digest: str) -> str | None:
     return digest if len(digest) == hashlib.sha256().digest_size * 2 else None
-
-
-def _write(
-    store: EpisodeStore,
-    attributes: EpisodeAttributes,
-    seen: list[Observation],
-    commanded: np.ndarray,
-) -> None:
-    rate_hz = attributes.model_rate_hz
-    tactile = np.concatenate([observation.tactile_kpa for observation in seen])
-    shown = [observation for observation in seen if CAMERA in observation.images]
-    images = np.concatenate([observation.images[CAMERA] for observation in shown])
-    shown_steps = np.concatenate([one.first_step + np.arange(len(one)) for one in shown])
-    reached = np.concatenate([observation.action_reached for observation in seen])
-    t_ref_ns = np.round(np.arange(len(tactile)) * NS_PER_S / rate_hz).astype(np.int64)
-    streams: list[tuple[str, Kind, str, np.ndarray]] = [
-        (CAMERA, "image", "rgb8", images),
-        ("action", "robot_state", "action_m_rad", reached),
-        ("action_commanded", "robot_state", "action_m_rad", np.asarray(commanded)),
-    ]
-    for index, side in enumerate(SIDES):
-        streams.append((f"tactile_{side}", "tactile", "kPa", tactile[:, index]))
-    poses = [one.object_poses for one in seen[1:] if one.object_poses is not None]
-    if poses and len(poses) == len(seen) - 1:
-        # The first observation is real, without known object poses.
-        values = np.concatenate(poses).astype(np.float64)
-        streams.append(("object_poses", "pose", "pose_m_wxyz", values))
-    with store.writer(kind="episode", attributes=attributes) as writer:
-        for name, kind, unit, values in streams:
-            writer.add_stream(
-                StreamDescriptor.model_validate(
-                    {
-                        "name": name,
-                        "kind": kind,
-                        "shape": values.shape[1:],
-                        "dtype": values.dtype.name,
-                        "unit": unit,
-                        "nominal_rate_hz": rate_hz,
-                        "frame": "world" if kind == "pose" else None,
-                    }
-                )
-            )
-            stamps_ns = t_ref_ns[shown_steps] if name == CAMERA else t_ref_ns[-len(values) :]
-            writer.append(name, values=values, t_ref_ns=stamps_ns)

@@ -1,10 +1,12 @@
 """Open-loop policies of graded quality: the demonstrator with errors, and three that fail."""
 
+import re
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
 
+from dextouch.errors import UnknownNameError
 from dextouch.geometry import transform
 from dextouch.hands.actions import (
     AnchorPoses,
@@ -17,6 +19,8 @@ from services.twin.stage import Stage
 
 # Names of the policies that should fail; scripts are named by `script_name`.
 HOLD, RETREAT, ELSEWHERE = "hold", "retreat", "another scene's actions"
+FAILING: Final = (HOLD, RETREAT, ELSEWHERE)
+_SCRIPT: Final = re.compile(r"script (\d{1,3}(?:\.\d+)?) mm")
 # Added to the seed for the actions of another scene: the same task, objects elsewhere.
 OTHER_SCENE: Final = 5_000
 _RETREAT_M = np.array([0.0, -0.10, 0.12])
@@ -29,9 +33,16 @@ def script_name(level_mm: float) -> str:
     return f"script {level_mm:g} mm"
 
 
-def scripted_actions(stage: Stage, seed: int, policy: str, levels_mm: tuple[float, ...]) -> Actions:
-    """Commands of a policy that does not look, steps 1 … 80, relative to the start's poses."""
-    noise_m = {script_name(level): level / 1000 for level in levels_mm}.get(policy, 0.0)
+def scripted_actions(stage: Stage, seed: int, policy: str) -> Actions:
+    """Commands of a policy that does not look, steps 1 … 80, relative to the start's poses.
+
+    Raises:
+        UnknownNameError: no such policy.
+    """
+    level = _SCRIPT.fullmatch(policy)
+    if level is None and policy not in FAILING:
+        raise UnknownNameError("script", policy, [script_name(10.0), *FAILING])
+    noise_m = float(level[1]) / 1000 if level else 0.0
     plan = stage.plan(seed + OTHER_SCENE * (policy == ELSEWHERE), noise_m=noise_m)
     anchor = stage.start(plan)
     actions = actions_from_poses(plan.commands, anchor)

@@ -12,10 +12,11 @@ from dextouch.errors import ConflictError, DexTouchError
 from dextouch.worlds import BatchWorld
 from services.cli.demo.settings import TASKS, DemoPlan
 from services.cli.main import run_command
-from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
+from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
+from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_probe import SuccessProbe
 from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name, scripted_actions
 from services.twin.settings import TwinSettings
@@ -138,7 +139,7 @@ def ladder(plan: DemoPlan) -> dict[str, Policy]:
     return {
         name: ReplayPolicy(
             {
-                (task, seed): scripted_actions(stage, seed, name, plan.levels_mm)
+                (task, seed): scripted_actions(stage, seed, name)
                 for task, stage in stages.items()
                 for seed in plan.seeds
             }

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from dextouch.episodes.format import stream_arrays as stream_arrays
     from dextouch.episodes.reader import EpisodeReader as EpisodeReader
     from dextouch.episodes.reader import RecordingReader as RecordingReader
+    from dextouch.episodes.rollout_episode import write_rollout as write_rollout
     from dextouch.episodes.sources import GroupFiles as GroupFiles
     from dextouch.episodes.sources import LocalGroup as LocalGroup
     from dextouch.episodes.store import EpisodeStore as EpisodeStore

@@ -6,6 +6,7 @@ from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from dextouch.worlds.baseline import CopyFirstWorld as CopyFirstWorld
+    from dextouch.worlds.fixed_batch import FixedBatchWorld as FixedBatchWorld
     from dextouch.worlds.routes import WorldServiceSettings as WorldServiceSettings
     from dextouch.worlds.routes import create_world_app as create_world_app
     from dextouch.worlds.routes import serve_worlds as serve_worlds

@@ -20,6 +20,7 @@ station calibrate latency, station calibrate profile, station calibrate robot-ba
 station calibrate show, station calibrate wrist, station serve,
 store delete, store list, store migrate, store purge, store repair, store restore, store serve,
 store show, store verify,
+study report, study run,
 train data, train direct-judge, train imagined, train policy, train probe, train state,
 train world-model,
 twin record, twin serve, up

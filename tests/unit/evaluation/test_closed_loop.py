@@ -10,9 +10,11 @@ from dextouch.clients.rollouts import RolloutClient
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.baseline import CopyFirstWorld
-from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate, matched_start
+from services.evaluation.closed_loop import EvaluationPlan, evaluate
+from services.evaluation.matched_starts import matched_start
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.hold import HoldPolicy
+from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_probe import SuccessProbe
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served

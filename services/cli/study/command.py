@@ -1,0 +1,167 @@
+"""The commands `dextouch study run` and `dextouch study report`."""
+
+import argparse
+import hashlib
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.episodes import EpisodeStore
+from services.cli.study.parts import (
+    PolicyFactory,
+    connect,
+    refuse_training_seeds,
+    served_worlds,
+)
+from services.evaluation.command_line import instructions_for, print_failures, print_scores
+from services.evaluation.reporting import ReportPictures, write_report
+from services.evaluation.reporting.latex import latex_tables
+from services.evaluation.scores import ClosedLoopReport
+from services.evaluation.settings import DEFAULT_PROBE
+from services.evaluation.studies.definition import StudyDefinition, read_definition
+from services.evaluation.studies.engine import StudyParts, cells_of, run_study, study_report
+from services.evaluation.studies.results import StudyHeader, StudyResults
+from services.evaluation.success_probe import SuccessProbe
+
+EXIT_FAILED = 1
+_RUN_EPILOG = """\
+example:
+  dextouch study run study.toml
+
+A study file:
+
+  name = "touch"
+  tasks = ["stand_bottle", "stack_bowls"]
+  first_seed = 31000
+  num_starts = 10
+
+  [imagined.model]
+  builtin = "world-model"
+
+  [policies.careful]
+  script = "script 5 mm"
+  [policies.mine]
+  factory = "package.module:make_policy"
+
+Everything that a study file can hold: docs/studies.md
+"""
+
+
+def main(arguments: list[str]) -> int:
+    """Run `dextouch study COMMAND`.
+
+    Returns:
+        0, or 1 if a rollout failed.
+    """
+    options = _parser().parse_args(arguments)
+    run: Any = options.run
+    return int(run(options))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = CommandParser(
+        prog="dextouch study",
+        description="Score policies in real and imagined worlds from matched starts.",
+    )
+    words = parser.add_subparsers(required=True, metavar="COMMAND")
+    run = words.add_parser(
+        "run",
+        help="run a study, or continue it",
+        description="Run the rollouts of a study that have no result yet, and write its report. "
+        "A study may be interrupted at any time; the same command continues it.",
+        epilog=_RUN_EPILOG,
+    )
+    run.add_argument("study", type=Path, metavar="STUDY", help="study file (TOML)")
+    run.add_argument(
+        "--folder",
+        type=Path,
+        metavar="PATH",
+        help="where results, rollouts and reports go (default: the study file without .toml)",
+    )
+    run.add_argument(
+        "--retry-failed", action="store_true", help="run rollouts that failed before once more"
+    )
+    run.set_defaults(run=_run)
+    report = words.add_parser(
+        "report",
+        help="write the report of a study's results so far",
+        description="Write report.json, a page for each imagined world, and tables.tex from the "
+        "results of a study, finished or not.",
+        epilog="example:\n  dextouch study report runs/touch",
+    )
+    report.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the study")
+    report.set_defaults(run=_report)
+    for one in (run, report):
+        add_json(one)
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    definition = read_definition(options.study)
+    folder = options.folder or options.study.with_suffix("")
+    refuse_training_seeds(definition)
+    probe_path = definition.probe or DEFAULT_PROBE
+    probe = SuccessProbe.load(probe_path)
+    instructions = instructions_for(definition.tasks, probe.metadata.settings["instructions"])
+    policies = PolicyFactory(definition)
+    policies.load()
+    with served_worlds(definition) as addresses:
+        digests = {"definition": definition.digest, "probe": _file_digest(probe_path)}
+        with ExitStack() as connections:
+            digests |= connect(addresses, connections).digests
+        header = StudyHeader(definition.name, definition.model_dump(mode="json"), digests)
+        results = StudyResults.create_or_resume(folder, header)
+        num_cells = sum(1 for _ in cells_of(definition))
+        print(f"{definition.name}: {len(results.outcomes)} of {num_cells} rollouts have a result")
+        report = run_study(
+            definition,
+            results,
+            StudyParts(
+                partial(connect, addresses),
+                policies.load,
+                probe,
+                instructions,
+                policies.training_starts(),
+                EpisodeStore(folder / "rollouts") if definition.keep_rollouts else None,
+            ),
+            retry_failed=options.retry_failed,
+        )
+    return _write(folder, definition, results, report, options.json)
+
+
+def _report(options: argparse.Namespace) -> int:
+    results = StudyResults.read(options.folder)
+    definition = StudyDefinition.model_validate(results.header.definition)
+    report = study_report(definition, results)
+    return _write(options.folder, definition, results, report, options.json)
+
+
+def _file_digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _write(
+    folder: Path,
+    definition: StudyDefinition,
+    results: StudyResults,
+    report: ClosedLoopReport,
+    json_path: Path | None,
+) -> int:
+    figures = report.to_report()
+    figures["study"] = {"name": definition.name, "digests": results.header.digests}
+    for path in (folder / "report.json", json_path):
+        write_result(path, figures, allow_nan=False)
+    for world in definition.imagined:
+        others = tuple(name for name in definition.imagined if name != world)
+        page = ClosedLoopReport(
+            report.scores, (world, *others), report.policies, report.failures
+        ).to_report()
+        about = {"about": {"study": definition.name, "in": world}}
+        write_report(page | about, ReportPictures(), folder / f"report {world}.html")
+    (folder / "tables.tex").write_text(latex_tables(report), encoding="utf-8")
+    print_scores(figures)
+    print_failures(figures, results.path)
+    print(f"\nreport: {folder / 'report.json'}")
+    return EXIT_FAILED if report.failures else 0

@@ -1,0 +1,69 @@
+"""Child process that serves one world of a study on a free port of this machine.
+
+It answers once with the URL and name of the world, and ends when its parent does.
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from dextouch.errors import DexTouchError
+from dextouch.serving import configure_logging, serve_parent
+from dextouch.worlds import (
+    BatchWorld,
+    FixedBatchWorld,
+    World,
+    WorldServiceSettings,
+    create_world_app,
+)
+from services.cli.servers import served
+
+
+def open_builtin(name: str) -> World[Any]:
+    """The twin, or the world model shipped with the package."""
+    if name == "twin":
+        from services.twin.settings import TwinSettings
+        from services.twin.world import TwinWorld
+
+        return TwinWorld(TwinSettings())
+    from services.world_model.checkpoints import default_checkpoint
+
+    return open_checkpoint(default_checkpoint())
+
+
+def open_checkpoint(path: Path) -> World[Any]:
+    """A world model of either kind, on one thread."""
+    import torch
+
+    from services.world_model.world import open_world
+
+    torch.set_num_threads(1)
+    return open_world(path)
+
+
+def main() -> None:
+    """Serve `builtin NAME` or `checkpoint PATH` until standard input closes.
+
+    The third argument is the number of rollouts in flight, the size of every batch: the rollouts
+    of an interrupted study meet others than before, and must not round differently for that.
+    """
+    requests, answer = serve_parent(niceness=0)
+    kind, value, batch_size = sys.argv[1:]
+    configure_logging(service=f"world {value}", log_format="auto", level="warning")
+    try:
+        world = open_builtin(value) if kind == "builtin" else open_checkpoint(Path(value))
+    except DexTouchError as error:
+        answer({"refused": error.message})
+        return
+    if isinstance(world, BatchWorld):
+        world = FixedBatchWorld(world, int(batch_size))
+    name = world.description.name
+    app = create_world_app({name: world}, WorldServiceSettings())
+    with served({name: app}) as urls:
+        answer({"url": urls[name], "world": name})
+        for _ in requests:
+            pass
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,205 @@
+"""Runs the rollouts of a study, several of each world at a time."""
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+
+from dextouch.clients import Policy
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import UnavailableError
+from services.evaluation.closed_loop import EvaluationPlan, begin_matched
+from services.evaluation.matched_starts import FailedStart, MatchedStart
+from services.evaluation.progress import Progress
+from services.evaluation.rollout_runner import Outcome, RolloutRunner
+from services.evaluation.scores import REAL, ClosedLoopReport, RolloutFailure, RolloutScore
+from services.evaluation.studies.definition import StudyDefinition
+from services.evaluation.studies.kept_rollouts import keep_rollout
+from services.evaluation.studies.results import Cell, StudyResults
+from services.evaluation.study_worlds import StudyWorlds
+from services.evaluation.success_probe import SuccessProbe
+
+Start = MatchedStart | FailedStart
+
+
+@dataclass(frozen=True)
+class StudyParts:
+    """What the rollouts of a study need.
+
+    Attributes:
+        connect: opens connections to all worlds; called once per thread.
+        load_policies: creates all policies by name; called once per thread, since a policy may keep
+            a state between calls.
+        probe: classifier of imagined success.
+        instructions: of every task.
+        trained_on: digests of training starts of each trained component, which are refused.
+        store: where rollouts are kept; None to keep none.
+    """
+
+    connect: Callable[[ExitStack], StudyWorlds]
+    load_policies: Callable[[], Mapping[str, Policy]]
+    probe: SuccessProbe
+    instructions: Mapping[str, str]
+    trained_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    store: EpisodeStore | None = None
+
+
+def cells_of(definition: StudyDefinition) -> Iterator[Cell]:
+    """All rollouts of a study, in the order of its report."""
+    for world in (REAL, *definition.imagined):
+        repeats = 1 if world == REAL else definition.repeats
+        for task in definition.tasks:
+            for seed in definition.seeds:
+                for policy in definition.policies:
+                    yield from (Cell(world, task, seed, policy, n) for n in range(repeats))
+
+
+def run_study(
+    definition: StudyDefinition,
+    results: StudyResults,
+    parts: StudyParts,
+    *,
+    retry_failed: bool = False,
+) -> ClosedLoopReport:
+    """Run the rollouts that have no result yet.
+
+    Equal definitions give equal reports, however often the study was interrupted and however many
+    rollouts were in flight, if worlds and policies are deterministic.
+
+    Args:
+        definition: of the study.
+        results: of earlier runs; every outcome is added as soon as it is known.
+        parts: worlds, policies and probe.
+        retry_failed: whether failed rollouts are run again.
+
+    Raises:
+        ConflictError: a start was trained on.
+        UnavailableError: a world stopped answering; the other results are kept.
+    """
+    missing = [
+        cell
+        for cell in cells_of(definition)
+        if cell not in results.outcomes
+        or (retry_failed and isinstance(results.outcomes[cell], RolloutFailure))
+    ]
+    if missing:
+        with ExitStack() as connections:
+            worlds = parts.connect(connections)
+            size_px = parts.probe.shape.image_size_px
+            worlds.check(list(definition.tasks), definition.num_steps, size_px)
+            plan = EvaluationPlan(
+                {task: parts.instructions[task] for task in definition.tasks},
+                definition.seeds,
+                definition.num_steps,
+                trained_on=parts.trained_on,
+            )
+            starts = begin_matched(worlds.addresses[REAL], plan, parts.probe)
+        by_key: dict[tuple[str, int], Start] = {(one.task, one.seed): one for one in starts}
+        _Workers(definition, results, parts, by_key).run(missing)
+    return study_report(definition, results)
+
+
+def study_report(definition: StudyDefinition, results: StudyResults) -> ClosedLoopReport:
+    """Scores of the finished rollouts, in an order that does not depend on when they ended.
+
+    Rollouts without a result count as failed, with the error `NotRunYet`.
+    """
+    ordered = [results.outcomes.get(c) or _not_run(c) for c in cells_of(definition)]
+    return ClosedLoopReport(
+        tuple(one for one in ordered if isinstance(one, RolloutScore)),
+        tuple(definition.imagined),
+        tuple(definition.policies),
+        tuple(one for one in ordered if isinstance(one, RolloutFailure)),
+    )
+
+
+def _not_run(cell: Cell) -> RolloutFailure:
+    message = "no result yet; `dextouch study run` continues the study"
+    return RolloutFailure(
+        cell.world, cell.policy, cell.task, cell.seed, "NotRunYet", message, repeat=cell.repeat
+    )
+
+
+class _Workers:
+    """One pool of threads per world, so that each world has rollouts to batch."""
+
+    def __init__(
+        self,
+        definition: StudyDefinition,
+        results: StudyResults,
+        parts: StudyParts,
+        starts: Mapping[tuple[str, int], Start],
+    ) -> None:
+        self._definition, self._results, self._parts = definition, results, parts
+        self._starts = starts
+        self._local = threading.local()
+        self._connections = ExitStack()
+        self._lock = threading.Lock()
+        self._stopping = threading.Event()
+
+    def run(self, cells: list[Cell]) -> None:
+        """Run rollouts and keep their outcomes.
+
+        Raises:
+            UnavailableError: a world stopped answering.
+        """
+        by_world: dict[str, list[Cell]] = {}
+        for cell in cells:
+            by_world.setdefault(cell.world, []).append(cell)
+        num_failed = 0
+        with (
+            self._connections,
+            Progress("rollouts", len(cells)) as progress,
+            ExitStack() as pools,
+        ):
+            pending: set[Future[Outcome | None]] = set()
+            for world, wanted in by_world.items():
+                pool = ThreadPoolExecutor(self._definition.in_flight, f"rollouts of {world}")
+                pools.callback(pool.shutdown, cancel_futures=True)
+                pending |= {pool.submit(self._outcome, cell) for cell in wanted}
+            try:
+                while pending:
+                    done, pending = wait(pending, return_when=FIRST_COMPLETED)
+                    for future in done:
+                        outcome = future.result()
+                        if outcome is not None:
+                            self._results.keep(outcome)
+                            num_failed += isinstance(outcome, RolloutFailure)
+                            progress.advance(failed=float(num_failed))
+            finally:
+                # After an error or Ctrl-C, threads end with their current rollout.
+                self._stopping.set()
+
+    def _outcome(self, cell: Cell) -> Outcome | None:
+        """Outcome of one rollout; None if the study is stopping."""
+        if self._stopping.is_set():
+            return None
+        runner, policies = self._of_this_thread()
+        start = self._starts[cell.task, cell.seed]
+        outcome, played = runner.run(
+            start, policies[cell.policy], cell.policy, cell.world, cell.repeat
+        )
+        if isinstance(outcome, RolloutFailure) and outcome.error == UnavailableError.__name__:
+            # A world that is gone would fail all the others, too.
+            runner.worlds.addresses[cell.world].client.worlds()
+        store = self._parts.store
+        if store is not None and played is not None and isinstance(start, MatchedStart):
+            world = runner.worlds.descriptions[cell.world]
+            keep_rollout(store, self._results.header, cell, start, played, world)
+        return outcome
+
+    def _of_this_thread(self) -> tuple[RolloutRunner, Mapping[str, Policy]]:
+        if not hasattr(self._local, "runner"):
+            with self._lock:
+                worlds = self._parts.connect(self._connections)
+                self._local.policies = self._parts.load_policies()
+            self._local.runner = RolloutRunner(
+                worlds,
+                self._parts.probe,
+                self._definition.num_steps,
+                shows_all=self._parts.store is not None,
+            )
+        runner: RolloutRunner = self._local.runner
+        policies: Mapping[str, Policy] = self._local.policies
+        return runner, policies

@@ -1,0 +1,141 @@
+"""Results of a study: a file that only grows, one JSON line per rollout, and can be resumed."""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from pydantic import TypeAdapter, ValidationError
+
+from dextouch.errors import ConflictError, CorruptDataError, StorageError
+from services.evaluation.rollout_runner import Outcome
+from services.evaluation.scores import RolloutFailure, RolloutScore
+
+FILE: Final = "results.jsonl"
+
+
+class Cell(NamedTuple):
+    """One rollout of a study."""
+
+    world: str
+    task: str
+    seed: int
+    policy: str
+    repeat: int
+
+
+@dataclass(frozen=True)
+class StudyHeader:
+    """First line of the file: what the results belong to.
+
+    `definition` is that of the study as JSON; `digests` are those of the definition, of every world
+    and of the success probe. Results are only continued with equal digests.
+    """
+
+    name: str
+    definition: dict[str, Any]
+    digests: dict[str, str]
+
+
+_ROW: Final = TypeAdapter[RolloutScore | RolloutFailure](RolloutScore | RolloutFailure)
+_HEADER: Final = TypeAdapter(StudyHeader)
+
+
+class StudyResults:
+    """The results of one study; open with `create_or_resume`.
+
+    Attributes:
+        outcomes: of all finished rollouts by cell.
+    """
+
+    def __init__(self, path: Path, header: StudyHeader, outcomes: dict[Cell, Outcome]) -> None:
+        self.path = path
+        self.header = header
+        self.outcomes = outcomes
+
+    @classmethod
+    def create_or_resume(cls, folder: Path, header: StudyHeader) -> "StudyResults":
+        """Open the results of a study; an incomplete last line of a killed study is removed.
+
+        Raises:
+            ConflictError: the folder holds results of another study, or of other worlds.
+            CorruptDataError: a damaged line.
+            StorageError: the file cannot be read or written.
+        """
+        path = folder / FILE
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if not path.exists() or b"\n" not in path.read_bytes():
+                path.write_bytes(_line(asdict(header)))
+                return cls(path, header, {})
+            whole = path.read_bytes()
+            kept = whole[: whole.rindex(b"\n") + 1]
+            if len(kept) < len(whole):
+                os.truncate(path, len(kept))
+        except OSError as error:
+            raise StorageError(f"results {path}: {error}; choose another --folder") from error
+        found = cls.read(folder)
+        _refuse_others(path, found.header.digests, header.digests)
+        return found
+
+    @classmethod
+    def read(cls, folder: Path) -> "StudyResults":
+        """Read the results in a folder; an incomplete last line is ignored.
+
+        Raises:
+            StorageError: there are none, or they cannot be read.
+            CorruptDataError: a damaged line.
+        """
+        path = folder / FILE
+        try:
+            first, *rows = path.read_bytes().split(b"\n")[:-1]
+        except (OSError, ValueError) as error:
+            raise StorageError(f"results {path}: no results of a study ({error})") from error
+        outcomes: dict[Cell, Outcome] = {}
+        number, line = 1, first
+        try:
+            header = _HEADER.validate_json(first)
+            for number, line in enumerate(rows, 2):  # noqa: B007 - for the message
+                outcome = _ROW.validate_json(line)
+                outcomes[cell_of(outcome)] = outcome
+        except ValidationError as error:
+            raise CorruptDataError(
+                f"results {path}, line {number}: not a row of a study ({line[:60]!r}); move the "
+                "folder away and run the study again"
+            ) from error
+        return cls(path, header, outcomes)
+
+    def keep(self, outcome: Outcome) -> None:
+        """Append an outcome; it is on the disk when this returns.
+
+        Raises:
+            StorageError: the file cannot be written.
+        """
+        try:
+            with self.path.open("ab") as file:
+                file.write(_line(asdict(outcome)))
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise StorageError(f"results {self.path}: cannot be written ({error})") from error
+        self.outcomes[cell_of(outcome)] = outcome
+
+
+def cell_of(outcome: Outcome) -> Cell:
+    """The cell that an outcome belongs to."""
+    return Cell(outcome.world, outcome.task, outcome.seed, outcome.policy, outcome.repeat)
+
+
+def _line(row: Mapping[str, object]) -> bytes:
+    return json.dumps(row, allow_nan=False).encode() + b"\n"
+
+
+def _refuse_others(path: Path, old: Mapping[str, str], new: Mapping[str, str]) -> None:
+    changed = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    if changed:
+        raise ConflictError(
+            f"results {path}: they are of another study ({', '.join(changed)} changed since); "
+            "choose another --folder, or delete this one"
+        )
