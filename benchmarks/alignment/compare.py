@@ -20,7 +20,6 @@ from dextouch.schemas import ClockReport, EpisodeAttributes, StoredAnchor
 from dextouch.streams import StreamDescriptor
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
-from services.alignment.synchronization.episode_streams import EpisodeStream, cut_stream
 from services.alignment.synchronization.grid_actions import (
     REQUIRED,
     GriddedStreams,
@@ -28,7 +27,13 @@ from services.alignment.synchronization.grid_actions import (
     place_streams,
 )
 from services.alignment.synchronization.progress import STAGE_BEGINS
-from services.alignment.synchronization.recorded_streams import Block, DatedStream, date_stream
+from services.alignment.synchronization.recorded_streams import (
+    Block,
+    DatedStream,
+    EpisodeStream,
+    cut_stream,
+    date_stream,
+)
 from services.alignment.synchronization.resampling import grid_times_ns
 from services.alignment.synchronization.stream_clock import TimedStream, time_stream
 from services.cli.demo.recording import measure

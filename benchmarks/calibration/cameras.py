@@ -9,8 +9,7 @@ from jaxtyping import Float64
 from benchmarks.figures import Figure
 from benchmarks.simulated.board_scenes import DISTORTION, K, simulated_boards
 from benchmarks.stages import Bar
-from services.alignment.calibration.board_detection import FoundBoards
-from services.alignment.calibration.intrinsics import calibrate_found
+from services.alignment.calibration.intrinsics import FoundBoards, calibrate_found
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 # Below this number of cameras the spread is too uncertain to compare.

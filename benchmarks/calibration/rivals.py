@@ -10,8 +10,8 @@ from jaxtyping import Float64
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError
 from dextouch.geometry import invert, transform
-from services.alignment.calibration.closed_form import park
 from services.alignment.calibration.hand_eye import HandEyeResult, solve_hand_eye
+from services.alignment.calibration.motion import park
 
 if TYPE_CHECKING:
     from benchmarks.simulated.board_scenes import Scene

@@ -8,8 +8,8 @@ from jaxtyping import Float64
 from dextouch.errors import LimitExceededError
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
-from services.alignment.calibration.board_detection import CHESSBOARD, FoundBoards
-from services.alignment.calibration.board_views import BoardViews, project
+from services.alignment.calibration.hand_eye import BoardViews, project
+from services.alignment.calibration.intrinsics import CHESSBOARD, FoundBoards
 from services.alignment.calibration.twists import move
 
 IMAGE_SIZE_PX = (1280, 720)

@@ -7,9 +7,8 @@ from dextouch.errors import NonFiniteError
 from dextouch.tactile import pad_forces_n
 from dextouch.tactile.layout import NUM_TAXELS, raw_indices
 from services.alignment.calibration.tactile_baseline import TactileCalibration, TaxelSurvey
-from services.alignment.calibration.tactile_faults import SATURATED, STATES
 from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
-from services.alignment.calibration.tactile_tare import TaxelTare, measure_tare
+from services.alignment.calibration.tactile_tare import SATURATED, STATES, TaxelTare, measure_tare
 
 STAGE = StageCells("tactile-calibration")
 _TARE, _GAIN, _FULL = 500.0, 100.0, 65_535.0

@@ -2,30 +2,42 @@
 
 import argparse
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
+from functools import partial
+from itertools import chain
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Int64
 from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
 from dextouch.command_line import CommandParser, add_json, write_result
-from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.errors import InvalidInputError
+from dextouch.episodes import EpisodeReader, EpisodeStore, disk_errors
+from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.hands.hand_files import load_hand
+from dextouch.hands.robot_hand import HandModel
 from dextouch.schemas import json_ready
 from dextouch.serving import load_settings
-from services.alignment.batch import OnRecordingProgress, Outcome, align_batch, not_aligned
-from services.alignment.jobs import episode_id_of
+from services.alignment.jobs import check_recording, episode_id_of
 from services.alignment.options import AlignmentOptions
-from services.alignment.other_hand import retarget_other_hand, save_motion
 from services.alignment.report import AlignmentReport, report_of
 from services.alignment.report_page import report_line, report_page
-from services.alignment.retargeting import RetargetStatus
+from services.alignment.retargeting import HandRetargeter, RetargetResult, RetargetStatus
+from services.alignment.retargeting.hand_profile import calibrated_profile
 from services.alignment.settings import AlignmentSettings, usable_cores
 from services.alignment.synchronization.progress import Progress
+from services.alignment.worker import AlignmentWorker
 
+NS_PER_S = 1e9
+# The recording, and how far it is.
+OnRecordingProgress = Callable[[str, Progress], None]
+# A recording, and its report or the error that prevented it.
+Outcome = tuple[str, AlignmentReport | DexTouchError]
 EXIT_REFUSED = 3
 # Width of a report that is not printed at a terminal.
 PAGE_WIDTH = 110
@@ -120,35 +132,30 @@ def _positive(text: str) -> int:
 def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     if parsed.all == bool(parsed.recordings):
         raise InvalidInputError("run: expected either ID … or --all; see run --help")
-    outcomes: list[Outcome] = []
-    wanted = list(dict.fromkeys(parsed.recordings))
+    wanted, refused = list(dict.fromkeys(parsed.recordings)), list[Outcome]()
     if parsed.all:
-        wanted, outcomes = not_aligned(EpisodeStore(parsed.store), settings.options)
+        wanted, refused = not_aligned(EpisodeStore(parsed.store), settings.options)
     console = Console(highlight=False, soft_wrap=True)
-    for outcome in outcomes:
-        _print_outcome(outcome, console)
+    reports, num_failed = [], 0
     with _bars(console, len(wanted)) as on_progress:
-        for outcome in align_batch(
+        outcomes = align_batch(
             parsed.store,
             wanted,
             settings.options,
             num_workers=parsed.workers,
             on_progress=on_progress,
-        ):
-            outcomes.append(outcome)
-            _print_outcome(outcome, console)
-    if not outcomes:
+        )
+        for _, result in chain(refused, outcomes):
+            if isinstance(result, DexTouchError):
+                print(f"dextouch align: {result.message}", file=sys.stderr)
+                num_failed += 1
+            else:
+                console.print(report_line(result), markup=False)
+                reports.append(json_ready(result))
+    if not reports and not num_failed:
         console.print("nothing to do: every recording has its episode")
-    reports = [json_ready(outcome.report) for outcome in outcomes if outcome.report]
     write_result(parsed.json, reports)
-    return EXIT_REFUSED if any(outcome.error for outcome in outcomes) else 0
-
-
-def _print_outcome(outcome: Outcome, console: Console) -> None:
-    if outcome.report is not None:
-        console.print(report_line(outcome.report), markup=False)
-    elif outcome.error is not None:
-        print(f"dextouch align: {outcome.error.message}", file=sys.stderr)
+    return EXIT_REFUSED if num_failed else 0
 
 
 @contextmanager
@@ -178,7 +185,9 @@ def _bars(console: Console, num_recordings: int) -> Iterator[OnRecordingProgress
 
 
 def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
-    report = find_report(EpisodeStore(parsed.store), parsed.id, settings.options)
+    episode = _find_episode(EpisodeStore(parsed.store), parsed.id, settings.options)
+    recordings = [entry.id for entry in episode.attributes.lineage if entry.kind == "recording"]
+    report = report_of(episode, recording_id=(recordings or [parsed.id])[-1], created=False)
     width = None if sys.stdout.isatty() else PAGE_WIDTH
     Console(highlight=False, width=width).print(report_page(report))
     write_result(parsed.json, [json_ready(report)])
@@ -187,9 +196,17 @@ def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
 
 def _retarget(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     hand = load_hand(parsed.model, parsed.mapping)
-    episode = find_episode(EpisodeStore(parsed.store), parsed.id, settings.options)
-    t_ref_ns, motion = retarget_other_hand(episode, hand)
-    save_motion(parsed.to, hand, t_ref_ns, motion)
+    episode = _find_episode(EpisodeStore(parsed.store), parsed.id, settings.options)
+    t_ref_ns, motion = _retarget_other_hand(episode, hand)
+    with disk_errors(f"write {parsed.to}"), parsed.to.open("wb") as file:
+        np.savez(
+            file,
+            joint_names=np.array(hand.joint_names),
+            t_ref_ns=t_ref_ns,
+            joints_rad=motion.joints_rad,
+            status=motion.status,
+            tip_error_m=motion.tip_error_m,
+        )
     solved = motion.status == RetargetStatus.SOLVED
     facts = {
         "episode_id": episode.attributes.episode_id,
@@ -208,26 +225,78 @@ def _retarget(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     return 0
 
 
-def find_report(store: EpisodeStore, item_id: str, options: AlignmentOptions) -> AlignmentReport:
-    """The report of an episode, or of the one that a recording became under these options.
+def align_batch(
+    store_url: str,
+    recording_ids: Sequence[str],
+    options: AlignmentOptions,
+    *,
+    num_workers: int,
+    on_progress: OnRecordingProgress,
+) -> Iterator[Outcome]:
+    """Align recordings in parallel; yields outcomes as they complete. Failures do not stop others.
 
-    Raises:
-        NotFoundError: neither; or the recording is not aligned.
+    `num_workers` are aligned at the same time, each in its own process; `on_progress` is called
+    from several threads.
     """
-    episode = find_episode(store, item_id, options)
-    recordings = [entry.id for entry in episode.attributes.lineage if entry.kind == "recording"]
-    return report_of(episode, recording_id=(recordings or [item_id])[-1], created=False)
+    workers: list[AlignmentWorker] = []
+    mine = threading.local()
+
+    def start() -> None:
+        mine.worker = AlignmentWorker(store_url)
+        workers.append(mine.worker)
+
+    def align(recording_id: str) -> Outcome:
+        try:
+            tell = partial(on_progress, recording_id)
+            return recording_id, mine.worker.run(recording_id, options, tell)
+        except DexTouchError as error:
+            return recording_id, error
+
+    threads = ThreadPoolExecutor(num_workers, thread_name_prefix="align", initializer=start)
+    try:
+        for ready in as_completed([threads.submit(align, one) for one in recording_ids]):
+            yield ready.result()
+    finally:
+        # Also when the caller goes away in the middle (Ctrl-C).
+        threads.shutdown(wait=False, cancel_futures=True)
+        for worker in workers:
+            worker.stop()
+        threads.shutdown()
 
 
-def find_episode(store: EpisodeStore, item_id: str, options: AlignmentOptions) -> EpisodeReader:
-    """An episode by its id, or by the id of the recording that it was made from.
+def not_aligned(store: EpisodeStore, options: AlignmentOptions) -> tuple[list[str], list[Outcome]]:
+    """Recordings without an episode under these options: ids to align, and what is refused."""
+    wanted, impossible = [], []
+    for recording_id in store.list(kind="recording"):
+        try:
+            if not store.exists(check_recording(store, recording_id, options)):
+                wanted.append(recording_id)
+        except InvalidInputError as error:
+            impossible.append((recording_id, error))
+    return wanted, impossible
 
-    Raises:
-        NotFoundError: neither; or the recording is not aligned under these options.
-    """
+
+def _find_episode(store: EpisodeStore, item_id: str, options: AlignmentOptions) -> EpisodeReader:
+    """An episode by its id, or by that of the recording it was made from."""
     if store.exists(item_id):
         return store.open(item_id)
     return store.open(episode_id_of(store.recording(item_id), options))
+
+
+def _retarget_other_hand(
+    episode: EpisodeReader, hand: HandModel
+) -> tuple[Int64[np.ndarray, " time"], RetargetResult]:
+    """Times on the episode's clock, at the rate of the tracker, and the motion of a robot hand."""
+    name = f"keypoints_{hand.side}"
+    if name not in episode.streams:
+        raise NotFoundError(
+            f"episode {episode.attributes.episode_id!r}: has no {name!r}, only "
+            f"{', '.join(sorted(episode.streams))}; expected an episode of a person"
+        )
+    stream = episode.read(name)
+    retargeter = HandRetargeter(hand, calibrated_profile(episode.attributes.calibration, hand.side))
+    t_s = (stream.t_ref_ns - stream.t_ref_ns[0]).astype(np.float64) / NS_PER_S
+    return stream.t_ref_ns, retargeter.retarget(stream.values, t_s=t_s)
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, AlignmentSettings], int]] = {

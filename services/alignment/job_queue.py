@@ -6,11 +6,10 @@ Every step of a job is committed to disk before anyone hears of it; only progres
 import asyncio
 import fcntl
 import json
-import os
 import sqlite3
 import threading
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import google_crc32c
@@ -200,22 +199,24 @@ class JobDatabase:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / DATABASE_FILE
-        with disk_errors(f"open the jobs in {folder}"):
-            folder.mkdir(parents=True, exist_ok=True)
-            self._lock_file = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o644)
-        self._guard = threading.Lock()
-        self._connection: sqlite3.Connection | None = None
-        try:
-            self._acquire_lock()
+        self._path, self._guard = folder / DATABASE_FILE, threading.Lock()
+        with ExitStack() as opened:
+            with disk_errors(f"open the jobs in {folder}"):
+                folder.mkdir(parents=True, exist_ok=True)
+                lock = opened.enter_context((folder / LOCK_FILE).open("a"))
+            try:
+                # Held by earlier versions as well, so that two versions never share jobs.
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise ConflictError(
+                    f"alignment jobs in {folder}: another alignment service uses them; stop it, or "
+                    "give this one a --jobs-folder of its own"
+                ) from error
             with self._errors("open"):
-                self._connection = sqlite3.connect(
-                    self._path, isolation_level=None, check_same_thread=False, timeout=0
-                )
-                self._prepare(self._connection)
-        except BaseException:
-            self.close()
-            raise
+                connection = sqlite3.connect(self._path, check_same_thread=False, timeout=0)
+                self._connection = opened.enter_context(closing(connection))
+                self._prepare(connection)
+            self._opened = opened.pop_all()
 
     def load(self) -> dict[str, AlignmentJob]:
         """Jobs by id, in the order in which they were submitted.
@@ -225,7 +226,7 @@ class JobDatabase:
         """
         select = "SELECT position, crc32c, CAST(job AS BLOB) FROM jobs ORDER BY position"
         with self._errors("read"), self._guard:
-            rows = self._open.execute(select).fetchall()
+            rows = self._connection.execute(select).fetchall()
         jobs = [_checked(body, crc, f"{self._path}, job {place}") for place, crc, body in rows]
         return {job.alignment_id: job for job in jobs}
 
@@ -235,7 +236,7 @@ class JobDatabase:
         Raises:
             StorageFullError: no space is left; nothing changed.
         """
-        with self._errors("write"), self._guard, _transaction(self._open) as connection:
+        with self._errors("write"), self._guard, self._connection as connection:
             connection.executemany(
                 "DELETE FROM jobs WHERE alignment_id = ?", [(key,) for key in removed]
             )
@@ -244,28 +245,7 @@ class JobDatabase:
     def close(self) -> None:
         """Close the database and release the lock."""
         with self._guard:
-            if self._connection is not None:
-                self._connection.close()
-                self._connection = None
-            if self._lock_file >= 0:
-                os.close(self._lock_file)
-                self._lock_file = -1
-
-    @property
-    def _open(self) -> sqlite3.Connection:
-        if self._connection is None:
-            raise UnavailableError(f"{self._path}: closed; the service is stopping")
-        return self._connection
-
-    def _acquire_lock(self) -> None:
-        # Held by earlier versions as well, so that two versions never share jobs.
-        try:
-            fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ConflictError(
-                f"alignment jobs in {self._path.parent}: another alignment service uses them; stop "
-                "it, or give this one a --jobs-folder of its own"
-            ) from error
+            self._opened.close()
 
     def _prepare(self, connection: sqlite3.Connection) -> None:
         """Create the table, or check it; import the jobs of an earlier version once."""
@@ -278,7 +258,8 @@ class JobDatabase:
         earlier = self._path.with_name(JSON_LINES_FILE)
         if version == 0:
             jobs = _read_json_lines(earlier)
-            with _transaction(connection):
+            with connection:
+                connection.execute("BEGIN")
                 connection.execute(SCHEMA)
                 connection.executemany(UPSERT, [_row(job) for job in jobs])
                 connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
@@ -306,25 +287,11 @@ class JobDatabase:
             # Extended codes carry the primary one in their lowest byte.
             code = getattr(error, "sqlite_errorcode", 0) & 0xFF
             if code == sqlite3.SQLITE_FULL:
-                raise StorageFullError(
-                    f"{what}: no space left; free space and try again"
-                ) from error
+                told = f"{what}: no space left; free space and try again"
+                raise StorageFullError(told) from error
             if code in DAMAGED:
                 raise CorruptDataError(f"{what}: damaged ({error}); {MOVE_AWAY}") from error
             raise StorageError(f"{what}: {error}") from error
-
-
-@contextmanager
-def _transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        yield connection
-        connection.execute("COMMIT")
-    except BaseException:
-        # A full disk may have rolled back already.
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
-        raise
 
 
 def _row(job: AlignmentJob) -> tuple[str, int, str]:

@@ -1,25 +1,24 @@
 """Errors of an aligned episode against the true episode that mock devices replayed."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
-from dextouch.episodes import StreamData
+from dextouch.episodes import EpisodeReader, StreamData
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import nearest_index
-from dextouch.hands.actions import HandTrajectory, poses_from_actions
+from dextouch.hands.actions import poses_from_actions
 from dextouch.hands.robot_hand import NUM_JOINTS, RobotHand
 from dextouch.metrics import tactile
-from dextouch.schemas import EpisodeAttributes
-from dextouch.streams import StreamDescriptor
 from dextouch.tactile import in_contact
-from dextouch.tactile.layout import SIDES
+from dextouch.tactile.layout import SIDES, Side
 from services.alignment.retargeting.hand_retargeter import HandRetargeter
 from services.alignment.retargeting.wrist import pose_difference
 from services.alignment.synchronization.resampling import (
+    GridPlacement,
     place_on_grid,
     poses_on_grid,
     vectors_on_grid,
@@ -33,22 +32,6 @@ MAX_COMPARED_SAMPLES = 400
 # Another sample than the nearest is believed only if its values fit this much better: a hand at
 # rest looks the same at every moment, up to noise.
 CLEARLY_BETTER = 0.5
-
-
-@runtime_checkable
-class Episode(Protocol):
-    """The part of `dextouch.episodes.EpisodeReader` that the comparison uses."""
-
-    @property
-    def attributes(self) -> EpisodeAttributes:
-        """Domain, anchor, clock reports."""
-
-    @property
-    def streams(self) -> Mapping[str, StreamDescriptor]:
-        """Descriptors by name."""
-
-    def read(self, name: str) -> StreamData:
-        """All samples of a stream."""
 
 
 @dataclass(frozen=True)
@@ -69,14 +52,9 @@ class Match:
         """Mean offset in nanoseconds."""
         return float(self.offset_ns.mean())
 
-    @property
-    def rms_ms(self) -> float:
-        """Standard deviation of the offset in milliseconds."""
-        return float(np.std(self.offset_ns.astype(np.float64)) / NS_PER_MS)
-
 
 def compare_with_truth(
-    episode: Episode, truth: Episode, *, origin_in_truth_ns: int | None = None
+    episode: EpisodeReader, truth: EpisodeReader, *, origin_in_truth_ns: int | None = None
 ) -> dict[str, Any]:
     """Errors of an episode against the truth episode that its mock devices replayed.
 
@@ -106,41 +84,59 @@ def compare_with_truth(
             f"truth: the episode has {sorted(episode.streams)}, the truth "
             f"{sorted(truth.streams)}; expected common streams"
         )
+
+    def match(name: str, origin_ns: int, reach_ns: int) -> Match:
+        period_ns = truth.streams[name].period_ns()
+        return match_samples(
+            episode.read(name), truth.read(name), origin_ns, reach_ns, period_ns=period_ns
+        )
+
     origin_ns = origin_in_truth_ns
     if origin_ns is None:
-        found = [match_samples(episode, truth, n, 0, FAR_NS).mean_offset_ns for n in shared]
+        found = [match(name, 0, FAR_NS).mean_offset_ns for name in shared]
         origin_ns = -round(float(np.median(found)))
-    matches = {name: match_samples(episode, truth, name, origin_ns, NEAR_NS) for name in shared}
+    matches = {name: match(name, origin_ns, NEAR_NS) for name in shared}
     left = {name: (m.mean_offset_ns + origin_ns) / NS_PER_MS for name, m in matches.items()}
     known = {report.stream: report.latency_ms or 0.0 for report in episode.attributes.clocks}
+    gloves = (
+        (episode.read(name).values[m.index], truth.read(name).values[m.true_index])
+        for name, m in matches.items()
+        if episode.streams[name].kind == "tactile"
+    )
     return {
-        "clock_rms_ms": {name: match.rms_ms for name, match in matches.items()},
+        "clock_rms_ms": {
+            name: float(np.std(m.offset_ns.astype(np.float64)) / NS_PER_MS)
+            for name, m in matches.items()
+        },
         "latency_ms": {name: known.get(name, 0.0) + error for name, error in left.items()},
         "latency_error_ms": left,
-        "num_dropped": {name: match.num_dropped for name, match in matches.items()},
+        "num_dropped": {name: m.num_dropped for name, m in matches.items()},
         "origin_ms": origin_ns / NS_PER_MS,
-        **_taxel_errors(episode, truth, matches),
+        **_taxel_errors(gloves),
         **_pose_errors(episode, truth, origin_ns),
     }
 
 
 def match_samples(
-    episode: Episode, truth: Episode, name: str, origin_ns: int, reach_ns: int
+    mine: StreamData, true: StreamData, origin_ns: int, reach_ns: int, *, period_ns: int
 ) -> Match:
     """Match every sample with its true one, near in time and of similar values.
 
     A constant delay may be longer than a period, so shifts by whole periods, up to `reach_ns`, are
     tried too, and used if the values then match clearly better.
     """
-    mine, true = episode.read(name), truth.read(name)
-    period_ns = truth.streams[name].period_ns()
     num = round(reach_ns / period_ns)
     shifts_ns = [origin_ns + period_ns * shift for shift in sorted(range(-num, num + 1), key=abs)]
     differences = np.array([_difference(mine, true, shift_ns, period_ns) for shift_ns in shifts_ns])
     best = int(np.argmin(differences))
     if not differences[best] < CLEARLY_BETTER * differences[0]:
         best = 0
-    return _pair(mine, true, shifts_ns[best])
+    nearest = nearest_index(true.t_ref_ns, mine.t_ref_ns + shifts_ns[best])
+    index = np.flatnonzero(np.concatenate([[True], np.diff(nearest) > 0]))
+    true_index = nearest[index]
+    offset_ns = mine.t_ref_ns[index] - true.t_ref_ns[true_index]
+    span = int(true_index[-1] - true_index[0]) + 1
+    return Match(index, true_index, offset_ns, span - len(index))
 
 
 def _difference(mine: StreamData, true: StreamData, shift_ns: int, period_ns: int) -> float:
@@ -154,48 +150,33 @@ def _difference(mine: StreamData, true: StreamData, shift_ns: int, period_ns: in
     return float(np.abs(values[inside] - nearest).mean())
 
 
-def _pair(mine: StreamData, true: StreamData, shift_ns: int) -> Match:
-    nearest = nearest_index(true.t_ref_ns, mine.t_ref_ns + shift_ns)
-    index = np.flatnonzero(np.concatenate([[True], np.diff(nearest) > 0]))
-    true_index = nearest[index]
-    offset_ns = mine.t_ref_ns[index] - true.t_ref_ns[true_index]
-    span = int(true_index[-1] - true_index[0]) + 1
-    return Match(index, true_index, offset_ns, span - len(index))
-
-
-def _taxel_errors(
-    episode: Episode, truth: Episode, matches: Mapping[str, Match]
-) -> dict[str, float | None]:
-    pairs = [
-        (
-            episode.read(name).values[match.index].astype(np.float64),
-            truth.read(name).values[match.true_index].astype(np.float64),
-        )
-        for name, match in matches.items()
-        if episode.streams[name].kind == "tactile"
-    ]
+def _taxel_errors(gloves: Iterable[tuple[np.ndarray, np.ndarray]]) -> dict[str, float | None]:
+    """Errors over pressures of all gloves, each beside the true ones."""
+    pairs = list(gloves)
     if not pairs:
         return {"taxel_iou": None, "taxel_mae_kpa": None}
-    mine, true = (np.concatenate(arrays) for arrays in zip(*pairs, strict=True))
+    mine, true = (np.concatenate(arrays).astype(np.float64) for arrays in zip(*pairs, strict=True))
     touched = bool((in_contact(mine) | in_contact(true)).any())
     iou = tactile.contact_iou(predicted_kpa=mine, true_kpa=true) if touched else None
     return {"taxel_iou": iou, "taxel_mae_kpa": tactile.mae(predicted_kpa=mine, true_kpa=true)}
 
 
-def _pose_errors(episode: Episode, truth: Episode, origin_ns: int) -> dict[str, float]:
+def _pose_errors(episode: EpisodeReader, truth: EpisodeReader, origin_ns: int) -> dict[str, float]:
     action = episode.read("action")
     reached = poses_from_actions(action.values, episode.attributes.anchor.to_poses())
     at_ns = action.t_ref_ns + origin_ns
     distances, angles, tips = [], [], []
     for side in SIDES:
-        mine = _of_side(reached, side)
-        Ts_true, valid = _true_poses(truth, f"wrist_{side}", at_ns)
-        distance, angle = pose_difference(mine[0][valid], Ts_true[valid])
+        values, at = _placed(truth, f"wrist_{side}", at_ns)
+        distance, angle = pose_difference(
+            getattr(reached, f"Ts_world_wrist_{side}")[at.valid],
+            poses_on_grid(values, at)[at.valid],
+        )
         distances.append(distance)
         angles.append(angle)
-        true_joints, valid = _true_joints(truth, side, at_ns)
-        hand = RobotHand(side)
-        apart = hand.fingertips_m(mine[1][valid]) - hand.fingertips_m(true_joints[valid])
+        joints_rad, valid = _true_joints(truth, side, at_ns)
+        hand, mine_rad = RobotHand(side), getattr(reached, f"joints_{side}_rad")
+        apart = hand.fingertips_m(mine_rad[valid]) - hand.fingertips_m(joints_rad[valid])
         tips.append(np.linalg.norm(apart, axis=-1))
     return {
         "wrist_error_mm": float(np.concatenate(distances).mean() * 1e3),
@@ -204,30 +185,20 @@ def _pose_errors(episode: Episode, truth: Episode, origin_ns: int) -> dict[str, 
     }
 
 
-def _of_side(trajectory: HandTrajectory, side: str) -> tuple[np.ndarray, np.ndarray]:
-    if side == "left":
-        return trajectory.Ts_world_wrist_left, trajectory.joints_left_rad
-    return trajectory.Ts_world_wrist_right, trajectory.joints_right_rad
-
-
-def _true_poses(
-    truth: Episode, name: str, at_ns: np.ndarray
-) -> tuple[Float64[np.ndarray, "n 4 4"], np.ndarray]:
+def _placed(truth: EpisodeReader, name: str, at_ns: np.ndarray) -> tuple[np.ndarray, GridPlacement]:
+    """Values of a true stream, and the neighbours of these times among them."""
     stream, period_ns = truth.read(name), truth.streams[name].period_ns()
     at = place_on_grid(stream.t_ref_ns, at_ns, period_ns=period_ns, max_gap_ns=3 * period_ns)
-    return poses_on_grid(stream.values, at), at.valid
+    return stream.values, at
 
 
 def _true_joints(
-    truth: Episode, side: str, at_ns: np.ndarray
-) -> tuple[Float64[np.ndarray, "n 20"], np.ndarray]:
+    truth: EpisodeReader, side: Side, at_ns: np.ndarray
+) -> tuple[Float64[np.ndarray, "n 20"], Bool[np.ndarray, " n"]]:
     """The robot's joints, or those retargeted from the true human hand."""
-    is_robot = "joints_measured" in truth.streams
-    name = "joints_measured" if is_robot else f"keypoints_{side}"
-    stream, period_ns = truth.read(name), truth.streams[name].period_ns()
-    at = place_on_grid(stream.t_ref_ns, at_ns, period_ns=period_ns, max_gap_ns=3 * period_ns)
-    values = vectors_on_grid(stream.values, at)
-    if not is_robot:
-        return HandRetargeter(side).retarget(values).joints_rad, at.valid
+    if "joints_measured" not in truth.streams:
+        keypoints, at = _placed(truth, f"keypoints_{side}", at_ns)
+        return HandRetargeter(side).retarget(vectors_on_grid(keypoints, at)).joints_rad, at.valid
+    joints_rad, at = _placed(truth, "joints_measured", at_ns)
     first = 0 if side == "left" else NUM_JOINTS
-    return values[:, first : first + NUM_JOINTS], at.valid
+    return vectors_on_grid(joints_rad, at)[:, first : first + NUM_JOINTS], at.valid

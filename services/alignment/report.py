@@ -62,28 +62,26 @@ def report_of(episode: EpisodeReader, *, recording_id: str, created: bool) -> Al
         absent=tuple(name for name in EXPECTED_STREAMS if name not in episode.streams),
         clocks=attributes.clocks,
         quality=attributes.quality,
-        retargeting=retargeting_figures(attributes.quality),
+        retargeting=_retargeting_figures(attributes.quality),
         refused_parts=refused_parts(attributes.calibration),
-        refused_taxels=refused_taxels(attributes.calibration),
+        refused_taxels=_refused_taxels(attributes.calibration),
         content_sha256=episode.content_sha256,
     )
 
 
-def retargeting_figures(quality: Mapping[str, float]) -> dict[str, dict[str, float]]:
-    """The figures of an episode's retargeting by side; empty where nothing was retargeted."""
+def _retargeting_figures(quality: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """By side; empty where nothing was retargeted."""
     found: dict[str, dict[str, float]] = {}
-    for side in SIDES:
-        prefix = f"retargeting_{side}_"
-        mine = {k.removeprefix(prefix): v for k, v in quality.items() if k.startswith(prefix)}
-        if mine:
-            found[side] = mine
+    for name, value in quality.items():
+        for side in SIDES:
+            figure = name.removeprefix(f"retargeting_{side}_")
+            if figure != name:
+                found.setdefault(side, {})[figure] = value
     return found
 
 
-def refused_taxels(
-    calibration: Mapping[str, Matrix],
-) -> dict[str, dict[str, tuple[int, ...]]]:
-    """Taxels that an episode's calibration marks as not measured, by stream and reason."""
+def _refused_taxels(calibration: Mapping[str, Matrix]) -> dict[str, dict[str, tuple[int, ...]]]:
+    """By stream and reason."""
     found: dict[str, dict[str, tuple[int, ...]]] = {}
     for name in ("tactile_left", "tactile_right"):
         states = np.array(calibration.get(f"{name}_refused_taxels", ()), dtype=np.int64).ravel()

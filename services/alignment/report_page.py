@@ -36,6 +36,25 @@ def report_line(report: AlignmentReport) -> str:
     )
 
 
+def report_page(report: AlignmentReport) -> Group:
+    """A report as tables for the terminal."""
+    return Group(
+        Text(f"{report.recording_id} → {report.episode_id}", style="bold"),
+        Text(
+            f"{report.domain}, {report.num_steps} steps, {report.duration_s:.1f} s; absent: "
+            f"{', '.join(report.absent) or 'nothing'}"
+        ),
+        _clocks(report),
+        *map(Text, _doubts(report)),
+        *([_retargeting(report.retargeting)] if report.retargeting else []),
+        _refused(report.refused_parts),
+        *(
+            Text(f"{stream}: taxels not measured and zero: {_by_reason(reasons)}")
+            for stream, reasons in report.refused_taxels.items()
+        ),
+    )
+
+
 def _doubts(report: AlignmentReport) -> list[str]:
     """Streams whose times may be wrong, with the reasons."""
     found = []
@@ -52,42 +71,17 @@ def _doubts(report: AlignmentReport) -> list[str]:
     return found
 
 
-def report_page(report: AlignmentReport) -> Group:
-    """A report as tables for the terminal."""
-    parts: list[Text | Table] = [
-        Text(f"{report.recording_id} → {report.episode_id}", style="bold"),
-        Text(
-            f"{report.domain}, {report.num_steps} steps, {report.duration_s:.1f} s; absent: "
-            f"{', '.join(report.absent) or 'nothing'}"
-        ),
-        _clocks(report),
-        *map(Text, _doubts(report)),
-    ]
-    if report.retargeting:
-        parts.append(_retargeting(report.retargeting))
-    parts.append(_refused(report.refused_parts))
-    parts += [
-        Text(f"{stream}: taxels not measured and zero: {_by_reason(reasons)}")
-        for stream, reasons in report.refused_taxels.items()
-    ]
-    return Group(*parts)
+def _table(title: str, columns: Sequence[str], *, left: Sequence[str]) -> Table:
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
+    for name in columns:
+        table.add_column(name, justify="left" if name in left else "right")
+    return table
 
 
 def _clocks(report: AlignmentReport) -> Table:
-    table = Table(title="streams", title_justify="left", box=SIMPLE_HEAD)
-    table.add_column("stream")
-    for name in (
-        "samples",
-        "in episode",
-        "dropped",
-        "gaps",
-        "residual ms",
-        "latency ms",
-        "drift ppm",
-        "steps",
-    ):
-        table.add_column(name, justify="right")
-    table.add_column("dated by")
+    figures = "samples|in episode|dropped|gaps|residual ms|latency ms|drift ppm|steps"
+    columns = ["stream", *figures.split("|"), "dated by"]
+    table = _table("streams", columns, left=("stream", "dated by"))
     for clock in report.clocks:
         sigma = "" if clock.latency_sigma_ms is None else f" ± {clock.latency_sigma_ms:.2f}"
         table.add_row(
@@ -106,35 +100,25 @@ def _clocks(report: AlignmentReport) -> Table:
 
 
 def _retargeting(figures: Mapping[str, Mapping[str, float]]) -> Table:
-    table = Table(title="retargeting", title_justify="left", box=SIMPLE_HEAD)
-    table.add_column("hand")
-    table.add_column("tip error mm", justify="right")
-    table.add_column("95 % below", justify="right")
-    table.add_column("steps by status")
+    columns = ("hand", "tip error mm", "95 % below", "steps by status")
+    table = _table("retargeting", columns, left=("hand", "steps by status"))
     for side, mine in figures.items():
         shares = {k.removeprefix("share_"): v for k, v in mine.items() if k.startswith("share_")}
         told = ", ".join(f"{name} {share:.2%}" for name, share in shares.items() if share)
-        table.add_row(
-            side,
-            _number(mine.get("tip_error_mm"), 2),
-            _number(mine.get("tip_error_p95_mm"), 2),
-            told,
-        )
+        errors_mm = (_number(mine.get(name), 2) for name in ("tip_error_mm", "tip_error_p95_mm"))
+        table.add_row(side, *errors_mm, told)
     return table
 
 
 def _refused(parts: Sequence[RefusedPart]) -> Table | Text:
     if not parts:
         return Text("the whole recording is in the episode")
-    table = Table(title="not in the episode", title_justify="left", box=SIMPLE_HEAD)
-    for name in ("from s", "to s", "for s"):
-        table.add_column(name, justify="right")
-    table.add_column("why")
+    table = _table("not in the episode", ("from s", "to s", "for s", "why"), left=("why",))
     longest = sorted(parts, key=lambda part: part.start_s - part.stop_s)[:MAX_LISTED]
     for part in sorted(longest, key=lambda part: part.start_s):
         why = WHY[part.reason] if part.stream is None else f"{part.stream}: {WHY[part.reason]}"
-        length_s = part.stop_s - part.start_s
-        table.add_row(f"{part.start_s:.2f}", f"{part.stop_s:.2f}", f"{length_s:.2f}", why)
+        times_s = part.start_s, part.stop_s, part.stop_s - part.start_s
+        table.add_row(*(f"{t_s:.2f}" for t_s in times_s), why)
     if len(parts) > MAX_LISTED:
         table.caption = f"and {len(parts) - MAX_LISTED} shorter ones"
     return table

@@ -13,12 +13,11 @@ from benchmarks.simulated import board_scenes as scenes
 from benchmarks.simulated.board_scenes import Motion, mount_difference
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.geometry import invert, transform
-from services.alignment.calibration.closed_form import park
 from services.alignment.calibration.hand_eye import (
     HandEyeNoise,
     solve_hand_eye,
 )
-from services.alignment.calibration.motion import DegenerateMotionError
+from services.alignment.calibration.motion import DegenerateMotionError, park
 from services.alignment.calibration.twists import move, twist
 
 RECORDED_POSES = Path(__file__).parents[3] / "shared/data/hand_eye/pose_samples.json"

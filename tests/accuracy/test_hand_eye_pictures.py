@@ -12,8 +12,8 @@ from benchmarks.simulated.board_scenes import mount_difference
 from dextouch.geometry import invert, pose_from_transform, transform
 from dextouch.geometry.rotations import rotation_from_vector
 from services.acquisition.devices import load_calibration
-from services.alignment.calibration.board_views import project
-from services.alignment.calibration.sharpness import edge_width_px
+from services.alignment.calibration.hand_eye import project
+from services.alignment.calibration.intrinsics import edge_width_px
 from services.alignment.calibration.twists import move
 from services.cli.calibrate.boards import find_board, parse_board
 from services.cli.calibrate.command import main

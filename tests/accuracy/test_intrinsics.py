@@ -11,16 +11,16 @@ import pytest
 from benchmarks.simulated import board_scenes as scenes
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.calibration.board_detection import (
+from services.alignment.calibration.intrinsics import (
     CHARUCO,
     EITHER_CHARUCO,
     LEGACY_CHARUCO,
     CharucoBoard,
     Chessboard,
     FoundBoards,
+    calibrate_found,
     find_boards,
 )
-from services.alignment.calibration.intrinsics import calibrate_found
 from services.alignment.calibration.motion import DegenerateMotionError
 
 PHOTOS = Path(__file__).parents[3] / "shared/data/camera_chessboard"

@@ -17,14 +17,19 @@ from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import ReplayStream
 from services.alignment.calibration.tactile_baseline import TactileCalibration
-from services.alignment.calibration.tactile_faults import STATES, classify_taxels
-from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
-from services.alignment.calibration.tactile_glove_calibration import (
+from services.alignment.calibration.tactile_gain import (
+    TaxelPress,
     calibrate_glove,
     filled_gain,
+    fit_gain,
     pad_taxels,
 )
-from services.alignment.calibration.tactile_tare import measure_tare, rounding_rms_counts
+from services.alignment.calibration.tactile_tare import (
+    STATES,
+    classify_taxels,
+    measure_tare,
+    rounding_rms_counts,
+)
 from services.cli.calibrate.command import main as calibrate
 
 PRESSURES_KPA = (5.0, 10.0, 20.0, 30.0)

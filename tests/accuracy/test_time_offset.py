@@ -7,8 +7,7 @@ import pytest
 
 from dextouch.errors import InvalidInputError
 from services.alignment.calibration.motion import DegenerateMotionError
-from services.alignment.calibration.tap_offset import estimate_tap_offset
-from services.alignment.calibration.time_offset import estimate_time_offset
+from services.alignment.calibration.time_offset import estimate_tap_offset, estimate_time_offset
 
 BASE_NS = 1_700_000_000_000_000_000
 

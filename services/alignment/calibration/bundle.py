@@ -1,26 +1,40 @@
-"""Bundle adjustment of hand-eye calibration: mount, target pose and their covariance.
+"""Weighted estimate of a mount and a target from two series of poses, with its uncertainty.
 
 Every view says T_world_tracker · D · X · B = Z, with the mount X, the target's pose Z, the
 measured pose B of the target in the mounted frame, and a small correction D of the tracker's
-pose, whose size the tracker's noise limits. All are found together by Gauss–Newton with analytic
-Jacobians; the corrections, six numbers a view, are eliminated by the Schur complement, so that
-the system to solve has 12 unknowns however many views there are.
+pose, whose size the tracker's noise limits. First the size of each source of noise is estimated
+from the residuals. Then all poses are found together by Gauss–Newton with analytic Jacobians; the
+corrections, six numbers a view, are eliminated by the Schur complement, so that the system to
+solve has 12 unknowns however many views there are. Hand-eye and robot-base calibration are this
+estimate with another sensor in the second series.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert
+from services.alignment.calibration.motion import Agreement
 from services.alignment.calibration.twists import adjoint, move, twist, twist_jacobian
 
+# Of the Gauss–Newton steps; below the smallest (rad, m) nothing changes that could be measured.
 MAX_ROUNDS = 30
-# Steps below this (rad, m) change nothing that could be measured.
 SMALLEST_STEP = 1e-10
+# Of the estimate of noise, in logarithms of variances.
+MAX_NOISE_ROUNDS = 25
+MAX_NOISE_STEP = 1.0
+SMALLEST_NOISE_STEP = 1e-3
+# The declared noise is trusted to a factor of four (one sigma): exp(1.4).
+PRIOR_LOG_SIGMA = 1.4
+# Lower bound of a variance, as a share of the declared one.
+MIN_SHARE = 1e-6
+# A pose that is known worse than this is of no use (one sigma, three axes together).
+MAX_SIGMA_ROTATION_RAD = np.deg2rad(0.5)
+MAX_SIGMA_TRANSLATION_M = 0.01
 
 
 class Linearised(NamedTuple):
@@ -39,6 +53,67 @@ Measurement = Callable[[np.ndarray], Linearised]
 
 
 @dataclass(frozen=True)
+class TrackerNoise:
+    """Expected noise of a tracker, one sigma for each axis; refined from the views."""
+
+    task: ClassVar[str]
+    tracker_rotation_rad: float = 8.7e-4
+    tracker_translation_m: float = 5e-4
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value > 0):
+                raise InvalidInputError(
+                    f"{self.task}: noise {name} is {value}, expected above zero"
+                )
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """How well views determine a pose.
+
+    Attributes:
+        covariance: [6, 6] of the pose's twist: turn (rad) and shift (m) along its own axes.
+        noise: estimated noise (one sigma per axis), named as in the expected one.
+        left_out_views: views that were far off and did not count.
+    """
+
+    covariance: Float64[np.ndarray, "6 6"]
+    noise: dict[str, float]
+    left_out_views: tuple[int, ...]
+
+    @property
+    def sigma_rotation_rad(self) -> float:
+        """One sigma of the rotation, length of the three axes' sigmas."""
+        return float(np.sqrt(np.diag(self.covariance)[:3].sum()))
+
+    @property
+    def sigma_translation_m(self) -> float:
+        """One sigma of the translation, likewise."""
+        return float(np.sqrt(np.diag(self.covariance)[3:].sum()))
+
+    @property
+    def doubt(self) -> str:
+        """Sigmas beside their limits if the pose is too uncertain to be used; else empty."""
+        sigma_rad, sigma_m = self.sigma_rotation_rad, self.sigma_translation_m
+        if sigma_rad <= MAX_SIGMA_ROTATION_RAD and sigma_m <= MAX_SIGMA_TRANSLATION_M:
+            return ""
+        return (
+            f"{np.rad2deg(sigma_rad):.2f} degrees and {sigma_m * 1e3:.1f} mm (one sigma), expected "
+            f"at most {np.rad2deg(MAX_SIGMA_ROTATION_RAD):.1f} and "
+            f"{MAX_SIGMA_TRANSLATION_M * 1e3:.0f}"
+        )
+
+
+@dataclass(frozen=True)
+class Component:
+    """One source of noise: declared standard deviation, and its covariance [n, 6, 6] at one."""
+
+    sigma: float
+    shapes: Float64[np.ndarray, "n 6 6"]
+
+
+@dataclass(frozen=True)
 class Bundle:
     """Result of the bundle adjustment.
 
@@ -52,6 +127,110 @@ class Bundle:
     X: Float64[np.ndarray, "4 4"]
     Z: Float64[np.ndarray, "4 4"]
     covariance: Float64[np.ndarray, "12 12"]
+
+
+def weighted_bundle(
+    agreed: Agreement,
+    tracker: TrackerNoise,
+    own: dict[str, Component],
+    *,
+    corners: Callable[[float], Measurement] | None = None,
+) -> tuple[Bundle, dict[str, float]]:
+    """The bundle weighted with the noise estimated from the views, and that noise.
+
+    The second series has the sources of noise `own`. With `corners`, the measurement of a board's
+    corners by the noise of their pixels, those are weighted instead of its poses.
+    """
+    series, Ts = agreed.series, agreed.predicted
+    J, C = predicted_jacobians(Ts, agreed.X @ Ts)
+    tracker_sigma = tracker.tracker_rotation_rad, tracker.tracker_translation_m
+    components = sensor_components("tracker", C, tracker_sigma) | own
+    left_over = twist(invert(series.Ts_mounted_target) @ Ts)
+    unknowns = J[:, :, 6:] if agreed.is_mount_known else J
+    found = estimate_sigmas(left_over, unknowns, list(components.values()))
+    sigmas = dict(zip(components, found.tolist(), strict=True))
+    if corners is None:
+        shares = [sigmas[name] ** 2 * own[name].shapes for name in own]
+        information = np.linalg.inv(np.sum(shares, axis=0))
+        measurement = pose_measurement(series.Ts_mounted_target, information)
+    else:
+        measurement = corners(sigmas["pixel_px"])
+    bundle = solve_bundle(
+        series.Ts_world_body,
+        measurement,
+        (sigmas["tracker_rotation_rad"], sigmas["tracker_translation_m"]),
+        (agreed.X, agreed.Z),
+        is_mount_known=agreed.is_mount_known,
+    )
+    return bundle, sigmas
+
+
+def sensor_components(
+    sensor: str, maps: np.ndarray, sigmas: tuple[float, float]
+) -> dict[str, Component]:
+    """Rotation and translation noise of a pose sensor, in its own axes.
+
+    Args:
+        sensor: for the names of the two components.
+        maps: [n, 6, 6] take its twists to those of the views.
+        sigmas: declared, rad and m an axis.
+    """
+    maps_T = np.swapaxes(maps, 1, 2)
+    turns, shifts = maps[:, :, :3] @ maps_T[:, :3], maps[:, :, 3:] @ maps_T[:, 3:]
+    return {
+        f"{sensor}_rotation_rad": Component(sigmas[0], turns),
+        f"{sensor}_translation_m": Component(sigmas[1], shifts),
+    }
+
+
+def estimate_sigmas(
+    left_over: np.ndarray, J: np.ndarray, components: list[Component]
+) -> Float64[np.ndarray, " k"]:
+    """Standard deviation of each component (variance component estimation).
+
+    The twist left over in view i has the covariance Σ_k θ_k M_ki of components of known shape. The
+    θ that fit best are found by Fisher scoring of the restricted likelihood (Patterson and Thompson
+    1971: it counts the unknowns that were fitted to the same views), with a log-normal prior about
+    the declared sizes, as few views say little.
+
+    Args:
+        left_over: [n, 6] twists of views that are not explained, before the last linear step.
+        J: [n, 6, m] how they change with the m unknowns that are fitted.
+        components: the sources.
+    """
+    M = np.stack([component.shapes for component in components])
+    declared = np.log(np.square([component.sigma for component in components]))
+    log_theta = declared.copy()
+    for _ in range(MAX_NOISE_ROUNDS):
+        step = _scoring_step(left_over, J, M, (log_theta, declared))
+        log_theta = log_theta + np.clip(step, -MAX_NOISE_STEP, MAX_NOISE_STEP)
+        log_theta = np.maximum(log_theta, declared + 2 * np.log(MIN_SHARE))
+        if np.abs(step).max() < SMALLEST_NOISE_STEP:
+            break
+    return np.exp(0.5 * log_theta)
+
+
+def _scoring_step(
+    left_over: np.ndarray, J: np.ndarray, M: np.ndarray, logs: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """One step of the logarithms of the variances; `logs` are where they are and were declared."""
+    log_theta, declared = logs
+    scaled = M * np.exp(log_theta)[:, None, None, None]
+    inverse = np.linalg.inv(scaled.sum(axis=0))
+    weighted_J = inverse @ J
+    fitted = np.linalg.inv((np.swapaxes(J, 1, 2) @ weighted_J).sum(axis=0))
+    unknowns = fitted @ (np.swapaxes(weighted_J, 1, 2) @ left_over[..., None]).sum(axis=0)
+    residual = inverse @ (left_over[..., None] - J @ unknowns)
+    squares = (np.swapaxes(residual, 1, 2) @ scaled @ residual).sum(axis=(1, 2, 3))
+    shares = inverse @ scaled
+    expected = np.trace(shares, axis1=2, axis2=3).sum(axis=1)
+    used_up = (np.swapaxes(weighted_J, 1, 2) @ scaled @ weighted_J).sum(axis=1)
+    expected -= (used_up * fitted.T).sum(axis=(1, 2))
+    gradient = 0.5 * (squares - expected) - (log_theta - declared) / PRIOR_LOG_SIGMA**2
+    flat = shares.reshape(len(M), -1)
+    turned = np.swapaxes(shares, 2, 3).reshape(len(M), -1)
+    fisher = 0.5 * flat @ turned.T + np.eye(len(M)) / PRIOR_LOG_SIGMA**2
+    return np.linalg.solve(fisher, gradient)
 
 
 def pose_measurement(Ts_measured: np.ndarray, information: np.ndarray) -> Measurement:

@@ -1,20 +1,81 @@
-"""Camera intrinsics and distortion from photos of a flat board, with standard deviations."""
+"""Camera intrinsics from photos of a flat board: detected corners, blur, and calibration.
 
-from collections.abc import Sequence
+A photo taken while camera or board moves shifts all corners along the motion, by half a pixel at 6
+px of blur, which the residuals do not show because the board's pose absorbs it. The edges of the
+squares do show it, those across the motion more than those along it.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.calibration.board_detection import FoundBoards
 from services.alignment.calibration.motion import DegenerateMotionError
 
+MIN_CORNERS = 8
+DICTIONARIES = ("DICT_4X4_50", "DICT_5X5_250", "DICT_6X6_250", "DICT_APRILTAG_36h11")
+CHESSBOARD = "chessboard"
+CHARUCO = "ChArUco"
+LEGACY_CHARUCO = "ChArUco, legacy (as printed before OpenCV 4.6)"
+EITHER_CHARUCO = "ChArUco, odd rows (legacy and current are the same)"
 MIN_VIEWS = 5
 # Views from one direction alone cannot tell focal length from distance.
 MIN_TILT_SPREAD_RAD = np.deg2rad(15.0)
 MAX_FOCAL_SIGMA = 0.05
+# Wider edges are blurred. Measured on rendered ChArUco boards: sharp 2.0 to 2.2 px, out of focus by
+# 1.5 px (one sigma) 3.1 to 3.7, moved by 3 px 2.4 to 3.3, moved by 6 px 4.1 to 5.1; on photos of a
+# real camera of 640 by 480 px 2.0 to 3.1.
+MAX_EDGE_WIDTH_PX = 3.8
+# That of 1280 by 720 px. Angles count: the pixels of larger images are smaller ones.
+USUAL_DIAGONAL_PX = 1469.0
+# The profile across an edge, as a part of it: further off the markers of ChArUco boards begin.
+REACH = 0.12
+MIN_REACH_PX = 2.0
+STEP_PX = 0.5
+
+
+@dataclass(frozen=True)
+class Chessboard:
+    """A plain chessboard: `columns` × `rows` inner corners, squares of `square_m`."""
+
+    columns: int
+    rows: int
+    square_m: float
+
+
+@dataclass(frozen=True)
+class CharucoBoard:
+    """A ChArUco board: `columns` × `rows` squares, with markers of a dictionary in them."""
+
+    columns: int
+    rows: int
+    square_m: float
+    marker_m: float
+    dictionary: str = "DICT_5X5_250"
+
+
+@dataclass(frozen=True)
+class FoundBoards:
+    """Corners of one board on photos of one size.
+
+    Attributes:
+        points_board: a photo each, [k, 3] corners in board coordinates (m).
+        pixels_px: a photo each, [k, 2] where they are.
+        image_size_px: width, height.
+        photos: indices of the photos on which the board was found.
+        num_photos: number of processed photos.
+        pattern: how the board is printed.
+    """
+
+    points_board: tuple[Float32[np.ndarray, "_ 3"], ...]
+    pixels_px: tuple[Float32[np.ndarray, "_ 2"], ...]
+    image_size_px: tuple[int, int]
+    photos: tuple[int, ...]
+    num_photos: int
+    pattern: str
 
 
 @dataclass(frozen=True)
@@ -42,6 +103,46 @@ class CameraCalibration:
     rms_by_photo_px: Float64[np.ndarray, " n"]
     coverage: float
     used_images: tuple[int, ...]
+
+
+View = tuple[Float32[np.ndarray, "_ 3"], Float32[np.ndarray, "_ 2"]]
+Detector = Callable[[np.ndarray], View | None]
+
+
+def find_boards(images: Sequence[np.ndarray], board: Chessboard | CharucoBoard) -> FoundBoards:
+    """Detect a board in every photo; photos without it are skipped.
+
+    Both ways in which ChArUco boards are printed are tried, and the one that fits is named.
+
+    Args:
+        images: uint8 [h, w] or [h, w, 3], all of one size.
+        board: what is on the photos.
+
+    Raises:
+        ShapeError: no images, or of different sizes.
+        InvalidInputError: the board is no board.
+    """
+    photos = [_grey(image, index) for index, image in enumerate(images)]
+    if len({photo.shape for photo in photos}) != 1:
+        shapes = sorted({photo.shape for photo in photos})
+        raise ShapeError(f"photos: got sizes {shapes}, expected one size and at least one photo")
+    detectors = (
+        {CHESSBOARD: _chessboard(board)} if isinstance(board, Chessboard) else _charuco(board)
+    )
+    seen = {
+        pattern: {index: view for index, p in enumerate(photos) if (view := detect(p)) is not None}
+        for pattern, detect in detectors.items()
+    }
+    pattern = max(seen, key=lambda name: sum(len(pixels) for _, pixels in seen[name].values()))
+    height, width = photos[0].shape
+    return FoundBoards(
+        tuple(points for points, _ in seen[pattern].values()),
+        tuple(pixels for _, pixels in seen[pattern].values()),
+        (width, height),
+        tuple(seen[pattern]),
+        len(photos),
+        pattern,
+    )
 
 
 def calibrate_found(found: FoundBoards) -> CameraCalibration:
@@ -83,6 +184,102 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
     )
 
 
+def max_edge_width_px(photo: np.ndarray) -> float:
+    """Edge width above which a photo of this size counts as blurred."""
+    return MAX_EDGE_WIDTH_PX * max(1.0, float(np.hypot(*photo.shape)) / USUAL_DIAGONAL_PX)
+
+
+def edge_width_px(
+    photo: UInt8[np.ndarray, "h w"], points_board: np.ndarray, pixels: np.ndarray
+) -> float:
+    """Width over which the edges between dark and light squares rise.
+
+    The edges along each of the board's two axes are summarized by their median; the wider counts.
+
+    Args:
+        photo: grey.
+        points_board: [n, 3] corners in board coordinates (m), of a regular grid.
+        pixels: [n, 2] where they were seen; the middle of the first pixel is 0, 0.
+
+    Returns:
+        About 2.5 sigma of the blur; infinity where no two corners are neighbours.
+    """
+    grid = np.asarray(points_board, dtype=np.float64)[:, :2]
+    apart = grid[None] - grid[:, None]
+    length = np.linalg.norm(apart, axis=-1)
+    square_m = length[length > 0].min()
+    ends = np.asarray(pixels, dtype=np.float64)
+    widths = []
+    for step_m in square_m * np.eye(2):
+        first, second = np.nonzero(np.abs(apart - step_m).max(axis=-1) < 0.01 * square_m)
+        if len(first):
+            widths.append(np.median(_widths_px(photo, ends[first], ends[second])))
+    return float(max(widths, default=np.inf))
+
+
+def _grey(image: np.ndarray, index: int) -> np.ndarray:
+    image = np.asarray(image)
+    if image.dtype != np.uint8 or image.ndim not in {2, 3} or image.shape[2:] not in {(), (3,)}:
+        raise ShapeError(
+            f"photo {index}: got {image.dtype} {image.shape}, expected uint8 [h, w] or [h, w, 3]"
+        )
+    return image if image.ndim == 2 else np.rint(image.mean(axis=2)).astype(np.uint8)
+
+
+def _chessboard(board: Chessboard) -> Detector:
+    import cv2
+
+    if min(board.columns, board.rows) < 3 or board.square_m <= 0:
+        raise InvalidInputError(f"board: got {board}, expected at least 3 by 3 inner corners")
+    rows, columns = np.mgrid[: board.rows, : board.columns]
+    flat = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
+    points = (flat * board.square_m).astype(np.float32)
+
+    def detect(photo: np.ndarray) -> View | None:
+        ok, corners = cv2.findChessboardCorners(photo, (board.columns, board.rows))
+        if not ok:
+            return None
+        # A window of less than half a square, or the next corner pulls.
+        gap_px = np.linalg.norm(np.diff(corners.reshape(board.rows, -1, 2), axis=1), axis=-1).min()
+        half_px = int(np.clip(0.35 * gap_px, 2, 11))
+        stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+        corners = cv2.cornerSubPix(photo, corners, (half_px, half_px), (-1, -1), stop)
+        return points, np.asarray(corners, dtype=np.float32).reshape(-1, 2)
+
+    return detect
+
+
+def _charuco(board: CharucoBoard) -> dict[str, Detector]:
+    """Detectors by marker layout, which OpenCV 4.6 changed."""
+    import cv2
+
+    if board.dictionary not in DICTIONARIES:
+        raise UnknownNameError("marker dictionary", board.dictionary, list(DICTIONARIES))
+    if min(board.columns, board.rows) < 3 or not 0 < board.marker_m < board.square_m:
+        raise InvalidInputError(f"board: got {board}, expected markers smaller than squares")
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+
+    def detector(*, legacy: bool) -> Detector:
+        printed = cv2.aruco.CharucoBoard(
+            (board.columns, board.rows), board.square_m, board.marker_m, dictionary
+        )
+        printed.setLegacyPattern(legacy)
+        charuco = cv2.aruco.CharucoDetector(printed)
+        places = np.asarray(printed.getChessboardCorners(), dtype=np.float32)
+
+        def detect(photo: np.ndarray) -> View | None:
+            corners, ids, _, _ = charuco.detectBoard(photo)
+            if ids is None or len(ids) < MIN_CORNERS:
+                return None
+            return places[ids.ravel()], np.asarray(corners, dtype=np.float32).reshape(-1, 2)
+
+        return detect
+
+    if board.rows % 2:
+        return {EITHER_CHARUCO: detector(legacy=False)}
+    return {CHARUCO: detector(legacy=False), LEGACY_CHARUCO: detector(legacy=True)}
+
+
 def _coverage(pixels_px: Sequence[np.ndarray], image_size_px: tuple[int, int]) -> float:
     cells = np.concatenate(list(pixels_px)) / np.array(image_size_px) * 4
     return len(np.unique(cells.astype(int).clip(0, 3), axis=0)) / 16
@@ -102,3 +299,30 @@ def _check_views(Rs_camera_board: np.ndarray, relative: float) -> None:
             spread_deg=float(np.rad2deg(spread_rad)),
             relative_sigma=relative,
         )
+
+
+def _widths_px(
+    photo: np.ndarray, first: np.ndarray, second: np.ndarray
+) -> Float64[np.ndarray, " edges"]:
+    """Contrast over the steepest rise across the middle of each edge."""
+    along = second - first
+    length_px = np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.column_stack([-along[:, 1], along[:, 0]]) / length_px
+    reach_px = max(MIN_REACH_PX, REACH * float(np.median(length_px)))
+    offsets = np.arange(-reach_px, reach_px + STEP_PX / 2, STEP_PX)
+    middle = 0.5 * (first + second)[:, None]
+    profiles = _sampled(photo, middle + offsets[:, None] * across[:, None])
+    steepest = np.abs(np.diff(profiles, axis=1)).max(axis=1) / STEP_PX
+    # Of the squares beside the edges: a blurred profile does not reach it within its length.
+    beside = np.linspace(-0.25, 0.25, 9)[:, None] * (length_px * across)[:, None]
+    dark, light = np.quantile(_sampled(photo, middle + beside), (0.1, 0.9))
+    return (light - dark) / np.maximum(steepest, 1e-9)
+
+
+def _sampled(photo: np.ndarray, places: np.ndarray) -> Float64[np.ndarray, "edges steps"]:
+    """Bilinear grey levels at pixels [..., 2]; outside the photo those of its rim."""
+    # Here, since commands that measure nothing import this module on stations without scipy.
+    from scipy.ndimage import map_coordinates
+
+    at = np.moveaxis(places, -1, 0)[::-1]
+    return map_coordinates(photo.astype(np.float64), at, order=1, mode="nearest")

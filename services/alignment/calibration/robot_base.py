@@ -11,18 +11,20 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.geometry import invert
-from services.alignment.calibration.closed_form import Series, agreeing_views, view_errors
+from services.alignment.calibration.bundle import (
+    PoseEstimate,
+    TrackerNoise,
+    sensor_components,
+    weighted_bundle,
+)
 from services.alignment.calibration.motion import (
     AXIS_NAMES,
     DegenerateMotionError,
+    Series,
+    agreeing_views,
     checked_poses,
     missing_axes,
-)
-from services.alignment.calibration.noise_components import sensor_components
-from services.alignment.calibration.pose_estimate import (
-    PoseEstimate,
-    TrackerNoise,
-    weighted_bundle,
+    view_errors,
 )
 from services.alignment.calibration.twists import adjoint
 
@@ -91,22 +93,21 @@ def solve_robot_base(
         _check_places(effector)
         mount = invert(_checked_mount(T_effector_tracker))
     agreed = agreeing_views(series, mount)
-    used = series.only(agreed.views)
     # The robot errs in the effector's axes.
     own = sensor_components(
         "robot",
-        adjoint(invert(agreed.predicted(used))),
+        adjoint(invert(agreed.predicted)),
         (noise.robot_rotation_rad, noise.robot_translation_m),
     )
-    bundle, sigmas = weighted_bundle(used, agreed, noise, own, is_mount_known=mount is not None)
-    _, errors = view_errors(used, bundle.X)
+    bundle, sigmas = weighted_bundle(agreed, noise, own)
+    _, errors = view_errors(agreed.series, bundle.X)
     rotation_rms_rad, translation_rms_m = np.sqrt(np.square(errors).mean(axis=0)).tolist()
     result = RobotBaseResult(
         covariance=bundle.covariance[6:, 6:],
         rotation_rms_rad=rotation_rms_rad,
         translation_rms_m=translation_rms_m,
         noise=sigmas,
-        left_out_views=agreed.left_out(series),
+        left_out_views=agreed.left_out,
         T_world_base=bundle.Z,
         T_effector_tracker=invert(bundle.X),
     )

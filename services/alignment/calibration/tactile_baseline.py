@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, raw_indices
-from services.alignment.calibration.tactile_faults import DEAD, OK, STATES, STUCK
+from services.alignment.calibration.tactile_tare import DEAD, OK, STATES, STUCK
 
 # Why a taxel of a take is not measured: what the calibration says, or that it has no reading.
 REASONS = (*STATES, "absent")

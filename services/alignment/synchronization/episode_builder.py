@@ -7,14 +7,9 @@ import numpy as np
 
 from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import EpisodeAttributes, LineageEntry, StoredAnchor
+from dextouch.schemas import EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
 from dextouch.streams import StreamDescriptor
-from services.alignment.calibration.lens_record import check_lenses
 from services.alignment.options import AlignmentOptions
-from services.alignment.synchronization.episode_streams import (
-    EpisodeStream,
-    cut_stream,
-)
 from services.alignment.synchronization.grid_actions import (
     COMMANDED_STREAMS,
     REQUIRED,
@@ -27,21 +22,17 @@ from services.alignment.synchronization.progress import OnProgress, progress_wit
 from services.alignment.synchronization.recorded_streams import (
     Block,
     DatedStream,
+    EpisodeStream,
     LoadedStream,
+    cut_stream,
     date_stream,
 )
 from services.alignment.synchronization.refused_parts import (
-    RefusedPart,
     refused_edges,
     refused_matrices,
     refused_stretches,
 )
-from services.alignment.synchronization.resampling import (
-    EDGE_PERIODS,
-    GridPlacement,
-    grid_times_ns,
-    longest_run,
-)
+from services.alignment.synchronization.resampling import EDGE_PERIODS, grid_times_ns, longest_run
 
 
 @dataclass(frozen=True)
@@ -59,12 +50,12 @@ class BuiltEpisode:
 
 @dataclass(frozen=True)
 class _Stretch:
-    """The part of a recording that becomes the episode, and why the rest does not."""
+    """The part of a recording that becomes the episode; matrices say why the rest does not."""
 
     gridded: GriddedStreams
     origin_ns: int
     num_refused: int
-    refused: list[RefusedPart]
+    refused: dict[str, Matrix]
 
 
 def build_episode(
@@ -96,22 +87,22 @@ def build_episode(
         stretch.gridded, recording.attributes.domain, recording.attributes.calibration
     )
     on_progress(progress_within("writing", 0.0))
-    origin_ns = stretch.origin_ns
     grid_ns = stretch.gridded.grid_ns - stretch.gridded.grid_ns[0]
     written = [
         *_action_streams(actions, grid_ns, options),
-        *(cut_stream(stream, origin_ns, int(grid_ns[-1])) for stream in streams.values()),
+        *(cut_stream(one, stretch.origin_ns, int(grid_ns[-1])) for one in streams.values()),
     ]
+    started_ns = recording.attributes.started_t_host_ns or 0
     quality = {
         "num_steps_refused": float(stretch.num_refused),
-        "origin_after_start_ns": float(origin_ns - (recording.attributes.started_t_host_ns or 0)),
+        "origin_after_start_ns": float(stretch.origin_ns - started_ns),
         **_stream_quality(streams, options),
         **actions.quality,
     }
     attributes = _episode_attributes(recording, episode_id, actions, streams, quality)
     more = {
         "model_rate_hz": options.model_rate_hz,
-        "calibration": attributes.calibration | refused_matrices(stretch.refused),
+        "calibration": attributes.calibration | stretch.refused,
     }
     return BuiltEpisode(attributes.model_copy(update=more), tuple(written))
 
@@ -133,22 +124,22 @@ def _find_stretch(
     run = longest_run(gridded.valid)
     if run[1] - run[0] < options.min_num_steps:
         raise InvalidInputError(_too_short(gridded, run, options, attributes.recording_id))
-    chosen = _slice(gridded, run)
+    chosen = gridded.part(*run)
     start_ns = attributes.started_t_host_ns
     if start_ns is None:
         start_ns = min(int(stream.t_ns[0]) for stream in parts.values())
-    edges = refused_edges(
+    parts_refused = refused_edges(
         {name: int(stream.t_ns[0]) for name, stream in parts.items()},
         {name: int(stream.t_ns[-1]) for name, stream in parts.items()},
         start_ns,
     )
     valid = {name: place.valid for name, place in gridded.at.items()}
-    inner = refused_stretches(gridded.grid_ns + origin_ns, valid, run, start_ns)
+    parts_refused += refused_stretches(gridded.grid_ns + origin_ns, valid, run, start_ns)
     return _Stretch(
         chosen,
         origin_ns + int(chosen.grid_ns[0]),
-        len(gridded.valid) - len(chosen.valid),
-        [*edges, *inner],
+        len(gridded.grid_ns) - len(chosen.grid_ns),
+        refused_matrices(parts_refused),
     )
 
 
@@ -203,8 +194,39 @@ def check_complete(recording: RecordingReader) -> None:
             f"missing; it has {sorted(attributes.calibration)}",
             missing=["K_head"],
         )
-    where = f"recording {attributes.recording_id!r}"
-    check_lenses(attributes.calibration, recording.streams, where=where)
+    _check_lenses(recording)
+
+
+def _check_lenses(recording: RecordingReader) -> None:
+    """Refuse a camera matrix that was measured on images of another size than were recorded.
+
+    Matrices that are absent are not asked for. Images are never undistorted here: the episode
+    carries `distortion_<camera>` beside `K_<camera>`.
+    """
+    calibration = recording.attributes.calibration
+    where = f"recording {recording.attributes.recording_id!r}"
+    for name, stream in recording.streams.items():
+        camera = name.removeprefix("camera_")
+        if stream.kind != "image" or camera == name:
+            continue
+        for matrix, shape in (
+            (f"K_{camera}", (3, 3)),
+            (f"distortion_{camera}", (1, 5)),
+            (f"image_size_{camera}_px", (1, 2)),
+        ):
+            if matrix in calibration and np.shape(calibration[matrix]) != shape:
+                raise InvalidInputError(
+                    f"{where}: calibration {matrix!r} is {np.shape(calibration[matrix])}, expected "
+                    f"{shape}"
+                )
+        size_px = calibration.get(f"image_size_{camera}_px")
+        recorded = (stream.shape[1], stream.shape[0])
+        if size_px is not None and tuple(size_px[0]) != recorded:
+            raise InvalidInputError(
+                f"{where}: K_{camera} was measured on images of {size_px[0][0]:g} by "
+                f"{size_px[0][1]:g} px, but {name!r} holds {recorded[0]} by {recorded[1]}; "
+                "calibrate the camera in the mode that is recorded"
+            )
 
 
 def _seen(stream: LoadedStream) -> LoadedStream:
@@ -243,15 +265,6 @@ def _common_stretch(
     }
     grid_ns = grid_times_ns(num_steps, options.model_rate_hz)
     return start_ns, place_streams(moved, grid_ns, max_gap_ns=options.max_gap_ns)
-
-
-def _slice(gridded: GriddedStreams, run: tuple[int, int]) -> GriddedStreams:
-    part = slice(*run)
-    at = {
-        name: GridPlacement(place.left[part], place.weight[part], place.valid[part])
-        for name, place in gridded.at.items()
-    }
-    return GriddedStreams(gridded.grid_ns[part], gridded.streams, at, gridded.valid[part])
 
 
 def _action_streams(

@@ -1,15 +1,22 @@
 """Hand trajectories and 67-D actions at the steps of the model's grid."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64, Int64, UInt8
 
 from dextouch.hands.actions import AnchorPoses, HandTrajectory, actions_from_poses
 from dextouch.schemas import Domain, Matrix
-from dextouch.tactile.layout import SIDES
-from services.alignment.synchronization.hand_joints import retarget_hands
+from dextouch.tactile.layout import SIDES, Side
+from services.alignment.retargeting.hand_profile import calibrated_profile
+from services.alignment.retargeting.hand_retargeter import (
+    HandRetargeter,
+    RetargetResult,
+    RetargetStatus,
+)
+from services.alignment.retargeting.keypoint_axes import hand_axes_check
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import (
     GridPlacement,
@@ -18,6 +25,9 @@ from services.alignment.synchronization.resampling import (
     vectors_on_grid,
 )
 
+NS_PER_S = 1e9
+# Samples of a recording from which a hand's axes, side and unit are checked.
+MAX_CHECKED = 2000
 POSE_STREAMS = ("wrist_left", "wrist_right", "head")
 COMMANDED_STREAMS = ("joints_commanded", "wrist_left_commanded", "wrist_right_commanded")
 REQUIRED: Mapping[Domain, tuple[str, ...]] = {
@@ -28,15 +38,32 @@ REQUIRED: Mapping[Domain, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class GriddedStreams:
-    """Streams that actions are computed from, and the placement of the grid among their samples.
-
-    `valid` marks the steps at which every one of them can be read without reaching across a gap.
-    """
+    """Streams that actions are computed from, and the placement of the grid among their samples."""
 
     grid_ns: Int64[np.ndarray, " n"]
     streams: Mapping[str, LoadedStream]
     at: Mapping[str, GridPlacement]
-    valid: Bool[np.ndarray, " n"]
+
+    @property
+    def valid(self) -> Bool[np.ndarray, " n"]:
+        """Steps at which every stream can be read without reaching across a gap."""
+        return np.logical_and.reduce([placement.valid for placement in self.at.values()])
+
+    def part(self, first: int, stop: int) -> "GriddedStreams":
+        """Steps first … stop - 1."""
+        at = {
+            name: GridPlacement(p.left[first:stop], p.weight[first:stop], p.valid[first:stop])
+            for name, p in self.at.items()
+        }
+        return GriddedStreams(self.grid_ns[first:stop], self.streams, at)
+
+    def poses(self, name: str) -> Float64[np.ndarray, "n 4 4"]:
+        """Transforms of a pose stream at the steps."""
+        return poses_on_grid(self.streams[name].values, self.at[name])
+
+    def vectors(self, name: str) -> Float64[np.ndarray, "n 40"]:
+        """Joint angles (rad) of a stream at the steps."""
+        return vectors_on_grid(self.streams[name].values, self.at[name])
 
 
 @dataclass(frozen=True)
@@ -59,10 +86,7 @@ def place_streams(
         )
         for name, stream in streams.items()
     }
-    valid = np.ones(len(grid_ns), dtype=bool)
-    for placement in at.values():
-        valid &= placement.valid
-    return GriddedStreams(grid_ns, streams, at, valid)
+    return GriddedStreams(grid_ns, streams, at)
 
 
 def make_actions(
@@ -72,18 +96,18 @@ def make_actions(
 
     Human hands are retargeted, a robot's joints taken as they are.
     """
-    left, right, head = (_poses(gridded, name) for name in POSE_STREAMS)
+    left, right, head = (gridded.poses(name) for name in POSE_STREAMS)
     if domain == "human":
-        joints, quality = retarget_hands(gridded.streams, gridded.at, calibration)
+        joints_rad, quality = retarget_hands(gridded.streams, gridded.at, calibration)
     else:
-        joints, quality = _joints(gridded, "joints_measured"), {}
-    trajectory = _trajectory((left, right, head), joints)
+        joints_rad, quality = gridded.vectors("joints_measured"), {}
+    trajectory = _trajectory((left, right, head), joints_rad)
     anchor = trajectory.anchor(0)
     commanded = None
     if all(name in gridded.streams for name in COMMANDED_STREAMS):
-        wrists = [_poses(gridded, f"wrist_{side}_commanded") for side in SIDES]
+        wrists = [gridded.poses(f"wrist_{side}_commanded") for side in SIDES]
         # Nobody commands the head: where it was is where it should have been.
-        wanted = _trajectory((*wrists, head), _joints(gridded, "joints_commanded"))
+        wanted = _trajectory((*wrists, head), gridded.vectors("joints_commanded"))
         commanded = actions_from_poses(wanted, anchor)
     return GridActions(anchor, actions_from_poses(trajectory, anchor), commanded, quality)
 
@@ -95,9 +119,73 @@ def _trajectory(poses: Sequence[np.ndarray], joints_rad: np.ndarray) -> HandTraj
     return HandTrajectory(left, right, joints_left_rad, joints_right_rad, head)
 
 
-def _poses(gridded: GriddedStreams, name: str) -> Float64[np.ndarray, "n 4 4"]:
-    return poses_on_grid(gridded.streams[name].values, gridded.at[name])
+def retarget_hands(
+    streams: Mapping[str, LoadedStream],
+    at: Mapping[str, GridPlacement],
+    calibration: Mapping[str, Matrix],
+) -> tuple[Float64[np.ndarray, "n 40"], dict[str, float]]:
+    """Joint angles of both hands, left before right, on the grid, and quality figures.
+
+    Each hand is retargeted in its own thread.
+
+    Every sample is retargeted once, at the rate at which the hand was tracked; the grid's steps
+    take the line between their two neighbours, which `at` has found to be in no gap.
+
+    `at` is valid at every step. `hand_profile_SIDE` of the calibration is the person's hand, which
+    is measured from the recording itself where it is absent.
+
+    Raises:
+        InvalidInputError: keypoints that are not a hand, of the other side or in other axes, see
+            `hand_axes_check` and `HandRetargeter.retarget`.
+    """
+    hands = {side: HandRetargeter(side, calibrated_profile(calibration, side)) for side in SIDES}
+
+    def retarget(side: Side) -> tuple[np.ndarray, dict[str, float]]:
+        name = f"keypoints_{side}"
+        return _retarget(hands[side], streams[name], at[name])
+
+    with ThreadPoolExecutor(len(SIDES), thread_name_prefix="retarget") as threads:
+        (left_rad, left), (right_rad, right) = threads.map(retarget, SIDES)
+    return np.concatenate([left_rad, right_rad], axis=1), left | right
 
 
-def _joints(gridded: GriddedStreams, name: str) -> Float64[np.ndarray, "n 40"]:
-    return vectors_on_grid(gridded.streams[name].values, gridded.at[name])
+def _retarget(
+    retargeter: HandRetargeter, stream: LoadedStream, at: GridPlacement
+) -> tuple[Float64[np.ndarray, "n 20"], dict[str, float]]:
+    side = retargeter.hand.side
+    first, stop = int(at.left.min()), int(at.left.max()) + 2
+    keypoints_m = stream.values[first:stop]
+    # What the calibration turns was turned when the stream was read: the rest is refused.
+    hand_axes_check(keypoints_m[:: 1 + len(keypoints_m) // MAX_CHECKED], side, {})
+    t_ns = stream.t_ns[first:stop]
+    # int64 first, so that seconds stay exact to the nanosecond.
+    t_s = (t_ns - t_ns[0]).astype(np.float64) / NS_PER_S
+    result = retargeter.retarget(keypoints_m, t_s=t_s)
+    near = GridPlacement(at.left - first, at.weight, at.valid)
+    # Extrapolation beyond the first or last sample could exceed the limits.
+    hand = retargeter.hand
+    joints_rad = np.clip(vectors_on_grid(result.joints_rad, near), hand.lower_rad, hand.upper_rad)
+    return joints_rad, _quality(side, result, near)
+
+
+def _quality(side: Side, result: RetargetResult, at: GridPlacement) -> dict[str, float]:
+    status = status_on_grid(result.status, at)
+    again = result.finger_status == RetargetStatus.REACQUIRED
+    figures = {
+        "num_steps_not_solved": float((status != RetargetStatus.SOLVED).sum()),
+        "num_fingers_reacquired": float(again.sum()),
+    }
+    errors_mm = result.tip_error_m[result.solved] * 1e3
+    if errors_mm.size:
+        figures["tip_error_mm"] = float(errors_mm.mean())
+        figures["tip_error_p95_mm"] = float(np.percentile(errors_mm, 95))
+    for kind in RetargetStatus:
+        figures[f"share_{kind.name.lower()}"] = float((status == kind).mean())
+    return {f"retargeting_{side}_{name}": value for name, value in figures.items()}
+
+
+def status_on_grid(status: np.ndarray, at: GridPlacement) -> UInt8[np.ndarray, " n"]:
+    """Status of each step: the worse of its two samples."""
+    left = np.where(at.weight == 1, at.left + 1, at.left)
+    right = np.where(at.weight == 0, at.left, at.left + 1)
+    return np.maximum(status[left], status[right]).astype(np.uint8)

@@ -12,14 +12,15 @@ from dextouch.command_line import progress
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.calibration.board_detection import (
+from services.alignment.calibration.intrinsics import (
     DICTIONARIES,
     CharucoBoard,
     Chessboard,
     FoundBoards,
+    edge_width_px,
     find_boards,
+    max_edge_width_px,
 )
-from services.alignment.calibration.sharpness import edge_width_px, max_edge_width_px
 
 Board = Chessboard | CharucoBoard
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")

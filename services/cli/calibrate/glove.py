@@ -7,10 +7,8 @@ import numpy as np
 
 from dextouch.command_line import progress
 from dextouch.errors import InvalidInputError
-from services.alignment.calibration.tactile_faults import OK, STATES
-from services.alignment.calibration.tactile_gain import TaxelGain
-from services.alignment.calibration.tactile_glove_calibration import calibrate_glove
-from services.alignment.calibration.tactile_tare import TaxelTare, measure_tare
+from services.alignment.calibration.tactile_gain import TaxelGain, calibrate_glove
+from services.alignment.calibration.tactile_tare import OK, STATES, TaxelTare, measure_tare
 from services.cli.calibrate.glove_takes import (
     PressRow,
     press_of,

@@ -19,8 +19,12 @@ from dextouch.clients import HttpLink, Reply
 from dextouch.command_line import progress
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.streams import SampleBatch
-from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
-from services.alignment.calibration.tactile_glove_calibration import calibrate_glove, pad_taxels
+from services.alignment.calibration.tactile_gain import (
+    TaxelPress,
+    calibrate_glove,
+    fit_gain,
+    pad_taxels,
+)
 from services.alignment.calibration.tactile_tare import TaxelTare, measure_tare
 from services.cli.calibrate.files import read_rows, read_stream
 

@@ -14,8 +14,11 @@ from dextouch.geometry import transform_from_pose
 from dextouch.geometry.rotations import vector_from_rotation
 from services.alignment.calibration.motion import DegenerateMotionError
 from services.alignment.calibration.tactile_baseline import TactileCalibration
-from services.alignment.calibration.tap_offset import estimate_tap_offset
-from services.alignment.calibration.time_offset import TimeOffset, estimate_time_offset
+from services.alignment.calibration.time_offset import (
+    TimeOffset,
+    estimate_tap_offset,
+    estimate_time_offset,
+)
 from services.cli.calibrate.files import TakenStream, read_stream
 from services.cli.calibrate.record import write_entry
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from dextouch.tactile import hand_canvas
 from dextouch.tactile.layout import Side, select_taxels
-from services.alignment.calibration.tactile_faults import STATES
-from services.alignment.calibration.tactile_glove_calibration import GloveCalibration, filled_gain
+from services.alignment.calibration.tactile_gain import GloveCalibration, filled_gain
+from services.alignment.calibration.tactile_tare import STATES
 from services.cli.calibrate.advice import VIEWS_PER_REGION, Coverage, TurnCoverage
 from services.cli.calibrate.boards import BoardView
 

@@ -32,8 +32,7 @@ from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.uploader import Uploader
-from services.alignment.calibration.tactile_gain import TaxelPress
-from services.alignment.calibration.tactile_glove_calibration import calibrate_glove
+from services.alignment.calibration.tactile_gain import TaxelPress, calibrate_glove
 from services.alignment.calibration.tactile_tare import measure_tare
 from services.alignment.recording_error import NEAR_NS, compare_with_truth, match_samples
 from services.alignment.schemas import AlignmentJob
@@ -234,8 +233,11 @@ def measure(
     errors = compare_with_truth(episode, truth, origin_in_truth_ns=origin_in_truth_ns)
     residuals = {}
     for name in errors["clock_rms_ms"]:
-        match = match_samples(episode, truth, name, origin_in_truth_ns, NEAR_NS)
-        t_s = episode.read(name).t_ref_ns[match.index] * 1e-9
+        mine, period_ns = episode.read(name), truth.streams[name].period_ns()
+        match = match_samples(
+            mine, truth.read(name), origin_in_truth_ns, NEAR_NS, period_ns=period_ns
+        )
+        t_s = mine.t_ref_ns[match.index] * 1e-9
         residuals[name] = np.stack([t_s, (match.offset_ns - match.mean_offset_ns) * 1e-6])
     return Take(episode, errors, devices, residuals)
 

@@ -8,15 +8,15 @@ from benchmarks.simulated.board_scenes import DISTORTION, K, Motion, board_point
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector, vector_from_rotation
-from services.alignment.calibration.board_views import BoardViews, polish, project
 from services.alignment.calibration.bundle import (
+    Component,
+    estimate_sigmas,
     pose_measurement,
     predicted_jacobians,
     solve_bundle,
 )
-from services.alignment.calibration.hand_eye import solve_hand_eye
+from services.alignment.calibration.hand_eye import BoardViews, polish, project, solve_hand_eye
 from services.alignment.calibration.motion import check_turns
-from services.alignment.calibration.noise_components import Component, estimate_sigmas
 from services.alignment.calibration.twists import (
     adjoint,
     hat,

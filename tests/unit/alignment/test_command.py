@@ -6,7 +6,7 @@ import threading
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from services.alignment import batch
+from services.alignment import command_line
 from services.cli.main import main
 from tests.unit.alignment.recordings import write_recording
 from tests.unit.alignment.test_service import FakeWorker
@@ -17,7 +17,8 @@ def worker(monkeypatch):
     """The same work in a thread; `test_worker.py` has real processes."""
     go_on = threading.Event()
     go_on.set()
-    monkeypatch.setattr(batch, "AlignmentWorker", type("Worker", (FakeWorker,), {"held": go_on}))
+    kind = type("Worker", (FakeWorker,), {"held": go_on})
+    monkeypatch.setattr(command_line, "AlignmentWorker", kind)
 
 
 @pytest.fixture

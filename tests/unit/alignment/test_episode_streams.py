@@ -9,7 +9,7 @@ from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.streams import StreamDescriptor
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
-from services.alignment.synchronization import episode_streams, recorded_streams
+from services.alignment.synchronization import recorded_streams
 from tests.system.long_take import encode_images
 from tests.unit.alignment.recordings import START_NS, write_recording
 
@@ -114,7 +114,7 @@ def test_pieces_of_any_size_give_the_same_episode(tmp_path, monkeypatch):
     hashes = []
     for number, (num_bytes, num_images) in enumerate([(16 << 20, 64), (3000, 8)]):
         monkeypatch.setattr(recorded_streams, "PIECE_BYTES", num_bytes)
-        monkeypatch.setattr(episode_streams, "IMAGES_AT_ONCE", num_images)
+        monkeypatch.setattr(recorded_streams, "IMAGES_AT_ONCE", num_images)
         report = align_recording(store, "take", OPTIONS)
         episode = store.open(report.episode_id)
         hashes.append({name: episode.array_sha256(name) for name in (*ROBOT, "action")})

@@ -6,7 +6,7 @@ import pytest
 from benchmarks.simulated.hand_motions import motion_of
 from dextouch.streams import StreamDescriptor
 from services.alignment.retargeting import RetargetStatus
-from services.alignment.synchronization.hand_joints import retarget_hands, status_on_grid
+from services.alignment.synchronization.grid_actions import retarget_hands, status_on_grid
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import place_on_grid, vectors_on_grid
 from services.twin.hands import twin_hand
