@@ -17,7 +17,7 @@ from benchmarks.retargeting.ours import OURS, OURS_EXACT, ColdStart
 from benchmarks.retargeting.rivals import DEX, DEXI, VECTOR, Rival
 from benchmarks.retargeting.scores import PinchScore, RobotScore
 from benchmarks.simulated.hand_motions import RATE_HZ
-from services.alignment.retargeting.options import RetargetOptions
+from services.alignment.retargeting import RetargetOptions
 
 # (library, how many times as fast), each with its vectors from the wrist to 15 points.
 PROMISED_SPEED = ((DEX, 150.0), (DEXI, 5.0))

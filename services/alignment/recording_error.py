@@ -9,14 +9,14 @@ from jaxtyping import Bool, Float64, Int64
 
 from dextouch.episodes import EpisodeReader, StreamData
 from dextouch.errors import InvalidInputError
-from dextouch.geometry import nearest_index
+from dextouch.geometry import invert, nearest_index
+from dextouch.geometry.rotations import rotation_angle
 from dextouch.hands.actions import poses_from_actions
 from dextouch.hands.robot_hand import NUM_JOINTS, RobotHand
 from dextouch.metrics import tactile
 from dextouch.tactile import in_contact
 from dextouch.tactile.layout import SIDES, Side
 from services.alignment.retargeting.hand_retargeter import HandRetargeter
-from services.alignment.retargeting.wrist import pose_difference
 from services.alignment.synchronization.resampling import (
     GridPlacement,
     place_on_grid,
@@ -137,6 +137,14 @@ def match_samples(
     offset_ns = mine.t_ref_ns[index] - true.t_ref_ns[true_index]
     span = int(true_index[-1] - true_index[0]) + 1
     return Match(index, true_index, offset_ns, span - len(index))
+
+
+def pose_difference(
+    Ts_world_a: Float64[np.ndarray, "n 4 4"], Ts_world_b: Float64[np.ndarray, "n 4 4"]
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """Distance (m) and angle (rad) between simultaneous poses."""
+    distance_m = np.linalg.norm(Ts_world_a[:, :3, 3] - Ts_world_b[:, :3, 3], axis=-1)
+    return distance_m, rotation_angle((invert(Ts_world_a) @ Ts_world_b)[:, :3, :3])
 
 
 def _difference(mine: StreamData, true: StreamData, shift_ns: int, period_ns: int) -> float:

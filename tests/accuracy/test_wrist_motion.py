@@ -25,7 +25,7 @@ from dextouch.hands.actions import (
 from services.alignment.calibration.hand_eye import solve_hand_eye
 from services.alignment.calibration.robot_base import solve_robot_base
 from services.alignment.calibration.twists import move
-from services.alignment.retargeting.wrist import pose_difference
+from services.alignment.recording_error import pose_difference
 from tests.accuracy.test_robot_base import pairs
 
 BOUND_M, BOUND_DEG = 1e-6, 1e-4

@@ -7,7 +7,7 @@ from services.alignment.retargeting.hand_retargeter import (
     RetargetStatus,
     warm_up,
 )
-from services.alignment.retargeting.options import RetargetOptions
+from services.alignment.retargeting.solver.arrays import RetargetOptions
 
 __all__ = [
     "HandProfile",

@@ -9,9 +9,7 @@ from jaxtyping import Bool, Float64, UInt8
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.hands.robot_hand import HandModel, RobotHand
-from services.alignment.retargeting.hand_arrays import hand_arrays, joint_places
 from services.alignment.retargeting.hand_profile import HandProfile
-from services.alignment.retargeting.options import RetargetOptions
 from services.alignment.retargeting.profile_fit import (
     checked_keypoints,
     measure_profile,
@@ -20,7 +18,14 @@ from services.alignment.retargeting.profile_fit import (
     unknown_person,
 )
 from services.alignment.retargeting.solver import arrays
-from services.alignment.retargeting.solver.arrays import SCRATCH, Memory, Output
+from services.alignment.retargeting.solver.arrays import (
+    SCRATCH,
+    Memory,
+    Output,
+    RetargetOptions,
+    hand_arrays,
+    joint_places,
+)
 from services.alignment.retargeting.solver.solve import retarget_samples
 
 NOMINAL_PERIOD_S = arrays.NOMINAL_PERIOD_S

@@ -10,17 +10,18 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import apply, invert
 from dextouch.geometry.rotations import rotation_angle, vector_from_rotation
 from dextouch.schemas import Matrix, matrix_rows
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting.hand_checks import seen_nodes
-from services.alignment.retargeting.wrist import calibrated_transform
 from services.alignment.retargeting.wrist_frame import WristFrame, wrist_frame
 
 # What people's palms differ from the mean one's, and what a grip adds, stays below this.
 MAX_OFF_RAD: Final = float(np.deg2rad(20.0))
+# How far R Rᵀ of a stored transform may be from the identity.
+RIGID_TOLERANCE: Final = 1e-6
 
 
 class KeypointAxes(NamedTuple):
@@ -33,6 +34,34 @@ class KeypointAxes(NamedTuple):
 
     keypoints_m: Float64[np.ndarray, "time 25 3"]
     frame: WristFrame
+
+
+def calibrated_transform(
+    calibration: Mapping[str, Matrix], name: str
+) -> Float64[np.ndarray, "4 4"] | None:
+    """A rigid transform of a recording's calibration; None if it has none of this name.
+
+    Raises:
+        ShapeError: not 4 by 4.
+        NonFiniteError: NaN or infinity.
+        InvalidInputError: its rotation is none, or mirrors, or the last row is not 0 0 0 1.
+    """
+    if name not in calibration:
+        return None
+    what, T = f"calibration {name!r}", np.asarray(calibration[name], dtype=np.float64)
+    if T.shape != (4, 4):
+        raise ShapeError(f"{what}: got shape {T.shape}, expected (4, 4)")
+    if not np.isfinite(T).all():
+        raise NonFiniteError(f"{what}: holds NaN or infinity; calibrate again")
+    R = T[:3, :3]
+    off, determinant = np.abs(R @ R.T - np.eye(3)).max(), np.linalg.det(R)
+    if off > RIGID_TOLERANCE or determinant < 0 or T[3].tolist() != [0, 0, 0, 1]:
+        raise InvalidInputError(
+            f"{what}: no rigid transform (R Rᵀ is off by {off:.1e}, expected at most "
+            f"{RIGID_TOLERANCE:.0e}; det {determinant:+.2f}; last row {T[3].tolist()}); calibrate "
+            "again"
+        )
+    return T
 
 
 def calibration_name(side: Side) -> str:

@@ -6,18 +6,12 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import CHAINS, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import HandModel
-from services.alignment.retargeting.hand_arrays import (
-    hand_arrays,
-    joint_places,
-    zero_points_m,
-)
 from services.alignment.retargeting.hand_profile import (
     BONE_RANGE_M,
     NUM_FINGERS,
     HandProfile,
     check_bone_unit,
 )
-from services.alignment.retargeting.options import RetargetOptions
 from services.alignment.retargeting.solver.arrays import (
     IMPLAUSIBLE,
     MAX_JOINTS,
@@ -25,6 +19,10 @@ from services.alignment.retargeting.solver.arrays import (
     SCRATCH,
     Memory,
     Output,
+    RetargetOptions,
+    hand_arrays,
+    joint_places,
+    zero_points_m,
 )
 from services.alignment.retargeting.solver.solve import retarget_samples
 

@@ -23,8 +23,11 @@ from services.alignment.calibration.tactile_baseline import (
     TactileCalibration,
     TaxelSurvey,
 )
-from services.alignment.retargeting.keypoint_axes import calibration_name, to_wrist_axes
-from services.alignment.retargeting.wrist import calibrated_transform
+from services.alignment.retargeting.keypoint_axes import (
+    calibrated_transform,
+    calibration_name,
+    to_wrist_axes,
+)
 from services.alignment.synchronization.resampling import EDGE_PERIODS
 from services.alignment.synchronization.stream_clock import TimedStream, time_stream
 

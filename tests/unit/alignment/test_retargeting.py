@@ -9,10 +9,9 @@ from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import HandModel, RobotHand
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
-from services.alignment.retargeting.hand_arrays import hand_arrays
 from services.alignment.retargeting.profile_fit import robot_bone_m, unknown_person
-from services.alignment.retargeting.solver.arrays import SCRATCH
-from services.alignment.retargeting.solver.points import linearize
+from services.alignment.retargeting.solver.arrays import SCRATCH, hand_arrays
+from services.alignment.retargeting.solver.minimize import linearize
 
 HAND = RobotHand("right")
 

@@ -6,7 +6,8 @@ import pytest
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.retargeting.wrist import pose_difference, rigid_transform
+from services.alignment.recording_error import pose_difference
+from services.alignment.retargeting.keypoint_axes import calibrated_transform
 
 
 def test_difference_of_poses_is_in_metres_and_radians():
@@ -30,4 +31,4 @@ def test_difference_of_poses_is_in_metres_and_radians():
 )
 def test_calibrations_that_are_no_transforms_are_refused_by_name(matrix, error, words):
     with pytest.raises(error, match=f"T_world_base.*{words}"):
-        rigid_transform(matrix, what="T_world_base")
+        calibrated_transform({"T_world_base": matrix}, "T_world_base")

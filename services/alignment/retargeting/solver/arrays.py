@@ -1,11 +1,18 @@
-"""Record types that the compiled solver reads and writes: hand, person, options, results.
+"""What the compiled solver reads and writes: hand, person, options, results.
 
 Tables of fixed size are records: compiled functions hand on one pointer, and strides are constants.
 """
 
+from dataclasses import astuple, dataclass, fields
 from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float64
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry.rotations import rotation_from_quaternion
+from dextouch.hands import solver_indices
+from dextouch.hands.robot_hand import HandModel
 
 MAX_FINGERS: Final = 5
 MAX_JOINTS: Final = 6
@@ -15,6 +22,25 @@ MAX_STARTS: Final = 8
 NOMINAL_PERIOD_S: Final = 1 / 60
 # Of a pinch that begins.
 PINCH_WEIGHT_FAR: Final = 1e-3
+
+# Beyond, products of weights and distances drown what the points say.
+MAX_WEIGHT = 1e6
+LEAST = 1e-6
+NO_TURN = (1.0, 0.0, 0.0, 0.0)
+# Phalanges of the robot's fingers as capsules.
+PHALANX_RADIUS_M = 0.0085
+# Where cold searches begin, as fractions from lower to upper limit, knuckle to tip. The first two
+# find nearly all postures; the others are for the rest.
+STARTS = (
+    (0.45, 0.50, 0.40, 0.45),
+    (0.75, 0.50, 0.75, 0.70),
+    (0.30, 0.25, 0.60, 0.50),
+    (0.60, 0.80, 0.45, 0.55),
+    (0.20, 0.60, 0.20, 0.20),
+    (0.85, 0.30, 0.30, 0.85),
+    (0.15, 0.85, 0.85, 0.15),
+    (0.90, 0.75, 0.10, 0.50),
+)
 
 # What became of a finger in a sample; see `RetargetStatus`.
 SOLVED, PARTIAL, REACQUIRED, UNCONVERGED, IMPLAUSIBLE, MISSING = range(6)
@@ -124,6 +150,70 @@ SCRATCH: Final = np.dtype(
 )
 
 
+@dataclass(frozen=True)
+class RetargetOptions:
+    """Options of the solver; the defaults are what `python -m benchmarks retargeting` measures.
+
+    Args:
+        temporal_weight_m2: pull towards the sample before, m²/rad² at 60 Hz beside points of unit
+            weight; at other rates in proportion to the rate. 0 follows every sample exactly.
+        velocity_limit_rad_s: no joint turns faster from sample to sample.
+        max_step_rad: live (`HandRetargeter.step`), largest change of a joint between two outputs,
+            regardless of the elapsed time; the default is 9.6 rad/s at 60 Hz. Motors that are led
+            to their targets smoothly may be given the velocity limit times the period of a slower
+            tracker.
+        pinch_near_m: below this distance of thumb and fingertip the vector between them has its
+            full weight.
+        pinch_far_m: from here on it has none, and thumb and finger are solved apart.
+        pinch_weight: the full weight, beside points of unit weight.
+        posture_weight_m2: pull of joints in a pinch towards what their own points ask for, m²/rad².
+        reacquire_after_s: a finger that was lost for so long is searched from several starts.
+        num_starts: of such a search, 1 … 8.
+        keeps_fingers_apart: push neighbouring fingers apart where their capsules overlap; costs
+            microseconds where they do not.
+    """
+
+    temporal_weight_m2: float = 1e-4
+    velocity_limit_rad_s: float = 9.6
+    max_step_rad: float = 0.16
+    pinch_near_m: float = 0.005
+    pinch_far_m: float = 0.060
+    pinch_weight: float = 100.0
+    posture_weight_m2: float = 3e-3
+    reacquire_after_s: float = 0.1
+    num_starts: int = len(STARTS)
+    keeps_fingers_apart: bool = False
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "temporal_weight_m2": (0.0, MAX_WEIGHT),
+            "velocity_limit_rad_s": (LEAST, np.inf),
+            "max_step_rad": (LEAST, np.inf),
+            "pinch_near_m": (LEAST, 1.0),
+            "pinch_far_m": (self.pinch_near_m + LEAST, 1.0),
+            "pinch_weight": (PINCH_WEIGHT_FAR, MAX_WEIGHT),
+            "posture_weight_m2": (0.0, MAX_WEIGHT),
+            "reacquire_after_s": (LEAST, np.inf),
+            "num_starts": (1, len(STARTS)),
+        }
+        wrong = [
+            f"{name} {getattr(self, name):g} (expected {low:g} … {high:g})"
+            for name, (low, high) in ranges.items()
+            if not low <= getattr(self, name) <= high
+        ]
+        if wrong:
+            raise InvalidInputError(f"retargeting options: got {', '.join(wrong)}")
+
+    def tuning(self, *, is_live: bool = False) -> np.ndarray:
+        """The options as the record, shape [1], that the compiled solver reads.
+
+        Args:
+            is_live: every output is sent to motors, so no joint goes further than `max_step_rad`.
+        """
+        types = [(field.name, field.type) for field in fields(self)]
+        return np.array([(*astuple(self), is_live)], dtype=[*types, ("is_live", bool)])
+
+
 class Memory(NamedTuple):
     """State that one sample leaves for the next, changed in place.
 
@@ -164,3 +254,47 @@ class Output(NamedTuple):
             np.empty(num_samples, dtype=np.uint8),
             np.empty((num_samples, num_fingers)),
         )
+
+
+def hand_arrays(hand: HandModel) -> np.ndarray:
+    """The hand's tables as one record `HAND`, shape [1]."""
+    record = np.zeros(1, dtype=HAND)
+    row = record[0]
+    row["num_fingers"] = len(hand.fingers)
+    row["thumb"] = next((f for f, one in enumerate(hand.fingers) if one.chain == "thumb"), -1)
+    fractions = np.full((MAX_STARTS, 1, MAX_JOINTS), 0.5)
+    fractions[:, 0, :4] = STARTS
+    for index, finger in enumerate(hand.fingers):
+        row["num_joints"][index] = len(finger.joints)
+        row["point_joints"][index] = finger.points
+        row["tip_m"][index] = finger.tip_m
+        row["radius_m"][index] = PHALANX_RADIUS_M
+        row["nodes"][index] = solver_indices(finger.chain)
+        for point in (1, 2):
+            # A finger with fewer joints: one bone follows two of the person's.
+            if finger.points[point] == finger.points[point - 1]:
+                row["nodes"][index, point] = -1
+        for joint, one in enumerate(finger.joints):
+            row["rotation"][index, joint] = rotation_from_quaternion(np.array(one.q_wxyz))
+            row["position_m"][index, joint] = one.position_m
+            axis = np.array(one.axis) / np.linalg.norm(one.axis)
+            row["axis"][index, joint] = axis
+            row["is_turned"][index, joint] = tuple(one.q_wxyz) != NO_TURN
+            along = int(np.argmax(np.abs(axis)))
+            row["axis_kind"][index, joint] = along if abs(axis[along]) == 1.0 else 3
+            row["axis_sign"][index, joint] = np.sign(axis[along])
+            row["lower_rad"][index, joint], row["upper_rad"][index, joint] = one.limits_rad
+    row["starts_rad"] = row["lower_rad"] + fractions * (row["upper_rad"] - row["lower_rad"])
+    row["knuckle_m"][: len(hand.fingers)] = zero_points_m(hand)[:, 0]
+    return record
+
+
+def joint_places(hand: HandModel) -> Bool[np.ndarray, "fingers 6"]:
+    """Indices of the hand's joints in the solver's [fingers, 6] angles."""
+    counts = np.array([len(finger.joints) for finger in hand.fingers])
+    return np.asarray(np.arange(MAX_JOINTS) < counts[:, None])
+
+
+def zero_points_m(hand: HandModel) -> Float64[np.ndarray, "fingers 4 3"]:
+    """Knuckle, PIP, DIP and tip of every finger at zero angles."""
+    return hand.chain_points_m(np.zeros((1, len(hand.joint_names))))[0]

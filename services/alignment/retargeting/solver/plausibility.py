@@ -13,7 +13,7 @@ from services.alignment.retargeting.solver.arrays import (
     SOLVED,
 )
 from services.alignment.retargeting.solver.compiled import compiled
-from services.alignment.retargeting.solver.points import place_joints
+from services.alignment.retargeting.solver.minimize import place_joints
 
 # Two bones bent by more than 140° are an error of the tracker: hands and robot stop at 120°.
 MAX_BEND_COSINE = -0.766
