@@ -6,6 +6,7 @@ import pytest
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
+from dextouch.schemas import matrix_rows
 from services.alignment.recording_error import pose_difference
 from services.alignment.retargeting.keypoint_axes import calibrated_transform
 
@@ -31,4 +32,4 @@ def test_difference_of_poses_is_in_metres_and_radians():
 )
 def test_calibrations_that_are_no_transforms_are_refused_by_name(matrix, error, words):
     with pytest.raises(error, match=f"T_world_base.*{words}"):
-        calibrated_transform({"T_world_base": matrix}, "T_world_base")
+        calibrated_transform({"T_world_base": matrix_rows(matrix)}, "T_world_base")
