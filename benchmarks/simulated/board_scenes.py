@@ -1,5 +1,6 @@
 """Simulated hand-eye scenes: noisy views of a board with a known mount."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -120,6 +121,16 @@ def simulated_boards(seed: int, num_views: int) -> FoundBoards:
         tuple(range(num_views)),
         num_views,
         CHESSBOARD,
+    )
+
+
+def selected_boards(found: FoundBoards, chosen: Sequence[int]) -> FoundBoards:
+    """A subset of the photos, by index into `found.photos`."""
+    return replace(
+        found,
+        points_board=tuple(found.points_board[index] for index in chosen),
+        pixels_px=tuple(found.pixels_px[index] for index in chosen),
+        photos=tuple(found.photos[index] for index in chosen),
     )
 
 

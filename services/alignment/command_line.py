@@ -266,7 +266,7 @@ def align_batch(
 
 def not_aligned(store: EpisodeStore, options: AlignmentOptions) -> tuple[list[str], list[Outcome]]:
     """Recordings without an episode under these options: ids to align, and what is refused."""
-    wanted, impossible = [], []
+    wanted, impossible = list[str](), list[Outcome]()
     for recording_id in store.list(kind="recording"):
         try:
             if not store.exists(check_recording(store, recording_id, options)):

@@ -1,7 +1,6 @@
 """Camera matrices against the one that photos were rendered with, and real photos."""
 
 import sys
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -121,18 +120,12 @@ def test_real_charuco_board_is_found_but_one_view_is_not_enough():
     assert len(found.pixels_px[0]) >= 20
 
 
-def without(found, index):
-    """All photos but one."""
-    kept = [k for k in range(len(found.photos)) if k != index]
-    fields = ("points_board", "pixels_px", "photos")
-    return replace(found, **{f: tuple(getattr(found, f)[k] for k in kept) for f in fields})
-
-
 def leave_one_out_rms_px(found):
     """Error of each photo, RMS in pixels, when only the board's pose is fitted to the photo."""
     left = []
     for index, (points, pixels) in enumerate(zip(found.points_board, found.pixels_px, strict=True)):
-        others = calibrate_found(without(found, index))
+        kept = [k for k in range(len(found.photos)) if k != index]
+        others = calibrate_found(scenes.selected_boards(found, kept))
         camera = others.K, others.distortion
         _, turn, shift = cv2.solvePnP(points, pixels, *camera)
         projected, _ = cv2.projectPoints(points, turn, shift, *camera)
