@@ -10,20 +10,13 @@ from fastapi import FastAPI
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import StorageError
 from dextouch.serving import create_service_app, serve
-from services.episode_store.admission import Admission, DiskReserve
 from services.episode_store.catalog import Catalog
-from services.episode_store.commit_process import CommitProcess
+from services.episode_store.committing import CommitProcess
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Intake
-from services.episode_store.metrics import StoreMetrics
-from services.episode_store.quotas import StationQuotas
+from services.episode_store.limits import StorageLimits
 from services.episode_store.reading import StoreReader
-from services.episode_store.routes import (
-    catalog_router,
-    episodes_router,
-    recordings_router,
-    uploads_router,
-)
+from services.episode_store.routes import reading_router, uploads_router
 from services.episode_store.settings import EpisodeStoreSettings
 
 logger = structlog.get_logger(__name__)
@@ -45,23 +38,17 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         max_window_steps=settings.max_window_steps,
         max_answer_bytes=settings.max_answer_bytes,
     )
-    reserve = DiskReserve(store.root, min_free_bytes=settings.min_free_bytes)
-    quotas = StationQuotas(
+    limits = StorageLimits(
         ingest.folder,
         recordings=catalog.bytes_by_station,
         quota_bytes=settings.quota_bytes_per_station,
-    )
-    metrics = StoreMetrics(open_uploads=lambda: quotas.num_open, free_bytes=reserve.free_bytes)
-    admission = Admission(
-        max_requests=settings.max_batches_in_flight, max_bytes=settings.max_bytes_in_flight
+        min_free_bytes=settings.min_free_bytes,
     )
     intake = Intake(
         ingest,
-        admission=admission,
-        reserve=reserve,
-        quotas=quotas,
-        metrics=metrics,
-        num_threads=settings.max_batches_in_flight,
+        limits,
+        max_batches=settings.max_batches_in_flight,
+        max_bytes=settings.max_bytes_in_flight,
     )
 
     @asynccontextmanager
@@ -80,16 +67,12 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         name="episode_store",
         settings=settings,
         routers=[
-            recordings_router(
-                intake=intake, catalog=catalog, reader=reader, max_page=settings.max_page
-            ),
-            episodes_router(catalog=catalog, reader=reader, max_page=settings.max_page),
-            catalog_router(catalog=catalog),
-            uploads_router(intake=intake),
+            uploads_router(intake),
+            reading_router(catalog, reader, max_page=settings.max_page),
         ],
         lifespan=lifespan,
     )
-    metrics.register(app.state.registry)
+    intake.register(app.state.registry)
     return app
 
 

@@ -1,6 +1,9 @@
 """Catalog of a store: filtered lists of episodes and recordings from cached summaries."""
 
+import os
+import re
 import threading
+import time
 from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Callable, Mapping
@@ -8,9 +11,17 @@ from typing import Any, Generic
 
 import structlog
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, Kind, RecordingReader
+from dextouch.episodes import (
+    COMMIT_FILE,
+    EpisodeReader,
+    EpisodeStore,
+    Kind,
+    RecordingReader,
+    disk_errors,
+)
 from dextouch.errors import NotFoundError, StorageError
 from dextouch.schemas import (
+    ID_PATTERN,
     CatalogHours,
     EpisodeList,
     EpisodeSummary,
@@ -18,7 +29,6 @@ from dextouch.schemas import (
     RecordingList,
     RecordingSummary,
 )
-from services.episode_store.changes import FolderChanges, Revision
 from services.episode_store.filters import CatalogFilter, Entry, EpisodeFilter, S
 
 __all__ = ["Catalog", "CatalogFilter", "EpisodeFilter"]
@@ -26,17 +36,34 @@ __all__ = ["Catalog", "CatalogFilter", "EpisodeFilter"]
 logger = structlog.get_logger(__name__)
 
 SECONDS_AN_HOUR = 3600.0
+# Stamps of a file system can be this coarse: another change may get the same stamp.
+SETTLED_NS = 2_000_000_000
+# Listing a bucket takes one request per 1000 objects.
+BUCKET_PERIOD_NS = 5_000_000_000
+# Stamp and inode of a commit record.
+Revision = tuple[int, int]
+NO_REVISION = (-1, -1)
 
 
 class _Shelf(Generic[S]):
-    """Entries of one kind sorted by id, refreshed by `entries`."""
+    """Entries of one kind sorted by id; a single `stat` while nothing changes.
+
+    Commits and deletions rename folders, which updates the parent folder's stamp. In-place changes
+    by other programs are noticed only at the next commit or deletion. A bucket is listed at most
+    once per BUCKET_PERIOD_NS, by ids only: an id that is deleted and written again in between goes
+    unnoticed.
+    """
 
     def __init__(
         self, store: EpisodeStore, kind: Kind, summarize: Callable[[str], Entry[S]]
     ) -> None:
+        self._store = store
         self._kind: Kind = kind
         self._summarize: Callable[[str], Entry[S]] = summarize
-        self._changes = FolderChanges(store, kind)
+        self._folder = store.root / f"{kind}s"
+        self._listed_ns: int | None = None
+        self._stamp_ns: int | None = None
+        self._is_settled = False
         self._known: dict[str, tuple[Revision, Entry[S] | None]] = {}
         self._entries: dict[str, Entry[S]] = {}
         self._guard = threading.Lock()
@@ -44,29 +71,67 @@ class _Shelf(Generic[S]):
     def entries(self) -> dict[str, Entry[S]]:
         """Current entries by id; the returned dictionary is never modified."""
         with self._guard:
-            found = self._changes.look()
+            found = self._look()
             if found is not None:
-                self._refresh(found)
+                self._known = {name: self._read(name, now) for name, now in found.items()}
+                known = ((name, entry) for name, (_, entry) in self._known.items())
+                self._entries = {name: entry for name, entry in known if entry is not None}
             return self._entries
 
-    def _refresh(self, found: Mapping[str, Revision]) -> None:
-        known = {}
-        for item_id, revision in found.items():
-            before = self._known.get(item_id)
-            if before is not None and before[0] == revision:
-                known[item_id] = before
-                continue
+    def _read(self, item_id: str, revision: Revision) -> tuple[Revision, Entry[S] | None]:
+        before = self._known.get(item_id)
+        if before is not None and before[0] == revision:
+            return before
+        try:
+            return revision, self._summarize(item_id)
+        except NotFoundError:
+            # Deleted while we were listing; one that comes back is read again.
+            return NO_REVISION, None
+        except StorageError as error:
+            logger.warning(
+                "omitted_from_catalog", kind=self._kind, id=item_id, reason=error.message
+            )
+            return revision, None
+
+    def _look(self) -> dict[str, Revision] | None:
+        """Revisions by sorted id; None if nothing changed since the last call."""
+        with disk_errors(f"list {self._folder.name}"):
             try:
-                known[item_id] = (revision, self._summarize(item_id))
-            except NotFoundError:
-                continue  # deleted while we were listing
-            except StorageError as error:
-                logger.warning(
-                    "omitted_from_catalog", kind=self._kind, id=item_id, reason=error.message
-                )
-                known[item_id] = (revision, None)
-        self._known = known
-        self._entries = {name: entry for name, (_, entry) in known.items() if entry is not None}
+                stamp_ns = self._folder.stat().st_mtime_ns
+            except FileNotFoundError:
+                self._stamp_ns = None
+                return self._list()
+            if self._is_settled and stamp_ns == self._stamp_ns:
+                return None
+            now_ns = time.time_ns()
+            found = self._scan()
+        self._stamp_ns, self._is_settled = stamp_ns, now_ns - stamp_ns > SETTLED_NS
+        return found
+
+    def _list(self) -> dict[str, Revision] | None:
+        # Listing an empty folder is free; a bucket is not listed again at once.
+        now_ns = time.monotonic_ns()
+        if self._listed_ns is not None and now_ns - self._listed_ns < BUCKET_PERIOD_NS:
+            return None
+        found = dict.fromkeys(self._store.list(kind=self._kind), (0, 0))
+        self._listed_ns = now_ns if found else None
+        return found
+
+    def _scan(self) -> dict[str, Revision]:
+        found = {}
+        # Plain names and one stat per id: thousands of Path objects would slow down a listing.
+        for name in sorted(os.listdir(self._folder)):  # noqa: PTH208
+            try:
+                state = os.stat(f"{self._folder}/{name}/{COMMIT_FILE}")  # noqa: PTH116
+            except (FileNotFoundError, NotADirectoryError):
+                continue
+            except PermissionError:
+                # Reading it reports the error; a name that is not an id is not an episode.
+                if re.fullmatch(ID_PATTERN, name):
+                    found[name] = (0, 0)
+                continue
+            found[name] = (state.st_mtime_ns, state.st_ino)
+        return found
 
 
 class Catalog:

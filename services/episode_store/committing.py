@@ -1,13 +1,24 @@
-"""Commit of a complete spool as a recording of the store, with bounded memory."""
+"""Commit of complete spools as recordings of the store, here or in a child process.
 
+Copying a take costs as much as receiving it, and would delay all stations in the process that
+acknowledges batches.
+"""
+
+import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
 from dextouch.episodes import EpisodeStore, WriteOptions
 from dextouch.episodes.spool import SpoolReader
-from dextouch.schemas import RecordingAttributes
+from dextouch.errors import DexTouchError, UnavailableError
+from dextouch.schemas import Problem, RecordingAttributes, error_from_problem, problem_from_error
+from dextouch.serving import ChildProcess, serve_parent
 from dextouch.streams import ENCODED_UNITS
 
+# Acknowledging batches has priority over committing.
+NICENESS = 5
+RETRY_AFTER_S = 1
 COPY_SAMPLES = 256
 COPY_BYTES = 4 << 20
 # Images take about 50 kB each.
@@ -38,3 +49,59 @@ def commit_spool(
             for batch in reader.batches(name, num_samples=num_samples):
                 writer.append(name, **vars(batch))
     return {name: reader.num_samples(name) for name in reader.streams}
+
+
+class CommitProcess:
+    """A `Commit` in a child process, one spool at a time; started on first use."""
+
+    def __init__(self, store_url: str) -> None:
+        self._store_url = store_url
+        self._child: ChildProcess | None = None
+        self._guard = threading.Lock()
+
+    def __call__(self, spool: Path, attributes: RecordingAttributes) -> dict[str, int]:
+        """Commit a spool; raises as `commit_spool`.
+
+        Raises:
+            UnavailableError: the process died; the spool is unchanged.
+        """
+        with self._guard:
+            if self._child is None or not self._child.is_running:
+                self._child = ChildProcess("services.episode_store.committing", self._store_url)
+            self._child.send({"spool": str(spool), "attributes": attributes.model_dump_json()})
+            try:
+                answer = self._child.receive()
+            except UnavailableError as error:
+                raise UnavailableError(
+                    f"finish {attributes.recording_id}: the process that writes recordings died: "
+                    f"{error.message}; try again",
+                    retry_after_s=RETRY_AFTER_S,
+                ) from error
+        if "problem" in answer:
+            raise error_from_problem(Problem.model_validate(answer["problem"]))
+        counts: dict[str, int] = answer["num_samples"]
+        return counts
+
+    def close(self) -> None:
+        """Wait for the running commit and end the process."""
+        with self._guard:
+            if self._child is not None:
+                self._child.close()
+                self._child = None
+
+
+def serve(store_url: str) -> None:
+    """Commit spools on request of the parent, until it ends."""
+    orders, answer = serve_parent(niceness=NICENESS)
+    store = EpisodeStore(store_url)
+    for order in orders:
+        attributes = RecordingAttributes.model_validate_json(order["attributes"])
+        try:
+            answer({"num_samples": commit_spool(store, Path(order["spool"]), attributes)})
+        except DexTouchError as error:
+            problem = problem_from_error(error, instance=attributes.recording_id, request_id="")
+            answer({"problem": problem.model_dump()})
+
+
+if __name__ == "__main__":
+    serve(sys.argv[1])

@@ -7,13 +7,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from weakref import WeakValueDictionary
 
 import structlog
 
 from dextouch.episodes import EpisodeStore, check_id
 from dextouch.episodes.care import UPLOADS
-from dextouch.episodes.spool import SpoolWriter
-from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.episodes.spool import SpoolReader, SpoolWriter
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnavailableError
 from dextouch.schemas import (
     ID_TAKEN,
     BatchReceipt,
@@ -21,15 +22,50 @@ from dextouch.schemas import (
     RecordingAttributes,
     RecordingStatus,
 )
+from dextouch.streams import read_batch
 from services.episode_store.committing import Commit, commit_spool
-from services.episode_store.locks import KeyedLocks
-from services.episode_store.quotas import idle_seconds
-from services.episode_store.upload import put_batch, upload_status
+from services.episode_store.limits import idle_seconds
 
 logger = structlog.get_logger(__name__)
 
 # Maximum wait for the lock of a recording, which finishing a long take holds.
 PATIENCE_S = 20.0
+RETRY_AFTER_S = 1
+
+
+class KeyedLocks:
+    """One lock per recording, so that recordings do not block each other."""
+
+    def __init__(self, *, patience_s: float) -> None:
+        self._patience_s = patience_s
+        self._guard = threading.Lock()
+        # Those who hold or wait for a lock keep it alive, so that unknown ids cost no memory.
+        self._locks: WeakValueDictionary[str, threading.Lock] = WeakValueDictionary()
+
+    @contextmanager
+    def holding(self, key: str) -> Iterator[None]:
+        """Context manager that holds the lock of a key.
+
+        Raises:
+            UnavailableError: the lock was not released in `patience_s`.
+        """
+        with self._guard:
+            lock = self._locks.setdefault(key, threading.Lock())
+        if not lock.acquire(timeout=self._patience_s):
+            # The traceback would keep it alive.
+            del lock
+            raise UnavailableError(
+                f"{key}: still locked after {self._patience_s:g} s; try again later",
+                retry_after_s=RETRY_AFTER_S,
+            )
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def is_wanted(self, key: str) -> bool:
+        """Whether a key is locked or waited for."""
+        return key in self._locks
 
 
 class Ingest:
@@ -74,11 +110,11 @@ class Ingest:
             if path.exists():
                 spool = self._upload(recording_id)
                 _check_same(attributes, spool.attributes)
-                return upload_status(spool)
+                return _status(spool)
             spool = SpoolWriter(path, attributes, sync=self._sync)
             self._keep(recording_id, spool)
             logger.info("recording_created", recording_id=recording_id)
-            return upload_status(spool)
+            return _status(spool)
 
     def status(self, recording_id: str) -> RecordingStatus:
         """Status of an upload.
@@ -89,7 +125,7 @@ class Ingest:
         with self._working_on(recording_id):
             if self._store.exists(recording_id, kind="recording"):
                 return RecordingStatus(recording_id=recording_id, state="finished")
-            return upload_status(self._upload(recording_id))
+            return _status(self._upload(recording_id))
 
     def put_batch(self, recording_id: str, stream: str, number: int, data: bytes) -> BatchReceipt:
         """Store a batch; it is durable when this returns.
@@ -103,7 +139,7 @@ class Ingest:
             StorageFullError: no space; acknowledged batches are kept.
         """
         with self._working_on(recording_id):
-            return put_batch(self._upload(recording_id), stream, number, data)
+            return _put_batch(self._upload(recording_id), stream, number, data)
 
     def finish(self, recording_id: str, body: FinishRecording) -> RecordingStatus:
         """Commit a complete upload; idempotent.
@@ -212,7 +248,7 @@ def _check_same(got: RecordingAttributes, ours: RecordingAttributes) -> None:
 
 def _check_complete(spool: SpoolWriter, body: FinishRecording) -> None:
     recording_id = spool.attributes.recording_id
-    here = upload_status(spool).next_batch
+    here = _status(spool).next_batch
     if set(body.num_batches) != set(here):
         raise InvalidInputError(
             f"finish {recording_id}: got streams {sorted(body.num_batches)}, expected "
@@ -231,3 +267,44 @@ def _check_complete(spool: SpoolWriter, body: FinishRecording) -> None:
         raise ConflictError(f"finish {recording_id}: {listed}; send the rest first", **differing)
     if not any(here.values()):
         raise InvalidInputError(f"finish {recording_id}: a recording without a sample")
+
+
+def _status(spool: SpoolWriter) -> RecordingStatus:
+    """The batch that each stream expects next."""
+    names = [stream.name for stream in spool.attributes.streams]
+    return RecordingStatus(
+        recording_id=spool.attributes.recording_id,
+        state="open",
+        next_batch={name: spool.num_batches(name) for name in names},
+    )
+
+
+def _put_batch(spool: SpoolWriter, stream: str, number: int, data: bytes) -> BatchReceipt:
+    recording_id = spool.attributes.recording_id
+    expected = spool.num_batches(stream)
+    if number > expected:
+        raise ConflictError(
+            f"{recording_id} {stream}: got batch {number}, expected {expected}; "
+            "send the missing ones first",
+            got=number,
+            expected=expected,
+        )
+    descriptor = next(known for known in spool.attributes.streams if known.name == stream)
+    batch = read_batch(data, descriptor, number=number)
+    replayed = number < expected
+    if not replayed:
+        spool.append_record(batch, flush=True)
+    elif SpoolReader(spool.path).appended(stream, number) != batch.body:
+        raise ConflictError(
+            f"{recording_id} {stream}: batch {number} exists with other samples; "
+            "batches are immutable",
+            got=number,
+            expected=expected,
+        )
+    return BatchReceipt(
+        recording_id=recording_id,
+        stream=stream,
+        number=number,
+        num_samples=batch.num_samples,
+        replayed=replayed,
+    )

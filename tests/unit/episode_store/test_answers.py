@@ -9,7 +9,7 @@ from dextouch.streams import unpack
 from services.episode_store import reading as reading_module
 from services.episode_store.app import create_app
 from services.episode_store.reading import is_known
-from services.episode_store.routes.media import MSGPACK, WINDOW_MSGPACK
+from services.episode_store.routes import MSGPACK, WINDOW_MSGPACK
 from tests.unit.episode_store.episodes import write_episode
 
 WINDOW = "/v1/episodes/e-1/windows?start=2&num_steps=5"

@@ -11,14 +11,11 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import LimitExceededError, StorageFullError, UnavailableError
 from dextouch.schemas import BatchReceipt, FinishRecording, Problem
 from dextouch.streams import encode_batch
-from services.episode_store import admission as admission_module
 from services.episode_store import ingest as ingest_module
-from services.episode_store.admission import Admission, DiskReserve
+from services.episode_store import limits as limits_module
 from services.episode_store.app import create_app
-from services.episode_store.ingest import Ingest
-from services.episode_store.intake import CREATE_BYTES
-from services.episode_store.locks import KeyedLocks
-from services.episode_store.quotas import StationQuotas
+from services.episode_store.ingest import Ingest, KeyedLocks
+from services.episode_store.limits import CREATE_BYTES, Admission, StorageLimits
 
 PATH = "/v1/recordings/take-1/streams/glove_left/batches/0"
 
@@ -82,18 +79,21 @@ def test_admission_bounds_requests_and_bytes():
         pass
 
 
-def test_the_reserve_stays_free_but_for_finishing(tmp_path, monkeypatch):
-    real = DiskReserve(tmp_path / "not" / "there", min_free_bytes=0)
-    assert real.free_bytes() > 0
-    monkeypatch.setattr(admission_module, "free_bytes_of", lambda _: 1500)
-    reserve = DiskReserve(tmp_path / "not" / "there", min_free_bytes=1000)
-    reserve.check_upload(500)
+def test_the_reserve_stays_free_but_for_finishing(tmp_path, monkeypatch, attributes):
+    folder = tmp_path / "not" / "there" / ".uploads"
+    limits = StorageLimits(folder, recordings=dict, quota_bytes=None, min_free_bytes=1000)
+    assert limits.free_bytes() > 0
+    monkeypatch.setattr(limits_module, "free_bytes_of", lambda _: 1500)
+    limits.check_batch("take-1", 500)
     with pytest.raises(StorageFullError, match="bytes exceed the") as caught:
-        reserve.check_upload(501)
+        limits.check_batch("take-1", 501)
     assert caught.value.details["retry_after_s"] > 1
-    reserve.check_commit(1500)
+    limits.begin(attributes)
+    limits.add("take-1", 1500)
+    limits.check_finish("take-1")
+    limits.add("take-1", 1)
     with pytest.raises(StorageFullError):
-        reserve.check_commit(1501)
+        limits.check_finish("take-1")
 
 
 @pytest.mark.parametrize("bound", [{"max_batches_in_flight": 1}, {"max_bytes_in_flight": 1024}])
@@ -130,7 +130,7 @@ async def test_a_busy_store_answers_before_it_reads(settings, attributes, glove_
 def disk(monkeypatch):
     """A disk whose free bytes a test chooses."""
     free = {"bytes": 10**9}
-    monkeypatch.setattr(admission_module, "free_bytes_of", lambda _: free["bytes"])
+    monkeypatch.setattr(limits_module, "free_bytes_of", lambda _: free["bytes"])
     return free
 
 
@@ -190,10 +190,11 @@ def test_a_station_keeps_to_its_quota(start, attributes, batch_of, settings):
     client.create(attributes.model_copy(update={"recording_id": "take-2", "station": "other"}))
     send("take-2", 0)
     store = EpisodeStore(settings.store_url)
-    quotas = StationQuotas(store.root / ".uploads", recordings=dict, quota_bytes=quota)
+    folder = store.root / ".uploads"
+    limits = StorageLimits(folder, recordings=dict, quota_bytes=quota, min_free_bytes=0)
     with pytest.raises(StorageFullError):
-        quotas.check_upload("take-1", 45_000)
-    quotas.check_upload("take-2", 45_000)
+        limits.check_batch("take-1", 45_000)
+    limits.check_batch("take-2", 45_000)
     # Finished recordings count, too, until they are deleted.
     client.finish("take-1", {"glove_left": 4, "wrist_left": 0})
     used = client.recordings(station="bench").recordings[0].num_bytes

@@ -9,7 +9,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import CorruptDataError, UnavailableError
 from dextouch.schemas import FinishRecording
 from dextouch.streams import encode_batch
-from services.episode_store.commit_process import CommitProcess
+from services.episode_store.committing import CommitProcess
 from services.episode_store.ingest import Ingest
 
 COUNTS = FinishRecording(num_batches={"glove_left": 1, "wrist_left": 0}, success=True)

@@ -23,7 +23,6 @@ from dextouch.errors import (
 from dextouch.schemas import FinishRecording, LedgerEntry
 from dextouch.streams import SampleBatch, encode_batch, pack
 from services.episode_store import ingest as ingest_module
-from services.episode_store import upload as upload_module
 from services.episode_store.ingest import Ingest
 from tests.unit.episodes.spooled_batches import GOLDEN, golden_batch
 
@@ -200,7 +199,7 @@ def test_a_crash_before_the_answer_counts_once(store, attributes, send, batch_of
     send(first, 0)
     with monkeypatch.context() as patch:
         # The process dies after the samples were spooled and before the station hears of it.
-        patch.setattr(upload_module, "BatchReceipt", _die)
+        patch.setattr(ingest_module, "BatchReceipt", _die)
         with pytest.raises(KeyboardInterrupt):
             send(first, 1)
     first.close()

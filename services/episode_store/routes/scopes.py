@@ -1,8 +1,0 @@
-"""Access scopes of the store: read and write."""
-
-from fastapi import Depends
-
-from dextouch.serving import RequireScope
-
-MAY_READ = Depends(RequireScope("store_read"))
-MAY_WRITE = Depends(RequireScope("store_write"))
