@@ -154,11 +154,8 @@ class Catalog:
         self, wanted: EpisodeFilter, *, limit: int, offset: int = 0, after: str | None = None
     ) -> EpisodeList:
         """One page of matching episodes, sorted by id, after the id `after`."""
-        found = _matching(self._episodes.entries(), wanted)
-        page, next_after = _page(found, limit, offset, after)
-        return EpisodeList.model_construct(
-            episodes=tuple(page), num_matching=len(found), next_after=next_after
-        )
+        page, facts = _page(self._episodes.entries(), wanted, limit, offset, after)
+        return EpisodeList.model_construct(episodes=page, **facts)
 
     def recordings(
         self,
@@ -169,11 +166,9 @@ class Catalog:
         after: str | None = None,
     ) -> RecordingList:
         """One page of matching finished recordings, sorted by id, after the id `after`."""
-        found = _matching(self._recordings.entries(), wanted or CatalogFilter())
-        page, next_after = _page(found, limit, offset, after)
-        return RecordingList.model_construct(
-            recordings=tuple(page), num_matching=len(found), next_after=next_after
-        )
+        wanted = wanted or CatalogFilter()
+        page, facts = _page(self._recordings.entries(), wanted, limit, offset, after)
+        return RecordingList.model_construct(recordings=page, **facts)
 
     def hours(self, wanted: EpisodeFilter) -> CatalogHours:
         """Total duration of matching episodes by task, domain and origin."""
@@ -236,13 +231,20 @@ def _matching(entries: Mapping[str, Entry[S]], wanted: CatalogFilter) -> dict[st
 
 
 def _page(
-    found: Mapping[str, S], limit: int, offset: int, after: str | None
-) -> tuple[list[S], str | None]:
+    entries: Mapping[str, Entry[S]],
+    wanted: CatalogFilter,
+    limit: int,
+    offset: int,
+    after: str | None,
+) -> tuple[tuple[S, ...], dict[str, Any]]:
+    """The summaries of a page, and the number of all that match with the id to go on after."""
+    found = _matching(entries, wanted)
     names = list(found)
     first = offset + (0 if after is None else bisect_right(names, after))
     chosen = names[first : first + limit]
-    is_last = first + limit >= len(names)
-    return [found[name] for name in chosen], None if is_last else chosen[-1]
+    next_after = None if first + limit >= len(names) else chosen[-1]
+    facts = {"num_matching": len(found), "next_after": next_after}
+    return tuple(found[name] for name in chosen), facts
 
 
 def _hours_row(group: list[EpisodeSummary]) -> HoursRow:

@@ -14,6 +14,7 @@ from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Domain, EpisodeSummary, Origin, RecordingSummary
 
 S = TypeVar("S", EpisodeSummary, RecordingSummary)
+_COMPARED = ("task", "operator", "station", "domain", "success", "recovered", "origin")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,7 @@ class CatalogFilter(FrozenModel):
 
     def matcher(self) -> Callable[[Entry[S]], bool]:
         """Compile the filter to a fast predicate."""
-        fields = [name for name in self._fields() if getattr(self, name) is not None]
+        fields = [name for name in _COMPARED if getattr(self, name, None) is not None]
         get = attrgetter(*fields) if fields else None
         expected = get(self) if get else None
         bounds = [quality_bound(text) for text in self.min_quality]
@@ -87,17 +88,11 @@ class CatalogFilter(FrozenModel):
 
         return matches
 
-    def _fields(self) -> tuple[str, ...]:
-        return ("task", "operator", "station", "domain", "success", "recovered")
-
 
 class EpisodeFilter(CatalogFilter):
     """Filter of episodes."""
 
     origin: Origin | None = None
-
-    def _fields(self) -> tuple[str, ...]:
-        return (*super()._fields(), "origin")
 
 
 class Page(FrozenModel):

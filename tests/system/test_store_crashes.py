@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.image_queue import MAX_WAITING_IMAGES
 from dextouch.episodes.spool import SpoolReader
+from dextouch.episodes.stream_writer import MAX_WAITING_IMAGES
 from tests.system import take_source
 from tests.system.crash_child import (
     APPENDED,

@@ -35,12 +35,14 @@ from dextouch.episodes.care import (
 from dextouch.errors import InvalidInputError, NotFoundError, StorageError
 from dextouch.schemas import (
     EpisodeAttributes,
+    EpisodeList,
     EpisodeSummary,
     RecordingAttributes,
+    RecordingList,
     RecordingSummary,
     json_ready,
 )
-from services.episode_store.catalog import Catalog, CatalogFilter, EpisodeFilter
+from services.episode_store.catalog import Catalog, EpisodeFilter
 from services.episode_store.commands.context import (
     EXIT_DAMAGED,
     Context,
@@ -68,41 +70,41 @@ def list_items(context: Context) -> Outcome:
     result: dict[str, Any] = {"num_matching": 0, "next_after": None}
     totals = []
     for each in KINDS if kind is None else (kind,):
-        list_one = _list_episodes if each == "episode" else _list_recordings
-        found, num_in_all = list_one(context, catalog)
+        found, num_in_all = _list_kind(context, catalog, each)
         result |= found | {"num_matching": result["num_matching"] + found["num_matching"]}
         totals.append(f"{num_in_all} {each}" + "s" * (num_in_all != 1))
     if kind != "episode" and root is not None:
-        result["unfinished"] = _list_interrupted(context, root)
+        interrupted = list(interrupted_takes(root))
+        result["unfinished"] = [name for _, name in interrupted]
+        for each, name in interrupted:
+            context.say(f"{name}  {each}  interrupted; `dextouch store repair` completes it")
     if not result["num_matching"] and not result.get("unfinished"):
         context.say(f"nothing matches, of {' and '.join(totals)}")
     return result, 0
 
 
-def _list_episodes(context: Context, catalog: Catalog) -> tuple[dict[str, Any], int]:
-    """List matching episodes; returns them and the total number."""
+def _list_kind(context: Context, catalog: Catalog, kind: Kind) -> tuple[dict[str, Any], int]:
+    """List matching items of a kind; returns them and the number of all."""
     options = context.options
     wanted = EpisodeFilter(task=options.task, domain=options.domain, origin=options.origin)
-    found = catalog.episodes(wanted, limit=sys.maxsize)
-    for row in found.episodes:
-        context.say(
-            f"{row.episode_id}  episode  {row.task}  {row.domain}  {row.origin}  "
-            f"{row.num_steps} steps  {_outcome(row)}"
-        )
-    return json_ready(found), catalog.episodes(EpisodeFilter(), limit=1).num_matching
-
-
-def _list_recordings(context: Context, catalog: Catalog) -> tuple[dict[str, Any], int]:
-    """List matching recordings; returns them and the total number."""
-    options = context.options
-    wanted = CatalogFilter(task=options.task, domain=options.domain)
-    found = catalog.recordings(wanted, limit=sys.maxsize)
-    for row in found.recordings:
-        context.say(
-            f"{row.recording_id}  recording  {row.task}  {row.domain}  "
-            f"{sum(row.num_samples.values())} samples  {_outcome(row)}"
-        )
-    return json_ready(found), catalog.recordings(CatalogFilter(), limit=1).num_matching
+    found: EpisodeList | RecordingList
+    if kind == "episode":
+        found = catalog.episodes(wanted, limit=sys.maxsize)
+        total = catalog.episodes(EpisodeFilter(), limit=1).num_matching
+        for episode in found.episodes:
+            context.say(
+                f"{episode.episode_id}  episode  {episode.task}  {episode.domain}  "
+                f"{episode.origin}  {episode.num_steps} steps  {_outcome(episode)}"
+            )
+    else:
+        found = catalog.recordings(wanted, limit=sys.maxsize)
+        total = catalog.recordings(limit=1).num_matching
+        for recording in found.recordings:
+            context.say(
+                f"{recording.recording_id}  recording  {recording.task}  {recording.domain}  "
+                f"{sum(recording.num_samples.values())} samples  {_outcome(recording)}"
+            )
+    return json_ready(found), total
 
 
 def _outcome(
@@ -111,29 +113,13 @@ def _outcome(
     return _OUTCOMES[row.success] + "  recovered" * row.recovered
 
 
-def _list_interrupted(context: Context, root: Path) -> list[str]:
-    """List interrupted takes, whose stages `recover` can complete; returns their names."""
-    names = []
-    for kind, name in interrupted_takes(root):
-        names.append(name)
-        context.say(f"{name}  {kind}  interrupted; `dextouch store repair` completes it")
-    return names
-
-
 def _list_trash(context: Context) -> Outcome:
-    entries = context.store.trash_list()
-    for entry in entries:
-        size = readable_size(entry.num_bytes)
-        context.say(f"{entry.item_id}  {entry.kind}  deleted {_date(entry.deleted_at_ns)}  {size}")
-    rows = [
-        {
-            "kind": entry.kind,
-            "id": entry.item_id,
-            "deleted_at": _date(entry.deleted_at_ns),
-            "num_bytes": entry.num_bytes,
-        }
-        for entry in entries
-    ]
+    rows = []
+    for entry in context.store.trash_list():
+        date, size = _date(entry.deleted_at_ns), readable_size(entry.num_bytes)
+        context.say(f"{entry.item_id}  {entry.kind}  deleted {date}  {size}")
+        known = {"kind": entry.kind, "id": entry.item_id}
+        rows.append(known | {"deleted_at": date, "num_bytes": entry.num_bytes})
     return {"trash": rows}, 0
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from dextouch.episodes.sources import LocalGroup as LocalGroup
     from dextouch.episodes.store import EpisodeStore as EpisodeStore
     from dextouch.episodes.store import local_folder as local_folder
+    from dextouch.episodes.stream_writer import WriteOptions as WriteOptions
     from dextouch.episodes.trash import TRASH_KINDS as TRASH_KINDS
     from dextouch.episodes.trash import TrashKind as TrashKind
     from dextouch.episodes.video import FULL_FORM as FULL_FORM
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
     from dextouch.episodes.window import mean_over_ranges as mean_over_ranges
     from dextouch.episodes.window import nearest_indices as nearest_indices
     from dextouch.episodes.window import step_ranges as step_ranges
-    from dextouch.episodes.write_options import WriteOptions as WriteOptions
     from dextouch.episodes.writer import EpisodeWriter as EpisodeWriter
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)

@@ -38,8 +38,8 @@ from dextouch.episodes.staging_recovery import (
     samples_of,
     sweep_stages,
 )
+from dextouch.episodes.stream_writer import WriteOptions
 from dextouch.episodes.uploads import delete_group, group_key, sweep_orphans, upload_group
-from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import (
     ConflictError,

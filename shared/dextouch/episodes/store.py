@@ -32,6 +32,7 @@ from dextouch.episodes.staging_recovery import (
     recover_stage,
     sweep_stages,
 )
+from dextouch.episodes.stream_writer import WriteOptions
 from dextouch.episodes.trash import (
     TrashEntry,
     TrashKind,
@@ -41,7 +42,6 @@ from dextouch.episodes.trash import (
     remove_for_good,
     restore_from_trash,
 )
-from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter, write_blocks
 from dextouch.errors import (
     ConflictError,

@@ -1,7 +1,10 @@
 """Writer of one stream of a group: validates blocks, encodes images, appends to the arrays."""
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -14,15 +17,39 @@ from dextouch.episodes.format import (
     stream_arrays,
 )
 from dextouch.episodes.image_codecs import pack_chunk
-from dextouch.episodes.image_queue import ImageQueue
 from dextouch.episodes.shard_writer import ShardWriter
 from dextouch.episodes.video import GopEncoder, VideoSettings, check_video_size, is_keyframe
-from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, StorageError
+from dextouch.frozen_model import FrozenModel
 from dextouch.images import DEFAULT_QUALITY, encode_jpeg
 from dextouch.streams import StreamDescriptor, check_encoded_image
 
+MAX_WAITING_IMAGES = 32
+WhenFull = Literal["wait", "drop"]
 Stamps = Mapping[str, np.ndarray]
+
+
+class WriteOptions(FrozenModel):
+    """Settings of a writer.
+
+    Attributes:
+        sync: sync every storage chunk to disk. Otherwise only committed groups survive a power
+            loss, while everything written survives a crash of the process.
+        threads: whether images are encoded in background threads, one per camera.
+        when_full: backpressure of the encoder queue: "wait" blocks the caller, "drop" drops and
+            counts the image, as a live take needs.
+        recoverable: whether an interrupted group is kept: at once after an exception or Ctrl-C, by
+            `EpisodeStore.recover` after a kill or on a full disk. None: recordings only, since
+            episodes can be recomputed from their recording. False suits writers that can start
+            over, such as an import.
+        video: quality of `h264` streams.
+    """
+
+    sync: bool = False
+    threads: bool = True
+    when_full: WhenFull = "wait"
+    recoverable: bool | None = None
+    video: VideoSettings = VideoSettings()
 
 
 class StreamWriter:
@@ -47,7 +74,7 @@ class StreamWriter:
         self._codec = codec_of(descriptor)
         self._dtype = descriptor.numpy_dtype()
         self._images = _EncodedImages(descriptor, options.video)
-        self._queue: ImageQueue | None = None
+        self._queue: _ImageQueue | None = None
         entries = stream_arrays(descriptor, kind)
         self.arrays = {
             name: ShardWriter(stage, name, entry, sync=options.sync)
@@ -94,25 +121,25 @@ class StreamWriter:
         # Once there is a queue, everything goes through it to keep the order.
         if self._queue is None:
             name, when_full = self.descriptor.name, self._options.when_full
-            self._queue = ImageQueue(self._write, name=name, when_full=when_full)
+            self._queue = _ImageQueue(self._write, name=name, when_full=when_full)
         self._queue.put(values, stamps)
 
     def _check_order(self, stamps_ns: np.ndarray) -> None:
-        least, first_ns, last_ns = self._least_step_ns, int(stamps_ns[0]), self._last_stamp_ns
-        if last_ns is not None and first_ns - last_ns < least:
-            raise self._disorder(first_ns - last_ns, 0)
+        first_ns, last_ns, least = int(stamps_ns[0]), self._last_stamp_ns, self._least_step_ns
         # Compared, not subtracted: the difference of two extreme stamps can overflow.
         earlier, later = stamps_ns[:-1], stamps_ns[1:]
         wrong = later <= earlier if least else later < earlier
-        if wrong.any():
-            bad = int(wrong.argmax())
-            raise self._disorder(int(later[bad]) - int(earlier[bad]), bad + 1)
-        self._last_stamp_ns = int(stamps_ns[-1])
-
-    def _disorder(self, step_ns: int, place: int) -> InvalidInputError:
-        return InvalidInputError(
+        if last_ns is not None and first_ns - last_ns < least:
+            bad, step_ns = 0, first_ns - last_ns
+        elif wrong.any():
+            bad = int(wrong.argmax()) + 1
+            step_ns = int(stamps_ns[bad]) - int(stamps_ns[bad - 1])
+        else:
+            self._last_stamp_ns = int(stamps_ns[-1])
+            return
+        raise InvalidInputError(
             f"{self.descriptor.name}: stamp goes from sample to sample by {step_ns} ns before "
-            f"sample {place} of this block, expected at least {self._least_step_ns} ns; "
+            f"sample {bad} of this block, expected at least {least} ns; "
             "sort the samples or drop the repeated ones"
         )
 
@@ -257,3 +284,62 @@ class _EncodedImages:
             self._video = GopEncoder(height, width, rate_hz=rate_hz, settings=self._settings)
             self.encoder = self._video.description
         return self._video.encode(image)
+
+
+class _ImageQueue:
+    """Writes blocks of images of a stream in order, in a background thread, with backpressure."""
+
+    def __init__(
+        self, write: Callable[[np.ndarray, Stamps], None], *, name: str, when_full: WhenFull
+    ) -> None:
+        self.num_dropped = 0
+        self._write, self._when_full = write, when_full
+        self._waiting: deque[tuple[Future[None], int]] = deque()
+        self._spare: deque[np.ndarray] = deque(maxlen=MAX_WAITING_IMAGES)
+        self._num_images = 0
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix=f"encode-{name}")
+
+    def put(self, values: np.ndarray, stamps: Stamps) -> None:
+        """Queue a copy of a block; re-raises the exception of an earlier one."""
+        while self._waiting and self._waiting[0][0].done():
+            self._take_oldest()
+        # A block larger than the queue is accepted when the queue is empty.
+        while self._waiting and self._num_images + len(values) > MAX_WAITING_IMAGES:
+            if self._when_full == "drop":
+                self.num_dropped += len(values)
+                return
+            self._take_oldest()
+        kept = {name: column.copy() for name, column in stamps.items()}
+        work = self._thread.submit(self._hand_on, self._copy(values), kept)
+        self._waiting.append((work, len(values)))
+        self._num_images += len(values)
+
+    def drain(self) -> None:
+        """Wait until the queue is empty; raises as `put`."""
+        while self._waiting:
+            self._take_oldest()
+
+    def stop(self, *, drop: bool) -> None:
+        """End the thread, after discarding or writing the queued blocks."""
+        self._thread.shutdown(cancel_futures=drop)
+
+    def _copy(self, values: np.ndarray) -> np.ndarray:
+        if values.dtype == object:
+            return values.copy()
+        # Reused buffers: page faults of fresh memory cost more than copying the image.
+        while self._spare:
+            spare = self._spare.pop()
+            if spare.shape == values.shape:
+                np.copyto(spare, values)
+                return spare
+        return values.copy()
+
+    def _hand_on(self, values: np.ndarray, stamps: Stamps) -> None:
+        self._write(values, stamps)
+        if values.dtype != object:
+            self._spare.append(values)
+
+    def _take_oldest(self) -> None:
+        done, num_images = self._waiting.popleft()
+        self._num_images -= num_images
+        done.result()

@@ -20,8 +20,7 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.staged_group import commit_stage, write_stage
 from dextouch.episodes.staging_recovery import RecoveredGroup, recover_stage
-from dextouch.episodes.stream_writer import StreamWriter
-from dextouch.episodes.write_options import WriteOptions
+from dextouch.episodes.stream_writer import StreamWriter, WriteOptions
 from dextouch.errors import (
     ConflictError,
     DexTouchError,
