@@ -69,8 +69,8 @@ class Uploader:
         self._store = store
         self._period_s = period_s
         self._keep_uploaded = keep_uploaded
-        self._errors: dict[str, str] = {}
-        self._num_refusals: dict[str, int] = {}
+        # The last error of each take, and how often in a row the store refused it.
+        self._failures: dict[str, tuple[str, int]] = {}
         # How long the store asked to be left alone.
         self._retry_after_s = 0.0
         self._stopping = threading.Event()
@@ -123,8 +123,7 @@ class Uploader:
                 "see GET /v1/uploads"
             )
         # Forgotten first: the upload may begin as soon as the file is gone.
-        self._num_refusals.pop(recording_id, None)
-        self._errors.pop(recording_id, None)
+        self._failures.pop(recording_id, None)
         with disk_errors(f"send {recording_id!r} again"):
             (path / REFUSED_FILE).unlink(missing_ok=True)
         return self._status(path, None)
@@ -146,8 +145,7 @@ class Uploader:
             try:
                 if self._upload(path):
                     done.append(path.name)
-                    self._errors.pop(path.name, None)
-                    self._num_refusals.pop(path.name, None)
+                    self._failures.pop(path.name, None)
                     give_back_free_memory()
             except DexTouchError as error:
                 self._note_failure(path, error)
@@ -157,7 +155,8 @@ class Uploader:
         return done
 
     def _status(self, path: Path, damage: str | None) -> UploadStatus:
-        name, error = path.name, damage or self._errors.get(path.name)
+        last_error, _ = self._failures.get(path.name, (None, 0))
+        error = damage or last_error
         uploaded, stored_as, reason = (path / UPLOADED_FILE).exists(), None, _refusal(path)
         if uploaded:
             stored_as = _stored_as(path)
@@ -166,7 +165,7 @@ class Uploader:
         elif self._store is None and error is None:
             error = NO_STORE
         return UploadStatus(
-            recording_id=name,
+            recording_id=path.name,
             uploaded=uploaded,
             stored_as=stored_as,
             refused=reason is not None,
@@ -176,14 +175,13 @@ class Uploader:
     def _note_failure(self, path: Path, error: DexTouchError) -> None:
         """Remember why a take was not sent, and set it aside once it is clear that it never is."""
         name = path.name
-        if self._errors.get(name) != error.message:
+        last_error, num_refusals = self._failures.get(name, ("", 0))
+        if last_error != error.message:
             logger.warning("fail_upload", recording_id=name, error=error.message)
-        self._errors[name] = error.message
-        if not isinstance(error, REFUSALS) or "retry_after_s" in error.details:
-            self._num_refusals.pop(name, None)
-            return
-        self._num_refusals[name] = self._num_refusals.get(name, 0) + 1
-        if self._num_refusals[name] < MAX_REFUSALS:
+        is_refusal = isinstance(error, REFUSALS) and "retry_after_s" not in error.details
+        num_refusals = num_refusals + 1 if is_refusal else 0
+        self._failures[name] = (error.message, num_refusals)
+        if num_refusals < MAX_REFUSALS:
             return
         try:
             with disk_errors(f"set take {name!r} aside"):
@@ -202,7 +200,7 @@ class Uploader:
         spool = SpoolReader(path)
         if not spool.closed or self._store is None:
             return False
-        status = self._begin(self._store, spool.attributes)
+        status = _begin(self._store, spool.attributes)
         recording_id = status.recording_id
         num_batches = {}
         for name, descriptor in spool.streams.items():
@@ -230,14 +228,15 @@ class Uploader:
                 shutil.rmtree(path)
         return True
 
-    def _begin(self, store: EpisodeStoreClient, attributes: RecordingAttributes) -> RecordingStatus:
-        """Begin an upload, under its second id where another recording has the first."""
-        try:
-            return store.create(attributes)
-        except ConflictError as error:
-            if error.details.get("reason") != ID_TAKEN:
-                raise
-        return store.create(attributes.model_copy(update={"recording_id": second_id(attributes)}))
+
+def _begin(store: EpisodeStoreClient, attributes: RecordingAttributes) -> RecordingStatus:
+    """Begin an upload, under its second id where another recording has the first."""
+    try:
+        return store.create(attributes)
+    except ConflictError as error:
+        if error.details.get("reason") != ID_TAKEN:
+            raise
+    return store.create(attributes.model_copy(update={"recording_id": second_id(attributes)}))
 
 
 def second_id(attributes: RecordingAttributes) -> str:

@@ -13,8 +13,7 @@ from dextouch.serving import create_service_app, serve
 from services.episode_store.catalog import Catalog
 from services.episode_store.committing import CommitProcess
 from services.episode_store.ingest import Ingest
-from services.episode_store.intake import Intake
-from services.episode_store.limits import StorageLimits
+from services.episode_store.intake import Intake, StorageLimits
 from services.episode_store.reading import StoreReader
 from services.episode_store.routes import reading_router, uploads_router
 from services.episode_store.settings import EpisodeStoreSettings

@@ -2,6 +2,7 @@
 
 import shutil
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,7 +12,7 @@ from weakref import WeakValueDictionary
 
 import structlog
 
-from dextouch.episodes import EpisodeStore, check_id
+from dextouch.episodes import EpisodeStore, check_id, disk_errors
 from dextouch.episodes.care import UPLOADS
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnavailableError
@@ -24,7 +25,6 @@ from dextouch.schemas import (
 )
 from dextouch.streams import read_batch
 from services.episode_store.committing import Commit, commit_spool
-from services.episode_store.limits import idle_seconds
 
 logger = structlog.get_logger(__name__)
 
@@ -234,6 +234,16 @@ class Ingest:
 
     def _path(self, recording_id: str) -> Path:
         return self.folder / recording_id
+
+
+def idle_seconds(path: Path) -> float:
+    """Seconds since the last write to an upload's folder."""
+    with disk_errors(f"look at upload {path.name}"):
+        try:
+            newest = max(file.stat().st_mtime for file in [path, *path.iterdir()])
+        except FileNotFoundError:
+            return 0.0
+    return max(0.0, time.time() - newest)
 
 
 def _check_same(got: RecordingAttributes, ours: RecordingAttributes) -> None:

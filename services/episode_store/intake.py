@@ -1,14 +1,21 @@
-"""Intake of uploads: applies the limits before the ingest, and counts what comes."""
+"""Intake of uploads: limits of batches in flight, disk and stations before the ingest; metrics."""
 
+import os
+import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 
 import anyio
 import anyio.to_thread
+import structlog
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
-from dextouch.errors import LimitExceededError, StorageFullError
+from dextouch.episodes import disk_errors, folder_bytes
+from dextouch.episodes.spool import read_attributes
+from dextouch.errors import LimitExceededError, NotFoundError, StorageError, StorageFullError
 from dextouch.schemas import (
     BatchReceipt,
     ExpireUploads,
@@ -16,12 +23,215 @@ from dextouch.schemas import (
     RecordingAttributes,
     RecordingStatus,
     UploadList,
+    UploadSummary,
 )
 from dextouch.streams import MAX_BATCH_BYTES
-from services.episode_store.ingest import Ingest
-from services.episode_store.limits import Admission, StorageLimits
+from services.episode_store.ingest import Ingest, idle_seconds
+
+logger = structlog.get_logger(__name__)
 
 SECONDS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+
+
+BUSY_RETRY_S = 1
+FULL_RETRY_S = 30
+# Maximum age of the sum of finished recordings; our own commits are counted at once.
+REFRESH_S = 1.0
+# Allowance for an upload's attributes and empty files.
+CREATE_BYTES = 1 << 16
+
+
+class Admission:
+    """Limits the batches in flight, by number and by the bytes of their bodies (backpressure).
+
+    A batch is admitted before its body is read, so a refused one costs no memory. A single batch is
+    always admitted.
+    """
+
+    def __init__(self, *, max_requests: int, max_bytes: int) -> None:
+        self._max_requests, self._max_bytes = max_requests, max_bytes
+        self._num_requests = self._num_bytes = 0
+        self._guard = threading.Lock()
+
+    @contextmanager
+    def admitted(self, num_bytes: int) -> Iterator[None]:
+        """Context manager that counts a body of this size while it is read and written.
+
+        Raises:
+            LimitExceededError: with `retry_after_s`, so the answer is 429.
+        """
+        with self._guard:
+            full = self._num_requests >= self._max_requests or (
+                self._num_requests and self._num_bytes + num_bytes > self._max_bytes
+            )
+            if full:
+                raise LimitExceededError(
+                    f"store is busy: {self._num_requests} batches with {self._num_bytes} bytes "
+                    f"are being written, allowed are {self._max_requests} and {self._max_bytes}; "
+                    f"send the batch again in {BUSY_RETRY_S} s",
+                    reason="busy",
+                    retry_after_s=BUSY_RETRY_S,
+                )
+            self._num_requests += 1
+            self._num_bytes += num_bytes
+        try:
+            yield
+        finally:
+            with self._guard:
+                self._num_requests -= 1
+                self._num_bytes -= num_bytes
+
+
+def free_bytes_of(folder: Path) -> int:
+    """Free disk space at a folder, which need not exist yet."""
+    with disk_errors(f"measure free space of {folder}"):
+        while not folder.exists():
+            folder = folder.parent
+        state = os.statvfs(folder)
+    return state.f_bavail * state.f_frsize
+
+
+@dataclass
+class _Account:
+    station: str
+    num_bytes: int
+
+
+class StorageLimits:
+    """Disk usage by uploads: a reserve stays free, and each station keeps to its quota.
+
+    Unfinished uploads and finished recordings count. The reserve is for finishing uploads, which
+    copies them. Thread-safe. Every check raises StorageFullError with `retry_after_s`; nothing was
+    written then.
+
+    Args:
+        folder: of the unfinished uploads.
+        recordings: bytes of finished recordings by station.
+        quota_bytes: of one station; None is unlimited.
+        min_free_bytes: the reserve.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        recordings: Callable[[], dict[str, int]],
+        quota_bytes: int | None,
+        min_free_bytes: int,
+    ) -> None:
+        self._folder, self._recordings = folder, recordings
+        self._quota, self._min_free = quota_bytes, min_free_bytes
+        self._guard = threading.Lock()
+        self._accounts: dict[str, _Account] = {
+            path.name: _Account(attributes.station, folder_bytes(path))
+            for path, attributes in self._spools()
+        }
+        self._finished: tuple[float, dict[str, int]] | None = None
+
+    @property
+    def num_open(self) -> int:
+        """Number of unfinished uploads."""
+        return len(self._accounts)
+
+    def free_bytes(self) -> int:
+        """Free bytes of the disk, including the reserve."""
+        return free_bytes_of(self._folder.parent)
+
+    def check_new(self, station: str) -> None:
+        """Check that a station may begin an upload."""
+        self._check_disk(CREATE_BYTES, self._min_free, "upload")
+        self._check_quota(station, CREATE_BYTES)
+
+    def check_batch(self, recording_id: str, num_bytes: int) -> None:
+        """Check that so many bytes of an upload may come."""
+        self._check_disk(num_bytes, self._min_free, "upload")
+        account = self._accounts.get(recording_id)
+        if account is not None:
+            self._check_quota(account.station, num_bytes)
+
+    def check_finish(self, recording_id: str) -> None:
+        """Check that an upload can be copied; this may use the reserve."""
+        account = self._accounts.get(recording_id)
+        self._check_disk(0 if account is None else account.num_bytes, 0, "finish")
+
+    def begin(self, attributes: RecordingAttributes) -> None:
+        """Register a new upload."""
+        with self._guard:
+            self._accounts.setdefault(attributes.recording_id, _Account(attributes.station, 0))
+
+    def add(self, recording_id: str, num_bytes: int) -> None:
+        """Add bytes of an upload."""
+        with self._guard:
+            if recording_id in self._accounts:
+                self._accounts[recording_id].num_bytes += num_bytes
+
+    def end(self, recording_id: str) -> None:
+        """Unregister an upload that was finished or dropped."""
+        with self._guard:
+            self._accounts.pop(recording_id, None)
+            self._finished = None
+
+    def idle(self, *, idle_s: float) -> UploadList:
+        """Uploads that have been idle for `idle_s`, by id."""
+        found = [
+            UploadSummary(
+                recording_id=path.name,
+                station=attributes.station,
+                task=attributes.task,
+                num_bytes=folder_bytes(path),
+                idle_s=idle_seconds(path),
+            )
+            for path, attributes in self._spools()
+        ]
+        return UploadList(uploads=tuple(upload for upload in found if upload.idle_s >= idle_s))
+
+    def _check_disk(self, num_bytes: int, reserve: int, what: str) -> None:
+        free = self.free_bytes()
+        if free - num_bytes < reserve:
+            raise StorageFullError(
+                f"{what}: {num_bytes} bytes exceed the {free} free bytes ({reserve} reserved); "
+                "acknowledged batches are kept, free space on the store's disk",
+                reason="disk",
+                got=free,
+                expected=reserve + num_bytes,
+                retry_after_s=FULL_RETRY_S,
+            )
+
+    def _check_quota(self, station: str, num_bytes: int) -> None:
+        if self._quota is None:
+            return
+        used = self._used(station)
+        if used + num_bytes > self._quota:
+            raise StorageFullError(
+                f"station {station!r}: {used} bytes are in use and {num_bytes} more were sent, "
+                f"allowed are {self._quota}; delete recordings or expire uploads of this station",
+                reason="quota",
+                got=used + num_bytes,
+                expected=self._quota,
+                retry_after_s=FULL_RETRY_S,
+            )
+
+    def _used(self, station: str) -> int:
+        now = time.monotonic()
+        with self._guard:
+            if self._finished is None or now - self._finished[0] > REFRESH_S:
+                self._finished = (now, self._recordings())
+            uploads = (a.num_bytes for a in self._accounts.values() if a.station == station)
+            return self._finished[1].get(station, 0) + sum(uploads)
+
+    def _spools(self) -> list[tuple[Path, RecordingAttributes]]:
+        found = []
+        with disk_errors("list uploads"):
+            paths = sorted(self._folder.iterdir()) if self._folder.is_dir() else []
+        # A name with a dot is an upload that is still being created.
+        for path in (path for path in paths if "." not in path.name):
+            try:
+                found.append((path, read_attributes(path)))
+            except NotFoundError:
+                continue  # no upload, or finished while we were listing
+            except StorageError as error:
+                logger.warning("damaged_upload", recording_id=path.name, reason=error.message)
+        return found
 
 
 class Intake:

@@ -17,8 +17,7 @@ from dextouch.schemas import (
     UploadList,
 )
 from dextouch.serving import AS_SET, JSON, MSGPACK, OCTETS, RequireScope, takes
-from services.episode_store.catalog import Catalog
-from services.episode_store.filters import EpisodeFilter, EpisodeQuery, RecordingQuery
+from services.episode_store.catalog import Catalog, EpisodeFilter, EpisodeQuery, RecordingQuery
 from services.episode_store.intake import Intake
 from services.episode_store.reading import Answer, SpanQuery, StoreReader, WindowQuery
 

@@ -175,7 +175,7 @@ class Bucket:
         self.address = address
         options = address.options
         # Blocks by key and version of their object, and number.
-        self.cache: LruCache[bytes] = LruCache(options.cache_bytes, len)
+        self.cache = LruCache(options.cache_bytes)
         config: Any = options.model_dump(exclude=_NOT_PASSED_ON, exclude_none=True)
         given = options.allow_http
         client: Any = None if given is None else {"allow_http": given}

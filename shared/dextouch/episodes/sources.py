@@ -1,16 +1,15 @@
 """File access for group readers, independent of the backend; local files are memory-mapped."""
 
 import mmap
-import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
+from functools import lru_cache
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from dextouch.episodes.files import disk_errors
 
-V = TypeVar("V")
 # Each mapping holds a file descriptor, and the usual limit is 1024 per process.
 MAX_MAPPED_FILES = 192
 
@@ -46,14 +45,16 @@ class GroupFiles(Protocol):
         ...
 
 
-class LruCache(Generic[V]):
-    """Thread-safe cache that evicts the least recently used values beyond a total weight."""
+class LruCache:
+    """Thread-safe cache of bytes that evicts the least recently used ones beyond a total size."""
 
-    def __init__(self, capacity: int, weigh: Callable[[V], int]) -> None:
-        self.capacity, self._weigh = capacity, weigh
-        self.forget()
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self._guard = threading.Lock()
+        self._values: OrderedDict[Hashable, bytes] = OrderedDict()
+        self._size = 0
 
-    def get(self, key: Hashable) -> V | None:
+    def get(self, key: Hashable) -> bytes | None:
         """The value of a key; None if it is not in the cache."""
         with self._guard:
             value = self._values.get(key)
@@ -61,25 +62,13 @@ class LruCache(Generic[V]):
                 self._values.move_to_end(key)
         return value
 
-    def put(self, key: Hashable, value: V) -> None:
+    def put(self, key: Hashable, value: bytes) -> None:
         """Add or replace a value."""
         with self._guard:
-            before = self._values.pop(key, None)
-            self._weight += self._weigh(value) - (0 if before is None else self._weigh(before))
+            self._size += len(value) - len(self._values.pop(key, b""))
             self._values[key] = value
-            while self._weight > self.capacity:
-                self._weight -= self._weigh(self._values.popitem(last=False)[1])
-
-    def forget(self) -> None:
-        """Drop all values, and the lock that another thread may have held at a fork."""
-        self._guard = threading.Lock()
-        self._values: OrderedDict[Hashable, V] = OrderedDict()
-        self._weight = 0
-
-
-# Evicted mappings are dropped, not closed: readers may still use them, and the last one frees them.
-_MAPPED: LruCache[mmap.mmap] = LruCache(MAX_MAPPED_FILES, lambda _: 1)
-os.register_at_fork(after_in_child=_MAPPED.forget)
+            while self._size > self.capacity:
+                self._size -= len(self._values.popitem(last=False)[1])
 
 
 def _mapped(path: Path) -> memoryview | None:
@@ -88,16 +77,17 @@ def _mapped(path: Path) -> memoryview | None:
         status = path.stat()
     except (FileNotFoundError, NotADirectoryError):
         return None
-    # A file that was replaced under the same name has another identity.
-    key = (str(path), status.st_ino, status.st_size, status.st_mtime_ns)
-    known = _MAPPED.get(key)
-    if known is None:
-        if status.st_size == 0:
-            return memoryview(b"")
-        with path.open("rb") as file:
-            known = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        _MAPPED.put(key, known)
-    return memoryview(known)
+    if status.st_size == 0:
+        return memoryview(b"")
+    return memoryview(_map(str(path), status.st_ino, status.st_size, status.st_mtime_ns))
+
+
+# Evicted mappings are dropped, not closed: readers may still use them, and the last one frees them.
+# A file that was replaced under the same name has another identity.
+@lru_cache(MAX_MAPPED_FILES)
+def _map(path: str, *_identity: int) -> mmap.mmap:
+    with Path(path).open("rb") as file:
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
 
 class LocalFile:

@@ -97,15 +97,14 @@ class SpoolWriter:
         """
         return cls(path, read_attributes(path), sync=sync, resume=True)
 
-    def append(self, stream_name: str, batch: SampleBatch, *, flush: bool = False) -> None:
+    def append(self, stream_name: str, batch: SampleBatch) -> None:
         """Append consecutive samples of a stream; cheap enough for every arrival.
 
         Args:
             stream_name: one of the recording's streams.
             batch: of the stream's dtype and shape; `t_host_ns` never decreases. Values of `jpeg`
                 and `h264` streams are an object array of bytes, one per image
-                (`dextouch.streams.samples.encoded_values`).
-            flush: keep the batch only if `flush` succeeds too.
+                (`dextouch.streams.encoded_values`).
 
         Raises:
             UnknownNameError: no such stream.
@@ -114,7 +113,7 @@ class SpoolWriter:
         """
         record = self.encode(stream_name, batch)
         if record is not None:
-            self.append_record(record, flush=flush)
+            self.append_record(record)
 
     def encode(self, stream_name: str, batch: SampleBatch) -> EncodedBatch | None:
         """Encode a batch for `append_record`; None for an empty one.
@@ -134,6 +133,10 @@ class SpoolWriter:
 
     def append_record(self, record: EncodedBatch, *, flush: bool = False) -> None:
         """Append an encoded batch, as `append` does.
+
+        Args:
+            record: of a stream of this recording.
+            flush: keep the batch only if `flush` succeeds too.
 
         Raises:
             InvalidInputError: it begins before the last sample of its stream.

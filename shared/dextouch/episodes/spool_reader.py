@@ -92,15 +92,15 @@ class SpoolReader:
         return body
 
     def batches(
-        self, stream_name: str, *, num_samples: int = DEFAULT_BATCH_SAMPLES, first: int = 0
+        self, stream_name: str, *, num_samples: int = DEFAULT_BATCH_SAMPLES
     ) -> Iterator[SampleBatch]:
-        """Iterate over batches of fixed size from number `first` on; batch n is always the same.
+        """Iterate over batches of fixed size; batch n is always the same.
 
         A spool that is still written yields only full batches; a closed one also the last, partial
         batch.
         """
         total = self.num_samples(stream_name)
-        for start in range(first * num_samples, total, num_samples):
+        for start in range(0, total, num_samples):
             stop = start + num_samples
             if stop <= total or self.closed:
                 yield self.read(stream_name, start, min(stop, total))

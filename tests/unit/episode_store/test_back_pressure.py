@@ -12,10 +12,10 @@ from dextouch.errors import LimitExceededError, StorageFullError, UnavailableErr
 from dextouch.schemas import BatchReceipt, FinishRecording, Problem
 from dextouch.streams import encode_batch
 from services.episode_store import ingest as ingest_module
-from services.episode_store import limits as limits_module
+from services.episode_store import intake as intake_module
 from services.episode_store.app import create_app
 from services.episode_store.ingest import Ingest, KeyedLocks
-from services.episode_store.limits import CREATE_BYTES, Admission, StorageLimits
+from services.episode_store.intake import CREATE_BYTES, Admission, StorageLimits
 
 PATH = "/v1/recordings/take-1/streams/glove_left/batches/0"
 
@@ -83,7 +83,7 @@ def test_the_reserve_stays_free_but_for_finishing(tmp_path, monkeypatch, attribu
     folder = tmp_path / "not" / "there" / ".uploads"
     limits = StorageLimits(folder, recordings=dict, quota_bytes=None, min_free_bytes=1000)
     assert limits.free_bytes() > 0
-    monkeypatch.setattr(limits_module, "free_bytes_of", lambda _: 1500)
+    monkeypatch.setattr(intake_module, "free_bytes_of", lambda _: 1500)
     limits.check_batch("take-1", 500)
     with pytest.raises(StorageFullError, match="bytes exceed the") as caught:
         limits.check_batch("take-1", 501)
@@ -130,7 +130,7 @@ async def test_a_busy_store_answers_before_it_reads(settings, attributes, glove_
 def disk(monkeypatch):
     """A disk whose free bytes a test chooses."""
     free = {"bytes": 10**9}
-    monkeypatch.setattr(limits_module, "free_bytes_of", lambda _: free["bytes"])
+    monkeypatch.setattr(intake_module, "free_bytes_of", lambda _: free["bytes"])
     return free
 
 

@@ -299,7 +299,7 @@ def upload(client, spool):
     for name, descriptor in spool.streams.items():
         number = status.next_batch.get(name, 0)
         if status.state == "open":
-            for batch in spool.batches(name, first=number):
+            for batch in list(spool.batches(name))[number:]:
                 client.send_batch("take-1", descriptor, batch, number=number)
                 number += 1
         num_batches[name] = number

@@ -20,7 +20,7 @@ class CountedBucket(Bucket):
     """Objects in memory with the two requests that reading makes, counted."""
 
     def __init__(self, data, capacity):
-        self.data, self.requests, self.cache = data, [], LruCache(capacity, len)
+        self.data, self.requests, self.cache = data, [], LruCache(capacity)
 
     def tail(self, key, length):
         self.requests.append(("tail", length))
@@ -48,7 +48,7 @@ def test_parts_of_an_object_are_slices_of_it(spans, capacity):
     for near, shift, length in spans:
         offset = max(0, near + shift)
         assert file.read(offset, length) == DATA[offset : offset + length]
-        assert sum(map(len, bucket.cache._values.values())) == bucket.cache._weight <= capacity
+        assert sum(map(len, bucket.cache._values.values())) == bucket.cache._size <= capacity
 
 
 def test_what_was_read_is_not_asked_for_again():
