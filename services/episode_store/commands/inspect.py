@@ -76,8 +76,8 @@ def list_items(context: Context) -> Outcome:
     if kind != "episode" and root is not None:
         interrupted = list(interrupted_takes(root))
         result["unfinished"] = [name for _, name in interrupted]
-        for each, name in interrupted:
-            context.say(f"{name}  {each}  interrupted; `dextouch store repair` completes it")
+        for what, name in interrupted:
+            context.say(f"{name}  {what}  interrupted; `dextouch store repair` completes it")
     if not result["num_matching"] and not result.get("unfinished"):
         context.say(f"nothing matches, of {' and '.join(totals)}")
     return result, 0
