@@ -16,8 +16,7 @@ from services.acquisition.devices.finger_tracker.mock import BridgeFingerTracker
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.sdk_link_server import BridgeServer
-from services.acquisition.mocks.sdk_link_sources import BridgeSource
+from services.acquisition.mocks.sdk_link import BridgeServer, BridgeSource
 
 
 def pattern_source(kind: str, place: str, *, seed: int) -> BridgeSource:

@@ -31,8 +31,7 @@ from services.acquisition.drivers.base import Decoder, Driver
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Ledger
-from services.acquisition.mocks.pair import MockPair
-from services.acquisition.mocks.place import MockPlace
+from services.acquisition.mocks.place import MockPair, MockPlace, TrackerPlace
 from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import (
     MockDevice,
@@ -40,7 +39,6 @@ from services.acquisition.mocks.replay import (
     ReplayStream,
     device_rng,
 )
-from services.acquisition.mocks.tracker_place import TrackerPlace
 from services.acquisition.station import Station
 from services.acquisition.supervisor import SpoolSafety
 

@@ -27,7 +27,7 @@ from services.acquisition.mock_station import MockFactory
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
-from services.acquisition.mocks.sdk_link_server import BridgePort
+from services.acquisition.mocks.sdk_link import BridgePort
 
 BOOT_NS = 4_000_000_000_000
 # The promise is tried by `make slow`; the default run must not need an idle machine.

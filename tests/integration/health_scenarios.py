@@ -15,8 +15,8 @@ from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.ledger import Fate, Ledger
-from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
+from services.acquisition.mocks.place import MockPair
 from services.acquisition.mocks.replay import ReplayStream
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")

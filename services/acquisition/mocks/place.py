@@ -1,16 +1,46 @@
-"""Context of a simulated glove in a mock station: the data that it replays, and its faults."""
+"""Where a simulated device of a mock station stands, and the driver on its other end."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 from dextouch.schemas import Matrix
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Decoder, Driver
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.pair import MockPair
-from services.acquisition.mocks.ports import PtyPort
+from services.acquisition.mocks.ports import HidPort, PtyPort
 from services.acquisition.mocks.replay import MockDevice, PacketSource, ReplayStream
+from services.acquisition.mocks.usb_backend import UsbPort
+
+TrackerLink = Literal["hid", "usb", "bridge"]
+REPORT_PORTS = {"hid": HidPort, "usb": UsbPort}
+
+
+@dataclass(frozen=True)
+class MockPair:
+    """A simulated device and the real driver on its other end.
+
+    Attributes:
+        device: plays the packets.
+        driver: reads them.
+        calibration: matrices by name that a calibrated station knows of such a device, such as
+            `tactile_left_tare_counts`; none where its maker's devices come without them.
+    """
+
+    device: MockDevice
+    driver: Driver
+    calibration: Mapping[str, Matrix] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class TrackerPlace:
+    """What all trackers of a mock station share, and how this one is linked."""
+
+    link: TrackerLink
+    faults: DeviceFaults
+    seed: int
+    clock: StationClock
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.mock_bridge import pattern_source
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.sdk_link_server import BridgeServer
+from services.acquisition.mocks.sdk_link import BridgeServer
 from services.acquisition.settings import AcquisitionSettings
 
 # The promises are tried by `make slow`; the default run must not need an idle machine.

@@ -36,10 +36,10 @@ from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
 from services.acquisition.drivers.sdk_link import BridgeDriver, FrameConvention
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.sdk_link_server import BridgePort
-from services.acquisition.mocks.sdk_link_sources import (
+from services.acquisition.mocks.sdk_link import (
     LEFT_HANDED,
     Y_UP,
+    BridgePort,
     hello_line,
     sign_of_life,
 )

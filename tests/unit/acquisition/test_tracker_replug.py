@@ -17,7 +17,7 @@ from services.acquisition.drivers.sdk_link import BridgeDriver
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.ports import HidPort
-from services.acquisition.mocks.sdk_link_server import BridgePort
+from services.acquisition.mocks.sdk_link import BridgePort
 from services.acquisition.mocks.usb_backend import UsbPort
 from services.acquisition.supervisor import DeviceSupervisor
 

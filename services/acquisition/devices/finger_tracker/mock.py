@@ -30,14 +30,14 @@ from services.acquisition.drivers.sdk_link import (
 )
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.ledger import Fate
-from services.acquisition.mocks.pair import MockPair
+from services.acquisition.mocks.place import REPORT_PORTS, MockPair, TrackerPlace
 from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
-from services.acquisition.mocks.sdk_link_sources import (
+from services.acquisition.mocks.sdk_link import (
     LEFT_HANDED,
     SOFTWARE,
+    bridged_pair,
     hello_line,
 )
-from services.acquisition.mocks.tracker_place import REPORT_PORTS, TrackerPlace, bridged_pair
 
 # What an occluded tracker does not see.
 _HIDDEN = chain_indices("thumb")

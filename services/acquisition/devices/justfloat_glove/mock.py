@@ -8,8 +8,7 @@ from jaxtyping import Float32
 from dextouch.tactile.layout import NUM_TAXELS
 from services.acquisition.devices.justfloat_glove.driver import TAIL, JustFloatGloveDecoder
 from services.acquisition.mocks.edits import PacketEdits, Pinned, without_first
-from services.acquisition.mocks.pair import MockPair
-from services.acquisition.mocks.place import MockPlace, serial_mock
+from services.acquisition.mocks.place import MockPair, MockPlace, serial_mock
 from services.acquisition.mocks.replay import ReplayStream
 
 COUNTS_PER_KPA = 40.0

@@ -18,7 +18,7 @@ from services.acquisition.devices.station_camera.capture import (
 from services.acquisition.devices.station_camera.driver import StationCamera
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.link import Link
-from services.acquisition.mocks.pair import MockPair
+from services.acquisition.mocks.place import MockPair
 from services.acquisition.mocks.ports import ReportDevice
 from services.acquisition.mocks.replay import MockDevice, ReplayStream
 

@@ -30,8 +30,7 @@ from services.acquisition.drivers.packets import (
     encode_packet,
 )
 from services.acquisition.mocks.edits import OurPacketEdits, Pinned, edit_ours
-from services.acquisition.mocks.pair import MockPair
-from services.acquisition.mocks.place import MockPlace
+from services.acquisition.mocks.place import MockPair, MockPlace
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
 

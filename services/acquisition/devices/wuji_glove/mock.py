@@ -24,8 +24,7 @@ from services.acquisition.devices.wuji_glove.driver import (
     crc16,
 )
 from services.acquisition.mocks.edits import PacketEdits, Pinned, without_first
-from services.acquisition.mocks.pair import MockPair
-from services.acquisition.mocks.place import MockPlace, serial_mock
+from services.acquisition.mocks.place import MockPair, MockPlace, serial_mock
 from services.acquisition.mocks.replay import ReplayStream, at_rate
 
 FULL_SCALE_KPA = 100.0

@@ -1,0 +1,226 @@
+"""Simulated SDK processes behind a bridge: local sockets that say the same to every station."""
+
+import contextlib
+import itertools
+import socket
+import threading
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+from services.acquisition.clock import PeriodicCall, StationClock, VirtualClock
+from services.acquisition.drivers.packets import (
+    SEQUENCE_MODULUS,
+    SOURCES,
+    VERSION,
+    Packet,
+    encode_packet,
+)
+from services.acquisition.drivers.sdk_link import (
+    BridgeDecoder,
+    BridgeDriver,
+    BridgeHello,
+    FrameConvention,
+)
+from services.acquisition.mocks.faults import DeviceFaults, Schedule
+from services.acquisition.mocks.place import MockPair, TrackerPlace
+from services.acquisition.mocks.ports import SEND_TIMEOUT_S, SocketPort
+from services.acquisition.mocks.replay import MockDevice, PacketSource
+
+# A left-handed sender in centimetres, and OpenVR's own frame: y up, looking along −z.
+LEFT_HANDED = FrameConvention(handedness="left", axes=("+x", "+y", "-z"))
+Y_UP = FrameConvention(handedness="right", axes=("+x", "+z", "-y"))
+SOFTWARE = "dextouch mock bridge 1"
+LIFE_PERIOD_NS = 50_000_000
+
+
+@runtime_checkable
+class BridgeSource(PacketSource, Protocol):
+    """What one bridge process says."""
+
+    magic: bytes
+
+    def hello(self) -> bytes:
+        """The first line of a connection."""
+        ...
+
+
+def sign_of_life(magic: bytes, sequence: int, t_device_ns: int) -> bytes:
+    """A packet without a payload."""
+    packet = Packet(VERSION, SOURCES["none"], sequence, t_device_ns, b"")
+    return encode_packet(magic, packet)
+
+
+def hello_line(hello: BridgeHello) -> bytes:
+    """A hello as it is sent."""
+    return hello.model_dump_json(exclude_none=True).encode() + b"\n"
+
+
+class BridgePort(SocketPort):
+    """A mock device's end of a bridge: a socket pair whose connections begin with the hello.
+
+    While it is plugged, `life` says as often as a bridge that it lives. Without it a host on a real
+    clock finds it silent while the device says nothing.
+    """
+
+    def __init__(self, name: str, hello: Callable[[], bytes]) -> None:
+        super().__init__(name)
+        self.life: PeriodicCall | None = None
+        self._hello = hello
+
+    def plug(self) -> None:
+        """Accept connections, and show that the bridge lives."""
+        super().plug()
+        if self.life is not None:
+            self.life.start()
+
+    def unplug(self) -> None:
+        """Close the connection and refuse new ones."""
+        if self.life is not None:
+            self.life.stop()
+        super().unplug()
+
+    def _on_open(self) -> None:
+        """Count the hello that waits in every new connection as sent."""
+        self.link.add_sent(len(self._hello()))
+
+    def _connect(self) -> socket.socket:
+        host_end = super()._connect()
+        if self._device_end is not None:
+            self._device_end.sendall(self._hello())
+        return host_end
+
+
+class BridgedDevice(MockDevice):
+    """A device behind a bridge process, which shows that it lives while the device says nothing.
+
+    Only on a real clock: with a virtual one, time stands while nothing is sent.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        source: BridgeSource,
+        port: BridgePort,
+        faults: DeviceFaults,
+        seed: int,
+    ) -> None:
+        super().__init__(name, source=source, port=port, faults=faults, seed=seed)
+        self._magic = source.magic
+        # The bridge numbers all that it sends, in the order in which it sends it.
+        self._numbering = threading.Lock()
+
+    def show_life(self) -> None:
+        """Send one heartbeat, which has a sequence number but no ledger entry."""
+        with self._numbering:
+            sequence = self._next_sequence
+            self._next_sequence = (sequence + 1) % SEQUENCE_MODULUS
+            self.port.send(sign_of_life(self._magic, sequence, 0))
+
+    def _send(self, index: int, schedule: Schedule) -> None:
+        with self._numbering:
+            super()._send(index, schedule)
+
+
+def bridged_pair(
+    name: str, source: BridgeSource, decoder: BridgeDecoder, place: TrackerPlace
+) -> MockPair:
+    """A simulated device behind a bridge, and the driver that asks the bridge for it."""
+    port, clock = BridgePort(name, source.hello), place.clock
+    device = BridgedDevice(name, source=source, port=port, faults=place.faults, seed=place.seed)
+    if not isinstance(clock, VirtualClock):
+        port.life = PeriodicCall(
+            device.show_life, period_ns=LIFE_PERIOD_NS, clock=clock, name="bridge-life"
+        )
+    driver = BridgeDriver(name, transport=port.transport, decoder=decoder, clock=clock)
+    return MockPair(device, driver)
+
+
+class BridgeServer:
+    """A bridge process's socket: says hello to every connection and sends all of them the same.
+
+    Args:
+        source: what is said.
+        clock: paces the samples.
+        port: to listen on; any free one if 0.
+    """
+
+    def __init__(self, source: BridgeSource, *, clock: StationClock, port: int = 0) -> None:
+        self._source = source
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._connections: list[socket.socket] = []
+        self._sequence = 0
+        self._t_sent_ns = clock.now_ns()
+        self._listener = socket.create_server(("127.0.0.1", port))
+        self.port = int(self._listener.getsockname()[1])
+        self._accepting = threading.Thread(target=self._accept, name="bridge-accept", daemon=True)
+        self._life = PeriodicCall(
+            self._show_life, period_ns=LIFE_PERIOD_NS, clock=clock, name="bridge-life"
+        )
+
+    def __enter__(self) -> "BridgeServer":
+        self._accepting.start()
+        self._life.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self._accepting.join()
+        self._life.stop()
+        self.disconnect()
+
+    def disconnect(self) -> None:
+        """Close all connections, as a process does that ends."""
+        with self._lock:
+            for connection in self._connections:
+                connection.close()
+            self._connections.clear()
+
+    def send_sample(self, index: int, t_device_ns: int) -> None:
+        """Send one sample to every connection."""
+        with self._lock:
+            for unit in self._source.units(index, self._sequence, t_device_ns):
+                self._send(unit)
+
+    def play(self) -> None:
+        """Send the whole source in its own time, round and round."""
+        waiter = self._clock.waiter(drives_time=True)
+        t_ns = self._source.t_ns
+        round_ns = int(t_ns[-1] + t_ns[-1] // max(1, len(t_ns) - 1))
+        start_ns = self._clock.now_ns()
+        for number in itertools.count():
+            for index, sample_ns in enumerate(t_ns):
+                due_ns = start_ns + number * round_ns + int(sample_ns)
+                waiter.wait_until(due_ns)
+                self.send_sample(index, due_ns)
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:  # stopped
+                return
+            connection.settimeout(SEND_TIMEOUT_S)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            with self._lock, contextlib.suppress(OSError):
+                connection.sendall(self._source.hello())
+                self._connections.append(connection)
+
+    def _show_life(self) -> None:
+        now_ns = self._clock.now_ns()
+        with self._lock:
+            if now_ns - self._t_sent_ns >= LIFE_PERIOD_NS:
+                self._send(sign_of_life(self._source.magic, self._sequence, now_ns))
+
+    def _send(self, unit: bytes) -> None:
+        self._sequence += 1
+        self._t_sent_ns = self._clock.now_ns()
+        for connection in list(self._connections):
+            try:
+                connection.sendall(unit)
+            except OSError:  # the station has gone
+                connection.close()
+                self._connections.remove(connection)
