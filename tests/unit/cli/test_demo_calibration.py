@@ -6,6 +6,8 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolReader
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration
+from services.acquisition.mock_station import LATENCY_SIGMA_MS
+from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.cli.demo import recording
 from tests.unit.bridges.takes import write_episode
@@ -33,6 +35,17 @@ def test_tare_and_gain_are_close_to_the_gloves_own_but_measured(measured, side):
     assert errors.std() <= 0.002
 
 
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_path_delays_are_measured_and_not_what_the_script_states(measured, side):
+    (((latency_ns,),), ((sigma_ns,),)) = (
+        measured[f"tactile_{side}_latency{name}_ns"] for name in ("", "_sigma")
+    )
+    stated_ns = FaultScript.first_light().of(f"glove_{side}").path_delay_ms * 1e6
+    # A real clock: the mock's threads wake late, which belongs to the path, by what the host does.
+    assert 0 < abs(latency_ns - stated_ns) < 5e6
+    assert 0 < sigma_ns < 5e6
+
+
 def test_without_gloves_nothing_is_measured(tmp_path):
     streams = [s for s in pattern_streams(1.0) if s.descriptor.kind != "tactile"]
     assert recording.measure_gloves(streams, tmp_path, seed=SEED) == {}
@@ -45,6 +58,7 @@ def test_the_take_carries_what_was_measured_and_not_the_gloves_own(tmp_path, mon
     take, _ = recording.record_take(truth, tmp_path / "spool", seed=SEED)
     kept = SpoolReader(take.spool_path).attributes.calibration
     for side in ("left", "right"):
+        assert kept[f"tactile_{side}_latency_sigma_ns"] != ((LATENCY_SIGMA_MS * 1e6,),)
         own = GloveCalibration.seeded(side, SEED)
         (tare,) = np.array(kept[f"tactile_{side}_tare_counts"])
         (gain,) = np.array(kept[f"tactile_{side}_gain_counts_per_kpa"])
