@@ -61,8 +61,8 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "processor time of all threads, so times of real time are those of one core; the clock "
             "fits are timed apart, right after the alignment, and taken off the calibration; "
             "arrivals need none",
-            "gloves are calibrated by a take under known pressures, path delays wrong by 0.2 ms "
-            "(sigma); the transfer over HTTP is not in these times",
+            "gloves are calibrated by a take under known pressures and by their answers, other "
+            "path delays are wrong by 0.2 ms (sigma); the transfer over HTTP is not in these times",
         ],
     )
 

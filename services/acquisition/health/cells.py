@@ -114,12 +114,7 @@ class _CellHistory(ABC):
     def _find_silent(
         self, is_same: np.ndarray, around: Float64[np.ndarray, " cells"]
     ) -> Bool[np.ndarray, " cells"]:
-        """Cells that stay at one reading while enough of their neighbours move, until they change.
-
-        Args:
-            is_same: cells without a change within the last 0.5 s.
-            around: share of its neighbours that moved within the last 0.5 s.
-        """
+        """Cells that stay the same while enough of their neighbours move, until they change."""
         self._around_ns = np.where(around >= WEAK_SHARE, self._recent_ns[-1], self._around_ns)
         slow = self._quiet() & (self._around_ns >= self._changed_ns + RECENT_NS)
         self._silent = self._silent | is_same & (around >= STRONG_SHARE) | slow
