@@ -1,7 +1,7 @@
 """Persistent record of a rollout: progress, the world's snapshot, and the last response."""
 
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,22 +67,33 @@ class RecordStore:
             raise _unknown(rollout_id)
         return RolloutRecord.from_bytes(stored.value, version=stored.version)
 
-    async def add(self, record: RolloutRecord, *, limit: int) -> None:
-        """Write a new rollout; raises LimitExceededError where `limit` are active or starting."""
-        await self._add(record.info.id, record.to_bytes(), limit=limit, ttl_s=self._ttl_s)
-
     @asynccontextmanager
     async def place(self, rollout_id: str, *, limit: int) -> AsyncIterator[int]:
         """Reserve a slot for a rollout that is starting; yields the version to compute it from.
 
-        The slot is released if the block fails; LimitExceededError as for `add`.
+        The slot is released if the block fails.
+
+        Raises:
+            LimitExceededError: `limit` rollouts are active or starting.
         """
-        await self._add(rollout_id, b"", limit=limit, ttl_s=max(self._ttl_s, PLACE_TTL_S))
-        try:
+        key, ttl_s = KEY_PREFIX + rollout_id, max(self._ttl_s, PLACE_TTL_S)
+        async with AsyncExitStack() as failed:
+            # Also where the reply is lost although the slot was written.
+            failed.push_async_callback(self._give_up, key)
+            if not await self._store.add(key, b"", within=KEY_PREFIX, limit=limit, ttl_s=ttl_s):
+                raise LimitExceededError(
+                    f"the limit of {limit} rollouts is reached; delete one that is no longer "
+                    f"needed, or try again later: each expires after {self._ttl_s:g} s without a "
+                    "chunk",
+                    retry_after_s=1,
+                )
             yield 1
-        except BaseException:
-            await self._give_up(rollout_id)
-            raise
+            failed.pop_all()
+
+    async def _give_up(self, key: str) -> None:
+        """Delete a rollout that no client knows; if that fails, it expires."""
+        with suppress(StorageError, UnavailableError):
+            await self._store.delete(key)
 
     async def write(self, record: RolloutRecord) -> int:
         """Replace the version that the record was computed from (compare and set).
@@ -104,26 +115,6 @@ class RecordStore:
     async def ping(self) -> None:
         """Raise UnavailableError when the store cannot be reached."""
         await self._store.ping()
-
-    async def _add(self, rollout_id: str, value: bytes, *, limit: int, ttl_s: float) -> None:
-        key = KEY_PREFIX + rollout_id
-        try:
-            added = await self._store.add(key, value, within=KEY_PREFIX, limit=limit, ttl_s=ttl_s)
-        except BaseException:
-            # It may have been written although the reply was lost.
-            await self._give_up(rollout_id)
-            raise
-        if not added:
-            raise LimitExceededError(
-                f"the limit of {limit} rollouts is reached; delete one that is no longer needed, "
-                f"or try again later: each expires after {self._ttl_s:g} s without a chunk",
-                retry_after_s=1,
-            )
-
-    async def _give_up(self, rollout_id: str) -> None:
-        """Delete a rollout that no client knows; if that fails, it expires."""
-        with suppress(StorageError, UnavailableError):
-            await self._store.delete(KEY_PREFIX + rollout_id)
 
 
 def _unknown(rollout_id: str) -> NotFoundError:

@@ -99,7 +99,9 @@ class RolloutService:
         self.limits = limits or RolloutLimits()
         self._workers = {name: WorldWorker(world) for name, world in worlds.items()}
         self._records = RecordStore(store, ttl_s=self.limits.ttl_s)
-        self._live = _LiveStates(capacity=self.limits.max_rollouts)
+        # The newest states of this process's rollouts, least recently used first, with the versions
+        # of their records.
+        self._live: OrderedDict[str, tuple[int, Any]] = OrderedDict()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
 
     def worlds(self) -> list[WorldDescription]:
@@ -147,7 +149,7 @@ class RolloutService:
                 ttl_s=self.limits.ttl_s,
             )
             version = await self._records.write(RolloutRecord(info, snapshot, version=placed))
-        self._live.put(info.id, version, started.state)
+        self._keep(info.id, version, started.state)
         logger.info("rollout_started", rollout_id=info.id, world=world, task=info.task)
         origin = RolloutOrigin(started.anchor, started.K_head)
         shown = started.observation.selected(selector)
@@ -209,14 +211,14 @@ class RolloutService:
         if seed is not None:
             changed["seed"] = seed
         info = parent.info.model_copy(update=changed)
-        record = RolloutRecord(info, parent.snapshot)
-        await self._records.add(record, limit=self.limits.max_rollouts)
+        async with self._records.place(info.id, limit=self.limits.max_rollouts) as placed:
+            await self._records.write(RolloutRecord(info, parent.snapshot, version=placed))
         logger.info("rollout_forked", rollout_id=info.id, parent_id=rollout_id)
         return info
 
     async def delete(self, rollout_id: str) -> None:
         """End a rollout."""
-        self._live.drop(rollout_id)
+        self._live.pop(rollout_id, None)
         await self._records.delete(rollout_id)
         logger.info("rollout_deleted", rollout_id=rollout_id)
 
@@ -230,8 +232,8 @@ class RolloutService:
     ) -> Answer:
         """Compute a chunk and commit its record."""
         before = stored.info
-        state = self._live.get(before.id, stored.version)
-        if state is None:
+        held, state = self._live.get(before.id, (0, None))
+        if held != stored.version:
             state = await worker.call(worker.world.restore, stored.snapshot)
         seed = chunk_seed(before.seed, before.next_chunk, before.world_digest)
         outcome = await worker.step(StepJob(state, request.actions, seed, request.selector))
@@ -254,16 +256,22 @@ class RolloutService:
         sha256 = request.sha256()
         record = RolloutRecord(info, outcome.snapshot, sha256, payload, stored.version)
         version = await self._records.write(record)
-        self._live.put(info.id, version, outcome.stepped.state)
+        self._keep(info.id, version, outcome.stepped.state)
         return Answer(payload, queued_s=outcome.queued_s, device_s=outcome.device_s)
 
     async def _end(self, record: RolloutRecord, error: EndedError) -> EndedError:
         """Mark a rollout as ended; returns the error that later chunks get."""
         info = record.info.model_copy(update={"ended": error.reason})
         await self._records.write(replace(record, info=info))
-        self._live.drop(info.id)
+        self._live.pop(info.id, None)
         logger.info("rollout_ended", rollout_id=info.id, reason=error.reason)
         return _over(info)
+
+    def _keep(self, rollout_id: str, version: int, state: object) -> None:
+        self._live[rollout_id] = (version, state)
+        self._live.move_to_end(rollout_id)
+        if len(self._live) > self.limits.max_rollouts:
+            self._live.popitem(last=False)
 
     def _worker(self, world: str) -> WorldWorker[Any]:
         if world not in self._workers:
@@ -288,30 +296,6 @@ class RolloutService:
                 f"rollout {info.id}: has {info.next_chunk} chunks, expected at most "
                 f"{self.limits.max_chunks}; start a new one"
             )
-
-
-class _LiveStates:
-    """LRU cache of the newest states of this process's rollouts."""
-
-    def __init__(self, *, capacity: int) -> None:
-        self._capacity = capacity
-        self._states: OrderedDict[str, tuple[int, Any]] = OrderedDict()
-
-    def get(self, rollout_id: str, version: int) -> Any | None:  # noqa: ANN401 - states are opaque
-        """The cached state of exactly this version, if any."""
-        held, state = self._states.get(rollout_id, (0, None))
-        return state if held == version else None
-
-    def put(self, rollout_id: str, version: int, state: object) -> None:
-        """Cache a state."""
-        self._states[rollout_id] = (version, state)
-        self._states.move_to_end(rollout_id)
-        if len(self._states) > self._capacity:
-            self._states.popitem(last=False)
-
-    def drop(self, rollout_id: str) -> None:
-        """Remove a state, if cached."""
-        self._states.pop(rollout_id, None)
 
 
 def chunk_seed(rollout_seed: int, chunk: int, world_digest: str) -> int:

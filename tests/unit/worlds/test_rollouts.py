@@ -381,7 +381,7 @@ async def test_memory_stays_flat_over_abandoned_rollouts():
     for _ in range(300):
         await begin(made)
         now_s[0] += 0.5
-    assert len(made._live._states) <= 4
+    assert len(made._live) <= 4
     store._expire()
     assert len(store._entries) <= 3
     assert len(made._locks) == 0
