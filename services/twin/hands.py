@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import UnknownNameError
 from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
-from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.robot_hand import HandModel, RobotHand
 from dextouch.tactile.layout import PALM_PITCH_M, PALM_SHAPE, Side
 from services.twin.human_hand import METACARPAL_BASES_M, human_fingers
 
@@ -54,13 +54,11 @@ _HUMAN_SHAPE: Final = HandShape(
 )
 
 
-class HumanHand(RobotHand):
+class HumanHand(HandModel):
     """A human hand with the robot's kinematic tree and joint order, but human bones and limits."""
 
     def __init__(self, side: str) -> None:
-        super().__init__(side)
-        self.fingers = human_fingers(self.side)
-        self.name = f"human {side} hand"
+        super().__init__(side, human_fingers(side), name=f"human {side} hand")
 
     def keypoints_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
         """The 25 tracked nodes in wrist coordinates, metres, for joint angles [T, 20]."""
@@ -80,7 +78,7 @@ class TwinHand:
 
     side: Side
     domain: Domain
-    kinematics: RobotHand
+    kinematics: HandModel
     shape: HandShape
 
     @property
@@ -135,5 +133,5 @@ def twin_hand(side: Side, domain: Domain) -> TwinHand:
     """
     if domain not in DOMAINS:
         raise UnknownNameError("domain", domain, list(DOMAINS))
-    kinematics = RobotHand(side) if domain == "robot" else HumanHand(side)
+    kinematics: HandModel = RobotHand(side) if domain == "robot" else HumanHand(side)
     return TwinHand(side, domain, kinematics, _ROBOT_SHAPE if domain == "robot" else _HUMAN_SHAPE)

@@ -6,7 +6,7 @@ with RolloutClient("http://127.0.0.1:8100") as client:
             rollout.step(policy.act(rollout.observation))
 """
 
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from copy import copy
 from typing import TypeVar
 from urllib.parse import urlencode
@@ -34,7 +34,7 @@ from dextouch.schemas import (
     decode_answer,
     encode_start,
     first_problems,
-    validated,
+    validate_fields,
 )
 
 MSGPACK = "application/msgpack"
@@ -100,7 +100,7 @@ class RolloutClient:
             UnavailableError: the service does not respond.
         """
         asked = {"world": world, "task": task, "seed": seed, "instruction": instruction}
-        request = validated(StartRequest, asked | {"action_kind": action_kind}, where="start")
+        request = validate_fields(StartRequest, asked | {"action_kind": action_kind}, where="start")
         observation, anchor, K_head = (None, None, None) if init is None else init
         start = RolloutStart(task, seed, instruction, action_kind, observation, anchor, K_head)
         query = _query(self.selector)
@@ -143,7 +143,6 @@ class Rollout:
     ) -> None:
         self._link = link
         self._query = query
-        self._origin = origin
         self.info = answer.rollout
         self.observation = answer.observation
         self.anchor = origin.anchor
@@ -197,26 +196,21 @@ class Rollout:
         """Branch at this step; a new seed gives the branch noise of its own."""
         body = ForkRequest(seed=seed).model_dump_json().encode()
         reply = self._link.request("POST", f"/v1/rollouts/{self.id}/fork", body=body)
-        info = _parsed(RolloutInfo, reply)
-        answer = RolloutAnswer(info, self.observation, self.told, self._origin)
-        return Rollout(self._link, self._query, answer, self._origin)
+        branch = copy(self)
+        branch.info = _parsed(RolloutInfo, reply)
+        return branch
 
     def close(self) -> None:
         """End the rollout at the service; an expired rollout counts as ended."""
-        try:
+        with suppress(NotFoundError):
             self._link.request("DELETE", f"/v1/rollouts/{self.id}")
-        except NotFoundError:
-            return
 
     def __enter__(self) -> "Rollout":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            self.close()
-            return
         # An exception in the block matters more than a failure to close the rollout.
-        with suppress(DexTouchError):
+        with nullcontext() if kind is None else suppress(DexTouchError):
             self.close()
 
 

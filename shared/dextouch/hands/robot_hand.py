@@ -9,12 +9,12 @@ the right palm faces +y, the left -y.
 
 import json
 from collections.abc import Iterable, Sequence
-from functools import cache, cached_property
+from functools import cache
 from importlib.resources import files
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
 from dextouch.geometry import transform
@@ -60,6 +60,11 @@ class FingerTable(NamedTuple):
 class HandModel:
     """A hand of 1 to 5 fingers with 1 to 6 hinges each.
 
+    Attributes:
+        joint_names: in the order of the joint vector: finger by finger, from the wrist out.
+        lower_rad: lower joint limits [joints].
+        upper_rad: upper joint limits [joints].
+
     Args:
         side: "left" or "right".
         fingers: tables in the order of the hand's joint vector.
@@ -80,49 +85,18 @@ class HandModel:
         self.side = side
         self.name = name
         self.fingers = tuple(fingers)
-
-    @cached_property
-    def joint_names(self) -> tuple[str, ...]:
-        """Joint names in the order of the joint vector: finger by finger, from the wrist out."""
-        return tuple(row.name for finger in self.fingers for row in finger.joints)
-
-    @cached_property
-    def lower_rad(self) -> Float64[np.ndarray, " joints"]:
-        """Lower joint limits."""
-        return np.array([row.limits_rad[0] for finger in self.fingers for row in finger.joints])
-
-    @cached_property
-    def upper_rad(self) -> Float64[np.ndarray, " joints"]:
-        """Upper joint limits."""
-        return np.array([row.limits_rad[1] for finger in self.fingers for row in finger.joints])
-
-    @cached_property
-    def _is_joint(self) -> Bool[np.ndarray, "fingers hinges"]:
-        """Mask of existing hinges in the padded [fingers, hinges] table."""
-        counts = np.array([len(finger.joints) for finger in self.fingers])
-        return np.asarray(np.arange(counts.max()) < counts[:, None])
-
-    @cached_property
-    def _offsets(self) -> Float64[np.ndarray, "fingers hinges 4 4"]:
-        rows = [row for finger in self.fingers for row in finger.joints]
-        offsets = np.tile(np.eye(4), (*self._is_joint.shape, 1, 1))
+        rows = [row for finger in fingers for row in finger.joints]
+        self.joint_names = tuple(row.name for row in rows)
+        self.lower_rad, self.upper_rad = np.array([row.limits_rad for row in rows]).T.copy()
+        counts = np.array([len(finger.joints) for finger in fingers])
+        # Tables of [fingers, hinges] are padded; this is the mask of existing hinges.
+        self._is_joint: Bool[np.ndarray, "fingers hinges"]
+        self._is_joint = np.asarray(np.arange(counts.max()) < counts[:, None])
         R = rotation_from_quaternion(np.array([row.q_wxyz for row in rows]))
-        offsets[self._is_joint] = transform(R, np.array([row.position_m for row in rows]))
-        return offsets
-
-    @cached_property
-    def _axes(self) -> Float64[np.ndarray, "fingers hinges 3"]:
-        axes = np.zeros((*self._is_joint.shape, 3))
-        axes[self._is_joint] = [row.axis for finger in self.fingers for row in finger.joints]
-        return axes
-
-    @cached_property
-    def _tips(self) -> Float64[np.ndarray, "fingers 3"]:
-        return np.array([finger.tip_m for finger in self.fingers])
-
-    @cached_property
-    def _points(self) -> Int64[np.ndarray, "fingers 3"]:
-        return np.array([finger.points for finger in self.fingers], dtype=np.int64)
+        self._offsets = np.tile(np.eye(4), (*self._is_joint.shape, 1, 1))
+        self._offsets[self._is_joint] = transform(R, np.array([row.position_m for row in rows]))
+        self._axes = np.zeros((*self._is_joint.shape, 3))
+        self._axes[self._is_joint] = [row.axis for row in rows]
 
     def joint_frames(
         self, joints_rad: np.ndarray
@@ -164,10 +138,10 @@ class HandModel:
         frames = self.joint_frames(joints_rad)
         # Padded with the last frame, so that index -1 is valid for all fingers.
         last = frames[:, :, -1]
-        tips = last[..., :3, :3] @ self._tips[:, :, None]
-        tip_points = tips[..., 0] + last[..., :3, 3]
+        tips_m = np.array([finger.tip_m for finger in self.fingers])
+        tip_points = (last[..., :3, :3] @ tips_m[:, :, None])[..., 0] + last[..., :3, 3]
         fingers = np.arange(len(self.fingers))[:, None]
-        points = frames[..., :3, 3][:, fingers, self._points]
+        points = frames[..., :3, 3][:, fingers, [finger.points for finger in self.fingers]]
         return np.concatenate([points, tip_points[:, :, None]], axis=2)
 
     def fingertips_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time fingers 3"]:

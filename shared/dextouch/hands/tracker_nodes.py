@@ -157,62 +157,56 @@ def nodes_of_tree(tree: Sequence[TreeNode]) -> list[Node]:
             another number of nodes, no name or two names. `node_order` checks that all chains are
             present.
     """
-    by_id = {node.id: node for node in tree}
+    num_ids = len({node.id for node in tree})
     roots = [node.id for node in tree if node.parent in (None, node.id)]
-    if len(by_id) < len(tree) or len(roots) != 1:
+    if num_ids < len(tree) or len(roots) != 1:
         raise InvalidInputError(
-            f"hand tree: got {len(tree)} nodes with {len(by_id)} different ids and roots {roots}, "
+            f"hand tree: got {len(tree)} nodes with {num_ids} different ids and roots {roots}, "
             "expected all ids different and one node, the wrist, without another node as parent"
         )
-    children: dict[int | None, list[int]] = {}
+    children: dict[int | None, list[TreeNode]] = {}
     for node in tree:
         if node.id != roots[0]:
-            children.setdefault(node.parent, []).append(node.id)
+            children.setdefault(node.parent, []).append(node)
     found: dict[int, Node] = {roots[0]: (WRIST, WRIST)}
     for first in children.get(roots[0], []):
-        ids = _path(first, children)
-        found |= _named(ids, [by_id[node_id].chain for node_id in ids])
-    lost = [node.id for node in tree if node.id not in found]
+        path = [first]
+        while following := children.get(path[-1].id):
+            if len(following) > 1:
+                raise InvalidInputError(
+                    f"hand tree: node {path[-1].id} has the children "
+                    f"{[node.id for node in following]}; only the wrist has several, each the "
+                    "first node of a chain"
+                )
+            path += following
+        found |= zip((node.id for node in path), _names(path), strict=True)
+    lost = [node for node in tree if node.id not in found]
     if lost:
         raise InvalidInputError(
-            f"hand tree: nodes {lost} do not lead back to the wrist {roots[0]}; their parents are "
-            f"{[by_id[node_id].parent for node_id in lost]}"
+            f"hand tree: nodes {[node.id for node in lost]} do not lead back to the wrist "
+            f"{roots[0]}; their parents are {[node.parent for node in lost]}"
         )
     return [found[node.id] for node in tree]
 
 
-def _path(first: int, children: Mapping[int | None, Sequence[int]]) -> list[int]:
-    """Node ids of a chain, from its first node to its tip."""
-    ids = [first]
-    while following := children.get(ids[-1], ()):
-        if len(following) > 1:
-            raise InvalidInputError(
-                f"hand tree: node {ids[-1]} has the children {list(following)}; only the wrist "
-                "has several, each the first node of a chain"
-            )
-        ids.append(following[0])
-    return ids
-
-
-def _named(ids: Sequence[int], labels: Sequence[str | None]) -> dict[int, Node]:
+def _names(path: Sequence[TreeNode]) -> list[Node]:
     """Chain and joint of the nodes of one chain, counted from the tip."""
-    chains = {label.lower() for label in labels if label is not None}
-    chains = {_CHAIN_WORDS.get(chain, chain) for chain in chains}
+    ids = [node.id for node in path]
+    labels = {node.chain.lower() for node in path if node.chain is not None}
+    chains = {_CHAIN_WORDS.get(label, label) for label in labels}
     if len(chains) != 1:
         raise InvalidInputError(
-            f"hand tree: the chain of nodes {list(ids)} is called {sorted(chains) or 'nothing'}, "
+            f"hand tree: the chain of nodes {ids} is called {sorted(chains) or 'nothing'}, "
             f"expected one of {list(CHAINS)} at one of its nodes at least"
         )
     (chain,) = chains
     if chain == _PALM:
-        return dict.fromkeys(ids, (_PALM, _PALM))
+        return [(_PALM, _PALM)] * len(path)
     joints = THUMB_JOINTS if chain == "thumb" else FINGER_JOINTS
-    allowed = (len(joints),) if chain == "thumb" else (len(joints), len(joints) - 1)
-    if chain not in CHAINS or len(ids) not in allowed:
+    allowed = {len(joints)} if chain == "thumb" else {len(joints), len(joints) - 1}
+    if chain not in CHAINS or len(path) not in allowed:
         raise InvalidInputError(
-            f"hand tree: {chain!r} has {len(ids)} nodes {list(ids)}, expected one of "
+            f"hand tree: {chain!r} has {len(path)} nodes {ids}, expected one of "
             f"{list(CHAINS)}: the thumb with 4 nodes, another finger with 5, or 4 from its knuckle"
         )
-    return {
-        node_id: (chain, joint) for node_id, joint in zip(ids, joints[-len(ids) :], strict=True)
-    }
+    return [(chain, joint) for joint in joints[-len(path) :]]

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.problems import first_problems as first_problems
     from dextouch.schemas.problems import problem_from_error as problem_from_error
     from dextouch.schemas.problems import status_of as status_of
-    from dextouch.schemas.problems import validated as validated
+    from dextouch.schemas.problems import validate_fields as validate_fields
     from dextouch.schemas.recordings import ID_TAKEN as ID_TAKEN
     from dextouch.schemas.recordings import BatchReceipt as BatchReceipt
     from dextouch.schemas.recordings import ExpireUploads as ExpireUploads

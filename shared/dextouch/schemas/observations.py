@@ -11,7 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
 from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
-from dextouch.schemas.problems import validated
+from dextouch.schemas.problems import validate_fields
 from dextouch.schemas.rollouts import ActionKind, RolloutInfo, StartRequest
 from dextouch.streams import pack, unpack
 
@@ -262,7 +262,7 @@ def decode_answer(data: bytes, *, max_bytes: int) -> RolloutAnswer:
         InvalidInputError: not a valid response.
     """
     raw, arrays = unpack(data, max_bytes=max_bytes)
-    fields = validated(AnswerFields, raw, where="answer")
+    fields = validate_fields(AnswerFields, raw, where="answer")
     origin = _origin_from(arrays, where="answer") if "K_head" in arrays else None
     observation = _observation_from(fields.observation, arrays, where="answer")
     return RolloutAnswer(fields.rollout, observation, fields.info, origin)
@@ -280,7 +280,7 @@ def decode_observation(data: bytes, *, max_bytes: int) -> Observation:
         InvalidInputError: not a valid observation.
     """
     raw, arrays = unpack(data, max_bytes=max_bytes)
-    fields = validated(ObservationFields, raw, where="observation")
+    fields = validate_fields(ObservationFields, raw, where="observation")
     return _observation_from(fields, arrays, where="observation")
 
 
@@ -305,7 +305,7 @@ def decode_start(data: bytes, *, max_bytes: int) -> tuple[StartRequest, RolloutS
         InvalidInputError: not a valid start request.
     """
     raw, arrays = unpack(data, max_bytes=max_bytes)
-    fields = validated(StartFields, raw, where="start")
+    fields = validate_fields(StartFields, raw, where="start")
     if fields.observation is None:
         return fields.start, start_from(fields.start)
     observation = _observation_from(fields.observation, arrays, where="start")

@@ -151,7 +151,7 @@ def first_problems(error: ValidationError, *, limit: int = 5) -> str:
     )
 
 
-def validated(model: type[ModelT], fields: object, *, where: str) -> ModelT:
+def validate_fields(model: type[ModelT], fields: object, *, where: str) -> ModelT:
     """A model of decoded fields.
 
     Raises:
