@@ -67,19 +67,11 @@ class StoredAnchor(FrozenModel):
     @classmethod
     def from_poses(cls, anchor: AnchorPoses) -> "StoredAnchor":
         """The stored form of an anchor."""
-        return cls(
-            T_world_wrist_left=matrix_rows(anchor.T_world_wrist_left),
-            T_world_wrist_right=matrix_rows(anchor.T_world_wrist_right),
-            T_world_camera_head=matrix_rows(anchor.T_world_camera_head),
-        )
+        return cls(**{name: matrix_rows(T) for name, T in vars(anchor).items()})
 
     def to_poses(self) -> AnchorPoses:
         """The anchor as arrays."""
-        return AnchorPoses(
-            np.array(self.T_world_wrist_left),
-            np.array(self.T_world_wrist_right),
-            np.array(self.T_world_camera_head),
-        )
+        return AnchorPoses(**{name: np.array(rows) for name, rows in self})
 
 
 class LineageEntry(FrozenModel):

@@ -19,7 +19,7 @@ from dextouch.streams import pack, unpack
 QUATERNION_TOLERANCE: Final = 1e-3
 ARRAYS = ("images", "tactile_kpa", "action_reached", "object_poses")
 IMAGE_PREFIX = "image/"
-ANCHOR_NAMES = ("T_world_wrist_left", "T_world_wrist_right", "T_world_camera_head")
+ANCHOR_NAMES = tuple(AnchorPoses.__dataclass_fields__)
 RIGID_TOLERANCE = 1e-6
 
 
@@ -340,10 +340,7 @@ def _observation_arrays(observation: Observation) -> dict[str, np.ndarray]:
 
 
 def _origin_arrays(origin: RolloutOrigin) -> dict[str, np.ndarray]:
-    return {
-        **dict(zip(ANCHOR_NAMES, origin.anchor.as_tuple(), strict=True)),
-        "K_head": origin.K_head,
-    }
+    return vars(origin.anchor) | {"K_head": origin.K_head}
 
 
 def _observation_from(

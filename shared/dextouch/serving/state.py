@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import redis.asyncio
 from redis.commands.core import AsyncScript
@@ -30,13 +30,18 @@ class Versioned:
     version: int
 
 
-@runtime_checkable
-class StateStore(Protocol):
-    """Expiring values with compare-and-set writes, so that no update is lost."""
+class MemoryState:
+    """Expiring values of one process, with compare-and-set writes, so that no update is lost."""
+
+    def __init__(self, *, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._clock_s = clock_s
+        self._entries: dict[str, tuple[Versioned, float]] = {}
 
     async def get(self, key: str) -> Versioned | None:
         """The value, or None when absent or expired."""
-        ...
+        self._expire()
+        entry = self._entries.get(key)
+        return None if entry is None else entry[0]
 
     async def set(self, key: str, value: bytes, *, expected_version: int, ttl_s: float) -> int:
         """Write if the version is the expected one (0: absent), and renew the time to live.
@@ -47,59 +52,6 @@ class StateStore(Protocol):
         Raises:
             ConflictError: another version is stored; see `expected` and `got`.
         """
-        ...
-
-    async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
-        """Write a new value unless `limit` live keys start with `within`; False if they do.
-
-        Counting and writing are atomic, so concurrent callers never exceed the limit.
-
-        Raises:
-            ConflictError: the key exists.
-        """
-        ...
-
-    async def delete(self, key: str) -> bool:
-        """Delete a key; False if absent."""
-        ...
-
-    async def ping(self) -> None:
-        """Raise UnavailableError when the store cannot be reached."""
-        ...
-
-    async def close(self) -> None:
-        """Close connections."""
-        ...
-
-
-def open_state(url: str) -> StateStore:
-    """Open the store at `memory://` or `redis://host:port/db`.
-
-    Raises:
-        InvalidInputError: an unsupported URL.
-    """
-    if url == "memory://":
-        return MemoryState()
-    if url.startswith(("redis://", "rediss://")):
-        return RedisState(url)
-    raise InvalidInputError(f"state: got {url!r}, expected memory:// or redis://HOST:PORT/DB")
-
-
-class MemoryState:
-    """A store of one process."""
-
-    def __init__(self, *, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._clock_s = clock_s
-        self._entries: dict[str, tuple[Versioned, float]] = {}
-
-    async def get(self, key: str) -> Versioned | None:
-        """See StateStore."""
-        self._expire()
-        entry = self._entries.get(key)
-        return None if entry is None else entry[0]
-
-    async def set(self, key: str, value: bytes, *, expected_version: int, ttl_s: float) -> int:
-        """See StateStore."""
         self._expire()
         stored = self._entries.get(key)
         version = 0 if stored is None else stored[0].version
@@ -110,7 +62,13 @@ class MemoryState:
         return written.version
 
     async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
-        """See StateStore."""
+        """Write a new value unless `limit` live keys start with `within`; False if they do.
+
+        Counting and writing are atomic, so concurrent callers never exceed the limit.
+
+        Raises:
+            ConflictError: the key exists.
+        """
         # No await between counting and writing, hence atomic in one event loop.
         self._expire()
         num_live = sum(other.startswith(within) for other in self._entries)
@@ -120,7 +78,7 @@ class MemoryState:
         return True
 
     async def delete(self, key: str) -> bool:
-        """See StateStore."""
+        """Delete a key; False if absent."""
         self._expire()
         return self._entries.pop(key, None) is not None
 
@@ -159,7 +117,7 @@ return 1
 
 
 class RedisState:
-    """A store shared by several processes; one hash per key, written by a Lua script.
+    """As `MemoryState`, shared by several processes; one hash per key, written by a Lua script.
 
     Args:
         url: redis://HOST:PORT/DB; connects lazily.
@@ -184,12 +142,12 @@ class RedisState:
         self._add = self._client.register_script(ADD)
 
     async def get(self, key: str) -> Versioned | None:
-        """See StateStore."""
+        """See MemoryState."""
         version, value = await self._call("HMGET", REDIS_PREFIX + key, "version", "value")
         return None if version is None else Versioned(value, int(version))
 
     async def set(self, key: str, value: bytes, *, expected_version: int, ttl_s: float) -> int:
-        """See StateStore."""
+        """See MemoryState."""
         written, version = await self._run(
             self._compare_and_set, key, expected_version, value, _milliseconds(ttl_s)
         )
@@ -198,7 +156,7 @@ class RedisState:
         return int(version)
 
     async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
-        """See StateStore."""
+        """See MemoryState."""
         counted = _literal(REDIS_PREFIX + within) + "*"
         added = await self._run(self._add, key, counted, limit, value, _milliseconds(ttl_s))
         if added < 0:
@@ -207,15 +165,15 @@ class RedisState:
         return bool(added)
 
     async def delete(self, key: str) -> bool:
-        """See StateStore."""
+        """See MemoryState."""
         return bool(await self._call("DEL", REDIS_PREFIX + key))
 
     async def ping(self) -> None:
-        """See StateStore."""
+        """Raise UnavailableError when the server cannot be reached."""
         await self._call("PING")
 
     async def close(self) -> None:
-        """See StateStore."""
+        """See MemoryState."""
         await self._client.aclose()
 
     async def _call(self, *command: Argument) -> Any:  # noqa: ANN401 - Redis answers by command
@@ -245,6 +203,22 @@ class RedisState:
             raise StorageError(f"redis at {self._where}: {error}") from error
         except RedisError as error:
             raise UnavailableError(f"redis at {self._where}: {error}", retry_after_s=1) from error
+
+
+StateStore = MemoryState | RedisState
+
+
+def open_state(url: str) -> StateStore:
+    """Open the store at `memory://` or `redis://host:port/db`.
+
+    Raises:
+        InvalidInputError: an unsupported URL.
+    """
+    if url == "memory://":
+        return MemoryState()
+    if url.startswith(("redis://", "rediss://")):
+        return RedisState(url)
+    raise InvalidInputError(f"state: got {url!r}, expected memory:// or redis://HOST:PORT/DB")
 
 
 def _version_conflict(key: str, *, expected: int, got: int) -> ConflictError:

@@ -53,13 +53,8 @@ class CopyFirstWorld:
     @staticmethod
     def beside(other: WorldDescription) -> "CopyFirstWorld":
         """Create the baseline for the tasks and cameras of another world."""
-        return CopyFirstWorld(
-            tasks=other.tasks,
-            cameras=other.cameras,
-            image_height_px=other.image_height_px,
-            image_width_px=other.image_width_px,
-            model_rate_hz=other.model_rate_hz,
-        )
+        size = {"image_height_px", "image_width_px", "model_rate_hz"}
+        return CopyFirstWorld(**other.model_dump(include={"tasks", "cameras"} | size))
 
     @property
     def description(self) -> WorldDescription:

@@ -333,33 +333,27 @@ async def test_starts_that_fail_or_are_cancelled_leave_their_place(state):
     made.close()
 
 
-class Failing:
-    """A store of which one command does its work, if any, and then fails."""
+def fail_after(store, command, error):
+    """Let a command of a store do its work, if any, and then fail."""
+    asked = getattr(store, command)
 
-    def __init__(self, store, command, error):
-        self._store, self.command, self._error = store, command, error
+    async def failing(*args, **kwargs):
+        await asked(*args, **kwargs)
+        raise error
 
-    def __getattr__(self, name):
-        asked = getattr(self._store, name)
-
-        async def fail(*args, **kwargs):
-            await asked(*args, **kwargs)
-            raise self._error
-
-        return fail if name == self.command else asked
+    setattr(store, command, failing)
 
 
 async def test_a_store_whose_answer_is_lost_holds_no_place(state):
     if isinstance(state, RedisState):
         await state._client.flushdb()
-    failing = Failing(state, "", UnavailableError("answer lost"))
-    made = service(failing, max_rollouts=2)
+    made = service(state, max_rollouts=2)
     first = await begin(made)
-    failing.command = "add"
+    fail_after(state, "add", UnavailableError("answer lost"))
     for asked in (begin(made), made.fork(first)):
         with pytest.raises(UnavailableError, match="answer lost"):
             await asked
-    failing.command = ""
+    del state.add
     await begin(made)
     with pytest.raises(LimitExceededError):
         await begin(made)
@@ -368,7 +362,9 @@ async def test_a_store_whose_answer_is_lost_holds_no_place(state):
 
 @pytest.mark.parametrize("error", [StorageError("read-only replica"), UnavailableError("gone")])
 async def test_the_error_of_a_start_stays_when_its_place_cannot_be_freed(error):
-    made = service(Failing(MemoryState(), "delete", error), Waiting())
+    store = MemoryState()
+    fail_after(store, "delete", error)
+    made = service(store, Waiting())
     with pytest.raises(InvalidInputError, match="no instruction"):
         await begin(made, RolloutStart("stand_bottle", 3, ""))
     made.close()
