@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
-from dextouch.geometry import cameras, interpolation, rotations, transforms
+from dextouch.geometry import interpolation, rotations, transforms
 
 vectors = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)
 
@@ -97,10 +97,10 @@ def test_the_nearest_sample_of_two_equally_near_ones_is_the_earlier():
 
 def test_a_pinhole_camera_sees_its_field_of_view_edge_to_edge():
     # 90° high: half the height is seen at 45°, so that the focal length is half the height.
-    K = cameras.pinhole_matrix(width_px=640, height_px=480, fovy_rad=np.pi / 2)
+    K = transforms.pinhole_matrix(width_px=640, height_px=480, fovy_rad=np.pi / 2)
     np.testing.assert_allclose(K, [[240, 0, 320], [0, 240, 240], [0, 0, 1]])
     points = np.array([[0.0, 0.0, 2.0], [0.0, 2.0, 2.0], [-1.0, 0.0, 2.0], [0.0, 0.0, -1.0]])
-    pixels, in_front = cameras.project(K, points)
+    pixels, in_front = transforms.project(K, points)
     np.testing.assert_allclose(pixels[:3], [[320, 240], [320, 480], [200, 240]])
     assert in_front.tolist() == [True, True, True, False]
 

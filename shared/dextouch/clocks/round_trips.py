@@ -151,9 +151,9 @@ class RoundTripClock:
         slope, doubt = self._slope()
         if skew is not None and skew.sigma_ppm * 1e3 < doubt:
             slope, doubt = skew.skew_ppm * 1e3, skew.sigma_ppm * 1e3
-        high_ns, low_ns = self._band_ns(x_s, slope)
+        high_ns, low_ns, age_s = self._band(x_s, slope)
         width_ns = max(0.0, high_ns - low_ns)
-        drift_ns = doubt * self._age_s(x_s, slope)
+        drift_ns = doubt * age_s
         return ClockOffset(
             at_local_ns=at_local_ns,
             offset_ns=self._reference[1] + round((high_ns + low_ns) / 2),
@@ -190,20 +190,15 @@ class RoundTripClock:
         below = -self._lower.supporting_line(middle_s).slope_ns_per_s
         return (above + below) / 2, abs(above - below) / 2
 
-    def _band_ns(self, x_s: float, slope: float) -> tuple[float, float]:
-        """Upper and lower bound of the offset."""
-        high_ns = self._upper.line_of_slope(slope).at(x_s)
-        low_ns = -self._lower.line_of_slope(-slope).at(x_s)
-        return high_ns, low_ns
-
-    def _age_s(self, x_s: float, slope: float) -> float:
-        """Distance in time from the exchanges that define the band."""
-        held = (self._upper.line_of_slope(slope), self._lower.line_of_slope(-slope))
-        return max(abs(x_s - line.x_at_s) for line in held)
+    def _band(self, x_s: float, slope: float) -> tuple[float, float, float]:
+        """Upper and lower bound (ns), and distance (s) from the exchanges that define them."""
+        high, low = self._upper.line_of_slope(slope), self._lower.line_of_slope(-slope)
+        age_s = max(abs(x_s - line.x_at_s) for line in (high, low))
+        return high.at(x_s), -low.at(x_s), age_s
 
     def _contradicts(self, x_s: float, high_ns: float, low_ns: float) -> bool:
         """Whether an exchange lies entirely outside the band of the others."""
         slope, doubt = self._slope()
-        band_high_ns, band_low_ns = self._band_ns(x_s, slope)
-        slack_ns = 2 * doubt * self._age_s(x_s, slope) + self._resolution_ns
+        band_high_ns, band_low_ns, age_s = self._band(x_s, slope)
+        slack_ns = 2 * doubt * age_s + self._resolution_ns
         return high_ns < band_low_ns - slack_ns or low_ns > band_high_ns + slack_ns

@@ -6,15 +6,15 @@ from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from dextouch.geometry import rotations as rotations
-    from dextouch.geometry.cameras import pinhole_matrix as pinhole_matrix
-    from dextouch.geometry.cameras import project as project
     from dextouch.geometry.interpolation import bracket as bracket
     from dextouch.geometry.interpolation import interpolate_linear as interpolate_linear
     from dextouch.geometry.interpolation import interpolate_poses as interpolate_poses
     from dextouch.geometry.interpolation import nearest_index as nearest_index
     from dextouch.geometry.transforms import apply as apply
     from dextouch.geometry.transforms import invert as invert
+    from dextouch.geometry.transforms import pinhole_matrix as pinhole_matrix
     from dextouch.geometry.transforms import pose_from_transform as pose_from_transform
+    from dextouch.geometry.transforms import project as project
     from dextouch.geometry.transforms import transform as transform
     from dextouch.geometry.transforms import transform_from_pose as transform_from_pose
 else:

@@ -235,9 +235,9 @@ class RequestMiddleware:
             await self._app(scope, receive, send)
             return
         started = time.perf_counter()
-        headers = Headers(scope=scope)
         state = scope.setdefault("state", {})
-        state["request_id"] = _request_id(headers)
+        given = Headers(scope=scope).get("x-request-id", "")
+        state["request_id"] = given if REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
         state["timings_s"] = {}
 
         async def send_with_headers(message: Message) -> None:
@@ -245,7 +245,9 @@ class RequestMiddleware:
                 duration_s = time.perf_counter() - started
                 answer = MutableHeaders(scope=message)
                 answer["x-request-id"] = state["request_id"]
-                answer["server-timing"] = _server_timing(state["timings_s"], duration_s)
+                parts = [*state["timings_s"].items(), ("total", duration_s)]
+                timings = (f"{name};dur={seconds * 1e3:.2f}" for name, seconds in parts)
+                answer["server-timing"] = ", ".join(timings)
                 self._count(scope, message["status"], duration_s)
             await send(message)
 
@@ -269,13 +271,3 @@ def timed(request: Request, part: str) -> Iterator[None]:
     finally:
         timings_s: dict[str, float] = request.state.timings_s
         timings_s[part] = timings_s.get(part, 0.0) + time.perf_counter() - started
-
-
-def _request_id(headers: Headers) -> str:
-    given = headers.get("x-request-id", "")
-    return given if REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
-
-
-def _server_timing(timings_s: dict[str, float], total_s: float) -> str:
-    parts = [*timings_s.items(), ("total", total_s)]
-    return ", ".join(f"{name};dur={seconds * 1e3:.2f}" for name, seconds in parts)

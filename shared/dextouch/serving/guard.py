@@ -105,11 +105,7 @@ class SitePolicy:
     origins: Sequence[str]
 
     def check(self, connection: HTTPConnection, *, is_unsafe: bool) -> None:
-        """Refuse pages of other sites; unsafe is what may change state, or opens a WebSocket.
-
-        Raises:
-            AccessDeniedError: a foreign host name or origin (see `reason`).
-        """
+        """Refuse pages of other sites; unsafe is what may change state, or opens a WebSocket."""
         host = ", ".join(connection.headers.getlist("host")).lower()
         self._check_host(host)
         if not is_unsafe:
@@ -308,11 +304,7 @@ class BodyRules:
         return NO_ROUTE
 
     def limited(self, receive: Receive, headers: Headers, rule: BodyRule) -> Receive:
-        """Wrap `receive` to enforce the limit, with or without Content-Length.
-
-        Raises:
-            HTTPException: 415, a media type that the route does not accept; 413, a larger body.
-        """
+        """Wrap `receive` to enforce the limit, with or without Content-Length."""
         limit = self._limit(headers, rule)
         received = 0
 

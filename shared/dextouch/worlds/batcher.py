@@ -5,7 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -19,16 +19,6 @@ ResultT = TypeVar("ResultT")
 
 
 @dataclass(frozen=True)
-class StepJob(Generic[State]):
-    """One rollout's next chunk and the requested part of its observation."""
-
-    state: State
-    actions: Float64[np.ndarray, "steps 67"]
-    seed: int
-    selector: ReturnSelector = EVERYTHING
-
-
-@dataclass(frozen=True)
 class StepOutcome(Generic[State]):
     """Result of a step, its serialized state, and timings."""
 
@@ -38,11 +28,18 @@ class StepOutcome(Generic[State]):
     device_s: float
 
 
-@dataclass
-class _Waiting(Generic[State]):
-    job: StepJob[State]
-    since_s: float
-    outcome: "asyncio.Future[StepOutcome[State]]"
+@dataclass(frozen=True, eq=False)
+class StepJob(Generic[State]):
+    """One rollout's next chunk, and what of its observation is wanted; made in the event loop."""
+
+    state: State
+    actions: Float64[np.ndarray, "steps 67"]
+    seed: int
+    selector: ReturnSelector = EVERYTHING
+    since_s: float = field(default_factory=time.perf_counter, init=False)
+    outcome: "asyncio.Future[StepOutcome[State]]" = field(
+        default_factory=lambda: asyncio.get_running_loop().create_future(), init=False
+    )
 
 
 class WorldWorker(Generic[State]):
@@ -56,7 +53,7 @@ class WorldWorker(Generic[State]):
         self.world = world
         self._max_waiting = max_waiting
         self._max_batch = max_batch if isinstance(world, BatchWorld) else 1
-        self._waiting: deque[_Waiting[State]] = deque()
+        self._waiting: deque[StepJob[State]] = deque()
         self._drain: asyncio.Task[None] | None = None
         self._executor = ThreadPoolExecutor(
             max_workers=1, thread_name_prefix=f"world-{world.description.name}"
@@ -75,11 +72,10 @@ class WorldWorker(Generic[State]):
                 f"expected at most {self._max_waiting}; try again",
                 retry_after_s=1,
             )
-        outcome = asyncio.get_running_loop().create_future()
-        self._waiting.append(_Waiting(job, time.perf_counter(), outcome))
+        self._waiting.append(job)
         if self._drain is None or self._drain.done():
             self._drain = asyncio.create_task(self._run_waiting())
-        return await outcome
+        return await job.outcome
 
     def close(self) -> None:
         """Finish the running step and reject pending ones."""
@@ -93,33 +89,32 @@ class WorldWorker(Generic[State]):
         while self._waiting:
             await self._run(self._take_batch())
 
-    def _take_batch(self) -> list[_Waiting[State]]:
+    def _take_batch(self) -> list[StepJob[State]]:
         """The oldest pending chunk and, up to the limit, others of its length."""
-        num_steps = len(self._waiting[0].job.actions)
-        batch: list[_Waiting[State]] = []
-        others: deque[_Waiting[State]] = deque()
+        num_steps = len(self._waiting[0].actions)
+        batch: list[StepJob[State]] = []
+        others: deque[StepJob[State]] = deque()
         while self._waiting:
-            entry = self._waiting.popleft()
-            fits = len(entry.job.actions) == num_steps and len(batch) < self._max_batch
-            (batch if fits else others).append(entry)
+            job = self._waiting.popleft()
+            fits = len(job.actions) == num_steps and len(batch) < self._max_batch
+            (batch if fits else others).append(job)
         self._waiting = others
         return batch
 
-    async def _run(self, batch: Sequence[_Waiting[State]]) -> None:
-        jobs = [entry.job for entry in batch]
-        (result,) = await asyncio.gather(self.call(self._step_all, jobs), return_exceptions=True)
+    async def _run(self, batch: Sequence[StepJob[State]]) -> None:
+        (result,) = await asyncio.gather(self.call(self._step_all, batch), return_exceptions=True)
         if not isinstance(result, BaseException):
             began_s, device_s, steps = result
-            for entry, (stepped, snapshot) in zip(batch, steps, strict=True):
-                if not entry.outcome.done():
-                    queued_s = began_s - entry.since_s
-                    entry.outcome.set_result(StepOutcome(stepped, snapshot, queued_s, device_s))
+            for job, (stepped, snapshot) in zip(batch, steps, strict=True):
+                if not job.outcome.done():
+                    queued_s = began_s - job.since_s
+                    job.outcome.set_result(StepOutcome(stepped, snapshot, queued_s, device_s))
         elif len(batch) == 1:
             _fail(batch[0], result)
         else:
             # One by one, so that only the faulty rollout fails.
-            for entry in batch:
-                await self._run([entry])
+            for job in batch:
+                await self._run([job])
 
     def _step_all(
         self, jobs: Sequence[StepJob[State]]
@@ -142,6 +137,6 @@ class WorldWorker(Generic[State]):
         return began_s, time.perf_counter() - began_s, results
 
 
-def _fail(entry: _Waiting[Any], error: BaseException) -> None:
-    if not entry.outcome.done():
-        entry.outcome.set_exception(error)
+def _fail(job: StepJob[Any], error: BaseException) -> None:
+    if not job.outcome.done():
+        job.outcome.set_exception(error)

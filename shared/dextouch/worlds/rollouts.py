@@ -116,13 +116,7 @@ class RolloutService:
         await self._records.ping()
 
     async def start(self, world: str, start: RolloutStart, selector: ReturnSelector) -> Answer:
-        """Start a rollout.
-
-        Raises:
-            UnknownNameError: world, task, camera or action kind.
-            InvalidInputError: a start the world cannot begin from.
-            LimitExceededError: the maximum number of rollouts is active.
-        """
+        """Start a rollout."""
         worker = self._worker(world)
         description = worker.world.description
         begin = check_start(start, description)
@@ -199,11 +193,8 @@ class RolloutService:
     async def fork(self, rollout_id: str, *, seed: int | None = None) -> RolloutInfo:
         """Branch at the current step: the copy shares the past and continues independently.
 
-        An ended rollout branches before the chunk that ended it.
-
-        Args:
-            rollout_id: of the rollout to branch; it is unchanged.
-            seed: of the branch's noise; None keeps the rollout's own.
+        An ended rollout branches before the chunk that ended it. A seed gives the branch its own
+        noise.
         """
         parent = await self._records.read(rollout_id)
         self._worker_of(parent.info)

@@ -137,13 +137,7 @@ class BatchWorld(World[State], Protocol[State]):
 
 
 def check_start(start: RolloutStart, description: WorldDescription) -> RolloutStart:
-    """Validate a start and keep only images of this world's cameras.
-
-    Raises:
-        UnknownNameError: task or action kind.
-        InvalidInputError: an observation where a seed is required, or vice versa.
-        ShapeError: an observation of another size than the world's.
-    """
+    """Validate a start and keep only images of this world's cameras."""
     if start.task not in description.tasks:
         raise UnknownNameError("task", start.task, list(description.tasks))
     if start.action_kind not in description.action_kinds:
@@ -171,10 +165,6 @@ def check_chunk(
     """Validate the length of an action chunk and return it as float64.
 
     Its numbers are validated by the world, which every `World` does before it changes anything.
-
-    Raises:
-        ShapeError: not [K, 67], or K is not a multiple of the world's chunk.
-        LimitExceededError: longer than the world's maximum.
     """
     checked = np.asarray(actions, dtype=np.float64)
     if checked.ndim != 2 or checked.shape[1] != ACTION_DIM or len(checked) == 0:
@@ -209,14 +199,7 @@ def check_answer(
     num_steps: int,
     selector: ReturnSelector = EVERYTHING,
 ) -> None:
-    """Validate a world's response.
-
-    Args:
-        observation: what it gave for a chunk.
-        description: of the world.
-        first_step: of the chunk.
-        num_steps: of the chunk.
-        selector: what was asked for: of `steps="last"` one step, the chunk's last, is expected.
+    """Validate a world's response to a chunk; of `steps="last"` only the last step is expected.
 
     Raises:
         NonFiniteError: NaN or infinity in the response, as extreme actions may cause.

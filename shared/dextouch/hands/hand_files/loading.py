@@ -18,10 +18,11 @@ from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_
 from dextouch.hands.hand_files.elements import Element, read_elements
 from dextouch.hands.hand_files.mapping import FingerMapping, WristMapping, read_mapping
 from dextouch.hands.hand_files.mjcf import MjcfModel
-from dextouch.hands.hand_files.urdf import HandModelFile, Joint, Link, UrdfModel, vector3
+from dextouch.hands.hand_files.urdf import Joint, Link, UrdfModel, vector3
 from dextouch.hands.robot_hand import FingerTable, HandModel, JointRow
 from dextouch.hands.skeleton import CHAINS
 
+ModelFile = UrdfModel | MjcfModel
 # Plausible lengths from knuckle to tip and from wrist to first hinge; detects millimetres.
 FINGER_LENGTH_M: Final = (0.01, 0.5)
 MAX_PALM_M: Final = 1.0
@@ -65,12 +66,11 @@ def load_hand(model_path: Path | str, mapping_path: Path | str) -> HandModel:
     hand = HandModel(mapping.side, tables, name=name)
     for table in tables:
         _check_units(table, f"{where}, finger {table.chain!r}")
-    _check_thumb_side(hand, where)
-    _check_palm(hand, where)
+    _check_mapping(hand, where)
     return hand
 
 
-def _model(root: Element) -> HandModelFile:
+def _model(root: Element) -> ModelFile:
     if root.tag == "robot":
         return UrdfModel(root)
     if root.tag == "mujoco":
@@ -96,7 +96,7 @@ def _wrist_axes(wrist: WristMapping, where: str) -> Float64[np.ndarray, "4 4"]:
 
 
 def _fixed_links(
-    model: HandModelFile, wrist: str, T_ours_wrist: Float64[np.ndarray, "4 4"]
+    model: ModelFile, wrist: str, T_ours_wrist: Float64[np.ndarray, "4 4"]
 ) -> dict[str, np.ndarray]:
     """T_ours_link [4, 4] of the wrist link and of all ancestors rigidly attached to it."""
     # Some models attach the wrist to the palm like another fingertip; fingers then start at a
@@ -115,7 +115,7 @@ def _fixed_links(
 
 
 def _finger_table(
-    model: HandModelFile, finger: FingerMapping, bases: dict[str, np.ndarray], where: str
+    model: ModelFile, finger: FingerMapping, bases: dict[str, np.ndarray], where: str
 ) -> FingerTable:
     """The table of one finger, which begins at one of `bases`, links fixed in our wrist frame."""
     tip = finger.tip
@@ -144,7 +144,7 @@ def _finger_table(
 
 
 def _links_between(
-    model: HandModelFile, bases: dict[str, np.ndarray], tip: str, where: str
+    model: ModelFile, bases: dict[str, np.ndarray], tip: str, where: str
 ) -> tuple[str, list[str]]:
     """The base link of a tip, and the links from there to the tip."""
     links: list[str] = []
@@ -227,36 +227,26 @@ def _check_units(finger: FingerTable, where: str) -> None:
             )
 
 
-def _middle_points_m(hand: HandModel) -> dict[str, np.ndarray]:
-    """Knuckle, PIP, DIP and tip [4, 3] by chain, with all joints at mid-range."""
-    middle = 0.5 * (hand.lower_rad + hand.upper_rad)
-    points = hand.chain_points_m(middle[None])[0]
-    return {finger.chain: points[index] for index, finger in enumerate(hand.fingers)}
-
-
-def _check_thumb_side(hand: HandModel, where: str) -> None:
-    """Check the order of knuckles from the thumb's side: index, middle, ring, little."""
-    points = _middle_points_m(hand)
-    chains = [chain for chain in CHAINS[1:] if chain in points]
-    across_m = [float(points[chain][0, 0]) for chain in chains]
-    if any(near <= far for near, far in pairwise(across_m)):
+def _check_mapping(hand: HandModel, where: str) -> None:
+    """Check that knuckles fall from the thumb's side, and that fingers bend to the palm."""
+    # Knuckle, PIP, DIP and tip [4, 3] by chain, with all joints at mid-range.
+    points_m = hand.chain_points_m(0.5 * (hand.lower_rad + hand.upper_rad)[None])[0]
+    across_m = {f.chain: float(points_m[k, 0, 0]) for k, f in enumerate(hand.fingers)}
+    falling_m = [across_m[chain] for chain in CHAINS[1:] if chain in across_m]
+    if any(near <= far for near, far in pairwise(falling_m)):
         listed = ", ".join(
-            f"{chain} {1e3 * x:.1f} mm" for chain, x in zip(chains, across_m, strict=True)
+            f"{chain} {1e3 * across_m[chain]:.1f} mm" for chain in CHAINS[1:] if chain in across_m
         )
         raise InvalidInputError(
             f"{where}: got knuckles along thumb_side at {listed}, expected them to fall "
             "from index to little; check thumb_side, fingers_along and the fingers' chains"
         )
-
-
-def _check_palm(hand: HandModel, where: str) -> None:
-    points = _middle_points_m(hand)
     to_palm = 1.0 if hand.side == "right" else -1.0
-    bends = []
-    for finger in hand.fingers:
-        if finger.chain != "thumb":
-            knuckle, _, _, tip = points[finger.chain]
-            bends.append(to_palm * (tip[1] - knuckle[1]) / _length_m(finger))
+    bends = [
+        to_palm * (points_m[k, 3, 1] - points_m[k, 0, 1]) / _length_m(finger)
+        for k, finger in enumerate(hand.fingers)
+        if finger.chain != "thumb"
+    ]
     if bends and float(np.mean(bends)) < -MAX_BACKWARD:
         raise InvalidInputError(
             f"{where}: fingers in the middle of their range bend to the back of a "

@@ -101,13 +101,7 @@ class HandMapping(_Table):
 
 
 def read_mapping(path: Path) -> HandMapping:
-    """Read the mapping of one hand.
-
-    Raises:
-        NotFoundError, StorageError: a missing or unreadable file.
-        LimitExceededError: over 64 KiB.
-        InvalidInputError: not TOML, or a key that is unknown, missing or of the wrong type.
-    """
+    """Read the mapping of one hand, of at most 64 KiB."""
     try:
         return HandMapping.model_validate(tomllib.loads(read_bounded(path, MAX_BYTES).decode()))
     except UnicodeDecodeError as error:

@@ -3,7 +3,6 @@
 Defaults follow the format: origin zero, axis x, lower and upper limit zero.
 """
 
-from collections.abc import Collection
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -60,39 +59,15 @@ class Link(NamedTuple):
     joints: tuple[Joint, ...] = ()
 
 
-class HandModelFile:
-    """A tree of links; each is read when asked for, so that only those of fingers must be valid.
+class UrdfModel:
+    """The links of a URDF, which must be a tree without unprocessed xacro.
 
-    Attributes:
-        source: name of the file.
-        parents: parent of each link; None of the root.
-        sites: names of places on links.
+    Links are read when asked for, so that only those of fingers must be valid.
     """
 
     def __init__(self, root: Element) -> None:
         self.source = root.source.rpartition(" line ")[0]
         self.parents: dict[str, str | None] = {}
-        self.sites: Collection[str] = ()
-
-    def link(self, name: str) -> Link:
-        """A link with the joints that move it."""
-        raise NotImplementedError
-
-    def site(self, name: str) -> tuple[str, np.ndarray]:
-        """The link of a site, and T_link_site [4, 4]."""
-        raise UnknownNameError(f"site in {self.source}:", name, list(self.sites))
-
-
-class UrdfModel(HandModelFile):
-    """The links of a URDF.
-
-    Raises:
-        InvalidInputError: not a tree (duplicate names, unknown links, a link with two parents), or
-            unprocessed xacro.
-    """
-
-    def __init__(self, root: Element) -> None:
-        super().__init__(root)
         self._joints: dict[str, Element] = {}
         for child in root.children:
             if child.tag.startswith("xacro:"):
@@ -126,7 +101,7 @@ class UrdfModel(HandModelFile):
         return end.text("link")
 
     def link(self, name: str) -> Link:
-        """See HandModelFile."""
+        """A link with the joint that moves it."""
         element = self._joints.get(name)
         if element is None:
             return Link(np.eye(4))
@@ -143,6 +118,10 @@ class UrdfModel(HandModelFile):
         else:
             joint = joint._replace(axis=_axis(element), limits_rad=_limits(element))
         return Link(T_parent_link, (joint,))
+
+    def site(self, name: str) -> tuple[str, np.ndarray]:
+        """URDF has no sites."""
+        raise UnknownNameError(f"site in {self.source}:", name, [])
 
 
 def _origin(joint: Element) -> np.ndarray:
