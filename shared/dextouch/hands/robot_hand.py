@@ -8,6 +8,7 @@ the right palm faces +y, the left -y.
 """
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.resources import files
@@ -193,14 +194,12 @@ def _check_fingers(fingers: Sequence[FingerTable], where: str) -> None:
 
 
 def _check_unique(names: Iterable[str], what: str) -> None:
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
+    for name, count in Counter(names).items():
+        if count > 1:
             raise InvalidInputError(
                 f"{what} {name!r} appears twice; names must differ, fingers share no hinge",
                 got=name,
             )
-        seen.add(name)
 
 
 def _check_finger(finger: FingerTable, where: str) -> None:

@@ -152,12 +152,14 @@ def first_problems(error: ValidationError, *, limit: int = 5) -> str:
 
 
 def validate_fields(model: type[ModelT], fields: object, *, where: str) -> ModelT:
-    """A model of decoded fields.
+    """A model of decoded fields, or of JSON as bytes.
 
     Raises:
         InvalidInputError: wrong fields; the message begins with `where`.
     """
     try:
+        if isinstance(fields, bytes):
+            return model.model_validate_json(fields)
         return model.model_validate(fields)
     except ValidationError as error:
         raise InvalidInputError(f"{where}: {first_problems(error)}") from error

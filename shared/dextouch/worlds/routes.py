@@ -4,12 +4,12 @@ import base64
 import json
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
 from jaxtyping import Shaped
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from dextouch.errors import InvalidInputError, ShapeError
@@ -23,8 +23,8 @@ from dextouch.schemas import (
     StartRequest,
     WorldList,
     decode_start,
-    first_problems,
     start_from,
+    validate_fields,
 )
 from dextouch.serving import (
     AS_SET,
@@ -51,7 +51,6 @@ REPLAYED_HEADER = "dextouch-replayed"
 MAX_BODY_BYTES = 2**28
 # Room for 1000 rows of float64, or some hundred rows as JSON.
 MAX_CHUNK_BYTES = 2**20
-BodyT = TypeVar("BodyT", bound=BaseModel)
 
 
 class ActionsBody(FrozenModel):
@@ -162,7 +161,7 @@ async def _start_of(request: Request) -> tuple[StartRequest, RolloutStart]:
     if kind == MSGPACK:
         # Encoding megabytes of images would block the event loop.
         return await run_in_threadpool(decode_start, body, max_bytes=MAX_BODY_BYTES)
-    asked = _from_json(StartRequest, body)
+    asked = validate_fields(StartRequest, body, where="body")
     return asked, start_from(asked)
 
 
@@ -170,7 +169,7 @@ async def _actions_of(request: Request) -> Shaped[np.ndarray, "..."]:
     kind, parameters = media_type(request.headers.get("content-type"))
     body = await request.body()
     if kind == JSON:
-        rows = _from_json(ActionsBody, body).actions
+        rows = validate_fields(ActionsBody, body, where="body").actions
         if any(len(row) != ACTION_DIM for row in rows) or not rows:
             lengths = sorted({len(row) for row in rows})
             raise ShapeError(f"chunk: got rows of {lengths} numbers, expected {ACTION_DIM}")
@@ -212,10 +211,3 @@ def _as_json(payload: bytes) -> bytes:
         for name, array in arrays.items()
     }
     return json.dumps({"fields": fields, "arrays": shown}).encode()
-
-
-def _from_json(model: type[BodyT], body: bytes) -> BodyT:
-    try:
-        return model.model_validate_json(body)
-    except ValidationError as error:
-        raise InvalidInputError(f"body: {first_problems(error)}") from error
