@@ -147,7 +147,14 @@ def _add_error_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def validation(request: Request, error: RequestValidationError) -> Response:
-        return _problem_response(request, *_validation_error(error))
+        items = [
+            {"where": ".".join(str(part) for part in item["loc"]), "what": str(item["msg"])}
+            for item in error.errors()
+        ]
+        malformed = any(item["type"] == "json_invalid" for item in error.errors())
+        text = "; ".join(f"{item['where']}: {item['what']}" for item in items)
+        ours = InvalidInputError(text or "invalid request", errors=items)
+        return _problem_response(request, ours, 400 if malformed else 422)
 
     @app.exception_handler(HTTPException)
     async def http(request: Request, error: HTTPException) -> Response:
@@ -177,16 +184,6 @@ def _refusal(request: Request, error: DexTouchError | HTTPException) -> Response
     response = _problem_response(request, ours, error.status_code)
     response.headers.update(error.headers or {})
     return response
-
-
-def _validation_error(error: RequestValidationError) -> tuple[DexTouchError, int]:
-    items = [
-        {"where": ".".join(str(part) for part in item["loc"]), "what": str(item["msg"])}
-        for item in error.errors()
-    ]
-    malformed = any(item["type"] == "json_invalid" for item in error.errors())
-    text = "; ".join(f"{item['where']}: {item['what']}" for item in items)
-    return InvalidInputError(text or "invalid request", errors=items), 400 if malformed else 422
 
 
 def _problem_response(

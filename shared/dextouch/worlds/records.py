@@ -112,10 +112,6 @@ class RecordStore:
         if not await self._store.delete(KEY_PREFIX + rollout_id):
             raise _unknown(rollout_id)
 
-    async def ping(self) -> None:
-        """Raise UnavailableError when the store cannot be reached."""
-        await self._store.ping()
-
 
 def _unknown(rollout_id: str) -> NotFoundError:
     return NotFoundError(

@@ -111,10 +111,6 @@ class RolloutService:
             for name, worker in self._workers.items()
         ]
 
-    async def ping(self) -> None:
-        """Raise UnavailableError when the store cannot be reached."""
-        await self._records.ping()
-
     async def start(self, world: str, start: RolloutStart, selector: ReturnSelector) -> Answer:
         """Start a rollout."""
         worker = self._worker(world)
@@ -178,7 +174,11 @@ class RolloutService:
                 return replayed
             if record.info.ended is not None:
                 raise _over(record.info)
-            self._check_length(record.info)
+            if record.info.next_chunk >= self.limits.max_chunks:
+                raise LimitExceededError(
+                    f"rollout {rollout_id}: has {record.info.next_chunk} chunks, expected at most "
+                    f"{self.limits.max_chunks}; start a new one"
+                )
             try:
                 return await self._advance(record, worker, request)
             except EndedError as error:
@@ -280,13 +280,6 @@ class RolloutService:
                 got=digest,
             )
         return worker
-
-    def _check_length(self, info: RolloutInfo) -> None:
-        if info.next_chunk >= self.limits.max_chunks:
-            raise LimitExceededError(
-                f"rollout {info.id}: has {info.next_chunk} chunks, expected at most "
-                f"{self.limits.max_chunks}; start a new one"
-            )
 
 
 def chunk_seed(rollout_seed: int, chunk: int, world_digest: str) -> int:

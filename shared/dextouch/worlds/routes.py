@@ -87,7 +87,7 @@ def create_world_app(
         await store.close()
 
     async def readiness() -> list[str]:
-        await service.ping()
+        await store.ping()
         return []
 
     return create_service_app(
