@@ -120,7 +120,7 @@ def _finger_table(
     """The table of one finger, which begins at one of `bases`, links fixed in our wrist frame."""
     tip = finger.tip
     if tip.site is not None:
-        link, T_link_tip = model.site(tip.site)
+        link, T_link_tip = model.site(tip.site, f"{where} tip")
     elif tip.link_name in model.parents:
         link, T_link_tip = tip.link_name, np.eye(4)
     else:

@@ -96,10 +96,10 @@ class MjcfModel:
         T_parent_body = place.T_body_parent @ self._settings.frame(place.element)
         return Link(T_parent_body, tuple(self._joint(joint) for joint in self._joints[name]))
 
-    def site(self, name: str) -> tuple[str, np.ndarray]:
+    def site(self, name: str, where: str) -> tuple[str, np.ndarray]:
         """The body of a site and T_body_site [4, 4]; `fromto` is refused."""
         if name not in self._sites:
-            raise UnknownNameError(f"site in {self.source}:", name, list(self._sites))
+            raise UnknownNameError(f"site in {where}:", name, list(self._sites))
         place = self._sites[name]
         element = self._settings.with_defaults(place)
         if "fromto" in element.attributes:

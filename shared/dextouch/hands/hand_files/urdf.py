@@ -119,9 +119,9 @@ class UrdfModel:
             joint = joint._replace(axis=_axis(element), limits_rad=_limits(element))
         return Link(T_parent_link, (joint,))
 
-    def site(self, name: str) -> tuple[str, np.ndarray]:
+    def site(self, name: str, where: str) -> tuple[str, np.ndarray]:
         """URDF has no sites."""
-        raise UnknownNameError(f"site in {self.source}:", name, [])
+        raise UnknownNameError(f"site in {where}:", name, [])
 
 
 def _origin(joint: Element) -> np.ndarray:
