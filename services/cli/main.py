@@ -78,7 +78,7 @@ COMMANDS = {
     ),
     "study": Command(
         "score policies in several worlds, defined in a file and resumable",
-        "services.cli.study:main",
+        "cli.study:main",
     ),
     "rate": Command("score rollouts by people: a page for raters, and their agreement"),
     "rate serve": Command(
