@@ -47,18 +47,16 @@ def examine() -> list[Finding]:
     ]
     for package, purpose in _PACKAGES.items():
         there = importlib.util.find_spec(package) is not None
-        hint = "" if there else install_hint(package)
-        findings.append(
-            Finding(f"{package} ({purpose})", "yes" if there else "no", ok=there, do=hint)
-        )
+        hint, answer = ("", "yes") if there else (install_hint(package), "no")
+        findings.append(Finding(f"{package} ({purpose})", answer, ok=there, do=hint))
     free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
-    findings.append(
-        Finding("free disk", f"{free_gb:.1f} GB", ok=free_gb > 2, do="free at least 2 GB")
-    )
-    redis = shutil.which("redis-server")
-    findings.append(Finding("redis-server (optional)", redis or "no: rollouts are kept in memory"))
-    libusb = ctypes.util.find_library("usb-1.0")
-    findings.append(Finding("libusb (optional)", libusb or "no: trackers by link usb need it"))
+    redis = shutil.which("redis-server") or "no: rollouts are kept in memory"
+    libusb = ctypes.util.find_library("usb-1.0") or "no: trackers by link usb need it"
+    findings += [
+        Finding("free disk", f"{free_gb:.1f} GB", ok=free_gb > 2, do="free at least 2 GB"),
+        Finding("redis-server (optional)", redis),
+        Finding("libusb (optional)", libusb),
+    ]
     for pattern in ("ttyACM*", "ttyUSB*", "hidraw*", "video*"):
         found = [_with_access(path) for path in sorted(Path("/dev").glob(pattern))]
         findings.append(Finding(f"devices {pattern}", ", ".join(found) or "none"))

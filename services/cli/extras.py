@@ -2,42 +2,21 @@
 
 from dextouch.errors import DexTouchError, UnavailableError
 
-# By import name; if several extras provide a package, the most relevant one.
-EXTRA_OF = {
-    "zarr": "store",
-    "zstandard": "store",
-    "google_crc32c": "store",
-    "av": "store",
-    "serial": "station",
-    "fastcrc": "station",
-    "hid": "station",
-    "usb": "station",
-    "cv2": "station",
-    "fastapi": "serve",
-    "uvicorn": "serve",
-    "httptools": "serve",
-    "rich": "serve",
-    "redis": "serve",
-    "httpx": "serve",
-    "pydantic_settings": "serve",
-    "structlog": "serve",
-    "prometheus_client": "serve",
-    "jinja2": "serve",
-    "websockets": "serve",
-    "scipy": "align",
-    "numba": "align",
-    "torch": "model",
-    "safetensors": "model",
-    "PIL": "model",
-    "mujoco": "twin",
-    "gymnasium": "gym",
-    "pyarrow": "export",
-    "mcap": "export",
-    "foxglove_schemas_protobuf": "export",
-    "numcodecs": "export",
+# Import names; if several extras provide a package, the most relevant one has it.
+_PACKAGES = {
+    "store": "zarr zstandard google_crc32c av",
+    "station": "serial fastcrc hid usb cv2",
+    "serve": "fastapi uvicorn httptools rich redis httpx pydantic_settings structlog "
+    "prometheus_client jinja2 websockets",
+    "align": "scipy numba",
+    "model": "torch safetensors PIL",
+    "twin": "mujoco",
+    "gym": "gymnasium",
+    "export": "pyarrow mcap foxglove_schemas_protobuf numcodecs",
     "rerun": "rerun",
-    "obstore": "s3",
+    "s3": "obstore",
 }
+EXTRA_OF = {package: extra for extra, names in _PACKAGES.items() for package in names.split()}
 
 
 def install_hint(package: str) -> str:
@@ -46,12 +25,7 @@ def install_hint(package: str) -> str:
 
 
 def missing_package(error: ModuleNotFoundError, otherwise: str = "") -> DexTouchError | None:
-    """Error for a missing package; None if no extra provides it.
-
-    Args:
-        error: error of the import.
-        otherwise: alternative to mention in the message.
-    """
+    """Error for a missing package, with an alternative; None if no extra provides it."""
     package = (error.name or "").partition(".")[0]
     if package not in EXTRA_OF:
         return None

@@ -19,7 +19,7 @@ from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli.servers import served
-from services.cli.training_data import in_processes
+from services.cli.training_data import comma_separated, in_processes
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.generation.demonstrations import imagine_episode
 from services.world_model.checkpoints import default_checkpoint
@@ -99,7 +99,8 @@ def main(argv: Sequence[str]) -> int:
         default=default_checkpoint(),
         help="world model (default: the package's)",
     )
-    parser.add_argument("--tasks", help="comma-separated tasks (default: all)")
+    tasks = "comma-separated tasks (default: all)"
+    parser.add_argument("--tasks", type=comma_separated, help=tasks)
     parser.add_argument("--seeds", type=seed_range, help="FIRST:LAST+1 (default: all)")
     parser.add_argument(
         "--jobs",
@@ -109,8 +110,8 @@ def main(argv: Sequence[str]) -> int:
     )
     add_json(parser)
     arguments = parser.parse_args(list(argv))
-    tasks = tuple(arguments.tasks.split(",")) if arguments.tasks else None
-    wanted = chosen_episodes(EpisodeStore(arguments.episodes), tasks, arguments.seeds)
+    source = EpisodeStore(arguments.episodes)
+    wanted = chosen_episodes(source, arguments.tasks or None, arguments.seeds)
     imagine = partial(
         imagine_all,
         episodes=arguments.episodes,

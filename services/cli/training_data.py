@@ -29,10 +29,10 @@ from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.schemas import RolloutStart
-from services.cli.data_mix import MIXES, Mix, options_of
 from services.evaluation.policies.asking import action_chunk, ask
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.progress import Progress
+from services.twin.data_mix import MIXES, Mix, options_of
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import episode_id, record, write_episode
 from services.twin.hands import DOMAINS, Domain
@@ -124,6 +124,7 @@ class Answer:
     refusal: str | None = None
 
 
+# Compiled once per process.
 @lru_cache(maxsize=12)
 def _stage(task: str, domain: Domain) -> Stage:
     return Stage(task, domain, TwinSettings())
@@ -169,8 +170,8 @@ def _played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
     return PlayedActions(choice.label, np.concatenate(rows), command)
 
 
-def _make(order: Order) -> Answer:
-    # Compiled once per process.
+def make_episode(order: Order) -> Answer:
+    """Record one episode and write it to its store."""
     stage = _stage(order.task, order.domain)
     try:
         if order.policy is None:
@@ -235,7 +236,7 @@ def make_training_data(
     counts = {"made": 0, "kept": len(orders) - len(missing), "succeeded": 0, "refused": 0}
     started_s = time.monotonic()
     with Progress("twin episodes", len(missing)) as progress:
-        answers = record_all(missing, num_jobs or os.cpu_count() or 1)
+        answers = in_processes(make_episode, missing, num_jobs or os.cpu_count() or 1)
         for done, answer in enumerate(answers, start=1):
             if answer.refusal is not None:
                 counts["refused"] += 1
@@ -250,11 +251,6 @@ def make_training_data(
                 episodes_per_s=1 / each_s, minutes_left=each_s * (len(missing) - done) / 60
             )
     return counts
-
-
-def record_all(orders: Sequence[Order], num_jobs: int) -> Iterator[Answer]:
-    """Record episodes in processes of their own; yields their results as they are done."""
-    return in_processes(_make, orders, num_jobs)
 
 
 def in_processes(
@@ -275,17 +271,9 @@ def in_processes(
             yield future.result()
 
 
-def _words(choices: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
-    """Parser of comma-separated names."""
-
-    def read(text: str) -> tuple[str, ...]:
-        names = tuple(name for name in text.split(",") if name)
-        wrong = [name for name in names if name not in choices]
-        if wrong or not names:
-            raise argparse.ArgumentTypeError(f"got {text!r}, expected some of {','.join(choices)}")
-        return names
-
-    return read
+def comma_separated(text: str) -> tuple[str, ...]:
+    """Parse names, for argparse."""
+    return tuple(name for name in text.split(",") if name)
 
 
 def _keywords(text: str) -> dict[str, Any]:
@@ -305,37 +293,22 @@ def _parser() -> argparse.ArgumentParser:
     add("--store", required=True, help="folder of the episode store")
     add("--first", type=int, default=0, help="first seed (%(default)s)")
     add("--count", type=int, default=130, help="seeds per task (%(default)s)")
-    add(
-        "--tasks",
-        type=_words(TASK_NAMES),
-        default=TASK_NAMES,
-        help="comma-separated (default: all)",
-    )
-    add("--domains", type=_words(DOMAINS), default=("robot",), help="robot,human (robot)")
+    tasks = "comma-separated (default: all)"
+    add("--tasks", type=comma_separated, default=TASK_NAMES, help=tasks)
+    add("--domains", type=comma_separated, default=("robot",), help="robot,human (robot)")
     mixes = parser.add_mutually_exclusive_group()
-    mixes.add_argument(
-        "--mix", choices=list(MIXES), default=DEFAULT_MIX, help="kinds of takes (%(default)s)"
-    )
+    kinds = "kinds of takes (%(default)s)"
+    mixes.add_argument("--mix", choices=list(MIXES), default=DEFAULT_MIX, help=kinds)
     for name, effect in (("exact", "no errors"), ("ladder", "errors of 0 … 40 mm in turn")):
-        mixes.add_argument(
-            f"--{name}",
-            dest="mix",
-            action="store_const",
-            const=name,
-            help=f"{effect}, no other kinds",
-        )
+        short = mixes.add_argument(f"--{name}", dest="mix", action="store_const", const=name)
+        short.help = f"{effect}, no other kinds"
     add("--miss-fraction", type=float, help="share of misses (default: the mix's)")
     add("--still-fraction", type=float, help="share of takes that stop or never start")
     add("--policy", metavar="[NAME=]MODULE:FACTORY", help="record rollouts of this policy instead")
-    add(
-        "--policy-arguments",
-        type=_keywords,
-        default={},
-        help="arguments of the factory, as a JSON object",
-    )
-    add(
-        "--images", type=int, default=1, metavar="N", help="images of every N-th step (%(default)s)"
-    )
+    arguments = "arguments of the factory, as a JSON object"
+    add("--policy-arguments", type=_keywords, default={}, help=arguments)
+    images = "images of every N-th step (%(default)s)"
+    add("--images", type=int, default=1, metavar="N", help=images)
     add("--streams", choices=STREAM_CHOICES, default="training", help="(%(default)s)")
     add("--jobs", type=int, help="processes (default: one per core)")
     add_json(parser)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 PORT = "0 for any free one"
+NEEDED = ("episode_store", "acquisition", "dashboard")
 # Makes the app of one service from the settings and the addresses of all services.
 Builder = Callable[["UpSettings", Mapping[str, str]], FastAPI]
 
@@ -78,10 +79,10 @@ class UpSettings(BaseSettings):
         "standard output",
     )
 
-    def port(self, name: str) -> int:
-        """Configured port of a service."""
-        ports: dict[str, int] = self.model_dump()
-        return ports[f"{name}_port"]
+    @property
+    def store_url(self) -> str:
+        """The store in the data folder."""
+        return str(self.data / "store")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -98,26 +99,25 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
         stop_on_signals(stop)
     builders = _wanted(settings)
     with ExitStack() as held:
-        bound = {}
         # Explicit ports first, so that no default takes one of them.
-        for name in sorted(
-            builders, key=lambda name: f"{name}_port" not in settings.model_fields_set
-        ):
+        given = settings.model_fields_set
+        bound = {}
+        for name in sorted(builders, key=lambda name: f"{name}_port" not in given):
             bound[name] = _bind(name, settings)
             held.callback(bound[name].socket.close)
-        places = {name: bound[name] for name in builders}
-        urls = {name: place.url for name, place in places.items()}
-        placed = [(places[name], _build(name, settings, urls)) for name in builders]
-        await serve_all(placed, stop=stop, on_ready=partial(_announce, settings, places))
+        urls = {name: bound[name].url for name in builders}
+        placed = [(bound[name], _build(name, settings, urls)) for name in builders]
+        await serve_all(placed, stop=stop, on_ready=partial(_announce, settings, urls))
     return 0
 
 
 def _bind(name: str, settings: UpSettings) -> Place:
-    port = settings.port(name)
+    field = f"{name}_port"
+    port: int = getattr(settings, field)
     try:
         return bind(name, host=LOOPBACK, port=port)
     except ConflictError:
-        if f"{name}_port" in settings.model_fields_set:
+        if field in settings.model_fields_set:
             raise
         print(f"{name}: port {port} is taken, so it gets any free one", file=sys.stderr)
         return bind(name, host=LOOPBACK, port=0)
@@ -130,30 +130,26 @@ def _build(name: str, settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
         raise InvalidInputError(f"settings of {name}: {first_problems(error)}") from error
     except ModuleNotFoundError as error:
         otherwise = f", or leave this service out with --without {name}"
-        refusal = missing_package(error, otherwise if name in _optional() else "")
+        refusal = missing_package(error, "" if name in NEEDED else otherwise)
         if refusal is None:
             raise
         raise refusal from error
 
 
-def _optional() -> list[str]:
-    needed = ("episode_store", "acquisition", "dashboard")
-    return [name for name in BUILDERS if name not in needed]
-
-
 def _wanted(settings: UpSettings) -> Mapping[str, Builder]:
+    optional = [name for name in BUILDERS if name not in NEEDED]
     for name in settings.without:
-        if name not in _optional():
-            raise UnknownNameError("service to leave out", name, _optional())
+        if name not in optional:
+            raise UnknownNameError("service to leave out", name, optional)
     return {name: build for name, build in BUILDERS.items() if name not in settings.without}
 
 
-def _announce(settings: UpSettings, places: Mapping[str, Place]) -> None:
-    for name, place in places.items():
-        print(f"{name:<14}{place.url}")
+def _announce(settings: UpSettings, urls: Mapping[str, str]) -> None:
+    for name, url in urls.items():
+        print(f"{name:<14}{url}")
     print(f"data          {settings.data.resolve()}")
-    print(f"\nOpen {places['dashboard'].url} · stop with Ctrl-C", flush=True)
-    write_result(settings.json_path, {name: place.url for name, place in places.items()})
+    print(f"\nOpen {urls['dashboard']} · stop with Ctrl-C", flush=True)
+    write_result(settings.json_path, dict(urls))
 
 
 # Services are imported lazily, to keep `dextouch --help` fast.
@@ -163,7 +159,7 @@ def _episode_store(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
     from services.episode_store.app import create_app
     from services.episode_store.settings import EpisodeStoreSettings
 
-    return create_app(EpisodeStoreSettings(store_url=_store_url(settings)))
+    return create_app(EpisodeStoreSettings(store_url=settings.store_url))
 
 
 def _alignment(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
@@ -172,7 +168,7 @@ def _alignment(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
 
     return create_app(
         AlignmentSettings(
-            store_url=_store_url(settings),
+            store_url=settings.store_url,
             align_new=settings.align_new,
             log_level=settings.log_level,
         )
@@ -191,7 +187,7 @@ def _station(settings: UpSettings, **given: object) -> "AcquisitionSettings":
     if settings.mock or "station" in settings.model_fields_set:
         given["station"] = settings.station
     if settings.mock_episode_id is not None:
-        given |= {"mock_store": _store_url(settings), "mock_episode_id": settings.mock_episode_id}
+        given |= {"mock_store": settings.store_url, "mock_episode_id": settings.mock_episode_id}
     station = AcquisitionSettings.model_validate(
         {"spool": settings.data / "spool", "mock": settings.mock} | given
     )
@@ -228,10 +224,6 @@ def _dashboard(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
     station = _station(settings).station
     upstreams = {f"{name}_url": url for name, url in urls.items() if name != "dashboard"}
     return create_app(DashboardSettings.model_validate({"station": station} | upstreams))
-
-
-def _store_url(settings: UpSettings) -> str:
-    return str(settings.data / "store")
 
 
 # In the order of the data flow; stopped in reverse.

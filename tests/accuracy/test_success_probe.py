@@ -8,11 +8,11 @@ import torch
 from scipy.stats import mannwhitneyu
 
 from dextouch.episodes import EpisodeStore
-from services.cli.data_mix import LADDER_M, MIXES
 from services.cli.training_data import Scope, make_training_data
 from services.evaluation.endings import read_ending_episodes
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
+from services.twin.data_mix import LADDER_M, MIXES
 
 pytestmark = pytest.mark.slow
 # Far from the seeds of training and of the checkpoint's own held-out set.

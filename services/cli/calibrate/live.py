@@ -75,10 +75,8 @@ def follow_folder(session: Session, arrivals: Arrivals) -> None:
     for name, data in arrivals:
         photo = decode_photo(data, where=name)
         view = find_board(name, photo, session.board)
-        if view is None:
-            print(f"{name}: no board")
-        elif view.is_blurred:
-            print(f"{name}: blurred, left out")
+        if view is None or view.is_blurred:
+            print(f"{name}: {'no board' if view is None else 'blurred, left out'}")
         else:
             session.keep(view, photo)
         if session.is_enough:
@@ -95,26 +93,24 @@ def collect_live(session: Session, arrivals: Arrivals, photos: Path) -> int:
         photo = decode_photo(data, where=name)
         view = find_board(name, photo, session.board)
         still = view is not None and before is not None and motion_px(view, before) <= MAX_MOTION_PX
+        if view is None:
+            why = "no board in the last image; does --board match this board?"
+        elif not still or view.is_blurred:
+            why = "the board in the last image moves or is blurred; hold it still"
+        elif not session.is_new(view, photo):
+            why = "the board is where it was; hold it elsewhere"
+        else:
+            why, num_idle = "", 0
+            (photos / f"live_{first + num_kept:04d}.jpg").write_bytes(data)
+            num_kept += 1
+            session.keep(view, photo)
         before = view
-        if view is None or not still or view.is_blurred or not session.is_new(view, photo):
-            num_idle += 1
-            if num_idle % TELL_AFTER_IMAGES == 0:
-                print(_why_nothing_is_kept(view, still=still))
-            continue
-        (photos / f"live_{first + num_kept:04d}.jpg").write_bytes(data)
-        num_kept, num_idle = num_kept + 1, 0
-        session.keep(view, photo)
         if session.is_enough:
             break
+        num_idle += bool(why)
+        if why and num_idle % TELL_AFTER_IMAGES == 0:
+            print(why)
     return num_kept
-
-
-def _why_nothing_is_kept(view: BoardView | None, *, still: bool) -> str:
-    if view is None:
-        return "no board in the last image; does --board match this board?"
-    if not still or view.is_blurred:
-        return "the board in the last image moves or is blurred; hold it still"
-    return "the board is where it was; hold it elsewhere"
 
 
 def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:

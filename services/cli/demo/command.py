@@ -20,31 +20,13 @@ from dextouch.serving import configure_logging
 from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, create_world_app
 from services.alignment.app import create_app as create_alignment
 from services.alignment.settings import AlignmentSettings
-from services.cli.demo.prediction import measure_prediction, read_scene
-from services.cli.demo.recording import (
-    Take,
-    align,
-    forget_take,
-    make_truth,
-    measure,
-    record_take,
-    upload,
-)
-from services.cli.demo.scoring import (
-    BASELINE,
-    MODEL,
-    committed_models,
-    judge,
-    ladder,
-    refuse_trained,
-    train_models,
-    use_one_thread,
-)
+from services.cli.demo import recording, scoring
 from services.cli.demo.settings import DemoPlan, parse
 from services.cli.demo.table import show
 from services.cli.servers import served
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
+from services.evaluation.prediction import measure_prediction, read_scene
 from services.evaluation.reporting import (
     ActionPicture,
     EpisodePicture,
@@ -92,7 +74,7 @@ def main(argv: Sequence[str]) -> int:
     """
     plan = parse(argv)
     configure_logging(service="demo", log_format="auto", level="warning")
-    use_one_thread()
+    scoring.use_one_thread()
     plan.output.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="dextouch-demo-") as folder:
         report = run(plan, Path(folder))
@@ -112,24 +94,24 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
     """Run all stages and return the contents of `report.json`; `folder` is for scratch."""
     stages, truths = Stages(), EpisodeStore(folder / "truth")
     with stages.stage("truth", "recording the truth in the physics twin"):
-        truth = make_truth(plan, folder / "truth")
+        truth = recording.make_truth(plan, folder / "truth")
     if plan.train:
         with stages.stage("train", "training world model, policy and probe"):
-            models = train_models(plan.output / "trained")
+            models = scoring.train_models(plan.output / "trained")
     else:
-        models = committed_models()
+        models = scoring.committed_models()
     with served(_apps(folder / "alignments", models.world_model)) as urls:
-        takes: dict[str, Take] = {
+        takes: dict[str, recording.Take] = {
             domain: _take(truths.open(episode_id), folder / "spool", seed, urls, stages)
             for seed, (domain, episode_id) in enumerate(truth.takes.items())
         }
         with stages.stage("predict", "predicting held-out scenes with the world model"):
             scenes = [read_scene(truths.open(episode_id)) for episode_id in truth.demonstrations]
-            refuse_trained(models.training_seeds, (scene.start.seed for scene in scenes))
+            scoring.refuse_trained(models.training_seeds, (scene.start.seed for scene in scenes))
             prediction = measure_prediction(models.world_model, scenes)
         with stages.stage("judge", "scoring policies in the twin and in the world model"):
-            policies = {**ladder(plan), "behaviour cloning": models.policy}
-            scores = judge(urls, policies, models, plan)
+            policies = {**scoring.ladder(plan), "behaviour cloning": models.policy}
+            scores = scoring.judge(urls, policies, models, plan)
     report = {
         "about": {
             "version": __version__,
@@ -165,7 +147,10 @@ def _apps(jobs_folder: Path, world_model: World[Any]) -> dict[str, FastAPI]:
         store_url=store, jobs_folder=jobs_folder, align_new=False, log_level="warning"
     )
     twin = TwinWorld(TwinSettings(cameras=(CAMERA,)))
-    imagined = {MODEL: world_model, BASELINE: CopyFirstWorld.beside(world_model.description)}
+    imagined = {
+        scoring.MODEL: world_model,
+        scoring.BASELINE: CopyFirstWorld.beside(world_model.description),
+    }
     served_worlds = WorldServiceSettings()
     return {
         "episode_store": create_store(EpisodeStoreSettings(store_url=store)),
@@ -177,16 +162,16 @@ def _apps(jobs_folder: Path, world_model: World[Any]) -> dict[str, FastAPI]:
 
 def _take(
     truth: EpisodeReader, spool: Path, seed: int, urls: Mapping[str, str], stages: Stages
-) -> Take:
+) -> recording.Take:
     """Record, upload and align one take, which replaces that of an earlier run."""
     domain, store = truth.attributes.domain, EpisodeStore(default_store())
     with stages.stage(f"record_{domain}", f"recording a {domain} take"):
-        recorded, devices = record_take(truth, spool, seed=seed)
-        forget_take(store, recorded.recording_id)
-        upload(spool, urls["episode_store"])
+        recorded, devices = recording.record_take(truth, spool, seed=seed)
+        recording.forget_take(store, recorded.recording_id)
+        recording.upload(spool, urls["episode_store"])
     with stages.stage(f"align_{domain}", f"aligning the {domain} take"):
-        job = align(urls["alignment"], recorded.recording_id)
-        return measure(store, truth, recorded, job.alignment_id, devices=devices)
+        job = recording.align(urls["alignment"], recorded.recording_id)
+        return recording.measure(store, truth, recorded, job.alignment_id, devices=devices)
 
 
 def _described(world: WorldDescription) -> str:
@@ -207,7 +192,7 @@ def worst_errors(takes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _pictures(
-    takes: Mapping[str, Take], predictions: tuple[PredictionPicture, ...]
+    takes: Mapping[str, recording.Take], predictions: tuple[PredictionPicture, ...]
 ) -> ReportPictures:
     robot = takes["robot"].episode
     measured = robot.window(0, robot.num_steps, cameras=())

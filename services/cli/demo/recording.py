@@ -39,7 +39,7 @@ from services.alignment.calibration.tactile_tare import measure_tare
 from services.alignment.recording_error import NEAR_NS, compare_with_truth, match_samples
 from services.alignment.schemas import AlignmentJob
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan
-from services.cli.training_data import Order, record_all
+from services.cli.training_data import Order, in_processes, make_episode
 from services.evaluation.progress import Progress
 from services.twin.cameras import CAMERAS
 from services.twin.hands import Domain
@@ -101,7 +101,7 @@ def make_truth(plan: DemoPlan, store_folder: Path) -> Truth:
     ]
     orders = [*takes.values(), *demonstrations]
     with Progress("episodes", len(orders)) as progress:
-        for answer in record_all(orders, min(MAX_PROCESSES, os.cpu_count() or 1)):
+        for answer in in_processes(make_episode, orders, min(MAX_PROCESSES, os.cpu_count() or 1)):
             if answer.refusal is not None:
                 raise InvalidInputError(f"{answer.episode_id}: {answer.refusal}")
             progress.advance()

@@ -15,7 +15,7 @@ from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas import LineageEntry
 from services.cli.demo.command import Stages, worst_errors
 from services.cli.demo.recording import align, forget_take
-from services.cli.demo.scoring import ladder
+from services.cli.demo.scoring import ladder, refuse_trained
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, parse
 from services.cli.demo.table import rate, show
 from services.cli.servers import bind, served
@@ -192,3 +192,10 @@ def test_the_table_shows_intervals():
     row = {"real": 0.0, "real_interval": [0.0, 0.39], "imagined": 0.5}
     assert rate(row, "real") == "0.00 (0.00 … 0.39)"
     assert rate(row, "imagined") == "0.50"
+
+
+def test_seeds_of_training_are_refused():
+    trained = {"press": (0, 219)}
+    refuse_trained(trained, range(220, 230))
+    with pytest.raises(ConflictError, match=r"'press' with seeds 0 … 219.*seed 219"):
+        refuse_trained(trained, range(219, 222))

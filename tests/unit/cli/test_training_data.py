@@ -9,8 +9,8 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
 from services.cli import training_data
-from services.cli.data_mix import MIXES, Mix, options_of
 from services.cli.training_data import PolicyChoice, Scope, make_training_data
+from services.twin.data_mix import MIXES, Mix, options_of
 
 
 def drawn(mix, seeds=2000, task="stand_bottle"):
@@ -142,8 +142,10 @@ def test_human_hands_and_named_tasks(tmp_path, capsys):
 
 
 def test_unknown_tasks_and_policies_for_human_hands_are_refused(tmp_path, capsys):
-    with pytest.raises(SystemExit):
+    with pytest.raises(UnknownNameError, match="'juggle'; valid: "):
         training_data.main(["--store", str(tmp_path), "--tasks", "juggle"])
+    with pytest.raises(InvalidInputError, match="at least one of each"):
+        training_data.main(["--store", str(tmp_path), "--tasks", ","])
     with pytest.raises(UnknownNameError, match="stand_bottle"):
         Scope(("juggle",))
     with pytest.raises(InvalidInputError, match="robot"):

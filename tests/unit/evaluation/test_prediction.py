@@ -1,17 +1,16 @@
-"""How the demo measures a world: on scenes whose touch and images follow a known rule."""
+"""How a world is measured: on scenes whose touch and images follow a known rule."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from dextouch.errors import ConflictError, InvalidInputError
+from dextouch.errors import InvalidInputError
 from dextouch.geometry import pinhole_matrix, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.schemas import EVERYTHING, Observation, RolloutStart
 from dextouch.worlds import CopyFirstWorld, SteppedRollout
-from services.cli.demo.prediction import Future, Scene, measure_prediction
-from services.cli.demo.scoring import refuse_trained
+from services.evaluation.prediction import Future, Scene, measure_prediction
 
 PX, NUM_STEPS = 8, 32
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -80,10 +79,3 @@ def test_a_lone_scene_has_no_other_and_no_scene_is_refused():
     assert "psnr_other_take" not in measure_prediction(world, [scene(1, 0.1)]).figures
     with pytest.raises(InvalidInputError, match="no scene"):
         measure_prediction(world, [])
-
-
-def test_seeds_of_training_are_refused():
-    trained = {"press": (0, 219)}
-    refuse_trained(trained, range(220, 230))
-    with pytest.raises(ConflictError, match=r"'press' with seeds 0 … 219.*seed 219"):
-        refuse_trained(trained, range(219, 222))
