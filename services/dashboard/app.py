@@ -1,7 +1,7 @@
 """Application factory of the dashboard."""
 
 from collections.abc import AsyncIterator, Mapping, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -13,7 +13,6 @@ from services.dashboard.pages import page_router, refusal_page
 from services.dashboard.routes import api_router, live_router
 from services.dashboard.sessions import Sessions
 from services.dashboard.settings import DashboardSettings
-from services.dashboard.topics import running
 from services.dashboard.upstream import Upstream
 
 STATIC = Path(__file__).parent / "static"
@@ -44,11 +43,9 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        async with AsyncExitStack() as held:
-            for upstream in upstreams.values():
-                held.push_async_callback(upstream.close)
-            await held.enter_async_context(running(feeds.topics.values()))
-            yield
+        yield
+        for upstream in upstreams.values():
+            await upstream.close()
 
     app = create_service_app(
         name="dashboard",

@@ -1,6 +1,7 @@
 """HTTP and WebSocket routes of the page: data, live updates and recorder actions."""
 
 import asyncio
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Annotated, Any
 from urllib.parse import quote
@@ -28,7 +29,7 @@ from services.dashboard.feeds import Feeds
 from services.dashboard.sessions import Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView
-from services.dashboard.topics import Message, Viewer
+from services.dashboard.topics import Topic
 from services.dashboard.touch import heatmap_layout
 
 WEBSOCKET_REFUSED = 1008
@@ -110,35 +111,44 @@ def live_router() -> APIRouter:
             await websocket.close(WEBSOCKET_REFUSED, error.message[:120])
             return
         await websocket.accept()
-        viewer = Viewer(websocket.app.state.feeds.topics)
-        sender = asyncio.create_task(_send_news(websocket, viewer))
+        topics: Mapping[str, Topic] = websocket.app.state.feeds.topics
+        session = asyncio.create_task(_close_with_session(websocket))
+        senders: dict[str, asyncio.Task[None]] = {}
         try:
             with suppress(WebSocketDisconnect):
                 while websocket.application_state is WebSocketState.CONNECTED:
-                    viewer.look_at(_view(await websocket.receive_text()))
+                    wanted = topics.keys() & _view(await websocket.receive_text())
+                    for name in senders.keys() - wanted:
+                        senders.pop(name).cancel()
+                    for name in wanted - senders.keys():
+                        senders[name] = asyncio.create_task(_send(websocket, topics[name]))
         finally:
-            viewer.look_at(())
-            sender.cancel()
-            with suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
-                await sender
+            tasks = (session, *senders.values())
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
 
     return router
 
 
-async def _send_news(websocket: WebSocket, viewer: Viewer) -> None:
-    """Send updates until the session ends."""
-    messages: list[Message] = []
-    try:
-        while True:
-            guard(websocket)
+async def _send(websocket: WebSocket, topic: Topic) -> None:
+    """Send the updates of a topic until the session or the connection ends."""
+    with suppress(AccessDeniedError, WebSocketDisconnect, RuntimeError):
+        async for messages in topic.updates():
             for message in messages:
+                guard(websocket)
                 if isinstance(message, bytes):
                     await websocket.send_bytes(message)
                 else:
                     await websocket.send_text(message)
-            messages = []
-            with suppress(TimeoutError):
-                messages = await asyncio.wait_for(viewer.news(), SESSION_CHECK_S)
+
+
+async def _close_with_session(websocket: WebSocket) -> None:
+    """Close the connection when its session ends."""
+    try:
+        while True:
+            guard(websocket)
+            await asyncio.sleep(SESSION_CHECK_S)
     except AccessDeniedError as error:
         await websocket.close(WEBSOCKET_REFUSED, error.message)
 

@@ -204,11 +204,10 @@ async def test_missing_service_is_named():
 
 
 async def test_taxel_messages_carry_the_pressures(feeds):
-    topic = feeds.topics["taxels"]
-    await topic.refresh()
-    assert [message[0] for message in topic.messages] == [1, 1]
+    messages = await feeds.topics["taxels"].newest()
+    assert [message[0] for message in messages] == [1, 1]
     for index, side in enumerate(("left", "right")):
-        message = topic.messages[index]
+        message = messages[index]
         assert message[1] == index
         assert int.from_bytes(message[2:4], "little") == 320
         np.testing.assert_array_equal(np.frombuffer(message[4:], "<f4"), PRESSURES[side])
@@ -216,6 +215,5 @@ async def test_taxel_messages_carry_the_pressures(feeds):
 
 async def test_lost_taxels_are_said():
     feeds = Feeds({"acquisition": broken_upstream("acquisition")}, DashboardSettings())
-    await feeds.topics["taxels"].refresh()
-    (message,) = feeds.topics["taxels"].messages
+    (message,) = await feeds.topics["taxels"].newest()
     assert json.loads(message)["topic"] == "taxels_lost"

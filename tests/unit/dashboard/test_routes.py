@@ -165,7 +165,7 @@ async def test_live_sends_what_is_in_view(make_app, services):
                 break
         assert json.loads(message["text"])["topic"] == "takes"
         await socket.leave()
-    assert all(not topic._viewers for topic in app.state.feeds.topics.values())
+    assert asyncio.all_tasks() == {asyncio.current_task()}
 
 
 async def test_live_refuses_foreign_sites(make_app):
@@ -201,7 +201,7 @@ async def test_live_ends_with_its_session(make_app, looks, ends_by):
         assert message["code"] == 1008
         assert "not signed in" in message["reason"]
         await socket.leave()
-    assert all(not topic._viewers for topic in app.state.feeds.topics.values())
+    assert asyncio.all_tasks() == {asyncio.current_task()}
 
 
 async def test_live_survives_nonsense(make_app):

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from services.dashboard.topics import Topic, Viewer, running
+from services.dashboard.topics import Topic
 
 
 class Source:
@@ -33,48 +33,57 @@ def topic(source):
 
 
 async def test_slow_viewer_gets_only_the_newest(topic):
-    viewer = Viewer({"news": topic})
-    viewer.look_at(["news"])
+    updates = topic.updates()
+    assert await anext(updates) == ["1"]
     for _ in range(3):
-        await topic.refresh()
-    assert await viewer.news() == ["3"]
+        await topic.newest()
+    assert await anext(updates) == ["5"]
 
 
-async def test_late_viewer_gets_what_is_known(topic):
-    await topic.refresh()
-    viewer = Viewer({"news": topic})
-    viewer.look_at(["news", "no such topic"])
-    assert await viewer.news() == ["1"]
+async def test_what_does_not_change_is_not_sent_again():
+    answers = iter(["a", "a", "a", "b"])
+
+    async def fetch():
+        return [next(answers)]
+
+    updates = Topic("news", 0.0, fetch).updates()
+    assert [await anext(updates), await anext(updates)] == [["a"], ["b"]]
 
 
-async def test_what_is_out_of_view_is_not_sent(topic):
-    other = Topic("other", 0.0, Source().fetch)
-    viewer = Viewer({"news": topic, "other": other})
-    viewer.look_at(["news", "other"])
-    viewer.look_at(["other"])
-    await topic.refresh()
-    await other.refresh()
-    assert await viewer.news() == ["1"]
-    assert viewer.changed.is_set() is False
+async def test_viewers_share_one_fetch_a_period(source):
+    topic = Topic("news", 3600.0, source.fetch)
+    found = await asyncio.gather(*(anext(topic.updates()) for _ in range(5)))
+    assert found == [["1"]] * 5
+    assert source.count == 1
 
 
 async def test_fetching_rests_without_viewers(topic, source):
-    viewer = Viewer({"news": topic})
-    async with running([topic]):
-        viewer.look_at(["news"])
-        assert await viewer.news() == ["1"]
-        viewer.look_at([])
-        for _ in range(5):  # one fetch may be under way
-            await asyncio.sleep(0)
-        resting = source.count
-        for _ in range(20):
-            await asyncio.sleep(0)
-        assert source.count == resting
+    updates = topic.updates()
+    await anext(updates)
+    await updates.aclose()
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert source.count == 1
+
+
+async def test_a_viewer_that_leaves_while_it_fetches_leaves_nothing_old(source):
+    entered, answer = asyncio.Event(), asyncio.Event()
+
+    async def fetch():
+        entered.set()
+        await answer.wait()
+        return await source.fetch()
+
+    topic = Topic("news", 3600.0, fetch)
+    leaving = asyncio.create_task(topic.newest())
+    await entered.wait()
+    staying = asyncio.create_task(topic.newest())
+    await asyncio.sleep(0)
+    leaving.cancel()
+    answer.set()
+    assert await staying == ["1"]
 
 
 async def test_a_failed_fetch_does_not_end_the_news(topic, source):
     source.fails = True
-    viewer = Viewer({"news": topic})
-    async with running([topic]):
-        viewer.look_at(["news"])
-        assert await viewer.news() == ["2"]
+    assert await anext(topic.updates()) == ["2"]
