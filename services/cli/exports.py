@@ -73,11 +73,7 @@ _JOINT = {"umi": _export_umi, "lerobot": _export_lerobot}
 
 @contextmanager
 def _replaced(folder: Path, *, force: bool) -> Iterator[None]:
-    """Replace an existing data set, restoring it if the new one fails.
-
-    Raises:
-        ConflictError: the folder exists and must not be replaced.
-    """
+    """Replace an existing data set, restoring it if the new one fails."""
     if not folder.exists():
         yield
         return
@@ -95,12 +91,7 @@ def _replaced(folder: Path, *, force: bool) -> Iterator[None]:
 
 
 def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
-    """The given ids, or those that match the filters.
-
-    Raises:
-        InvalidInputError: both ids and filters, or an id twice.
-        NotFoundError: nothing to export.
-    """
+    """The given ids, or those that match the filters."""
     given = ((key, getattr(options, key)) for key in ("task", "domain", "operator"))
     wanted = {key: value for key, value in given if value is not None}
     if options.ids and wanted:
@@ -185,77 +176,47 @@ def _import(options: argparse.Namespace) -> Report:
 
 def export_main(argv: Sequence[str]) -> int:
     """Run `dextouch export`."""
-    options = _export_parser().parse_args(list(argv))
+    parser = _parser("export", "Write episodes or recordings for other tools.", _EXPORT_HELP)
+    add = parser.add_argument
+    forms = sorted([*_SINGLE, *_JOINT])
+    add("ids", nargs="*", metavar="ID", help="default: all that match the filters")
+    add("--format", required=True, choices=forms, help="output format")
+    to = "file; mcap and rrd: or a folder"
+    add("--to", required=True, type=Path, metavar="PATH", help=to)
+    kinds = ("episode", "recording")
+    add("--kind", choices=kinds, default="episode", help="kind of the ids (%(default)s)")
+    add("--task", metavar="TASK", help="only episodes of this task")
+    add("--domain", choices=("human", "robot"), help="only episodes of this domain")
+    add("--operator", metavar="P", help="only items of this operator")
+    add("--force", action="store_true", help="replace existing files")
+    quality = "mcap: encode rgb8 images as JPEG (default: lossless)"
+    add("--jpeg-quality", type=int, metavar="1…100", help=quality)
+    rate = "lerobot: frames per second (default: model rate)"
+    add("--fps", type=int, metavar="N", help=rate)
+    name = "lerobot: name of the data set (%(default)s)"
+    add("--repo-id", default="dextouch/export", metavar="USER/NAME", help=name)
+    options = parser.parse_args(list(argv))
     write_result(options.json, _export(options))
     return 0
 
 
 def import_main(argv: Sequence[str]) -> int:
     """Run `dextouch import`."""
-    options = _import_parser().parse_args(list(argv))
+    parser = _parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
+    add = parser.add_argument
+    add("path", type=Path, metavar="PATH", help="file or folder to read")
+    add("--format", required=True, choices=("lerobot", "mcap", "umi"), help="input format")
+    add("--id-prefix", default="", metavar="TEXT", help="lerobot: prefix of every id")
+    images = "lerobot: unit of stored images (%(default)s)"
+    add("--images", choices=("h264", "jpeg", "rgb8"), default="h264", help=images)
+    options = parser.parse_args(list(argv))
     write_result(options.json, _import(options))
     return 0
 
 
 def _parser(word: str, does: str, more: str) -> argparse.ArgumentParser:
     parser = CommandParser(prog=f"dextouch {word}", description=does, epilog=more)
-    parser.add_argument(
-        "--store", metavar="URL", default=default_store(), help="the store (%(default)s)"
-    )
+    store = "the store (%(default)s)"
+    parser.add_argument("--store", metavar="URL", default=default_store(), help=store)
     add_json(parser)
-    return parser
-
-
-def _export_parser() -> argparse.ArgumentParser:
-    parser = _parser("export", "Write episodes or recordings for other tools.", _EXPORT_HELP)
-    parser.add_argument("ids", nargs="*", metavar="ID", help="default: all that match the filters")
-    parser.add_argument(
-        "--format", required=True, choices=sorted([*_SINGLE, *_JOINT]), help="output format"
-    )
-    parser.add_argument(
-        "--to", required=True, type=Path, metavar="PATH", help="file; mcap and rrd: or a folder"
-    )
-    parser.add_argument(
-        "--kind",
-        choices=("episode", "recording"),
-        default="episode",
-        help="kind of the ids (%(default)s)",
-    )
-    parser.add_argument("--task", metavar="TASK", help="only episodes of this task")
-    parser.add_argument("--domain", choices=("human", "robot"), help="only episodes of this domain")
-    parser.add_argument("--operator", metavar="P", help="only items of this operator")
-    parser.add_argument("--force", action="store_true", help="replace existing files")
-    parser.add_argument(
-        "--jpeg-quality",
-        type=int,
-        metavar="1…100",
-        help="mcap: encode rgb8 images as JPEG (default: lossless)",
-    )
-    parser.add_argument(
-        "--fps", type=int, metavar="N", help="lerobot: frames per second (default: model rate)"
-    )
-    parser.add_argument(
-        "--repo-id",
-        default="dextouch/export",
-        metavar="USER/NAME",
-        help="lerobot: name of the data set (%(default)s)",
-    )
-    return parser
-
-
-def _import_parser() -> argparse.ArgumentParser:
-    parser = _parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
-    parser.add_argument("path", type=Path, metavar="PATH", help="file or folder to read")
-    parser.add_argument(
-        "--format", required=True, choices=("lerobot", "mcap", "umi"), help="input format"
-    )
-    parser.add_argument(
-        "--id-prefix", default="", metavar="TEXT", help="lerobot: prefix of every id"
-    )
-    parser.add_argument(
-        "--images",
-        choices=("h264", "jpeg", "rgb8"),
-        default="h264",
-        help="lerobot: unit of stored images (%(default)s)",
-    )
     return parser

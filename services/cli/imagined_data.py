@@ -91,23 +91,16 @@ def main(argv: Sequence[str]) -> int:
         description=__doc__,
         epilog="example:\n  dextouch train imagined --episodes runs/episodes --store runs/imagined",
     )
-    parser.add_argument("--episodes", required=True, help="store of the episodes to imagine")
-    parser.add_argument("--store", required=True, help="store for the imagined episodes")
-    parser.add_argument(
-        "--checkpoint",
-        type=Path,
-        default=default_checkpoint(),
-        help="world model (default: the package's)",
-    )
+    add = parser.add_argument
+    add("--episodes", required=True, help="store of the episodes to imagine")
+    add("--store", required=True, help="store for the imagined episodes")
+    model = "world model (default: the package's)"
+    add("--checkpoint", type=Path, default=default_checkpoint(), help=model)
     tasks = "comma-separated tasks (default: all)"
-    parser.add_argument("--tasks", type=comma_separated, help=tasks)
-    parser.add_argument("--seeds", type=seed_range, help="FIRST:LAST+1 (default: all)")
-    parser.add_argument(
-        "--jobs",
-        type=positive,
-        default=os.cpu_count() or 1,
-        help="processes (default: one per core)",
-    )
+    add("--tasks", type=comma_separated, help=tasks)
+    add("--seeds", type=seed_range, help="FIRST:LAST+1 (default: all)")
+    jobs = "processes (default: one per core)"
+    add("--jobs", type=positive, default=os.cpu_count() or 1, help=jobs)
     add_json(parser)
     arguments = parser.parse_args(list(argv))
     source = EpisodeStore(arguments.episodes)

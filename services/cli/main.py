@@ -129,11 +129,7 @@ def _group_usage(group: str) -> str:
 
 
 def find_command(words: Sequence[str]) -> tuple[str, list[str]]:
-    """Name of the command that a command line runs, and its arguments.
-
-    Raises:
-        UnknownNameError: no such command.
-    """
+    """Name of the command that a command line runs, and its arguments."""
     first, second = words[0], words[1] if len(words) > 1 else ""
     if first not in {name.partition(" ")[0] for name in COMMANDS}:
         raise UnknownNameError("command", first, [name for name in COMMANDS if " " not in name])
@@ -148,12 +144,7 @@ def find_command(words: Sequence[str]) -> tuple[str, list[str]]:
 
 
 def run_command(words: Sequence[str]) -> int:
-    """Run a command line without the program's name, and return its exit status.
-
-    Raises:
-        DexTouchError: what the command refuses.
-        ModuleNotFoundError: it needs a package that is not installed.
-    """
+    """Run a command line without the program's name, and return its exit status."""
     name, arguments = find_command(words)
     module, _, function = COMMANDS[name].target.partition(":")
     if not module:

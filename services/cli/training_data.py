@@ -81,11 +81,7 @@ class PolicyChoice:
 
     @classmethod
     def parse(cls, address: str, arguments: Mapping[str, Any]) -> "PolicyChoice":
-        """Validate the address and create a choice.
-
-        Raises:
-            InvalidInputError: an invalid address.
-        """
+        """Validate the address and create a choice."""
         PolicySource.parse(address)
         return cls(address, json.dumps(arguments, sort_keys=True))
 
@@ -144,9 +140,6 @@ def _played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
     """Closed-loop actions of a policy in the twin, from the start of a seed.
 
     The twin is deterministic, so that an episode with these actions is the rollout.
-
-    Raises:
-        InvalidInputError, ShapeError, NonFiniteError: the policy failed; includes its traceback.
     """
     world, policy, task = _world(), _policy(choice), stage.task
     start = RolloutStart(task=task.name, seed=seed, instruction=task.instruction)

@@ -129,22 +129,14 @@ def parse_board(text: str) -> Board:
 
 
 def photo_paths(folder: Path) -> list[Path]:
-    """The photos of a folder, sorted by name.
-
-    Raises:
-        NotFoundError: no such folder.
-    """
+    """The photos of a folder, sorted by name."""
     if not folder.is_dir():
         raise NotFoundError(f"{folder}: no such folder of photos")
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
 
 
 def decode_photo(data: bytes, *, where: str) -> UInt8[np.ndarray, "h w"]:
-    """Decode a photo to a grey image.
-
-    Raises:
-        CorruptDataError: not an image.
-    """
+    """Decode a photo to a grey image."""
     import cv2
 
     encoded = np.frombuffer(data, dtype=np.uint8)
@@ -155,11 +147,7 @@ def decode_photo(data: bytes, *, where: str) -> UInt8[np.ndarray, "h w"]:
 
 
 def find_board(name: str, photo: np.ndarray, board: Board) -> BoardView | None:
-    """Detect the board in a grey photo (uint8 [h, w]); None if not found.
-
-    Raises:
-        InvalidInputError: an invalid board.
-    """
+    """Detect the board in a grey photo (uint8 [h, w]); None if not found."""
     found = find_boards([photo], board)
     if not found.photos:
         return None
@@ -212,11 +200,7 @@ def is_ambiguous(board: Board) -> bool:
 
 
 def board_pose(view: BoardView, lens: Lens) -> Float64[np.ndarray, "4 4"]:
-    """T_camera_board of one view, by least squares on its corners.
-
-    Raises:
-        InvalidInputError: the corners allow no pose (all on one line).
-    """
+    """T_camera_board of one view, by least squares on its corners."""
     import cv2
 
     points, pixels = view.points_board.astype(np.float64), view.pixels.astype(np.float64)

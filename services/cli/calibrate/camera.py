@@ -108,12 +108,7 @@ def _keep(
 
 
 def read_lens(folder: Path, camera: str) -> tuple[Lens, tuple[int, int]]:
-    """OpenCV's lens of a calibrated camera, and width and height of its images (px).
-
-    Raises:
-        NotFoundError: the camera is not calibrated in this folder.
-        InvalidInputError: a matrix of another shape.
-    """
+    """OpenCV's lens of a calibrated camera, and width and height of its images (px)."""
     try:
         matrices = read_matrices(folder)
         K = named_matrix(matrices, f"K_{camera}", (3, 3))

@@ -63,11 +63,7 @@ class TakenStream:
         return float(self.calibration.get(name, ((0.0,),))[0][0])
 
     def timed(self) -> tuple[Int64[np.ndarray, " n"], Shaped[np.ndarray, "n ..."]]:
-        """Times on the host's clock without the calibrated latency, and the values at them.
-
-        Raises:
-            ClockFitError: no clock can be fitted to the stamps.
-        """
+        """Times on the host's clock without the calibrated latency, and the values at them."""
         latency_ns = round(self.number(f"{self.descriptor.name}_latency_ns"))
         timing = time_stream(self.batch, self.descriptor, latency_ns=latency_ns)
         return timing.t_host_ns, self.batch.values[timing.kept]
@@ -131,12 +127,7 @@ def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row
 
 
 def read_json(path: Path, expected: str) -> list[object]:
-    """Read a list from a JSON file.
-
-    Raises:
-        NotFoundError: no such file.
-        InvalidInputError: not a JSON list, or empty.
-    """
+    """Read a list from a JSON file."""
     try:
         content = json.loads(_existing(path, expected).read_text(encoding="utf-8"))
     except ValueError as error:
@@ -147,12 +138,7 @@ def read_json(path: Path, expected: str) -> list[object]:
 
 
 def pairs_of(entries: list[object], path: Path, expected: str) -> Float64[np.ndarray, "n 2 4 4"]:
-    """Pairs of 4x4 matrices from the content of a JSON file.
-
-    Raises:
-        InvalidInputError: not numbers.
-        ShapeError: not pairs of 4x4.
-    """
+    """Pairs of 4x4 matrices from the content of a JSON file."""
     try:
         pairs = np.array(entries, dtype=np.float64)
     except (ValueError, TypeError) as error:
@@ -165,12 +151,7 @@ def pairs_of(entries: list[object], path: Path, expected: str) -> Float64[np.nda
 def poses_of_photos(
     path: Path, entries: list[object] | None, expected: str
 ) -> dict[str, np.ndarray]:
-    """T_world_tracker by photo, from the content of a JSON file, or else from the CSV at `path`.
-
-    Raises:
-        NotFoundError: no such file.
-        InvalidInputError: not such a file, or a photo twice.
-    """
+    """T_world_tracker by photo, from the content of a JSON file, or else from the CSV at `path`."""
     if entries is None:
         rows = read_rows(path, PhotoPose, "pose", expected)
     else:

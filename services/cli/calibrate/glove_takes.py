@@ -105,12 +105,7 @@ def write_presses(path: Path, rows: Sequence[PressRow]) -> None:
 
 
 def parse_press(words: str, relative_sigma: float) -> PressRow:
-    """Parse a pressure typed by the operator (`PRESS_HELP`), before its take.
-
-    Raises:
-        InvalidInputError: no pressure above 0.
-        UnknownNameError: no such pad.
-    """
+    """Parse a pressure typed by the operator (`PRESS_HELP`), before its take."""
     matched = _PRESS.fullmatch(words.strip().lower())
     groups = matched.groupdict() if matched else {}
     try:

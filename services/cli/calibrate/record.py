@@ -114,12 +114,7 @@ def write_picture(folder: Path, name: str, svg: str) -> Path:
 
 
 def named_matrix(matrices: Mapping[str, Matrix], name: str, shape: tuple[int, int]) -> np.ndarray:
-    """Get a matrix as float64.
-
-    Raises:
-        NotFoundError: missing.
-        InvalidInputError: of another shape.
-    """
+    """Get a matrix as float64."""
     if name not in matrices:
         raise NotFoundError(
             f"calibration: {name!r} is missing; there is {', '.join(sorted(matrices)) or 'nothing'}"

@@ -81,11 +81,7 @@ class Take:
 
 
 def make_truth(plan: DemoPlan, store_folder: Path) -> Truth:
-    """Record the true episodes in the twin, on all cores.
-
-    Raises:
-        InvalidInputError: the physics diverged.
-    """
+    """Record the true episodes in the twin, on all cores."""
     store = str(store_folder)
     takes = {
         domain: Order(task, domain, plan.take_seed, TakeOptions(), store)
@@ -188,11 +184,7 @@ def _check_own(attributes: RecordingAttributes) -> None:
 
 
 def upload(spool_root: Path, store_url: str) -> None:
-    """Send every take of the spool to the store service.
-
-    Raises:
-        UnavailableError: a take could not be sent and remains in the spool.
-    """
+    """Send every take of the spool to the store service."""
     with EpisodeStoreClient(store_url) as client:
         uploader = Uploader(spool_root, client, period_s=UPLOAD_PERIOD_S)
         uploader.upload_all()

@@ -71,11 +71,7 @@ def refuse_trained(training_seeds: Mapping[str, tuple[int, int]], seeds: Iterabl
 
 
 def committed_models() -> Models:
-    """Load the networks shipped with the package.
-
-    Raises:
-        NotFoundError, CorruptDataError: a file is missing or damaged.
-    """
+    """Load the networks shipped with the package."""
     return _load(default_checkpoint(), DEFAULT_POLICY, DEFAULT_PROBE)
 
 
@@ -155,10 +151,6 @@ def judge(
 
     Returns:
         `policies`, `agreement` and other entries of `report.json`.
-
-    Raises:
-        ConflictError: scenes that the world model was trained on.
-        DexTouchError: a rollout failed.
     """
     refuse_trained(models.training_seeds, plan.seeds)
     twin, imagined = RolloutClient(urls["twin"]), RolloutClient(urls["imagined"])

@@ -47,13 +47,8 @@ def parse(argv: Sequence[str]) -> DemoPlan:
         f"the store {default_store()}, where the next run replaces them (DEXTOUCH_DATA names "
         "another data folder).",
     )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        default=Path("demo"),
-        metavar="FOLDER",
-        help="folder of the results (%(default)s)",
-    )
+    results = "folder of the results (%(default)s)"
+    parser.add_argument("--output", type=Path, default=Path("demo"), metavar="FOLDER", help=results)
     add_json(parser)
     parser.add_argument(
         "--train",
@@ -61,13 +56,8 @@ def parse(argv: Sequence[str]) -> DemoPlan:
         help="train a small state model, the policy and the probe anew instead of using the "
         "committed ones (takes far longer than the demo itself)",
     )
-    parser.add_argument(
-        "--seeds",
-        type=int,
-        metavar="N",
-        default=6,
-        help="held-out scenes per task for scoring policies (%(default)s)",
-    )
+    scenes = "held-out scenes per task for scoring policies (%(default)s)"
+    parser.add_argument("--seeds", type=int, metavar="N", default=6, help=scenes)
     arguments = parser.parse_args(list(argv))
     if arguments.seeds < 1:
         parser.error(f"--seeds: got {arguments.seeds}, expected at least 1")
