@@ -9,44 +9,44 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
-from pydantic import BaseModel, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from dextouch.episodes import EpisodeStore, RecordingReader
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, NotFoundError, ShapeError
 from dextouch.geometry import transform_from_pose
-from dextouch.schemas import Matrix, first_problems, matrix_rows
+from dextouch.schemas import Matrix, first_problems
 from dextouch.streams import SampleBatch, StreamDescriptor
 from services.alignment.synchronization.stream_clock import time_stream
-
-POSE_COLUMNS = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 
 Row = TypeVar("Row", bound=BaseModel)
 
 
 class PhotoPose(BaseModel):
-    """Pose of the tracker at a photo: a matrix, or instead the columns `POSE_COLUMNS`."""
+    """Pose of the tracker in the world at a photo: position (m) and unit quaternion."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
 
     image: str
-    T_world_tracker: Matrix
+    x_m: float
+    y_m: float
+    z_m: float
+    qw: float
+    qx: float
+    qy: float
+    qz: float
 
-    @model_validator(mode="before")
-    @classmethod
-    def _matrix_of_columns(cls, given: object) -> object:
-        if not isinstance(given, dict) or not set(POSE_COLUMNS) <= given.keys():
-            return given
-        pose = np.array([float(given[column]) for column in POSE_COLUMNS])
-        length = float(np.linalg.norm(pose[3:]))
+    @model_validator(mode="after")
+    def _is_unit(self) -> "PhotoPose":
+        length = float(np.linalg.norm(self.pose[3:]))
         if not abs(length - 1) <= 0.01:
             raise ValueError(f"quaternion of length {length:.3f}, expected 1 (order w x y z)")
-        return {**given, "T_world_tracker": matrix_rows(transform_from_pose(pose))}
+        return self
 
-    @field_validator("T_world_tracker")
-    @classmethod
-    def _is_4_by_4(cls, rows: Matrix) -> Matrix:
-        if np.shape(rows) != (4, 4):
-            raise ValueError(f"got {np.shape(rows)}, expected 4 by 4")
-        return rows
+    @property
+    def pose(self) -> Float64[np.ndarray, "7"]:
+        """x, y, z, qw, qx, qy, qz."""
+        return np.array([self.x_m, self.y_m, self.z_m, self.qw, self.qx, self.qy, self.qz])
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,11 @@ def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row
             reader = csv.DictReader(file, skipinitialspace=True)
             for cells in reader:
                 given = {str(column): cell for column, cell in cells.items() if cell}
-                rows.append(_checked(kind, given, f"{path}: line {reader.line_num}", expected))
+                rows.append(kind.model_validate(given))
+    except ValidationError as error:
+        raise InvalidInputError(
+            f"{path}: line {reader.line_num}: {first_problems(error)}; expected {expected}"
+        ) from error
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InvalidInputError(
             f"{path}: no CSV in UTF-8 ({error}); expected {expected}"
@@ -126,43 +130,34 @@ def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row
     return rows
 
 
-def read_json(path: Path, expected: str) -> list[object]:
-    """Read a list from a JSON file."""
+def read_pairs(path: Path, expected: str) -> Float64[np.ndarray, "n 2 4 4"]:
+    """Pairs of 4x4 matrices from a JSON file, at least one.
+
+    Raises:
+        NotFoundError: no such file.
+        InvalidInputError: not JSON, or not numbers.
+        ShapeError: not pairs of 4x4.
+    """
     try:
-        content = json.loads(_existing(path, expected).read_text(encoding="utf-8"))
-    except ValueError as error:
+        pairs = np.array(json.loads(_existing(path, expected).read_bytes()), dtype=np.float64)
+    except json.JSONDecodeError as error:
         raise InvalidInputError(f"{path}: no JSON ({error}); expected {expected}") from error
-    if not isinstance(content, list) or not content:
-        raise InvalidInputError(f"{path}: expected a list with at least one pose: {expected}")
-    return content
-
-
-def pairs_of(entries: list[object], path: Path, expected: str) -> Float64[np.ndarray, "n 2 4 4"]:
-    """Pairs of 4x4 matrices from the content of a JSON file."""
-    try:
-        pairs = np.array(entries, dtype=np.float64)
     except (ValueError, TypeError) as error:
         raise InvalidInputError(f"{path}: {error}; expected {expected}") from error
     if pairs.ndim != 4 or pairs.shape[1:] != (2, 4, 4):
-        raise ShapeError(f"{path}: got {pairs.shape}, expected [n, 2, 4, 4]: {expected}")
+        raise ShapeError(
+            f"{path}: got {pairs.shape}, expected [n, 2, 4, 4], at least one pair: {expected}"
+        )
     return pairs
 
 
-def poses_of_photos(
-    path: Path, entries: list[object] | None, expected: str
-) -> dict[str, np.ndarray]:
-    """T_world_tracker by photo, from the content of a JSON file, or else from the CSV at `path`."""
-    if entries is None:
-        rows = read_rows(path, PhotoPose, "pose", expected)
-    else:
-        rows = [
-            _checked(PhotoPose, e, f"{path}: entry {n}", expected) for n, e in enumerate(entries)
-        ]
+def poses_of_photos(path: Path, expected: str) -> dict[str, np.ndarray]:
+    """T_world_tracker by photo, from a CSV file; no photo may be named twice."""
     poses: dict[str, np.ndarray] = {}
-    for row in rows:
+    for row in read_rows(path, PhotoPose, "pose", expected):
         if row.image in poses:
             raise InvalidInputError(f"{path}: image {row.image!r} is named twice")
-        poses[row.image] = np.array(row.T_world_tracker)
+        poses[row.image] = transform_from_pose(row.pose)
     return poses
 
 
@@ -170,10 +165,3 @@ def _existing(path: Path, expected: str) -> Path:
     if not path.is_file():
         raise NotFoundError(f"{path}: no such file; expected {expected}")
     return path
-
-
-def _checked(kind: type[Row], given: object, where: str, expected: str) -> Row:
-    try:
-        return kind.model_validate(given)
-    except ValidationError as error:
-        raise InvalidInputError(f"{where}: {first_problems(error)}; expected {expected}") from error

@@ -13,16 +13,15 @@ from services.alignment.calibration.robot_base import solve_robot_base
 from services.cli.calibrate.advice import turn_coverage
 from services.cli.calibrate.boards import board_pose, is_ambiguous, parse_board, read_photos
 from services.cli.calibrate.camera import read_lens
-from services.cli.calibrate.files import pairs_of, poses_of_photos, read_json
+from services.cli.calibrate.files import poses_of_photos, read_pairs
 from services.cli.calibrate.pictures import turns_picture
 from services.cli.calibrate.record import write_picture, write_pose
 
 # Tracker of each camera, by the stream names of recordings.
 TRACKERS = {"head": "head", "wrist_left": "left", "wrist_right": "right"}
 POSES_HELP = (
-    "CSV with the columns image,x_m,y_m,z_m,qw,qx,qy,qz (T_world_tracker), or JSON: "
-    '[{"image": "a.jpg", "T_world_tracker": 4x4}, …], or without photos '
-    "[[T_world_tracker, T_camera_board], …]"
+    "CSV with the columns image,x_m,y_m,z_m,qw,qx,qy,qz (T_world_tracker), or without photos "
+    "JSON: [[T_world_tracker, T_camera_board], …], each 4x4"
 )
 PAIRS_HELP = "JSON: [[T_world_tracker, T_base_effector], …], each 4x4, both of the same moment"
 BASE_NAME = "T_world_base"
@@ -98,7 +97,7 @@ def calibrate_base(options: argparse.Namespace) -> dict[str, object]:
             axes.
         InvalidInputError: too few pairs, or pairs that contradict each other.
     """
-    pairs = pairs_of(read_json(options.poses, PAIRS_HELP), options.poses, PAIRS_HELP)
+    pairs = read_pairs(options.poses, PAIRS_HELP)
     mount = np.eye(4) if options.same_frame else None
     result = solve_robot_base(pairs[:, 0], pairs[:, 1], T_effector_tracker=mount)
     left_out = list(result.left_out_views)
@@ -123,15 +122,12 @@ def calibrate_base(options: argparse.Namespace) -> dict[str, object]:
 
 def _read_views(options: argparse.Namespace) -> PosedViews:
     """Read poses from the file, and boards from the photos or from the same file."""
-    path, entries = options.poses, None
-    if path.suffix.lower() == ".json":
-        entries = read_json(path, POSES_HELP)
-    if entries is not None and all(isinstance(entry, list) for entry in entries):
-        trackers, boards = np.swapaxes(pairs_of(entries, path, POSES_HELP), 0, 1)
+    if options.poses.suffix.lower() == ".json":
+        trackers, boards = np.swapaxes(read_pairs(options.poses, POSES_HELP), 0, 1)
         names = tuple(f"view {index}" for index in range(len(trackers)))
         views = PosedViews(names, trackers, invert(boards) if options.invert == "board" else boards)
     else:
-        views = _with_photos(poses_of_photos(path, entries, POSES_HELP), options)
+        views = _with_photos(poses_of_photos(options.poses, POSES_HELP), options)
         if options.invert == "board":
             raise InvalidInputError(
                 "--invert board: the board's poses come from photos and are right"

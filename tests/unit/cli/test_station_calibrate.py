@@ -161,9 +161,9 @@ def test_broken_pose_files_are_refused_with_their_line(tmp_path):
     broken = tmp_path / "poses.json"
     for text, error, words in (
         ("{", InvalidInputError, "no JSON"),
-        ("[]", InvalidInputError, "at least one"),
+        ("[]", ShapeError, "at least one"),
         ("[[[1, 0], [0, 1]]]", ShapeError, "expected"),
-        ('[{"image": "a"}]', InvalidInputError, "entry 0"),
+        ('[{"image": "a"}]', InvalidInputError, r"\[\[T_world_tracker"),
     ):
         broken.write_text(text)
         with pytest.raises(error, match=words):
