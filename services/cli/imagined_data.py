@@ -42,14 +42,7 @@ def chosen_episodes(
 
 
 def imagine_all(episode_ids: Sequence[str], *, episodes: str, output: str, checkpoint: Path) -> int:
-    """Imagine robot episodes of a store, and return their number; existing results are kept.
-
-    Args:
-        episode_ids: episodes to imagine.
-        episodes: store to read.
-        output: store to write.
-        checkpoint: checkpoint of a world model of either kind.
-    """
+    """Imagine robot episodes of a store, and return their number; existing results are kept."""
     source, target = EpisodeStore(episodes), EpisodeStore(output)
     torch.set_num_threads(1)
     world = open_world(checkpoint)

@@ -52,11 +52,6 @@ class DashboardSettings(ServiceSettings):
 
     def upstream_urls(self) -> dict[str, str]:
         """Configured services by name, in the order of the data flow."""
-        urls = {
-            "acquisition": self.acquisition_url,
-            "episode_store": self.episode_store_url,
-            "alignment": self.alignment_url,
-            "twin": self.twin_url,
-            "world_model": self.world_model_url,
-        }
+        names = ("acquisition", "episode_store", "alignment", "twin", "world_model")
+        urls = {name: getattr(self, f"{name}_url") for name in names}
         return {name: url.rstrip("/") for name, url in urls.items() if url}

@@ -3,6 +3,7 @@
 import argparse
 import csv
 import json
+import math
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -51,7 +52,7 @@ Ask = Callable[[str], str]
 
 
 class PressRow(BaseModel):
-    """One row of the list of presses; `stop_s` None means the end of the take.
+    """One row of the list of presses, by default of the whole take.
 
     Instead of `pressure_kpa`, a weight may be given by `mass_kg` and `area_cm2`.
     """
@@ -63,7 +64,7 @@ class PressRow(BaseModel):
     sigma_kpa: float | None = Field(default=None, ge=0)
     pads: str = "all"
     start_s: float = 0.0
-    stop_s: float | None = None
+    stop_s: float = math.inf
 
     @model_validator(mode="before")
     @classmethod
@@ -108,10 +109,9 @@ def parse_press(words: str, relative_sigma: float) -> PressRow:
     """Parse a pressure typed by the operator (`PRESS_HELP`), before its take."""
     matched = _PRESS.fullmatch(words.strip().lower())
     groups = matched.groupdict() if matched else {}
+    given = {name: text for name, text in groups.items() if text}
     try:
-        row = PressRow.model_validate(
-            {"take": ""} | {n: text for n, text in groups.items() if text}
-        )
+        row = PressRow.model_validate({"take": ""} | given)
     except ValidationError as error:
         raise InvalidInputError(
             f"pressure: got {words!r}, expected {PRESS_HELP}, above 0"
@@ -135,11 +135,8 @@ def press_of(row: PressRow, options: argparse.Namespace) -> TaxelPress:
     """The readings of one press."""
     batch = read_take(row.take, options)
     t_s = (batch.t_host_ns - batch.t_host_ns[:1]) * 1e-9
-    wanted = t_s >= row.start_s
-    if row.stop_s is not None:
-        wanted &= t_s < row.stop_s
-    taxels = pad_taxels(row.pads)
-    return TaxelPress(row.pressure_kpa, row.sigma_kpa or 0.0, batch.values[wanted], taxels)
+    counts = batch.values[(t_s >= row.start_s) & (t_s < row.stop_s)]
+    return TaxelPress(row.pressure_kpa, row.sigma_kpa or 0.0, counts, pad_taxels(row.pads))
 
 
 @dataclass(frozen=True)

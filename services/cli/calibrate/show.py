@@ -121,29 +121,24 @@ def _entry_of(name: str) -> str:
 
 
 def _judge(name: str, matrices: Mapping[str, Matrix], now: datetime) -> Finding:
-    problems: list[Problem] = []
-    made_at = age_days = None
+    reasons, made_at, age_days = [], None, None
     stamp = matrices.get(f"{_entry_of(name)}_calibrated_at_unix_s")
-    if stamp is not None:
+    if stamp is None:
+        reasons.append(f"age unknown; {_where_from(name)}")
+    else:
         made = datetime.fromtimestamp(float(stamp[0][0]), tz=UTC)
         made_at, age_s = made.isoformat(timespec="seconds"), (now - made).total_seconds()
         age_days = age_s / 86_400
         if age_s > MAX_AGE_S:
-            problems.append(
-                ("WARN", f"{age_days:.0f} days old, expected at most 7; calibrate again")
-            )
+            reasons.append(f"{age_days:.0f} days old, expected at most 7; calibrate again")
         if age_s < -60:
-            problems.append(
-                ("WARN", "made in the future; set the clock of one of the two machines")
-            )
-    else:
-        problems.append(("WARN", f"age unknown; {_where_from(name)}"))
+            reasons.append("made in the future; set the clock of one of the two machines")
     sigma, doubts = _sigma(name, matrices)
-    problems += doubts
+    problems = [*(("WARN", reason) for reason in reasons), *doubts]
     level = max((level for level, _ in problems), key=list(LEVELS).index, default="OK")
     shape = "x".join(str(n) for n in np.shape(matrices[name]))
-    reasons = tuple(reason for _, reason in problems)
-    return Finding(name, shape, made_at, age_days, sigma, level, reasons)
+    stated = tuple(reason for _, reason in problems)
+    return Finding(name, shape, made_at, age_days, sigma, level, stated)
 
 
 def _where_from(name: str) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from fastapi import FastAPI
 
 from dextouch import __version__
@@ -74,7 +75,8 @@ def main(argv: Sequence[str]) -> int:
     """
     plan = parse(argv)
     configure_logging(service="demo", log_format="auto", level="warning")
-    scoring.use_one_thread()
+    # More threads slow down small networks beside busy services.
+    torch.set_num_threads(1)
     plan.output.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="dextouch-demo-") as folder:
         report = run(plan, Path(folder))

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from dextouch.clients import Policy, RolloutClient
 from dextouch.errors import ConflictError, DexTouchError
 from dextouch.worlds import BatchWorld
@@ -107,11 +105,6 @@ def _stores(*stores: str, to: Path | None = None) -> list[str]:
     """Flags that name the stores to read, and the file to write."""
     flags = [word for store in stores for word in ("--episodes", store)]
     return flags if to is None else [*flags, "--output", str(to)]
-
-
-def use_one_thread() -> None:
-    """Limit torch to one thread; more slow down small networks beside busy services."""
-    torch.set_num_threads(1)
 
 
 def _load(world_model: Path, policy: Path, probe: Path) -> Models:
