@@ -24,7 +24,7 @@ from dextouch.schemas import (
     TakePrompt,
 )
 from services.acquisition.clock import StationClock
-from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.base import Driver
 from services.acquisition.memory import give_back_free_memory
 from services.acquisition.path_latency import add_latencies
 from services.acquisition.supervisor import check_free_space
@@ -65,6 +65,9 @@ class Recorder:
         clock: of the station.
         calibration: matrices that travel with every recording.
         options: how takes are kept.
+
+    Attributes:
+        take: the running or ended one, which reader threads append to; None before the first.
     """
 
     def __init__(
@@ -95,7 +98,7 @@ class Recorder:
         """Where it stands."""
         with self._lock:
             self._settle()
-            take = self._take
+            take = self.take
             return RecorderStatus(
                 state=self._state,
                 actions=ACTIONS[self._state],
@@ -106,12 +109,6 @@ class Recorder:
                 problems=self._problems(),
                 check=self._check,
             )
-
-    def accept(self, readings: Readings) -> None:
-        """Spool new readings while recording (called by the reader threads)."""
-        take = self._take
-        if take is not None:
-            take.accept(readings)
 
     def arm(self, prompt: TakePrompt) -> RecorderStatus:
         """Set the prompt of the next take."""
@@ -161,8 +158,8 @@ class Recorder:
     def close(self) -> None:
         """Give the files back; an unsaved take stays in the spool for the next start."""
         with self._lock:
-            if self._take is not None:
-                self._take.release()
+            if self.take is not None:
+                self.take.release()
 
     def _act(
         self, action: RecorderAction, recording_id: str | None, do: Callable[[], None]
@@ -184,7 +181,7 @@ class Recorder:
 
     def _settle(self) -> None:
         """A take that ended because of the disk is checked on the next request."""
-        if self._state == "recording" and self._take is not None and self._take.has_ended:
+        if self._state == "recording" and self.take is not None and self.take.has_ended:
             self._stop()
             self._state = "checking"
             self._done.add("stop")
@@ -204,7 +201,7 @@ class Recorder:
 
     def _arm(self, prompt: TakePrompt | None) -> None:
         self._prompt = prompt
-        self._take: Take | None = None
+        self.take: Take | None = None
         self._check: TakeCheck | None = None
         self._saved_as: bool | None = None
         self._done: set[RecorderAction] = set()
@@ -215,16 +212,16 @@ class Recorder:
             self.spool_root.mkdir(parents=True, exist_ok=True)
         check_free_space(self.spool_root, self._options.safety)
         spool = SpoolWriter(self.spool_root / attributes.recording_id, attributes)
-        self._take = Take(spool, drivers=self._drivers, clock=self._clock, options=self._options)
+        self.take = Take(spool, drivers=self._drivers, clock=self._clock, options=self._options)
         self._done = set()
         logger.info("start_take", recording_id=attributes.recording_id)
 
     def _stop(self) -> None:
-        if self._take is not None:
-            self._check = self._take.end()
+        if self.take is not None:
+            self._check = self.take.end()
 
     def _save(self, how: SaveTake) -> None:
-        take, check = self._take, self._check
+        take, check = self.take, self._check
         if take is None or check is None:
             raise ConflictError("recorder: there is no take; record one first")
         if not check.complete and not how.accept_incomplete:
@@ -245,7 +242,7 @@ class Recorder:
         give_back_free_memory()
 
     def _discard(self) -> None:
-        take = self._take
+        take = self.take
         if take is None:
             return
         self._discarded_id = take.spool.attributes.recording_id
@@ -279,9 +276,9 @@ class Recorder:
         )
 
     def _recording_id(self) -> str | None:
-        return self._take.spool.attributes.recording_id if self._take else None
+        return self.take.spool.attributes.recording_id if self.take else None
 
     def _problems(self) -> tuple[str, ...]:
-        own = self._take.problems() if self._take else ()
+        own = self.take.problems() if self.take else ()
         found = self._check.problems if self._check else ()
         return (*own, *(problem.message for problem in found))

@@ -104,7 +104,9 @@ class Station:
         return {s.driver.name: s.events() for s in self.supervisors}
 
     def _accept(self, readings: Readings) -> None:
-        self.recorder.accept(readings)
+        take = self.recorder.take
+        if take is not None:
+            take.accept(readings)
         self.live.accept(readings)
         self.health.accept(readings)
         if self.paths.asks:

@@ -14,6 +14,8 @@ from dextouch.schemas import TakePrompt
 from services.acquisition.clock import RealClock
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
+from services.acquisition.station import LiveView
+from services.acquisition.take import Take
 from tests.integration.recording_streams import human_streams
 
 ROOT = Path(__file__).parents[2]
@@ -26,10 +28,9 @@ def measure(folder):
     """Delays of every packet of one glove of a whole station, printed as JSON (ms)."""
     streams = human_streams(SECONDS, CAMERAS)
     with MockStation(streams, FaultScript(), 1, RealClock(), spool_root=Path(folder)) as mock:
-        station = mock.station
         sent_ns, spooled_ns, live_ns = {}, {}, {}
         device = next(p.device for p in mock.pairs if p.device.name == "glove_left")
-        make_units, spool, show = device.source.units, station.recorder.accept, station.live.accept
+        make_units = device.source.units
 
         def units(index, sequence, t_device_ns):
             made = make_units(index, sequence, t_device_ns)
@@ -37,16 +38,16 @@ def measure(folder):
             return made
 
         def noting(accept, times_ns):
-            def accept_and_note(name, readings):
-                accept(name, readings)
+            def accept_and_note(receiver, readings):
+                accept(receiver, readings)
                 for sample in readings.get("tactile_left", ()):
                     times_ns[sample.sequence] = time.monotonic_ns()
 
             return accept_and_note
 
         device.source.units = units
-        station.recorder.accept = noting(spool, spooled_ns)
-        station.live.accept = noting(show, live_ns)
+        Take.accept = noting(Take.accept, spooled_ns)
+        LiveView.accept = noting(LiveView.accept, live_ns)
         mock.run_take(PROMPT, recording_id="take")
     late_ms = {
         name: [(times_ns[s] - sent_ns[s]) / 1e6 for s in sent_ns]

@@ -48,15 +48,21 @@ def advance(clock, duration_ns):
     waiter.close()
 
 
+def deliver(recorder, readings):
+    """As a station does."""
+    if recorder.take is not None:
+        recorder.take.accept(readings)
+
+
 def play(recorder, clock, seconds, streams=("tactile_left", "head")):
     rest, pose = np.full(360, 120, np.uint16), np.array([0.0, 0, 0, 1, 0, 0, 0])
     for index in range(round(seconds * 100)):
         counts = rest + np.uint16(index % 3)
         now_ns = clock.now_ns()
         if "head" in streams:
-            recorder.accept({"head": [Sample(now_ns, pose, 5, index)]})
+            deliver(recorder, {"head": [Sample(now_ns, pose, 5, index)]})
         if "tactile_left" in streams and index % 5 in (0, 1, 3):
-            recorder.accept({"tactile_left": [Sample(now_ns, counts, 5, index)]})
+            deliver(recorder, {"tactile_left": [Sample(now_ns, counts, 5, index)]})
         advance(clock, 10_000_000)
 
 
@@ -136,7 +142,7 @@ def test_gap_and_rate_are_found(recorder, clock):
 def test_readers_make_their_bytes_before_they_hold_the_lock(recorder, clock, monkeypatch):
     recorder.arm(PROMPT)
     recorder.record("take")
-    running, held = recorder._take, []
+    running, held = recorder.take, []
     encode, write = running.spool.encode, running.spool.append_record
 
     def noting(call):
@@ -157,7 +163,7 @@ def test_a_packet_missing_since_before_the_take_is_no_gain(recorder, clock):
     counter.lost = 3
     recorder.arm(PROMPT)
     recorder.record("take")
-    recorder.accept({"tactile_left": [Sample(clock.now_ns(), values, 5, 1)]})
+    recorder.take.accept({"tactile_left": [Sample(clock.now_ns(), values, 5, 1)]})
     counter.lost, counter.late = 2, 1
     (glove, _) = recorder.stop().check.streams
     assert (glove.stream, glove.lost) == ("tactile_left", 0)
@@ -201,7 +207,7 @@ def test_an_old_take_is_free_at_once_and_waits_for_no_collector(recorder, clock)
     play(recorder, clock, 1.0)
     recorder.stop()
     recorder.save(ANYWAY)
-    take = weakref.ref(recorder._take)
+    take = weakref.ref(recorder.take)
     gc.disable()
     try:
         recorder.arm(PROMPT)

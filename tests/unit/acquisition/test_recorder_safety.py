@@ -73,7 +73,7 @@ def advance(clock, duration_ns):
 
 def play(recorder, clock, num_samples, first=0):
     for index in range(first, first + num_samples):
-        recorder.accept({"head": [Sample(clock.now_ns(), POSE, 5, index)]})
+        recorder.take.accept({"head": [Sample(clock.now_ns(), POSE, 5, index)]})
         advance(clock, 10_000_000)
 
 
@@ -118,7 +118,7 @@ def test_readers_do_not_wait_for_the_disk(make_recorder, clock, monkeypatch):
     mover.start()
     assert stuck.wait(20)
     for index in range(50):
-        recorder.accept({"head": [Sample(clock.now_ns(), POSE, 5, index)]})
+        recorder.take.accept({"head": [Sample(clock.now_ns(), POSE, 5, index)]})
     assert recorder.status().num_samples == {"head": 50}
     assert SpoolReader(recorder.spool_root / "take").num_samples("head") == 50
     monkeypatch.undo()

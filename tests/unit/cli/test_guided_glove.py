@@ -62,7 +62,7 @@ class Bench:
             values = np.rint(counts + noise).clip(0, 65535).astype(np.uint16)
             now_ns = self.clock.now_ns()
             sample = Sample(now_ns, values, now_ns, self.num_samples)
-            self.recorder.accept({"tactile_left": [sample]})
+            self.recorder.take.accept({"tactile_left": [sample]})
             waiter = self.clock.waiter(drives_time=True)
             waiter.wait_until(now_ns + 16_666_667)
             waiter.close()
