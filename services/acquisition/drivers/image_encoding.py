@@ -24,12 +24,13 @@ from dextouch.episodes import (
     decoder_of_this_thread,
     is_keyframe,
 )
-from dextouch.errors import NotFoundError
+from dextouch.errors import DeviceError, NotFoundError
 from dextouch.images import encode_jpeg
 from dextouch.streams import (
     Sample,
     encoded_values,
 )
+from services.acquisition.drivers.packets import DecoderStatistics
 
 ImageEncoding = Literal["rgb8", "jpeg", "h264"]
 MAX_WAITING_IMAGES = 8
@@ -205,22 +206,26 @@ class GroupPreview:
 
 
 class WholeGroups:
-    """H.264 samples of a device that encodes itself in; the same in whole groups out.
+    """Gives the H.264 samples of a device that encodes itself in whole groups only.
 
     A group that lost an image is dropped as a whole: the store could not take the rest of it.
+
+    Args:
+        stream: for messages.
+        statistics: where dropped images are counted as refused.
     """
 
-    def __init__(self) -> None:
-        self.num_left_out = 0
+    def __init__(self, stream: str, statistics: DecoderStatistics) -> None:
+        self._stream, self._statistics = stream, statistics
         self._group: list[Sample] = []
         # Of the sample that a group is expected to begin after; None where any may.
         self._whole_until: int | None = None
 
-    def add(self, sample: Sample) -> list[Sample] | None:
-        """The next sample; a whole group when it is the last one of it.
+    def add(self, sample: Sample) -> list[Sample]:
+        """The next sample; a whole group when it is the last one of it, [] before.
 
-        Returns:
-            The group, [] while it is not whole, None when the device's groups have another length.
+        Raises:
+            DeviceError: the device's groups have another length.
         """
         begins = is_keyframe(sample.values.item())
         follows = bool(self._group) and sample.sequence == self._group[-1].sequence + 1
@@ -229,9 +234,15 @@ class WholeGroups:
         is_too_long = not begins and sample.sequence - 1 == self._whole_until
         if begins or not follows:
             self.reset()
-        if is_too_short or is_too_long or not (begins or follows):
-            self.num_left_out += 1
-            return None if is_too_short or is_too_long else []
+        if is_too_short or is_too_long:
+            self._statistics.refused += 1
+            raise DeviceError(
+                f"{self._stream}: its H.264 groups have another length than {GOP_IMAGES} images; "
+                "set the bridge's encoder, or let it send JPEG images"
+            )
+        if not (begins or follows):
+            self._statistics.refused += 1
+            return []
         self._group.append(sample)
         if len(self._group) < GOP_IMAGES:
             return []
@@ -241,5 +252,5 @@ class WholeGroups:
 
     def reset(self) -> None:
         """Drop the unfinished group; the next sample need not follow."""
-        self.num_left_out += len(self._group)
+        self._statistics.refused += len(self._group)
         self._group, self._whole_until = [], None

@@ -44,7 +44,6 @@ class ImageQuality:
         num_clipped: of the checked ones, those with more than 20 % clipped pixels.
         num_gaps: gaps of the driver's stamps.
         num_dropped: images that found the encoder's queue full.
-        largest_gap_ns: between two stamps.
     """
 
     frozen: bool = False
@@ -58,7 +57,6 @@ class ImageQuality:
     num_clipped: int = 0
     num_gaps: int = 0
     num_dropped: int = 0
-    largest_gap_ns: int = 0
 
     @property
     def clipped(self) -> bool:
@@ -80,29 +78,23 @@ class SessionMedian:
     """The median of a whole session in bounded memory: evenly thinned out when it gets full."""
 
     def __init__(self) -> None:
-        # All of it at the start, so that a session takes no more with the time.
-        self._values = np.zeros(MAX_SHARPNESSES)
-        self._count = 0
+        self._values: list[float] = []
         self._every = 1
         self._num_seen = 0
 
     def add(self, value: float) -> None:
         """One more value."""
         if self._num_seen % self._every == 0:
-            self._values[self._count] = value
-            self._count += 1
+            self._values.append(value)
         self._num_seen += 1
-        if self._count == MAX_SHARPNESSES:
-            self._count //= 2
-            self._values[: self._count] = self._values[::2]
+        if len(self._values) == MAX_SHARPNESSES:
+            del self._values[1::2]
             self._every *= 2
 
     @property
     def value(self) -> float | None:
         """The median; None of fewer than 10 values."""
-        if self._count < MIN_SHARPNESSES:
-            return None
-        return float(np.median(self._values[: self._count]))
+        return float(np.median(self._values)) if len(self._values) >= MIN_SHARPNESSES else None
 
 
 class ImageChecker:
@@ -173,7 +165,6 @@ class ImageChecker:
     def _note_stamp(self, t_ns: int) -> None:
         if self._last_t_ns is not None:
             gap_ns = t_ns - self._last_t_ns
-            self._found.largest_gap_ns = max(self._found.largest_gap_ns, gap_ns)
             if gap_ns > GAP_PERIODS * self._period_ns:
                 self._found.num_gaps += 1
                 self._gap_seen_ns = t_ns

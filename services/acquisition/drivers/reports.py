@@ -1,7 +1,6 @@
 """Numbered 64-byte reports ↔ a packet's bytes, and the decoders of trackers that send them."""
 
 import struct
-from dataclasses import dataclass
 
 from dextouch.errors import InvalidInputError
 from dextouch.streams import StreamDescriptor
@@ -36,50 +35,43 @@ def split_into_reports(report_id: int, counter: int, data: bytes) -> list[bytes]
     ]
 
 
-@dataclass
-class ReassemblyStatistics:
-    """What a reassembler has seen."""
-
-    reports: int = 0
-    malformed: int = 0
-    incomplete: int = 0
-
-
 class ReportReassembler:
-    """Joins the parts of one message; a missing part costs that message alone."""
+    """Joins the parts of one message; a missing part costs that message alone.
+
+    Attributes:
+        num_reports: how many came.
+        num_incomplete: messages of which a part was missing.
+    """
 
     def __init__(self) -> None:
-        self.statistics = ReassemblyStatistics()
+        self.num_reports = self.num_incomplete = 0
         self._parts: list[bytes] = []
         self._key = (0, 0, 0)
 
     def reset(self) -> None:
         """Forget half a message."""
-        if self._parts:
-            self.statistics.incomplete += 1
+        self.num_incomplete += bool(self._parts)
         self._parts = []
 
     def feed(self, report: bytes) -> tuple[int, bytes] | None:
-        """(report id, message) when this report completes one."""
-        self.statistics.reports += 1
+        """(report id, message) when this report completes one; None of one that is malformed."""
+        self.num_reports += 1
         if len(report) != REPORT_BYTES:
-            self.statistics.malformed += 1
             return None
         report_id, counter, part, num_parts, length = REPORT_HEADER.unpack_from(report)
+        key = (report_id, counter, num_parts)
         if part >= num_parts or length > PART_BYTES:
-            self.statistics.malformed += 1
             return None
         if part == 0:
             self.reset()
-            self._key = (report_id, counter, num_parts)
-        elif part != len(self._parts) or (report_id, counter, num_parts) != self._key:
+            self._key = key
+        elif part != len(self._parts) or key != self._key:
             self.reset()
             return None
         self._parts.append(report[REPORT_HEADER.size : REPORT_HEADER.size + length])
         if part + 1 < num_parts:
             return None
-        message = b"".join(self._parts)
-        self._parts = []
+        message, self._parts = b"".join(self._parts), []
         return report_id, message
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import GOP_IMAGES, is_keyframe
-from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.errors import DeviceError, InvalidInputError, NotFoundError
 from dextouch.images import decode_jpeg
 from dextouch.streams import Sample
 from services.acquisition.devices.camera.driver import CameraDecoder
@@ -16,6 +16,7 @@ from services.acquisition.drivers.image_encoding import (
     ImageEncoder,
     WholeGroups,
 )
+from services.acquisition.drivers.packets import DecoderStatistics
 
 SIZE_PX = (32, 48)
 WAIT_S = 20.0
@@ -168,19 +169,21 @@ def passed(groups, samples):
 
 
 def test_whole_groups_pass():
-    samples, groups = encoded(20), WholeGroups()
+    samples, counts = encoded(20), DecoderStatistics()
+    groups = WholeGroups("camera_head", counts)
     assert passed(groups, samples) == [samples[:8], samples[8:16]]
     groups.reset()
-    assert groups.num_left_out == 4
+    assert counts.refused == 4
 
 
 @pytest.mark.parametrize("lost", [0, 3, 7, 8, 12])
 def test_a_group_that_lost_an_image_is_left_out(lost):
-    samples, groups = encoded(24), WholeGroups()
+    samples, counts = encoded(24), DecoderStatistics()
+    groups = WholeGroups("camera_head", counts)
     torn = lost // GOP_IMAGES
     expected = [samples[8 * g : 8 * g + 8] for g in range(3) if g != torn]
     assert passed(groups, samples[:lost] + samples[lost + 1 :]) == expected
-    assert groups.num_left_out == GOP_IMAGES - 1
+    assert counts.refused == GOP_IMAGES - 1
 
 
 def renumbered(samples):
@@ -189,12 +192,13 @@ def renumbered(samples):
 
 @pytest.mark.parametrize("length", [3, 9])
 def test_groups_of_another_length_are_named(length):
-    groups = WholeGroups()
+    groups = WholeGroups("camera_head", DecoderStatistics())
     if length < GOP_IMAGES:
         samples = renumbered([*encoded(length), *encoded(1)])
     else:
         whole = encoded(8)
         samples = renumbered([*whole, whole[-1]])
-    answers = [groups.add(sample) for sample in samples]
-    assert answers[-1] is None
-    assert None not in answers[:-1]
+    for sample in samples[:-1]:
+        groups.add(sample)
+    with pytest.raises(DeviceError, match="another length than 8 images"):
+        groups.add(samples[-1])

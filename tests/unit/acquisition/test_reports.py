@@ -17,16 +17,16 @@ MESSAGES = st.lists(st.binary(min_size=1, max_size=400), min_size=1, max_size=12
 def reassemble(reports):
     reassembler = ReportReassembler()
     found = [reassembler.feed(report) for report in reports]
-    return [message for message in found if message is not None], reassembler.statistics
+    return [message for message in found if message is not None], reassembler
 
 
 @given(MESSAGES)
 def test_round_trip(messages):
     reports = [r for i, m in enumerate(messages) for r in split_into_reports(DATA_REPORT, i, m)]
     assert all(len(report) == REPORT_BYTES for report in reports)
-    found, statistics = reassemble(reports)
+    found, reassembler = reassemble(reports)
     assert found == [(DATA_REPORT, message) for message in messages]
-    assert statistics.incomplete == 0
+    assert reassembler.num_incomplete == 0
 
 
 @given(MESSAGES, st.data())
@@ -41,8 +41,8 @@ def test_lost_reports_cost_only_their_messages(messages, data):
 
 @given(st.lists(st.binary(max_size=70)))
 def test_no_reports_break_it(reports):
-    _, statistics = reassemble(reports)
-    assert statistics.reports == len(reports)
+    _, reassembler = reassemble(reports)
+    assert reassembler.num_reports == len(reports)
 
 
 def test_limits():

@@ -37,16 +37,16 @@ def assert_keypoints(samples, numbers):
 
 def fill_the_ring(tracker, driver, messages):
     """Send all while nobody reads, then read what the kernel kept: its number of whole messages."""
-    before = driver.decoder.reports.statistics.reports
+    before = driver.decoder.reports.num_reports
     for report in chain(*messages):
         tracker.send(report)
     num_kept = RING // len(messages[0])
     assert_keypoints(collect(driver, STREAM, num_kept), range(num_kept))
     # What is left is the begin of a message, and then nothing.
-    while driver.decoder.reports.statistics.reports < before + RING:
+    while driver.decoder.reports.num_reports < before + RING:
         assert driver.read() == {}
     assert driver.read() == {}
-    assert driver.decoder.reports.statistics.reports == before + RING
+    assert driver.decoder.reports.num_reports == before + RING
     return num_kept
 
 
@@ -60,7 +60,7 @@ def test_what_the_ring_cannot_hold_is_counted(tracker, opened, measured, num_sen
     assert_keypoints(collect(driver, STREAM, 1), [num_sent])
     assert driver.statistics.lost == num_sent - num_kept
     # Half of a message was kept.
-    assert driver.decoder.reports.statistics.incomplete == 1
+    assert driver.decoder.reports.num_incomplete == 1
     measured(
         "finger tracker, uhid",
         f"{num_sent} packets unread",

@@ -6,7 +6,6 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from dextouch.episodes import GOP_IMAGES
 from dextouch.errors import CorruptDataError, DeviceError, InvalidInputError
 from dextouch.images import decode_jpeg, jpeg_size
 from dextouch.streams import (
@@ -71,7 +70,7 @@ class CameraDecoder(StreamDecoder[Packet]):
             MAGIC, min_payload=PAYLOAD_HEADER.size + 1, max_payload=MAX_PAYLOAD_BYTES
         )
         super().__init__(self._descriptor, packets)
-        self._groups = WholeGroups()
+        self._groups = WholeGroups(stream, self.statistics)
         self._checker = ImageChecker(period_ns=self._descriptor.period_ns())
         self.damaged_images = 0
         self._num_images = 0
@@ -85,7 +84,6 @@ class CameraDecoder(StreamDecoder[Packet]):
         """Forget half a packet, and a group that was begun."""
         super().reset()
         self._groups.reset()
-        self._count_left_out()
 
     def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
         """Images completed by `data`: uint8 [h, w, 3], or bytes as a 0-d object array.
@@ -96,7 +94,7 @@ class CameraDecoder(StreamDecoder[Packet]):
         samples = super().feed(data, t_host_ns)
         if self._encoding != "h264":
             return samples
-        return [whole for sample in samples for whole in self._whole_group(sample)]
+        return [whole for sample in samples for whole in self._groups.add(sample)]
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
         check_packet(packet, device=self._stream, source=None)
@@ -139,20 +137,6 @@ class CameraDecoder(StreamDecoder[Packet]):
         except (CorruptDataError, InvalidInputError):
             return None
         return encoded_values([body]).reshape(())
-
-    def _whole_group(self, sample: Sample) -> list[Sample]:
-        group = self._groups.add(sample)
-        self._count_left_out()
-        if group is None:
-            raise DeviceError(
-                f"{self._stream}: its H.264 groups have another length than {GOP_IMAGES} images; "
-                "set the bridge's encoder, or let it send JPEG images"
-            )
-        return group
-
-    def _count_left_out(self) -> None:
-        self.statistics.refused += self._groups.num_left_out
-        self._groups.num_left_out = 0
 
     def _look(self, sample: Sample) -> None:
         if self._encoding == "rgb8":
