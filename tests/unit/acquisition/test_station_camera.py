@@ -204,7 +204,7 @@ def test_images_lost_before_us_are_counted_by_the_stamps():
     driver = camera.driver()
     assert [s.sequence for s in read_all(driver, camera)] == [0, 1, 5, 6, 8]
     assert driver.statistics.lost == 4
-    assert (driver.quality.num_gaps, driver.quality.largest_gap_ns) == (2, 4 * PERIOD)
+    assert driver.quality.num_gaps == 2
     assert driver.quality.gap
 
 
