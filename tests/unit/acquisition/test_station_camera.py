@@ -36,11 +36,17 @@ def picture(index):
     return image
 
 
-class FakeCapture:
+class FakeCapture(CaptureLink):
     """Gives what its camera's script says."""
 
     def __init__(self, camera):
-        self.camera, self.exposure_ns = camera, camera.exposure_ns
+        super().__init__(address="/dev/video7", serial_number="AB12")
+        self.camera = camera
+
+    def _connect(self):
+        self.camera.opened += 1
+        self.exposure_ns = self.camera.exposure_ns
+        return self.camera
 
     def wait(self, timeout_s):
         step = self.camera.next_step()
@@ -55,8 +61,8 @@ class FakeCapture:
             return None
         return CapturedImage(step["image"], step["stamp"])
 
-    def close(self):
-        self.camera.closed += 1
+    def _release(self, handle):
+        handle.closed += 1
 
 
 class FakeCamera:
@@ -66,18 +72,15 @@ class FakeCamera:
         self.steps, self.exposure_ns = list(steps), exposure_ns
         self.clock, self.current, self.opened, self.closed = Clock(), None, 0, 0
 
-    def open(self):
-        self.opened += 1
-        return FakeCapture(self)
-
     def next_step(self):
         self.current = self.steps.pop(0)
         return self.current
 
     def driver(self, **options):
-        link = CaptureLink(self.open, address="/dev/video7", serial_number="AB12")
         settings = StationCameraSettings(**{"encoding": "rgb8"} | WANTED | options)
-        return StationCamera(settings, link=link, clock=self.clock, max_encode_wait_s=20.0)
+        return StationCamera(
+            settings, link=FakeCapture(self), clock=self.clock, max_encode_wait_s=20.0
+        )
 
 
 def image(index, *, stamp="own", pixels=None):

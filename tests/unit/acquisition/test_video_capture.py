@@ -9,7 +9,6 @@ from dextouch.errors import DeviceError
 from services.acquisition.clock import RealClock
 from services.acquisition.devices.station_camera.capture import (
     CapturedImage,
-    CaptureLink,
     OpenCvCapture,
     StationCameraSettings,
     find_camera,
@@ -45,8 +44,28 @@ def video(tmp_path):
     return path
 
 
+class FileCapture(OpenCvCapture):
+    """A video file in place of a camera: it has no clock, and images as fast as they are read."""
+
+    def wait(self, timeout_s):
+        if not self._opened().grab():
+            raise DeviceError("no more images")
+        return True
+
+    def _connect(self):
+        video = cv2.VideoCapture(self._find(), cv2.CAP_FFMPEG)
+        self._check(video)
+        return video
+
+
+def opened(source, request=REQUEST, capture=OpenCvCapture):
+    link = capture(lambda: source, request)
+    link.open()
+    return link
+
+
 def test_a_video_file_comes_back_in_the_right_colours(video):
-    capture = OpenCvCapture(video, REQUEST, is_file=True)
+    capture = opened(video, capture=FileCapture)
     for index in range(NUM_IMAGES):
         assert capture.wait(0.1)
         found = capture.retrieve()
@@ -57,7 +76,7 @@ def test_a_video_file_comes_back_in_the_right_colours(video):
 
 
 def test_a_video_file_through_the_driver_has_arrival_stamps_only(video):
-    link = CaptureLink(lambda: OpenCvCapture(video, REQUEST, is_file=True), address=video)
+    link = FileCapture(lambda: video, REQUEST)
     camera = StationCamera(REQUEST, link=link, clock=RealClock(), max_encode_wait_s=20.0)
     camera.open()
     samples = [camera.read()["camera_head"][0] for _ in range(NUM_IMAGES)]
@@ -79,12 +98,12 @@ def test_a_video_file_through_the_driver_has_arrival_stamps_only(video):
 )
 def test_another_size_or_rate_is_refused(video, request_, match):
     with pytest.raises(DeviceError, match=match):
-        OpenCvCapture(video, request_, is_file=True)
+        opened(video, request_, FileCapture)
 
 
 def test_an_absent_camera_is_a_device_error(tmp_path):
     with pytest.raises(DeviceError, match="plugged in"):
-        OpenCvCapture(str(tmp_path / "video9"), REQUEST)
+        opened(str(tmp_path / "video9"))
 
 
 @pytest.mark.parametrize(
@@ -156,7 +175,7 @@ def test_an_image_with_the_drivers_stamp(v4l2):
     bgr = np.zeros((48, 64, 3), np.uint8)
     bgr[..., 0] = 200
     v4l2.script = (bgr,)
-    capture = OpenCvCapture("/dev/video0", REQUEST)
+    capture = opened("/dev/video0")
     assert capture.wait(0.05)
     found = capture.retrieve()
     assert isinstance(found, CapturedImage)
@@ -166,38 +185,38 @@ def test_an_image_with_the_drivers_stamp(v4l2):
 
 def test_nothing_yet_is_no_image_and_no_error(v4l2):
     v4l2.script = ((False, []),)
-    assert OpenCvCapture("/dev/video0", REQUEST).wait(0.05) is False
+    assert opened("/dev/video0").wait(0.05) is False
 
 
 @pytest.mark.parametrize("step", ["Error is reported for camera stream", (True, [])])
 def test_an_unplugged_camera_is_a_device_error(v4l2, step):
     v4l2.script = (step,)
     with pytest.raises(DeviceError, match="unplugged"):
-        OpenCvCapture("/dev/video0", REQUEST).wait(0.05)
+        opened("/dev/video0").wait(0.05)
 
 
 @pytest.mark.parametrize("step", [None, cv2.error("jpeg"), np.zeros((1, 900), np.uint8)])
 def test_a_damaged_image_is_none(v4l2, step):
     v4l2.script = (step,)
-    capture = OpenCvCapture("/dev/video0", REQUEST)
+    capture = opened("/dev/video0")
     assert capture.wait(0.05)
     assert capture.retrieve() is None
 
 
 def test_the_pixel_format_is_asked_for_first(v4l2):
-    capture = OpenCvCapture("/dev/video0", REQUEST)
-    asked = capture._video.order
+    capture = opened("/dev/video0")
+    asked = capture._opened().order
     assert asked[0] == cv2.CAP_PROP_FOURCC
     assert asked.index(cv2.CAP_PROP_FRAME_WIDTH) < asked.index(cv2.CAP_PROP_FPS)
 
 
 def test_exposures_are_in_the_units_of_v4l2(v4l2):
-    assert OpenCvCapture("/dev/video0", REQUEST).exposure_ns == 15_600_000
+    assert opened("/dev/video0").exposure_ns == 15_600_000
     fixed = wanted(exposure_ms=8)
-    capture = OpenCvCapture("/dev/video0", fixed)
+    capture = opened("/dev/video0", fixed)
     assert capture.exposure_ns == 8_000_000
-    assert capture._video.properties[cv2.CAP_PROP_EXPOSURE] == 80
-    assert capture._video.properties[cv2.CAP_PROP_AUTO_EXPOSURE] == 1
+    assert capture._opened().properties[cv2.CAP_PROP_EXPOSURE] == 80
+    assert capture._opened().properties[cv2.CAP_PROP_AUTO_EXPOSURE] == 1
 
 
 @pytest.mark.parametrize(
@@ -207,7 +226,7 @@ def test_exposures_are_in_the_units_of_v4l2(v4l2):
 def test_a_camera_that_cannot_is_refused_and_given_back(v4l2, refused, match):
     v4l2.refused = {refused}
     with pytest.raises(DeviceError, match=match):
-        OpenCvCapture("/dev/video0", wanted(exposure_ms=8))
+        opened("/dev/video0", wanted(exposure_ms=8))
     assert v4l2.released == 1
 
 
@@ -241,29 +260,18 @@ def test_an_unknown_or_ambiguous_serial_number_names_what_is_there(tmp_path):
         find_camera("AB12", folder)
 
 
-def test_a_link_gives_no_bytes_and_opens_anew():
-    closed = []
-
-    class Nothing:
-        exposure_ns = None
-
-        def wait(self, timeout_s):
-            return False
-
-        def retrieve(self):
-            return None
-
-        def close(self):
-            closed.append(1)
-
-    link = CaptureLink(Nothing, address="/dev/video0", serial_number="A")
-    for refused in (link.read, lambda: link.write(b"1"), lambda: link.capture):
-        with pytest.raises(DeviceError, match="camera /dev/video0"):
+def test_a_link_gives_no_bytes_and_opens_anew(v4l2):
+    link = OpenCvCapture(lambda: "/dev/video0", wanted(device="/dev/video0"))
+    for refused in (link.read, lambda: link.write(b"1"), lambda: link.wait(0.05)):
+        with pytest.raises(DeviceError, match="camera /dev/video0: not open"):
             refused()
     link.open()
-    first = link.capture
+    for refused in (link.read, lambda: link.write(b"1")):
+        with pytest.raises(DeviceError, match=r"camera /dev/video0: (provides|accepts)"):
+            refused()
+    first = link._opened()
     link.open()
-    assert link.capture is not first
+    assert link._opened() is not first
     link.close()
     link.close()
-    assert len(closed) == 2
+    assert v4l2.released == 2

@@ -1,9 +1,10 @@
 """Settings of a camera on the station's own bus."""
 
+from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import UInt8
@@ -11,7 +12,10 @@ from pydantic import Field, model_validator
 
 from dextouch.errors import DeviceError
 from services.acquisition.devices.kind import CameraStream, DeviceSettings
-from services.acquisition.transports.ports import HandleTransport, TransportInfo
+from services.acquisition.transports.ports import Handle, HandleTransport, TransportInfo
+
+if TYPE_CHECKING:
+    import cv2
 
 BY_ID = Path("/dev/v4l/by-id")
 NS_PER_MS = 1_000_000
@@ -92,148 +96,116 @@ class CapturedImage:
     t_driver_ns: int | None
 
 
-@runtime_checkable
-class Capture(Protocol):
-    """An opened camera."""
-
-    @property
-    def exposure_ns(self) -> int | None:
-        """The exposure that the camera states; None where it does not."""
-        ...
-
-    def wait(self, timeout_s: float) -> bool:
-        """Fetch the next image; False when none came in time.
-
-        Raises:
-            DeviceError: the camera is gone.
-        """
-        ...
-
-    def retrieve(self) -> CapturedImage | None:
-        """Decode the image fetched by `wait`; None when it is damaged."""
-        ...
-
-    def close(self) -> None:
-        """Give the camera back."""
-        ...
-
-
-class CaptureLink(HandleTransport[Capture]):
-    """The transport of a camera: reopens it each time and returns its location.
+class CaptureLink(HandleTransport[Handle]):
+    """Base of transports to a camera, which gives images instead of bytes.
 
     Args:
-        opener: finds and opens the camera.
         address: for messages.
         serial_number: of the camera, for messages.
+
+    Attributes:
+        exposure_ns: what the opened camera states; None where it does not.
     """
 
-    def __init__(
-        self, opener: Callable[[], Capture], *, address: str, serial_number: str | None = None
-    ) -> None:
-        super().__init__(TransportInfo("camera", address, serial_number))
-        self._opener = opener
+    advice = "is it plugged in, is it in use, may this user read it?"
 
-    @property
-    def capture(self) -> Capture:
-        """The opened camera.
+    def __init__(self, *, address: str, serial_number: str | None = None) -> None:
+        super().__init__(TransportInfo("camera", address, serial_number))
+        self.exposure_ns: int | None = None
+
+    @abstractmethod
+    def wait(self, timeout_s: float) -> bool:
+        """Fetch the next image; False when none came in time.
 
         Raises:
-            DeviceError: it is not open.
+            DeviceError: the camera is gone, or not open.
         """
-        return self._opened()
 
-    def _receive(self, handle: Capture) -> bytes:
-        raise DeviceError(f"{self.info}: provides images, not bytes; read it through its capture")
+    @abstractmethod
+    def retrieve(self) -> CapturedImage | None:
+        """Decode the image fetched by `wait`; None when it is damaged."""
 
-    def _send(self, handle: Capture, data: bytes) -> None:
+    def _receive(self, handle: Handle) -> bytes:
+        raise DeviceError(f"{self.info}: provides images, not bytes; read it by `wait`")
+
+    def _send(self, handle: Handle, data: bytes) -> None:
         raise DeviceError(f"{self.info}: accepts no data, got {len(data)}")
 
-    def _connect(self) -> Capture:
-        return self._opener()
 
-    def _release(self, handle: Capture) -> None:
-        handle.close()
-
-
-class OpenCvCapture:
-    """A camera by OpenCV's V4L2 backend; or a video file, which has no stamps of a clock.
+class OpenCvCapture(CaptureLink["cv2.VideoCapture"]):
+    """A camera by OpenCV's V4L2 backend.
 
     Args:
-        source: device such as /dev/video0, or the file.
+        find: gives the device, such as /dev/video0, at every opening.
         request: size, rate, pixel format and exposure that it must give.
-        is_file: whether `source` is a video file; its images come as fast as they are read.
-
-    Raises:
-        DeviceError: absent, in use, or not able to do what it is asked for.
     """
 
-    def __init__(
-        self, source: str, request: StationCameraSettings, *, is_file: bool = False
-    ) -> None:
-        import cv2
-
-        self._cv2, self._source, self._is_file = cv2, source, is_file
-        self.exposure_ns: int | None = None
-        try:
-            self._video = cv2.VideoCapture(source, cv2.CAP_FFMPEG if is_file else cv2.CAP_V4L2)
-        except cv2.error as error:
-            raise DeviceError(f"camera {source}: cannot be opened ({error})") from error
-        try:
-            self._set_up(request)
-        except DeviceError:
-            self._video.release()
-            raise
+    def __init__(self, find: Callable[[], str], request: StationCameraSettings) -> None:
+        address = request.serial_number or request.device or "not opened"
+        super().__init__(address=address, serial_number=request.serial_number)
+        self._find = find
+        self._request = request
 
     def wait(self, timeout_s: float) -> bool:
         """Fetch the next image; False when none came in time.
 
         Raises:
-            DeviceError: the camera is gone, or the file is at its end.
+            DeviceError: the camera is gone, or not open.
         """
-        if self._is_file:
-            if not self._video.grab():
-                raise DeviceError(f"camera {self._source}: no more images")
-            return True
+        import cv2
+
+        timeout_ns = max(1, round(timeout_s * 1e9))
         try:
-            came, ready = self._cv2.VideoCapture.waitAny(
-                [self._video], timeoutNs=max(1, round(timeout_s * 1e9))
-            )
-        except self._cv2.error as error:
-            raise DeviceError(f"camera {self._source}: unplugged while reading") from error
+            came, ready = cv2.VideoCapture.waitAny([self._opened()], timeoutNs=timeout_ns)
+        except cv2.error as error:
+            raise DeviceError(f"{self.info}: unplugged while reading") from error
         if came and not len(ready):
             # Neither an image nor the end of the timeout: hung up.
-            raise DeviceError(f"camera {self._source}: unplugged while waiting")
+            raise DeviceError(f"{self.info}: unplugged while waiting")
         return bool(came)
 
     def retrieve(self) -> CapturedImage | None:
         """Decode the image fetched by `wait`; None when it is damaged."""
-        stamp_ms = self._video.get(self._cv2.CAP_PROP_POS_MSEC)
+        import cv2
+
+        video = self._opened()
+        stamp_ms = video.get(cv2.CAP_PROP_POS_MSEC)
         try:
-            is_whole, image = self._video.retrieve()
-        except self._cv2.error:
+            is_whole, image = video.retrieve()
+        except cv2.error:
             return None
         if not is_whole or image is None or image.ndim != 3:
             return None
         t_driver_ns = round(stamp_ms * NS_PER_MS) if stamp_ms > 0 else None
-        return CapturedImage(self._cv2.cvtColor(image, self._cv2.COLOR_BGR2RGB), t_driver_ns)
+        return CapturedImage(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), t_driver_ns)
 
-    def close(self) -> None:
-        """Give the camera back."""
-        self._video.release()
+    def _connect(self) -> "cv2.VideoCapture":
+        import cv2
 
-    def _set_up(self, request: StationCameraSettings) -> None:
-        if not self._video.isOpened():
-            raise DeviceError(
-                f"camera {self._source}: cannot be opened; is it plugged in, is it in use, may "
-                "this user read it?"
-            )
-        if not self._is_file:
-            self._ask(request)
-            self._set_exposure(request.exposure_ns)
-        self._check(request)
+        # The device of now, for messages.
+        self.info = replace(self.info, address=self._find())
+        try:
+            video = cv2.VideoCapture(self.info.address, cv2.CAP_V4L2)
+        except cv2.error as error:
+            raise OSError(error) from error
+        if not video.isOpened():
+            raise OSError("not opened by OpenCV")
+        try:
+            self._ask(video)
+            self._set_exposure(video)
+            self._check(video)
+        except DeviceError:
+            video.release()
+            raise
+        return video
 
-    def _ask(self, request: StationCameraSettings) -> None:
-        cv2, video = self._cv2, self._video
+    def _release(self, handle: "cv2.VideoCapture") -> None:
+        handle.release()
+
+    def _ask(self, video: "cv2.VideoCapture") -> None:
+        import cv2
+
+        request = self._request
         # The pixel format comes first: it decides which sizes and rates there are.
         fourcc = cv2.VideoWriter.fourcc(*request.fourcc)
         video.set(cv2.CAP_PROP_FOURCC, fourcc)
@@ -241,10 +213,12 @@ class OpenCvCapture:
         video.set(cv2.CAP_PROP_FRAME_HEIGHT, request.height_px)
         video.set(cv2.CAP_PROP_FPS, request.rate_hz)
         if int(video.get(cv2.CAP_PROP_FOURCC)) != fourcc:
-            raise DeviceError(f"camera {self._source}: has no pixel format {request.fourcc!r}")
+            raise DeviceError(f"{self.info}: has no pixel format {request.fourcc!r}")
 
-    def _set_exposure(self, exposure_ns: int | None) -> None:
-        cv2, video = self._cv2, self._video
+    def _set_exposure(self, video: "cv2.VideoCapture") -> None:
+        import cv2
+
+        exposure_ns = self._request.exposure_ns
         if exposure_ns is None:
             # Cameras without the control refuse it; they are automatic anyway.
             video.set(cv2.CAP_PROP_AUTO_EXPOSURE, AUTOMATIC_EXPOSURE)
@@ -252,24 +226,26 @@ class OpenCvCapture:
             units = max(1, round(exposure_ns / EXPOSURE_UNIT_NS))
             is_set = video.set(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE)
             if not is_set or not video.set(cv2.CAP_PROP_EXPOSURE, units):
-                raise DeviceError(f"camera {self._source}: has no fixed exposure; leave it out")
+                raise DeviceError(f"{self.info}: has no fixed exposure; leave it out")
         # Of automatic exposure this is where it begins, and all that is known.
         units = round(video.get(cv2.CAP_PROP_EXPOSURE))
         self.exposure_ns = units * EXPOSURE_UNIT_NS if units > 0 else None
 
-    def _check(self, request: StationCameraSettings) -> None:
-        cv2, video = self._cv2, self._video
+    def _check(self, video: "cv2.VideoCapture") -> None:
+        import cv2
+
+        request = self._request
         got = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)))
         if got != request.size_px:
             raise DeviceError(
-                f"camera {self._source}: gives {got[1]} by {got[0]} px, expected "
+                f"{self.info}: gives {got[1]} by {got[0]} px, expected "
                 f"{request.width_px} by {request.height_px}; choose a supported size"
             )
         rate_hz = video.get(cv2.CAP_PROP_FPS)
         # Cameras that do not tell their rate say 0.
         if rate_hz > 0 and abs(rate_hz / request.rate_hz - 1) > RATE_TOLERANCE:
             raise DeviceError(
-                f"camera {self._source}: gives {rate_hz:g} images a second, expected "
+                f"{self.info}: gives {rate_hz:g} images a second, expected "
                 f"{request.rate_hz:g}; choose a supported rate"
             )
 

@@ -7,6 +7,7 @@ exposure. A camera whose stamps are on another clock gives arrival stamps only, 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.schemas import Matrix
@@ -159,7 +160,7 @@ class StationCamera(Driver):
         self,
         settings: StationCameraSettings,
         *,
-        link: CaptureLink,
+        link: CaptureLink[Any],
         clock: StationClock,
         max_encode_wait_s: float | None = None,
     ) -> None:
@@ -212,7 +213,7 @@ class StationCamera(Driver):
         # Loading a video encoder takes longer than the first images would wait.
         self._queue.prepare()
         super().open()
-        exposure_ns = self._link.capture.exposure_ns
+        exposure_ns = self._link.exposure_ns
         self._exposure_ns = self._settings.exposure_ns if exposure_ns is None else exposure_ns
         self._heard_ns, self._silence_ns = self._clock.now_ns(), FIRST_IMAGE_NS
 
@@ -222,12 +223,11 @@ class StationCamera(Driver):
         Raises:
             DeviceError: the camera is gone, silent, or gives other images than asked for.
         """
-        capture = self._link.capture
-        if capture.wait(READ_TIMEOUT_S):
+        if self._link.wait(READ_TIMEOUT_S):
             t_host_ns = self._clock.now_ns()
             self._heard_ns = t_host_ns
             self._silence_ns = max(MIN_SILENCE_NS, SILENT_PERIODS * self._settings.period_ns)
-            self._take(capture.retrieve(), t_host_ns)
+            self._take(self._link.retrieve(), t_host_ns)
         else:
             self._check_silence()
         samples = self._queue.collect(self._encode_wait_s)
@@ -291,22 +291,14 @@ def build(settings: StationCameraSettings, clock: StationClock) -> StationCamera
     Raises:
         InvalidInputError: neither serial number nor device.
     """
-    find, address = _finder(settings)
-    link = CaptureLink(
-        lambda: OpenCvCapture(find(), settings),
-        address=address,
-        serial_number=settings.serial_number,
-    )
-    return StationCamera(settings, link=link, clock=clock)
-
-
-def _finder(settings: StationCameraSettings) -> tuple[Callable[[], str], str]:
-    """What finds the camera at every opening, and how it is called in messages."""
+    find: Callable[[], str]
     if settings.serial_number is not None:
-        return partial(find_camera, settings.serial_number), settings.serial_number
-    if settings.device is not None:
-        return partial(str, settings.device), settings.device
-    raise InvalidInputError(f"camera {settings.stream}: set its serial_number or its device")
+        find = partial(find_camera, settings.serial_number)
+    elif settings.device is not None:
+        find = partial(str, settings.device)
+    else:
+        raise InvalidInputError(f"camera {settings.stream}: set its serial_number or its device")
+    return StationCamera(settings, link=OpenCvCapture(find, settings), clock=clock)
 
 
 KIND = DeviceKind(name="station_camera", settings=StationCameraSettings, build=build)

@@ -1,7 +1,7 @@
 """A simulated camera on the station's own bus.
 
-A camera driver delivers images, not bytes, so this mock implements the `Capture` protocol: images
-with the kernel's stamps, four buffers, an error when it is pulled out.
+A camera driver delivers images, not bytes, so this mock is a `CaptureLink`: images with the
+kernel's stamps, four buffers, an error when it is pulled out.
 """
 
 import struct
@@ -39,8 +39,7 @@ class VideoPort(ReportDevice):
         self.link = Link()
         # What the camera states, if anything.
         self.exposure_ns: int | None = None
-        self._name = name
-        self.transport = CaptureLink(self._open, address=f"mock:{name}", serial_number=name)
+        self.transport = MockCapture(self, name)
 
     def plug(self) -> None:
         """Plug in."""
@@ -67,32 +66,24 @@ class VideoPort(ReportDevice):
         """
         with self._changed:
             self._changed.wait_for(lambda: self._reports or not self.is_plugged, timeout_s)
-            self._check("unplugged while reading")
+            if not self.is_plugged:
+                raise DeviceError(f"{self.transport.info}: unplugged while reading")
             return self._reports.popleft() if self._reports else b""
 
-    def _open(self) -> "MockCapture":
-        self._check("is not plugged in")
-        self.flush()
-        self.link.set_open(is_open=True)
-        return MockCapture(self)
 
-    def _check(self, otherwise: str) -> None:
-        if not self.is_plugged:
-            raise DeviceError(f"camera mock:{self._name}: {otherwise}")
-
-
-class MockCapture:
+class MockCapture(CaptureLink[VideoPort]):
     """The host's end of a mock camera."""
 
-    def __init__(self, port: VideoPort) -> None:
-        self.exposure_ns = port.exposure_ns
+    def __init__(self, port: VideoPort, name: str) -> None:
+        super().__init__(address=f"mock:{name}", serial_number=name)
         self._port = port
         self._unit = b""
 
     def wait(self, timeout_s: float) -> bool:
         """Fetch the next image; images fetched before have been processed by now."""
-        self._port.link.add_consumed(len(self._unit))
-        self._unit = self._port.take(timeout_s)
+        port = self._opened()
+        port.link.add_consumed(len(self._unit))
+        self._unit = port.take(timeout_s)
         return bool(self._unit)
 
     def retrieve(self) -> CapturedImage | None:
@@ -103,9 +94,17 @@ class MockCapture:
             return None
         return CapturedImage(pixels.reshape(height_px, width_px, 3), t_driver_ns)
 
-    def close(self) -> None:
-        """Give the camera back."""
-        self._port.link.set_open(is_open=False)
+    def _connect(self) -> VideoPort:
+        port = self._port
+        if not port.is_plugged:
+            raise DeviceError(f"{self.info}: is not plugged in")
+        port.flush()
+        port.link.set_open(is_open=True)
+        self.exposure_ns, self._unit = port.exposure_ns, b""
+        return port
+
+    def _release(self, handle: VideoPort) -> None:
+        handle.link.set_open(is_open=False)
 
 
 class VideoSource:
