@@ -108,7 +108,9 @@ class Station:
         if take is not None:
             take.accept(readings)
         self.live.accept(readings)
-        self.health.accept(readings)
+        now_ns = self.clock.now_ns()
+        for name, samples in readings.items():
+            self.health.queues[name].add(samples, now_ns)
         if self.paths.asks:
             self.paths.accept(readings)
 

@@ -125,10 +125,15 @@ def run(names, links, minutes):
     devices = [Played(pair, clock, seed) for seed, pair in enumerate(pairs)]
     supervisors = [device.supervisor for device in devices]
     monitor = HealthMonitor(supervisors, calibration=calibration, clock=clock, station="s")
+
+    def accept(readings):
+        for name, samples in readings.items():
+            monitor.queues[name].add(samples, clock.now_ns())
+
     for tick in range(1, round(minutes * 60e9 / TICK_NS) + 1):
         end_ns = START_NS + tick * TICK_NS
         for device in devices:
-            device.play_until(end_ns, monitor.accept)
+            device.play_until(end_ns, accept)
         clock.t_ns = end_ns
         monitor.tick()
     return monitor

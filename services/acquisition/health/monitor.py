@@ -13,7 +13,7 @@ from dextouch.schemas import (
 )
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import PeriodicCall, StationClock
-from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.base import Driver
 from services.acquisition.glove_record import glove_record, is_ours
 from services.acquisition.health.cells import TaxelJudge, cell_judge
 from services.acquisition.health.clock import ClockJudge, CountingJudge
@@ -151,6 +151,9 @@ class HealthMonitor:
         calibration: of the station.
         clock: of the station.
         paths: measured path delays, which are compared with the calibration.
+
+    Attributes:
+        queues: of each stream's samples, filled by the reader threads with what they have spooled.
     """
 
     def __init__(
@@ -168,6 +171,7 @@ class HealthMonitor:
         self._log = EventLog()
         streams = [stream for s in supervisors for stream in _watch(s, calibration, paths)]
         self._streams = {stream.name: stream for stream in streams}
+        self.queues = {stream.name: stream.queue for stream in streams}
         descriptors = [descriptor for s in supervisors for descriptor in s.driver.descriptors]
         self._itself = _Watched(
             STATION, [CalibrationJudge(descriptors, calibration), self._judge_itself]
@@ -193,12 +197,6 @@ class HealthMonitor:
     def stop(self) -> None:
         """End the thread."""
         self._ticks.stop()
-
-    def accept(self, readings: Readings) -> None:
-        """Keep samples for the next evaluation (called by the reader threads, once spooled)."""
-        now_ns = self._clock.now_ns()
-        for name, samples in readings.items():
-            self._streams[name].queue.add(samples, now_ns)
 
     def evaluate(self) -> None:
         """One regular evaluation now."""

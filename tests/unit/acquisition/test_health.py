@@ -60,7 +60,8 @@ class Bench:
 
     def accept(self, readings):
         self.live.accept(readings)
-        self.monitor.accept(readings)
+        for name, samples in readings.items():
+            self.monitor.queues[name].add(samples, self.clock.now_ns())
 
     def second(self, *, rate=1.0, lost=0, crc=0, evaluate=True):
         values = (self.counts, np.array([0.0, 0, 0, 1, 0, 0, 0]))
