@@ -147,7 +147,7 @@ DAY_PROBE = """
 import json, resource, sys
 import numpy as np
 from dextouch.clocks import OnlineClock, TickCounter
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from dextouch.streams.samples import ClockCapabilities, StreamDescriptor
 kind, rate_hz, hours = sys.argv[1], 1, 24
 capabilities = {
     "u16 sequence": ClockCapabilities(sequence=True, sequence_bits=16),

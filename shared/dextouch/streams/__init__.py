@@ -15,22 +15,22 @@ if TYPE_CHECKING:
     from dextouch.streams.batch import frame_body as frame_body
     from dextouch.streams.batch import read_batch as read_batch
     from dextouch.streams.batch import sample_ends as sample_ends
-    from dextouch.streams.checks import ENCODED_UNITS as ENCODED_UNITS
-    from dextouch.streams.checks import H264_UNIT as H264_UNIT
-    from dextouch.streams.checks import JPEG_UNIT as JPEG_UNIT
-    from dextouch.streams.checks import check_batch as check_batch
-    from dextouch.streams.checks import check_encoded_image as check_encoded_image
-    from dextouch.streams.checks import check_follows as check_follows
-    from dextouch.streams.descriptors import MAX_STREAMS as MAX_STREAMS
-    from dextouch.streams.descriptors import ClockCapabilities as ClockCapabilities
-    from dextouch.streams.descriptors import StreamDescriptor as StreamDescriptor
-    from dextouch.streams.descriptors import StreamKind as StreamKind
     from dextouch.streams.packing import pack as pack
     from dextouch.streams.packing import unpack as unpack
+    from dextouch.streams.samples import ENCODED_UNITS as ENCODED_UNITS
+    from dextouch.streams.samples import H264_UNIT as H264_UNIT
+    from dextouch.streams.samples import JPEG_UNIT as JPEG_UNIT
+    from dextouch.streams.samples import MAX_STREAMS as MAX_STREAMS
     from dextouch.streams.samples import NO_DEVICE_TIME as NO_DEVICE_TIME
     from dextouch.streams.samples import NO_SEQUENCE as NO_SEQUENCE
+    from dextouch.streams.samples import ClockCapabilities as ClockCapabilities
     from dextouch.streams.samples import Sample as Sample
     from dextouch.streams.samples import SampleBatch as SampleBatch
+    from dextouch.streams.samples import StreamDescriptor as StreamDescriptor
+    from dextouch.streams.samples import StreamKind as StreamKind
+    from dextouch.streams.samples import check_batch as check_batch
+    from dextouch.streams.samples import check_encoded_image as check_encoded_image
+    from dextouch.streams.samples import check_follows as check_follows
     from dextouch.streams.samples import encoded_values as encoded_values
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)

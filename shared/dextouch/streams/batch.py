@@ -20,10 +20,14 @@ from dextouch.errors import (
     LimitExceededError,
     PacketError,
 )
-from dextouch.streams.checks import ENCODED_UNITS, check_batch
-from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.packing import unpack
-from dextouch.streams.samples import SampleBatch, encoded_values
+from dextouch.streams.samples import (
+    ENCODED_UNITS,
+    SampleBatch,
+    StreamDescriptor,
+    check_batch,
+    encoded_values,
+)
 
 MAGIC = b"DXTB"
 VERSION = 2

@@ -1,16 +1,88 @@
-"""A timed reading of a sensor, and batches of consecutive readings."""
+"""Streams of sensors: their descriptors, samples and batches, and which batches are valid."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Int64, Shaped
+from pydantic import Field, model_validator
 
-from dextouch.errors import ShapeError
+from dextouch.errors import CorruptDataError, InvalidInputError, ShapeError
+from dextouch.frozen_model import FrozenModel
+from dextouch.images import jpeg_size
 
+# Batches and windows add an axis to those of a sample, and a packed array has at most eight.
+MAX_SAMPLE_AXES = 7
+# More than the largest H.264 picture (level 6.2) at three bytes per pixel.
+MAX_SAMPLE_BYTES = 1 << 27
+MIN_RATE_HZ = 1e-6
+# Limit for new recordings and episodes, since each stream keeps up to eight files open while it is
+# written. Those of older releases may have more.
+MAX_STREAMS = 100
+StreamKind = Literal["tactile", "keypoints", "pose", "image", "robot_state", "scalar"]
 # Placeholders where a device provides no time stamp or no sequence number.
 NO_DEVICE_TIME = -1
 NO_SEQUENCE = -1
+JPEG_UNIT = "jpeg"
+H264_UNIT = "h264"
+# Values of these units are encoded images (bytes).
+ENCODED_UNITS = (JPEG_UNIT, H264_UNIT)
+# Start code of H.264 access units (ITU-T H.264, Annex B), optionally preceded by a zero byte.
+_START_CODES = (b"\x00\x00\x00\x01", b"\x00\x00\x01")
+
+
+class ClockCapabilities(FrozenModel):
+    """Time stamps and sequence numbers that a device provides; timing quality depends on them."""
+
+    crc: bool = False
+    sequence: bool = False
+    sequence_bits: int = Field(default=32, ge=8, le=64)
+    device_time: bool = False
+    tick_ns: int = Field(default=1, ge=1)
+    device_time_bits: int = Field(default=64, ge=16, le=64)
+
+
+class StreamDescriptor(FrozenModel):
+    """One stream of a recording or an episode.
+
+    `shape` is that of one sample's payload, at most MAX_SAMPLE_BYTES; `unit` that of its values
+    (`counts`, `kPa`, `m`, `rad`, `pose_m_wxyz`, `rgb8`, …); `frame` their coordinate system, if
+    any.
+    """
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")
+    kind: StreamKind
+    shape: tuple[Annotated[int, Field(ge=1)], ...] = Field(max_length=MAX_SAMPLE_AXES)
+    dtype: Literal["uint8", "uint16", "int64", "float32", "float64"]
+    unit: str
+    nominal_rate_hz: float = Field(ge=MIN_RATE_HZ, le=10_000)
+    frame: str | None = None
+    side: Literal["left", "right"] | None = None
+    device: str | None = None
+    capabilities: ClockCapabilities = ClockCapabilities()
+
+    @model_validator(mode="after")
+    def _fits_in_memory(self) -> "StreamDescriptor":
+        if self.sample_bytes() > MAX_SAMPLE_BYTES:
+            raise ValueError(
+                f"{self.name}: a sample of shape {self.shape} takes {self.sample_bytes()} bytes, "
+                f"expected at most {MAX_SAMPLE_BYTES}"
+            )
+        return self
+
+    def sample_bytes(self) -> int:
+        """Size of one sample in memory."""
+        return math.prod(self.shape) * self.numpy_dtype().itemsize
+
+    def numpy_dtype(self) -> np.dtype[np.generic]:
+        """The payload's dtype, little endian."""
+        return np.dtype(self.dtype).newbyteorder("<")
+
+    def period_ns(self) -> int:
+        """Nominal sample period."""
+        return round(1e9 / self.nominal_rate_hz)
 
 
 @dataclass(frozen=True)
@@ -64,3 +136,88 @@ def encoded_values(images: Sequence[bytes]) -> Shaped[np.ndarray, " n"]:
     values = np.empty(len(images), dtype=object)
     values[:] = images
     return values
+
+
+def check_batch(descriptor: StreamDescriptor, batch: SampleBatch) -> None:
+    """Check that a batch matches its stream.
+
+    Args:
+        descriptor: of the stream.
+        batch: values of the descriptor's dtype and shape; for the units `jpeg` and `h264` an
+            object array of bytes; `t_host_ns` is non-decreasing.
+
+    Raises:
+        ShapeError: another dtype or shape.
+        InvalidInputError: stamps that go back, or invalid image data.
+    """
+    values, name = batch.values, descriptor.name
+    for stamp in ("t_host_ns", "t_device_ns", "sequence"):
+        column = getattr(batch, stamp)
+        if column.dtype != np.int64 or column.shape != (len(batch),):
+            raise ShapeError(f"{name}: {stamp} is {column.dtype} {column.shape}, expected int64")
+    if descriptor.unit in ENCODED_UNITS:
+        _check_images(descriptor, values)
+    elif values.dtype != descriptor.numpy_dtype() or values.shape[1:] != descriptor.shape:
+        raise ShapeError(
+            f"{name}: got values {values.dtype} {values.shape}, expected {descriptor.dtype} "
+            f"[n, {', '.join(map(str, descriptor.shape))}]"
+        )
+    if len(batch) < 2:
+        return
+    # Compared, not subtracted: the difference of two extreme stamps can overflow.
+    back = np.flatnonzero(batch.t_host_ns[1:] < batch.t_host_ns[:-1])
+    if len(back):
+        raise InvalidInputError(
+            f"{name}: t_host_ns goes back after sample {int(back[0])} of the batch; "
+            "append samples in the order of their arrival"
+        )
+
+
+def check_follows(name: str, t_host_ns: int, last_t_host_ns: int | None) -> None:
+    """Check that a batch does not start before the last sample of its stream.
+
+    Raises:
+        InvalidInputError: it does.
+    """
+    if last_t_host_ns is not None and t_host_ns < last_t_host_ns:
+        raise InvalidInputError(
+            f"{name}: t_host_ns goes back to {t_host_ns} from {last_t_host_ns}; "
+            "append samples in the order of their arrival"
+        )
+
+
+def _check_images(descriptor: StreamDescriptor, values: np.ndarray) -> None:
+    name = descriptor.name
+    if values.dtype != object or values.ndim != 1:
+        raise ShapeError(
+            f"{name}: got values {values.dtype} {values.shape}, expected an object array of "
+            "bytes, one an image (see dextouch.streams.samples.encoded_values)"
+        )
+    for index, data in enumerate(values):
+        check_encoded_image(descriptor, data, where=f"{name}: image {index} of the batch")
+
+
+def check_encoded_image(descriptor: StreamDescriptor, data: object, *, where: str) -> None:
+    """Check an encoded image of a stream with the unit `jpeg` or `h264`.
+
+    For H.264 only the start code is checked; the size is known after decoding.
+
+    Raises:
+        ShapeError: not bytes, or an image of another size.
+        InvalidInputError: another format.
+    """
+    if not isinstance(data, bytes):
+        raise ShapeError(f"{where} is {type(data).__name__}, expected bytes")
+    if descriptor.unit == H264_UNIT:
+        if not data.startswith(_START_CODES):
+            raise InvalidInputError(
+                f"{where}: begins with {data[:4]!r}, expected an H.264 access unit with a start "
+                "code (Annex B)"
+            )
+        return
+    try:
+        size = jpeg_size(data, where=where)
+    except CorruptDataError as error:
+        raise InvalidInputError(error.message) from error
+    if size != descriptor.shape[:2]:
+        raise ShapeError(f"{where} is {size} pixels, expected {descriptor.shape[:2]}")

@@ -6,7 +6,7 @@ import numpy as np
 
 from dextouch.episodes import EpisodeStore
 from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import StreamDescriptor
 from tests.unit.evaluation import toy
 
 GRID_NS = np.round(np.arange(toy.STEPS) * 1e9 / 15).astype(np.int64)
