@@ -22,20 +22,20 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         await jobs.start()
-        watching: list[asyncio.Task[None]] = []
+        watch = None
         if settings.align_new:
-            watch = NewRecordings(store, jobs).watch(settings.period_s)
-            watching.append(asyncio.create_task(watch))
+            look = NewRecordings(store, jobs).watch(settings.period_s)
+            watch = asyncio.create_task(look)
         try:
             yield
         finally:
-            for task in watching:
-                task.cancel()
-            await asyncio.gather(*watching, return_exceptions=True)
+            if watch is not None:
+                watch.cancel()
+                await asyncio.gather(watch, return_exceptions=True)
             await jobs.close()
 
     async def readiness() -> Sequence[str]:
-        return jobs.waiting_for()
+        return [] if jobs.is_warm else ["solver"]
 
     return create_service_app(
         name="alignment",

@@ -59,7 +59,8 @@ RETRY_AFTER_S = 5
 class JobQueue:
     """All jobs of one service, in the order in which they were submitted.
 
-    Change jobs only while holding `lock`. Belongs to one event loop.
+    Change jobs only while holding `lock`; a change that cannot be saved raises `StorageError` and
+    leaves them as they were. Belongs to one event loop.
 
     Args:
         max_open: jobs that may wait or run.
@@ -107,14 +108,17 @@ class JobQueue:
         Raises:
             NotFoundError: there is no job `after`.
         """
-        ids = list(self._jobs)
-        start = 0 if after is None else ids.index(self.get(after).alignment_id) + 1
-        rest = [i for i in ids[start:] if state is None or self._jobs[i].state == state]
+        jobs = [job for job in self._jobs.values() if job.state == (state or job.state)]
+        rest = jobs
+        if after is not None:
+            ids = list(self._jobs)
+            later = set(ids[ids.index(self.get(after).alignment_id) + 1 :])
+            rest = [job for job in jobs if job.alignment_id in later]
         shown = rest[:limit]
         return AlignmentList(
-            alignments=tuple(self.get(alignment_id) for alignment_id in shown),
-            num_matching=sum(state is None or job.state == state for job in self._jobs.values()),
-            next_after=shown[-1] if len(rest) > limit else None,
+            alignments=tuple(job.with_eta() for job in shown),
+            num_matching=len(jobs),
+            next_after=shown[-1].alignment_id if len(rest) > limit else None,
         )
 
     @property
@@ -132,11 +136,10 @@ class JobQueue:
         return known is not None and known.state == "running" and known.started_at == job.started_at
 
     async def add(self, jobs: Sequence[AlignmentJob]) -> None:
-        """Append new jobs; those that wait, run or are done stay as they are. Needs `lock`.
+        """Append new jobs; those that wait, run or are done stay as they are.
 
         Raises:
             LimitExceededError: too many would be open; none is added.
-            StorageError: they cannot be saved; none is added.
         """
         again = {None, "failed", "cancelled"}
         states = {key: job.state for key, job in self._jobs.items()}
@@ -156,16 +159,12 @@ class JobQueue:
         self._jobs = {key: job for key, job in kept.items() if key not in forgotten}
 
     async def save(self, job: AlignmentJob) -> None:
-        """Replace a job by its next state. Needs `lock`.
-
-        Raises:
-            StorageError: it cannot be saved; the job stays as it was.
-        """
+        """Replace a job by its next state."""
         await self._commit([], [job])
         self._jobs[job.alignment_id] = job
 
     async def save_if_possible(self, job: AlignmentJob) -> None:
-        """Replace a job by a state that is a fact, even if the disk is full. Needs `lock`."""
+        """Replace a job by a state that is a fact, even if the disk is full."""
         try:
             await self._commit([], [job])
         except StorageError as error:
@@ -236,10 +235,9 @@ class JobDatabase:
         Raises:
             StorageFullError: no space is left; nothing changed.
         """
+        delete = "DELETE FROM jobs WHERE alignment_id = ?"
         with self._errors("write"), self._guard, self._connection as connection:
-            connection.executemany(
-                "DELETE FROM jobs WHERE alignment_id = ?", [(key,) for key in removed]
-            )
+            connection.executemany(delete, [(key,) for key in removed])
             connection.executemany(UPSERT, [_row(job) for job in saved])
 
     def close(self) -> None:

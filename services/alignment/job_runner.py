@@ -55,9 +55,9 @@ class JobRunner:
             CorruptDataError: they are damaged.
         """
         folder = self._settings.jobs_folder or Path(self._store.root) / JOBS_FOLDER
-        for job in await self.queue.open(folder):
-            resumed = job.crashed(max_attempts=self._settings.max_attempts)
-            async with self.queue.lock:
+        async with self.queue.lock:
+            for job in await self.queue.open(folder):
+                resumed = job.crashed(max_attempts=self._settings.max_attempts)
                 await self.queue.save_if_possible(resumed)
         await asyncio.to_thread(self._store.sweep)
         work = [self._warm_up(), *(self._work(worker) for worker in self._workers)]
@@ -70,10 +70,9 @@ class JobRunner:
         at_work = list(self._at_work)
         await asyncio.to_thread(self._stop_workers)
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        for alignment_id in at_work:
-            job = self.queue.get(alignment_id)
-            if job.state == "running":
-                async with self.queue.lock:
+        async with self.queue.lock:
+            for job in map(self.queue.get, at_work):
+                if job.state == "running":
                     await self.queue.save_if_possible(job.interrupted())
         ended = asyncio.ensure_future(asyncio.to_thread(self._threads.shutdown))
         while not ended.done():
@@ -145,10 +144,6 @@ class JobRunner:
         await self._announce()
         return self.queue.get(alignment_id)
 
-    def waiting_for(self) -> list[str]:
-        """Names of the conditions that must be met before the service is ready."""
-        return [] if self.is_warm else ["solver"]
-
     async def _warm_up(self) -> None:
         """Start the first worker early, because compiling its solver takes long."""
         loop = asyncio.get_running_loop()
@@ -209,8 +204,7 @@ class JobRunner:
         except Exception:
             # The job's supervisor: one broken recording must not end the service.
             logger.exception("alignment_crashed", recording_id=job.recording_id)
-            broken = DexTouchError("unexpected error; see the service's log")
-            ended = job.failed(broken)
+            ended = job.failed(DexTouchError("unexpected error; see the service's log"))
         async with self.queue.lock:
             if not self.queue.is_current(job):
                 return

@@ -126,14 +126,8 @@ class AlignmentJob(FrozenModel):
         return self._with(eta_s=elapsed_s * (1 - self.progress) / self.progress)
 
     def _waiting(self, *, attempts: int) -> "AlignmentJob":
-        return self._with(
-            state="waiting",
-            attempts=attempts,
-            progress=0.0,
-            stage=None,
-            stream=None,
-            started_at=None,
-        )
+        again: dict[str, object] = {"stage": None, "stream": None, "started_at": None}
+        return self._with(state="waiting", attempts=attempts, progress=0.0, **again)
 
     def _ended(self, state: JobState, **changes: object) -> "AlignmentJob":
         return self._with(state=state, ended_at=_now(), stage=None, stream=None, **changes)
