@@ -71,7 +71,7 @@ def seen_samples(keypoints_m: np.ndarray, *, where: str) -> Float64[np.ndarray, 
     keypoints = np.asarray(keypoints_m)
     if keypoints.ndim != 3 or keypoints.shape[1:] != (NUM_KEYPOINTS, 3) or not len(keypoints):
         raise ShapeError(f"{where}: got shape {keypoints.shape}, expected [T ≥ 1, 25, 3]")
-    looked_at = seen_nodes(_thinned(keypoints, MAX_LOOKED_AT))
+    looked_at = seen_nodes(thinned(keypoints, MAX_LOOKED_AT))
     num_seen = np.isfinite(looked_at[:, PALM_NODES, 0]).sum(axis=1)
     if not (num_seen >= MIN_PALM_NODES).any():
         raise InvalidInputError(
@@ -80,10 +80,11 @@ def seen_samples(keypoints_m: np.ndarray, *, where: str) -> Float64[np.ndarray, 
             "how the hand is turned; record the hand where it is seen",
             fault="unseen",
         )
-    return _thinned(looked_at[num_seen >= MIN_PALM_NODES], MAX_SAMPLES)
+    return thinned(looked_at[num_seen >= MIN_PALM_NODES], MAX_SAMPLES)
 
 
-def _thinned(samples: np.ndarray, most: int) -> np.ndarray:
+def thinned(samples: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of the samples, evenly spread."""
     return samples[np.linspace(0, len(samples) - 1, min(most, len(samples))).round().astype(int)]
 
 
@@ -225,12 +226,7 @@ def _median_distances(samples: np.ndarray) -> Float64[np.ndarray, "25 25"]:
 def _compared(
     distances: np.ndarray, places: np.ndarray
 ) -> tuple[Float64[np.ndarray, " orders"], Float64[np.ndarray, " orders"]]:
-    """Size and misfit of the mean hand for each order of nodes; NaN where too little is seen.
-
-    Args:
-        distances: [25, 25] m between the nodes as they came.
-        places: [orders, 25] where each of our nodes is among them; −1 nowhere.
-    """
+    """Size and misfit of the mean hand for each order of nodes; NaN where too little is seen."""
     at = places[:, _PAIRS]
     found = np.where((at >= 0).all(axis=2), distances[at[..., 0], at[..., 1]], np.nan)
     is_enough = np.isfinite(found).sum(axis=1) >= MIN_PAIRS

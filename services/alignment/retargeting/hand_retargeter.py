@@ -120,21 +120,14 @@ class HandRetargeter:
         self._was_sent = joints_rad is not None
         if joints_rad is None:
             return
-        angles = np.asarray(joints_rad, dtype=np.float64)
-        num = len(self.hand.joint_names)
-        if angles.shape != (num,):
-            raise ShapeError(f"joints_rad: got shape {angles.shape}, expected [{num}]")
+        angles, hand = np.asarray(joints_rad, dtype=np.float64), self.hand
+        if angles.shape != hand.lower_rad.shape:
+            raise ShapeError(f"joints_rad: got {angles.shape}, expected {hand.lower_rad.shape}")
         if not np.isfinite(angles).all():
             raise InvalidInputError(f"joints_rad: got {angles.tolist()}, expected finite angles")
-        self._memory.joints_rad[self._is_joint] = np.clip(
-            angles, self.hand.lower_rad, self.hand.upper_rad
-        )
+        self._memory.joints_rad[self._is_joint] = np.clip(angles, hand.lower_rad, hand.upper_rad)
 
-    def step(
-        self,
-        keypoints_m: np.ndarray,
-        elapsed_s: float = NOMINAL_PERIOD_S,
-    ) -> RetargetResult:
+    def step(self, keypoints_m: np.ndarray, elapsed_s: float = NOMINAL_PERIOD_S) -> RetargetResult:
         """Joint angles of the next sample, live; fingers that are not tracked hold their angles.
 
         No joint goes further from one output to the next than `velocity_limit_rad_s` allows in the
@@ -164,11 +157,7 @@ class HandRetargeter:
         tables = (self._arrays, self._person, tuning, self._scratch)
         return self._follow(tables, (keypoints[None], self._elapsed_s), self._memory)
 
-    def retarget(
-        self,
-        keypoints_m: np.ndarray,
-        t_s: np.ndarray | None = None,
-    ) -> RetargetResult:
+    def retarget(self, keypoints_m: np.ndarray, t_s: np.ndarray | None = None) -> RetargetResult:
         """Joint angles of a whole recording; untracked stretches are interpolated in time.
 
         Args:
@@ -190,17 +179,15 @@ class HandRetargeter:
         tuning = replace(self.options, reacquire_after_s=lost_s).tuning()
         tables = (self._arrays, person, tuning, np.zeros(1, dtype=SCRATCH))
         result = self._follow(tables, (keypoints, elapsed_s), self._blank())
-        never = np.asarray(~result.solved.any(axis=0))
-        if never.any():
-            names = ", ".join(
-                finger.chain for finger, gone in zip(self.hand.fingers, never, strict=True) if gone
-            )
+        followed = result.solved.any(axis=0)
+        never = [f.chain for f, is_so in zip(self.hand.fingers, followed, strict=True) if not is_so]
+        if never:
             raise InvalidInputError(
-                f"keypoints of the {self.hand.side} hand: {names} followed in no sample (bones "
-                "or knuckles are not those of the profile, or nodes are missing); expected every "
-                "finger at least once"
+                f"keypoints of the {self.hand.side} hand: {', '.join(never)} followed in no sample "
+                "(bones or knuckles are not those of the profile, or nodes are missing); expected "
+                "every finger at least once"
             )
-        return replace(result, joints_rad=self._fill(result, np.cumsum(elapsed_s)))
+        return replace(result, joints_rad=self._filled(result, np.cumsum(elapsed_s)))
 
     def measure(self, keypoints_m: np.ndarray) -> HandProfile:
         """Measure the profile of a person from calibration samples.
@@ -224,10 +211,7 @@ class HandRetargeter:
         return Memory.starting_at(rest[: len(self.hand.fingers)])
 
     def _follow(
-        self,
-        tables: tuple[np.ndarray, ...],
-        samples: tuple[np.ndarray, ...],
-        memory: Memory,
+        self, tables: tuple[np.ndarray, ...], samples: tuple[np.ndarray, ...], memory: Memory
     ) -> RetargetResult:
         output = Output.of(len(samples[0]), len(self.hand.fingers))
         retarget_samples(tables, samples, memory, output)
@@ -239,19 +223,17 @@ class HandRetargeter:
             solved=output.finger_status < arrays.IMPLAUSIBLE,
         )
 
-    def _fill(self, result: RetargetResult, t_s: np.ndarray) -> Float64[np.ndarray, "time joints"]:
-        """Untracked stretches of fingers, linearly between the samples around; held at ends.
+    def _filled(self, result: RetargetResult, t_s: np.ndarray) -> np.ndarray:
+        """Angles with untracked stretches of fingers filled linearly, in time; held at ends.
 
-        In time, so that the rate limit, which the samples around keep, holds within as well.
+        So the rate limit, which the samples around keep, holds within as well.
         """
         filled = result.joints_rad.copy()
-        finger_of = np.nonzero(self._is_joint)[0]
-        for joint, finger in enumerate(finger_of):
+        for joint, finger in enumerate(np.nonzero(self._is_joint)[0]):
             known = result.solved[:, finger]
-            if not known.all():
-                filled[~known, joint] = np.interp(
-                    t_s[~known], t_s[known], result.joints_rad[known, joint]
-                )
+            filled[~known, joint] = np.interp(
+                t_s[~known], t_s[known], result.joints_rad[known, joint]
+            )
         return filled
 
 
@@ -268,9 +250,9 @@ def _elapsed_s(num_samples: int, t_s: np.ndarray | None) -> Float64[np.ndarray, 
         if times.shape != (num_samples,):
             raise ShapeError(f"t_s: got shape {times.shape}, expected [{num_samples}]")
         elapsed[1:] = np.diff(times)
-        bad = np.flatnonzero(~((elapsed > 0) & np.isfinite(elapsed)))
-        if bad.size or not np.isfinite(times).all():
-            at = int(bad[0]) if bad.size else 0
+        wrong = ~((elapsed > 0) & np.isfinite(elapsed) & np.isfinite(times))
+        if wrong.any():
+            at = int(np.argmax(wrong))
             raise InvalidInputError(
                 f"t_s: sample {at} is {elapsed[at]:g} s after the one before; expected finite, "
                 "rising times"

@@ -6,6 +6,7 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import CHAINS, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import HandModel
+from services.alignment.retargeting.hand_checks import thinned
 from services.alignment.retargeting.hand_profile import (
     BONE_RANGE_M,
     NUM_FINGERS,
@@ -71,7 +72,7 @@ def person_arrays(profile: HandProfile, hand: HandModel) -> np.ndarray:
     """Record `PERSON` of a profile, for the fingers that the robot hand has."""
     sigma_m = max(profile.point_sigma_m, LEAST_SIGMA_M)
     record = np.zeros(1, dtype=PERSON)
-    rows, num = chains_of(hand), len(hand.fingers)
+    rows, num = _chains_of(hand), len(hand.fingers)
     record["is_known"] = True
     record["is_rigid"] = profile.is_rigid
     own_m, bone_m = robot_bone_m(hand), profile.bone_m[rows].copy()
@@ -95,7 +96,7 @@ def person_arrays(profile: HandProfile, hand: HandModel) -> np.ndarray:
     return record
 
 
-def chains_of(hand: HandModel) -> list[int]:
+def _chains_of(hand: HandModel) -> list[int]:
     """Which chain of the tracked skeleton (thumb … little) each of the hand's fingers follows."""
     return [CHAINS.index(finger.chain) for finger in hand.fingers]
 
@@ -131,7 +132,7 @@ def measure_profile(keypoints_m: np.ndarray, hand: HandModel) -> HandProfile:
     """
     # Knuckle, PIP, DIP and tip of thumb … little (of the thumb: CMC, MCP, IP, tip).
     points_m = checked_keypoints(keypoints_m)[:, _NODES]
-    whole = np.asarray(np.isfinite(points_m).all(axis=(-1, -2)))
+    whole = np.isfinite(points_m).all(axis=(-1, -2))
     _check_seen(whole, hand.side)
     points_m[~whole] = np.nan
     lengths = np.linalg.norm(np.diff(points_m, axis=2), axis=-1)
@@ -139,12 +140,12 @@ def measure_profile(keypoints_m: np.ndarray, hand: HandModel) -> HandProfile:
     check_bone_unit(float(np.nanmedian(lengths[:, index_finger, 0])), where="keypoints")
     low, high = BONE_RANGE_M
     lengths[~((lengths >= low) & (lengths <= high)).all(axis=-1)] = np.nan
-    _check_seen(np.asarray(np.isfinite(lengths).all(axis=-1)), hand.side)
+    _check_seen(np.isfinite(lengths).all(axis=-1), hand.side)
     bone_m = np.nanmedian(lengths, axis=0)
     spread_m = 1.4826 * np.nanmedian(np.abs(lengths - bone_m), axis=0)
     # The length of a bone has the noise of two points along it.
     point_sigma_m = float(np.median(spread_m) / np.sqrt(2))
-    rows = _spread(np.flatnonzero(whole.any(axis=1)))
+    rows = thinned(np.flatnonzero(whole.any(axis=1)), NUM_SAMPLES)
     moved_m = _knuckle_motion(points_m[rows], hand)
     usable = whole[rows] & np.isfinite(moved_m).all(axis=-1)
     knuckle_m, travel, sigma_m = np.zeros((NUM_FINGERS, 3)), np.zeros(5), np.zeros(5)
@@ -161,34 +162,22 @@ def measure_profile(keypoints_m: np.ndarray, hand: HandModel) -> HandProfile:
 
 
 def _check_seen(whole: np.ndarray, side: str) -> None:
-    never = np.asarray(~whole.any(axis=0))
-    if never.any():
-        names = ", ".join(name for name, gone in zip(CHAINS, never, strict=True) if gone)
+    never = [name for name, seen in zip(CHAINS, whole.any(axis=0), strict=True) if not seen]
+    if never:
         raise InvalidInputError(
-            f"keypoints of the {side} hand: no step shows all nodes of {names} with bones of "
-            f"{BONE_RANGE_M[0]} … {BONE_RANGE_M[1]} m; expected every finger at least once"
+            f"keypoints of the {side} hand: no step shows all nodes of {', '.join(never)} with "
+            f"bones of {BONE_RANGE_M[0]} … {BONE_RANGE_M[1]} m; expected every finger at least once"
         )
-
-
-def _spread(rows: np.ndarray) -> np.ndarray:
-    """At most `NUM_SAMPLES` of the rows, evenly."""
-    chosen = np.linspace(0, len(rows) - 1, min(len(rows), NUM_SAMPLES)).round().astype(int)
-    return np.asarray(rows[chosen])
 
 
 def _knuckle_motion(points_m: np.ndarray, hand: HandModel) -> Float64[np.ndarray, "n 5 3"]:
     """Knuckles of the robot when its fingers point like the tracked ones; NaN if unknown."""
-    own, rows, num = hand_arrays(hand), chains_of(hand), len(points_m)
+    own, rows, num = hand_arrays(hand), _chains_of(hand), len(points_m)
     keypoints = np.full((num, NUM_KEYPOINTS, 3), np.nan)
     keypoints[:, _NODES] = points_m
-    output = Output.of(num, len(rows))
+    output, person = Output.of(num, len(rows)), unknown_person(own, robot_bone_m(hand))
     retarget_samples(
-        (
-            own,
-            unknown_person(own, robot_bone_m(hand)),
-            EVERY_SAMPLE_ALONE.tuning(),
-            np.zeros(1, dtype=SCRATCH),
-        ),
+        (own, person, EVERY_SAMPLE_ALONE.tuning(), np.zeros(1, dtype=SCRATCH)),
         (keypoints, np.full(num, np.inf)),
         Memory.starting_at(np.zeros((len(rows), MAX_JOINTS))),
         output,

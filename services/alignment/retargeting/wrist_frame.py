@@ -192,13 +192,7 @@ def _palm(
 def _laid_over(
     mean: np.ndarray, palms: np.ndarray, is_used: np.ndarray
 ) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
-    """Rotations, sizes and offsets with palm ≈ size · R · mean + offset (Umeyama 1991).
-
-    Args:
-        mean: [9, 3] nodes of the mean palm.
-        palms: [n, 9, 3] in the tracker's axes.
-        is_used: [n, 9] which nodes count.
-    """
+    """Rotations, sizes and offsets with palm ≈ size · R · mean + offset (Umeyama 1991)."""
     weights = is_used / is_used.sum(axis=1, keepdims=True)
     places = np.where(is_used[..., None], palms, 0.0)
     middle_mean, middle = weights @ mean, np.einsum("nk,nkx->nx", weights, places)
