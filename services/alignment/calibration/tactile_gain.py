@@ -233,10 +233,8 @@ def fit_gain(
     _check_direction(points)
     takes = [press.counts for press in presses]
     state = classify_taxels(takes, tare, full_scale_counts=full_scale_counts)
-    silent = _silent_under_pressure(points)
-    state[silent & (state != SATURATED)] = kind_of_silence(takes, tare.side)[
-        silent & (state != SATURATED)
-    ]
+    silent = _silent_under_pressure(points) & (state != SATURATED)
+    state[silent] = kind_of_silence(takes, tare.side)[silent]
     pressed = points.used[:-1].any(axis=0)
     state[points.saturated[:-1].any(axis=0) & ~pressed] = SATURATED
     state[~pressed & (state == OK)] = UNPROVEN
@@ -244,7 +242,7 @@ def fit_gain(
     gain, sigma, zero, excess = _lines(points)
     state = _judge_lines(points, (gain, sigma, excess), state)
     good = state == OK
-    line = zero + gain * points.pressure_kpa[:-1, None]
+    line = zero + gain * points.pressure_kpa[:-1]
     safe = np.where(good, gain, 1.0)
     residual_kpa = np.where(points.used[:-1] & good, (points.counts[:-1] - line) / safe, 0.0)
     return TaxelGain(np.where(good, gain, 0.0), np.where(good, sigma, 0.0), state, residual_kpa)
@@ -254,8 +252,8 @@ def fit_gain(
 class _Points:
     """Levels of all presses and the rest take: rows 0 … K−1 presses, row K the tare."""
 
-    pressure_kpa: Float64[np.ndarray, " k"]
-    sigma_kpa: Float64[np.ndarray, " k"]
+    pressure_kpa: Float64[np.ndarray, "k 1"]
+    sigma_kpa: Float64[np.ndarray, "k 1"]
     counts: Float64[np.ndarray, "k 320"]
     sigma_counts: Float64[np.ndarray, "k 320"]
     used: Bool[np.ndarray, "k 320"]
@@ -274,9 +272,10 @@ def _points(tare: TaxelTare, presses: Sequence[TaxelPress], full_scale_counts: f
         at_stop = select_taxels((raw >= limit).mean(axis=0), side=tare.side)
         full.append(press.taxels & (at_stop > MAX_SATURATED_READINGS))
         used.append(press.taxels & ~full[-1])
+    known = np.array([*((press.pressure_kpa, press.sigma_kpa) for press in presses), (0.0, 0.0)])
     return _Points(
-        np.array([*(press.pressure_kpa for press in presses), 0.0]),
-        np.array([*(press.sigma_kpa for press in presses), 0.0]),
+        known[:, :1],
+        known[:, 1:],
         np.stack([*counts, select_taxels(tare.level.mean_counts, side=tare.side)]),
         np.stack([*sigmas, select_taxels(tare.level.sigma_counts, side=tare.side)]),
         np.stack([*used, np.ones(NUM_TAXELS, dtype=np.bool_)]),
@@ -322,15 +321,11 @@ def _check_direction(points: _Points) -> None:
 
 def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, "320"]:
     """Taxels without response in every press to which the others respond."""
-    response = points.counts[:-1] - points.counts[-1]
-    usual = np.array(
-        [
-            np.median(row[used]) if used.any() else 0.0
-            for row, used in zip(response, points.used[:-1], strict=True)
-        ]
-    )[:, None]
-    told = points.used[:-1] & (usual >= MIN_MOVE_COUNTS)
-    silent = told & (np.abs(response) < SILENT_RATIO * usual)
+    response, used = points.counts[:-1] - points.counts[-1], points.used[:-1]
+    usual = [np.median(r[u]) if u.any() else 0.0 for r, u in zip(response, used, strict=True)]
+    least = np.array(usual)[:, None]
+    told = used & (least >= MIN_MOVE_COUNTS)
+    silent = told & (np.abs(response) < SILENT_RATIO * least)
     return told.any(axis=0) & (silent == told).all(axis=0)
 
 
@@ -339,21 +334,18 @@ def _lines(points: _Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
     The pressure's sigma enters through the gain, hence the rounds (York 1966, uncorrelated).
     """
-    P = points.pressure_kpa[:, None]
-    gain = np.zeros(NUM_TAXELS)
+    P, gain = points.pressure_kpa, np.zeros(NUM_TAXELS)
     for _ in range(ROUNDS):
-        variance = points.sigma_counts**2 + (gain * points.sigma_kpa[:, None]) ** 2
+        variance = points.sigma_counts**2 + (gain * points.sigma_kpa) ** 2
         weight = np.where(points.used, 1 / np.maximum(variance, 1e-12), 0.0)
         total = weight.sum(axis=0)
-        mean_P, mean_c = (weight * P).sum(axis=0) / total, (weight * points.counts).sum(axis=0)
-        mean_c = mean_c / total
+        mean_P, mean_c = ((weight * values).sum(axis=0) / total for values in (P, points.counts))
         spread = (weight * (P - mean_P) ** 2).sum(axis=0)
         slope = (weight * (P - mean_P) * (points.counts - mean_c)).sum(axis=0)
         gain = np.divide(slope, spread, out=np.zeros(NUM_TAXELS), where=spread > 0)
     zero = mean_c - gain * mean_P
     chi2 = (weight * (points.counts - zero - gain * P) ** 2).sum(axis=0)
-    free = np.maximum(points.used.sum(axis=0) - 2, 1)
-    excess = chi2 / free
+    excess = chi2 / np.maximum(points.used.sum(axis=0) - 2, 1)
     sigma = np.sqrt(np.maximum(excess, 1.0) / np.maximum(spread, 1e-300))
     return gain, sigma, zero, excess
 
@@ -363,13 +355,12 @@ def _judge_lines(
 ) -> UInt8[np.ndarray, "320"]:
     gain, sigma, excess = line
     good = state == OK
-    P = points.pressure_kpa[:, None]
-    mean = (points.used * points.counts).sum(axis=0) / points.used.sum(axis=0)
-    middle = (points.used * P).sum(axis=0) / points.used.sum(axis=0)
+    P, num = points.pressure_kpa, points.used.sum(axis=0)
+    mean, middle = ((points.used * values).sum(axis=0) / num for values in (points.counts, P))
     off = np.where(points.used, points.counts - mean - gain * (P - middle), 0.0)
     highest_kpa = np.where(points.used, P, 0.0).max(axis=0)
     bent = np.abs(off).max(axis=0) > MAX_NONLINEARITY * np.abs(gain) * highest_kpa
-    bent &= (excess > MIN_NONLINEARITY_SIGMAS**2) & (points.used.sum(axis=0) >= MIN_POINTS_FOR_LINE)
+    bent &= (excess > MIN_NONLINEARITY_SIGMAS**2) & (num >= MIN_POINTS_FOR_LINE)
     state = state.copy()
     state[good & ((highest_kpa < MIN_RANGE_KPA) | (sigma > MAX_RELATIVE_SIGMA * gain))] = IMPRECISE
     state[good & bent] = NONLINEAR
