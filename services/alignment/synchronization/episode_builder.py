@@ -1,7 +1,7 @@
 """Builds an episode on one reference clock from a recording, reading samples lazily."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -83,19 +83,17 @@ def build_episode(
         streams[name] = date_stream(recording, name)
     stretch = _find_stretch(recording, streams, options, on_progress)
     on_progress(progress_within("retargeting", 0.0))
-    actions = make_actions(
-        stretch.gridded, recording.attributes.domain, recording.attributes.calibration
-    )
+    source, gridded = recording.attributes, stretch.gridded
+    actions = make_actions(gridded, source.domain, source.calibration)
     on_progress(progress_within("writing", 0.0))
-    grid_ns = stretch.gridded.grid_ns - stretch.gridded.grid_ns[0]
+    grid_ns = gridded.grid_ns - gridded.grid_ns[0]
     written = [
         *_action_streams(actions, grid_ns, options),
         *(cut_stream(one, stretch.origin_ns, int(grid_ns[-1])) for one in streams.values()),
     ]
-    started_ns = recording.attributes.started_t_host_ns or 0
     quality = {
         "num_steps_refused": float(stretch.num_refused),
-        "origin_after_start_ns": float(stretch.origin_ns - started_ns),
+        "origin_after_start_ns": float(stretch.origin_ns - (source.started_t_host_ns or 0)),
         **_stream_quality(streams, options),
         **actions.quality,
     }
@@ -115,32 +113,49 @@ def _find_stretch(
 ) -> _Stretch:
     """Load the streams that actions are made of and choose the longest stretch that all share."""
     attributes = recording.attributes
+    where = f"recording {attributes.recording_id!r}"
     names = [n for n in (*REQUIRED[attributes.domain], *COMMANDED_STREAMS) if n in streams]
     parts = {}
     for number, name in enumerate(names):
         on_progress(progress_within("placing", number / len(names), name))
         parts[name] = _seen(streams[name].load())
-    origin_ns, gridded = _common_stretch(parts, options, attributes.recording_id)
-    run = longest_run(gridded.valid)
-    if run[1] - run[0] < options.min_num_steps:
-        raise InvalidInputError(_too_short(gridded, run, options, attributes.recording_id))
-    chosen = gridded.part(*run)
+    empty = [name for name, stream in parts.items() if len(stream.t_ns) < 2]
+    if empty:
+        raise InvalidInputError(f"{where}: streams {empty} hold fewer than two usable samples")
+    first_ns = {name: int(stream.t_ns[0]) for name, stream in parts.items()}
+    last_ns = {name: int(stream.t_ns[-1]) for name, stream in parts.items()}
+    origin_ns, stop_ns = max(first_ns.values()), min(map(_end_ns, parts.values()))
+    num_steps = int(max(stop_ns - origin_ns, 0) * 1e-9 * options.model_rate_hz) + 1
+    # Relative to the origin from here on: int64 stays exact, floats stay small.
+    moved = {name: replace(stream, t_ns=stream.t_ns - origin_ns) for name, stream in parts.items()}
+    grid_ns = grid_times_ns(num_steps, options.model_rate_hz)
+    gridded = place_streams(moved, grid_ns, max_gap_ns=options.max_gap_ns)
+    valid = {name: place.valid for name, place in gridded.at.items()}
+    first, stop = longest_run(gridded.valid)
+    if stop - first < options.min_num_steps:
+        bad = {name: int((~mine).sum()) for name, mine in valid.items()}
+        worst = ", ".join(f"{name} ({count})" for name, count in bad.items() if count) or "none"
+        raise InvalidInputError(
+            f"{where}: the longest stretch without a gap has {stop - first} of {num_steps} steps, "
+            f"expected at least {options.min_num_steps}; steps lost to gaps above "
+            f"{options.max_gap_ms:g} ms by stream: {worst}"
+        )
     start_ns = attributes.started_t_host_ns
     if start_ns is None:
-        start_ns = min(int(stream.t_ns[0]) for stream in parts.values())
-    parts_refused = refused_edges(
-        {name: int(stream.t_ns[0]) for name, stream in parts.items()},
-        {name: int(stream.t_ns[-1]) for name, stream in parts.items()},
-        start_ns,
-    )
-    valid = {name: place.valid for name, place in gridded.at.items()}
-    parts_refused += refused_stretches(gridded.grid_ns + origin_ns, valid, run, start_ns)
+        start_ns = min(first_ns.values())
+    refused = refused_edges(first_ns, last_ns, start_ns)
+    refused += refused_stretches(grid_ns + origin_ns, valid, (first, stop), start_ns)
     return _Stretch(
-        chosen,
-        origin_ns + int(chosen.grid_ns[0]),
-        len(gridded.grid_ns) - len(chosen.grid_ns),
-        refused_matrices(parts_refused),
+        gridded.part(first, stop),
+        origin_ns + int(grid_ns[first]),
+        num_steps - (stop - first),
+        refused_matrices(refused),
     )
+
+
+def _end_ns(stream: LoadedStream) -> int:
+    """How far a stream may be continued."""
+    return int(stream.t_ns[-1]) + round(EDGE_PERIODS * stream.descriptor.period_ns())
 
 
 def _episode_attributes(
@@ -181,17 +196,18 @@ def check_complete(recording: RecordingReader) -> None:
         InvalidInputError: names the streams or the calibration that are missing or do not fit.
     """
     attributes = recording.attributes
+    where = f"recording {attributes.recording_id!r}"
     missing = [name for name in REQUIRED[attributes.domain] if name not in recording.streams]
     if missing:
         raise InvalidInputError(
-            f"recording {attributes.recording_id!r}: streams {missing} are missing, which an "
-            f"episode of domain {attributes.domain!r} needs; it has {sorted(recording.streams)}",
+            f"{where}: streams {missing} are missing, which an episode of domain "
+            f"{attributes.domain!r} needs; it has {sorted(recording.streams)}",
             missing=missing,
         )
     if "K_head" not in attributes.calibration:
         raise InvalidInputError(
-            f"recording {attributes.recording_id!r}: calibration 'K_head' (3 by 3, pixels) is "
-            f"missing; it has {sorted(attributes.calibration)}",
+            f"{where}: calibration 'K_head' (3 by 3, pixels) is missing; it has "
+            f"{sorted(attributes.calibration)}",
             missing=["K_head"],
         )
     _check_lenses(recording)
@@ -209,15 +225,12 @@ def _check_lenses(recording: RecordingReader) -> None:
         camera = name.removeprefix("camera_")
         if stream.kind != "image" or camera == name:
             continue
-        for matrix, shape in (
-            (f"K_{camera}", (3, 3)),
-            (f"distortion_{camera}", (1, 5)),
-            (f"image_size_{camera}_px", (1, 2)),
-        ):
-            if matrix in calibration and np.shape(calibration[matrix]) != shape:
+        shapes = {f"K_{camera}": (3, 3), f"distortion_{camera}": (1, 5)}
+        for matrix, shape in (shapes | {f"image_size_{camera}_px": (1, 2)}).items():
+            found = np.shape(calibration[matrix]) if matrix in calibration else shape
+            if found != shape:
                 raise InvalidInputError(
-                    f"{where}: calibration {matrix!r} is {np.shape(calibration[matrix])}, expected "
-                    f"{shape}"
+                    f"{where}: calibration {matrix!r} is {found}, expected {shape}"
                 )
         size_px = calibration.get(f"image_size_{camera}_px")
         recorded = (stream.shape[1], stream.shape[0])
@@ -240,48 +253,24 @@ def _seen(stream: LoadedStream) -> LoadedStream:
         useful = finite.reshape(len(finite), -1).all(axis=1)
     if useful.all():
         return stream
-    return LoadedStream(stream.descriptor, stream.t_ns[useful], stream.values[useful])
-
-
-def _common_stretch(
-    parts: Mapping[str, LoadedStream], options: AlignmentOptions, recording_id: str
-) -> tuple[int, GriddedStreams]:
-    """The first common moment on the host's clock, and the streams on a grid that starts there."""
-    empty = [name for name, stream in parts.items() if len(stream.t_ns) < 2]
-    if empty:
-        raise InvalidInputError(
-            f"recording {recording_id!r}: streams {empty} hold fewer than two usable samples"
-        )
-    start_ns = max(int(stream.t_ns[0]) for stream in parts.values())
-    stop_ns = min(
-        int(stream.t_ns[-1]) + round(EDGE_PERIODS * stream.descriptor.period_ns())
-        for stream in parts.values()
-    )
-    num_steps = int(max(stop_ns - start_ns, 0) * 1e-9 * options.model_rate_hz) + 1
-    # Relative to the origin from here on: int64 stays exact, floats stay small.
-    moved = {
-        name: LoadedStream(stream.descriptor, stream.t_ns - start_ns, stream.values)
-        for name, stream in parts.items()
-    }
-    grid_ns = grid_times_ns(num_steps, options.model_rate_hz)
-    return start_ns, place_streams(moved, grid_ns, max_gap_ns=options.max_gap_ns)
+    return replace(stream, t_ns=stream.t_ns[useful], values=stream.values[useful])
 
 
 def _action_streams(
     actions: GridActions, grid_ns: np.ndarray, options: AlignmentOptions
 ) -> Iterator[EpisodeStream]:
-    kinds = {"action": actions.measured, "action_commanded": actions.commanded}
-    for name, values in kinds.items():
-        if values is not None:
-            descriptor = StreamDescriptor(
-                name=name,
-                kind="robot_state",
-                shape=(67,),
-                dtype="float64",
-                unit="action",
-                nominal_rate_hz=options.model_rate_hz,
-            )
-            yield EpisodeStream(descriptor, iter([Block(grid_ns, values)]))
+    descriptor = StreamDescriptor(
+        name="action",
+        kind="robot_state",
+        shape=(67,),
+        dtype="float64",
+        unit="action",
+        nominal_rate_hz=options.model_rate_hz,
+    )
+    yield EpisodeStream(descriptor, iter([Block(grid_ns, actions.measured)]))
+    if actions.commanded is not None:
+        commanded = descriptor.model_copy(update={"name": "action_commanded"})
+        yield EpisodeStream(commanded, iter([Block(grid_ns, actions.commanded)]))
 
 
 def _stream_quality(
@@ -294,18 +283,3 @@ def _stream_quality(
         if stream.timing.report.num_steps:
             quality[f"{name}_num_clock_steps"] = float(stream.timing.report.num_steps)
     return quality
-
-
-def _too_short(
-    gridded: GriddedStreams,
-    run: tuple[int, int],
-    options: AlignmentOptions,
-    recording_id: str,
-) -> str:
-    bad = {name: int((~place.valid).sum()) for name, place in gridded.at.items()}
-    worst = ", ".join(f"{name} ({count})" for name, count in bad.items() if count) or "none"
-    return (
-        f"recording {recording_id!r}: the longest stretch without a gap has {run[1] - run[0]} of "
-        f"{len(gridded.valid)} steps, expected at least {options.min_num_steps}; steps lost to "
-        f"gaps above {options.max_gap_ms:g} ms by stream: {worst}"
-    )

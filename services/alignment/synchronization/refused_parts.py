@@ -45,8 +45,8 @@ def refused_edges(
     latest = max(first_ns, key=lambda name: first_ns[name])
     earliest = min(last_ns, key=lambda name: last_ns[name])
     return [
-        _part(min(first_ns.values()), first_ns[latest], start_ns, ("late_start", latest)),
-        _part(last_ns[earliest], max(last_ns.values()), start_ns, ("early_end", earliest)),
+        _part(min(first_ns.values()), first_ns[latest], start_ns, "late_start", latest),
+        _part(last_ns[earliest], max(last_ns.values()), start_ns, "early_end", earliest),
     ]
 
 
@@ -62,19 +62,14 @@ def refused_stretches(
         start_ns: of the recording.
     """
     step_ns = int(t_ns[1] - t_ns[0])
-    parts = []
 
-    def add(run: tuple[int, int], why: tuple[RefusedReason, str | None]) -> None:
-        parts.append(_part(int(t_ns[run[0]]), int(t_ns[run[1] - 1]) + step_ns, start_ns, why))
+    def part(run: tuple[int, int], reason: RefusedReason, stream: str | None) -> RefusedPart:
+        stop_ns = int(t_ns[run[1] - 1]) + step_ns
+        return _part(int(t_ns[run[0]]), stop_ns, start_ns, reason, stream)
 
-    for name, mine in valid.items():
-        for run in runs_of(~mine):
-            add(run, ("gap", name))
+    gaps = [part(run, "gap", name) for name, mine in valid.items() for run in runs_of(~mine)]
     good = np.logical_and.reduce(list(valid.values()))
-    for run in runs_of(good):
-        if run != taken:
-            add(run, ("shorter", None))
-    return parts
+    return gaps + [part(run, "shorter", None) for run in runs_of(good) if run != taken]
 
 
 def refused_matrices(parts: list[RefusedPart]) -> dict[str, Matrix]:
@@ -89,27 +84,19 @@ def refused_matrices(parts: list[RefusedPart]) -> dict[str, Matrix]:
 
 def refused_parts(calibration: Mapping[str, Matrix]) -> tuple[RefusedPart, ...]:
     """The refused parts that an episode carries, in order of time."""
-    parts = []
-    for name, rows in calibration.items():
-        match = _KEY.fullmatch(name)
-        if match is None:
-            continue
-        reason, stream = match.groups()
-        parts += [
-            RefusedPart.model_validate(
-                {"start_s": start_s, "stop_s": stop_s, "reason": reason, "stream": stream}
-            )
-            for start_s, stop_s in rows
-        ]
+    parts = [
+        RefusedPart.model_validate(
+            {"start_s": start_s, "stop_s": stop_s, "reason": match[1], "stream": match[2]}
+        )
+        for name, rows in calibration.items()
+        if (match := _KEY.fullmatch(name))
+        for start_s, stop_s in rows
+    ]
     return tuple(sorted(parts, key=lambda part: (part.start_s, part.stop_s, part.stream or "")))
 
 
 def _part(
-    begin_ns: int, end_ns: int, start_ns: int, why: tuple[RefusedReason, str | None]
+    begin_ns: int, end_ns: int, start_ns: int, reason: RefusedReason, stream: str | None
 ) -> RefusedPart:
-    return RefusedPart(
-        start_s=(begin_ns - start_ns) / NS_PER_S,
-        stop_s=(end_ns - start_ns) / NS_PER_S,
-        reason=why[0],
-        stream=why[1],
-    )
+    start_s, stop_s = (begin_ns - start_ns) / NS_PER_S, (end_ns - start_ns) / NS_PER_S
+    return RefusedPart(start_s=start_s, stop_s=stop_s, reason=reason, stream=stream)
