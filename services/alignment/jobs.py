@@ -14,7 +14,7 @@ from services.alignment.synchronization.episode_builder import (
     build_episode,
     check_complete,
 )
-from services.alignment.synchronization.progress import OnProgress, Progress, progress_within
+from services.alignment.synchronization.progress import OnProgress, progress_within
 
 logger = structlog.get_logger(__name__)
 
@@ -29,7 +29,7 @@ def align_recording(
     store: EpisodeStore,
     recording_id: str,
     options: AlignmentOptions,
-    on_progress: OnProgress | None = None,
+    on_progress: OnProgress = lambda _: None,
 ) -> AlignmentReport:
     """Align one recording and write the episode.
 
@@ -44,9 +44,9 @@ def align_recording(
     """
     recording = store.recording(recording_id)
     episode_id = episode_id_of(recording, options)
-    created = False
-    if not store.exists(episode_id):
-        created = _write(store, recording, episode_id, options, on_progress or _ignore)
+    created = not store.exists(episode_id) and _write(
+        store, recording, episode_id, options, on_progress
+    )
     return report_of(store.open(episode_id), recording_id=recording_id, created=created)
 
 
@@ -81,14 +81,13 @@ def check_recordings(
                 raise
             refused[recording_id] = error
     if refused:
-        reasons = {recording_id: error.message for recording_id, error in refused.items()}
-        told = "; ".join(list(reasons.values())[:MAX_LISTED])
-        more = f"; and {len(reasons) - MAX_LISTED} more" if len(reasons) > MAX_LISTED else ""
+        told = "; ".join([error.message for error in refused.values()][:MAX_LISTED])
+        more = f"; and {len(refused) - MAX_LISTED} more" if len(refused) > MAX_LISTED else ""
         unknown = all(isinstance(error, NotFoundError) for error in refused.values())
         raise (NotFoundError if unknown else InvalidInputError)(
-            f"alignments: {len(reasons)} of {len(recording_ids)} recordings cannot be aligned, so "
+            f"alignments: {len(refused)} of {len(recording_ids)} recordings cannot be aligned, so "
             f"no job was started; omit them: {told}{more}",
-            refused=reasons,
+            refused={recording_id: error.message for recording_id, error in refused.items()},
         )
     return episodes
 
@@ -127,14 +126,9 @@ def _write_streams(writer: EpisodeWriter, episode: BuiltEpisode, on_progress: On
     """Write the samples of every stream; empty streams are omitted."""
     num_streams = len(episode.streams)
     for number, stream in enumerate(episode.streams):
-        name, announced = stream.descriptor.name, False
-        for block in stream.blocks:
-            if not announced:
+        name = stream.descriptor.name
+        for index, block in enumerate(stream.blocks):
+            if not index:
                 writer.add_stream(stream.descriptor)
-                announced = True
             writer.append(name, values=block.values, t_ref_ns=block.t_ns)
             on_progress(progress_within("writing", number / num_streams, name))
-
-
-def _ignore(_: Progress) -> None:
-    """Default progress callback."""

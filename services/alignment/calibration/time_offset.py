@@ -207,9 +207,8 @@ def _correlation(t_a: np.ndarray, a: np.ndarray, t_b: np.ndarray, b: np.ndarray)
     if last - first < MIN_OVERLAP_S:
         return -1.0
     inside = (t_a >= first) & (t_a <= last)
-    mine = a[inside] - a[inside].mean(axis=0)
     other = np.stack([np.interp(t_a[inside], t_b, column) for column in b.T], axis=1)
-    other = other - other.mean(axis=0)
+    mine, other = _centred(a[inside]), _centred(other)
     power = float((mine**2).sum() * (other**2).sum())
     return float((mine * other).sum() / np.sqrt(power)) if power > 0 else -1.0
 
@@ -218,35 +217,34 @@ def _refined(
     grid_a: np.ndarray, a: np.ndarray, spline_b: CubicSpline, start_s: float
 ) -> tuple[float, float]:
     """Gauss–Newton on the offset; gain and offset of every component are eliminated."""
-    slope_b = spline_b.derivative()
+    slope_b, spacing_s = spline_b.derivative(), float(grid_a[1] - grid_a[0])
+    # Low-passed noise is correlated: only 2 · cutoff numbers a second are independent.
+    per_number = max(1.0, 1 / (2 * CUTOFF_HZ * spacing_s))
     offset_s, sigma_s = start_s, np.inf
     for _ in range(MAX_ITERATIONS):
         t_b = grid_a - offset_s
         inside = (t_b >= spline_b.x[0]) & (t_b <= spline_b.x[-1])
-        gradient = normal = squares = 0.0
-        for column in range(a.shape[1]):
-            mine = a[inside, column]
-            design = np.stack([spline_b(t_b[inside])[:, column], np.ones(len(mine))], axis=1)
-            gain, *_ = np.linalg.lstsq(design, mine, rcond=None)
-            residual = mine - design @ gain
-            # Moving b later by d changes it by -slope · d; what gain and zero absorb is taken out.
-            moved = -gain[0] * slope_b(t_b[inside])[:, column]
-            moved -= design @ np.linalg.lstsq(design, moved, rcond=None)[0]
-            gradient += float(moved @ residual)
-            normal += float(moved @ moved)
-            squares += float(residual @ residual)
+        mine, other = _centred(a[inside]), _centred(spline_b(t_b[inside]))
+        power = np.maximum((other**2).sum(axis=0), np.finfo(np.float64).tiny)
+        gain = (mine * other).sum(axis=0) / power
+        residual = mine - gain * other
+        # Moving b later by d changes it by -slope · d; what gain and zero absorb is taken out.
+        moved = _centred(-gain * slope_b(t_b[inside]))
+        moved -= (moved * other).sum(axis=0) / power * other
+        normal = float((moved**2).sum())
         if normal <= 0:
             return offset_s, np.inf
-        step_s = gradient / normal
+        step_s = float((moved * residual).sum()) / normal
         offset_s += step_s
-        # Low-passed noise is correlated: only 2 · cutoff numbers a second are independent.
-        spacing_s = float(grid_a[1] - grid_a[0])
-        per_number = max(1.0, 1 / (2 * CUTOFF_HZ * spacing_s))
-        variance = squares / max(1, inside.sum() * a.shape[1] - 3)
+        variance = float((residual**2).sum()) / max(1, inside.sum() * a.shape[1] - 3)
         sigma_s = SIGMA_FACTOR * float(np.sqrt(variance * per_number / normal))
         if abs(step_s) < 1e-7:
             break
     return offset_s, sigma_s
+
+
+def _centred(values: np.ndarray) -> Float64[np.ndarray, "n k"]:
+    return values - values.mean(axis=0)
 
 
 def _onsets(t_s: np.ndarray, pressure_kpa: np.ndarray) -> tuple[list[float], float]:

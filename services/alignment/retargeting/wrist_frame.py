@@ -94,6 +94,7 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
     R, sizes, offsets = _laid_over(mean, palm[None], is_used[None])
     R_tracker_wrist, size = R[0], float(sizes[0])
     left_over = palm[is_used] - (size * mean[is_used] @ R_tracker_wrist.T + offsets[0])
+    misfit_m = float(np.sqrt(np.square(left_over).sum(axis=1).mean()))
     turn_rad = _turn_of_samples(samples, mean, is_used, R_tracker_wrist)
     if turn_rad > MAX_TURN_RAD:
         raise InvalidInputError(
@@ -109,7 +110,7 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
         raise InvalidInputError(
             f"{where}: the uncertainty of the wrist's axes is {np.rad2deg(sigma_rad):.1f} degrees "
             f"(one sigma), expected at most {np.rad2deg(MAX_SIGMA_RAD):.0f}; the palm's nodes "
-            f"deviate by {np.sqrt(np.square(left_over).sum(1).mean()) * 1e3:.1f} mm RMS",
+            f"deviate by {misfit_m * 1e3:.1f} mm RMS",
             fault="uncertain",
         )
     has_wrist = is_used[PALM_NODES.index(WRIST_NODE)]
@@ -118,7 +119,7 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
         T_tracker_wrist=transform(R_tracker_wrist, origin),
         covariance=covariance,
         size=size,
-        misfit_m=float(np.sqrt(np.square(left_over).sum(axis=1).mean())),
+        misfit_m=misfit_m,
         turn_rad=turn_rad,
         num_samples=len(samples),
     )
