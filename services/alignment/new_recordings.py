@@ -70,8 +70,7 @@ class NewRecordings:
         Raises:
             StorageError: the store cannot be listed, or jobs cannot be kept.
         """
-        listed = await asyncio.to_thread(self._store.list, kind="recording")
-        new = self._new(listed)
+        new = self._new(await asyncio.to_thread(self._store.list, kind="recording"))
         if not new:
             return
         aligned = await asyncio.to_thread(_aligned, self._store)
@@ -100,11 +99,10 @@ class NewRecordings:
         try:
             recording = await asyncio.to_thread(self._store.recording, recording_id)
         except DexTouchError as error:
-            before, _ = self._unreadable.get(recording_id, ("", 0.0))
-            if error.message != before:
-                reason = error.message
+            reason = error.message
+            if reason != self._unreadable.get(recording_id, ("",))[0]:
                 logger.warning("alignment_failed", recording_id=recording_id, reason=reason)
-            self._unreadable[recording_id] = error.message, time.monotonic()
+            self._unreadable[recording_id] = reason, time.monotonic()
             return False
         self._unreadable.pop(recording_id, None)
         if recording.attributes.task.startswith(CALIBRATION_TASKS):
@@ -142,6 +140,6 @@ def _has_episode(
         # Of the trash, or damaged.
         with suppress(DexTouchError):
             lineage = store.open(episode_id).attributes.lineage
-            if any(entry.sha256 == recording.content_sha256 for entry in lineage):
+            if recording.content_sha256 in {entry.sha256 for entry in lineage}:
                 return True
     return False

@@ -33,18 +33,19 @@ def folder_of_code(*bases: Path) -> Path | None:
     Returns:
         None where none may be written.
     """
-    digest = hashlib.sha256()
-    for path in sorted(PACKAGE.glob("*.py")):
-        digest.update(path.read_bytes())
-    name = digest.hexdigest()[:16]
+    code = b"".join(path.read_bytes() for path in sorted(PACKAGE.glob("*.py")))
+    name = hashlib.sha256(code).hexdigest()[:16]
     tried: list[Path] = []
     for base in bases:
         try:
             # What a link leads to is checked and used, wherever the link leads later.
-            tried.append(base.resolve() / name)
-            folder = tried[-1]
-            is_new = _make(folder)
-            if not (_is_safe(folder) and _is_own(folder)):
+            folder = base.resolve() / name
+            tried.append(folder)
+            is_new = not folder.is_dir()
+            if is_new:
+                _make(folder)
+            is_own = os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid()
+            if not (is_own and _is_safe(folder)):
                 continue
         except (OSError, RuntimeError):  # the latter for links in a circle
             continue
@@ -54,21 +55,14 @@ def folder_of_code(*bases: Path) -> Path | None:
     return None
 
 
-def _make(folder: Path) -> bool:
-    """Make a folder and the one above, for this user alone to write; whether it is new."""
+def _make(folder: Path) -> None:
+    """Make a folder and the one above, for this user alone to write."""
     folder.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
-    if folder.is_dir():
-        return False
     umask = os.umask(_OTHERS_WRITE)
     os.umask(umask)
     # numba leaves the modes of its files to the umask.
     is_strict = umask & _OTHERS_WRITE == _OTHERS_WRITE
     folder.mkdir(exist_ok=True, mode=0o755 if is_strict else 0o700)
-    return True
-
-
-def _is_own(folder: Path) -> bool:
-    return os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid()
 
 
 def _is_safe(folder: Path) -> bool:
