@@ -23,7 +23,7 @@ from dextouch.hands.hand_files import load_hand
 from dextouch.hands.robot_hand import HandModel
 from dextouch.schemas import json_ready
 from dextouch.serving import load_settings
-from services.alignment.jobs import check_recording, episode_id_of
+from services.alignment.jobs import AlignmentWorker, check_recording, episode_id_of
 from services.alignment.options import AlignmentOptions
 from services.alignment.report import AlignmentReport, report_of
 from services.alignment.report_page import report_line, report_page
@@ -31,7 +31,6 @@ from services.alignment.retargeting import HandRetargeter, RetargetResult, Retar
 from services.alignment.retargeting.hand_profile import calibrated_profile
 from services.alignment.settings import AlignmentSettings, usable_cores
 from services.alignment.synchronization.progress import Progress
-from services.alignment.worker import AlignmentWorker
 
 NS_PER_S = 1e9
 # The recording, and how far it is.

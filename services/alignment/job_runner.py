@@ -15,11 +15,10 @@ from dextouch.errors import (
     UnavailableError,
 )
 from services.alignment.job_queue import RETRY_AFTER_S, JobQueue
-from services.alignment.jobs import check_recordings, episode_id_of
+from services.alignment.jobs import AlignmentWorker, check_recordings, episode_id_of
 from services.alignment.schemas import ENDED, AlignmentJob, AlignmentRequest
 from services.alignment.settings import AlignmentSettings
 from services.alignment.synchronization.progress import Progress
-from services.alignment.worker import AlignmentWorker
 
 logger = structlog.get_logger(__name__)
 

@@ -144,7 +144,7 @@ class TaxelSurvey:
     def __init__(self, calibration: TactileCalibration) -> None:
         self._calibration = calibration
         self._first: np.ndarray | None = None
-        self._low = self._high = np.zeros(NUM_TAXELS)
+        self._low, self._high = np.full(NUM_TAXELS, np.inf), np.full(NUM_TAXELS, -np.inf)
         self._num_finite = np.zeros(NUM_TAXELS, dtype=np.int64)
         self._num_samples = 0
 
@@ -157,11 +157,10 @@ class TaxelSurvey:
         taxels = self._calibration.taxels(counts)
         if not len(taxels):
             return
-        low, high = taxels.min(axis=0), taxels.max(axis=0)
         if self._first is None:
-            self._first, self._low, self._high = taxels[0].astype(np.float64), low, high
-        else:
-            self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
+            self._first = taxels[0].astype(np.float64)
+        self._low = np.minimum(self._low, taxels.min(axis=0))
+        self._high = np.maximum(self._high, taxels.max(axis=0))
         self._num_finite += np.isfinite(taxels).sum(axis=0)
         self._num_samples += len(taxels)
 

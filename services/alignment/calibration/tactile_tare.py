@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
+from numpy.lib.stride_tricks import sliding_window_view
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.tactile.layout import (
@@ -221,17 +222,13 @@ def _restless(counts: Float64[np.ndarray, "time 360"], level: Level) -> Bool[np.
 
 def _neighbours() -> Int64[np.ndarray, "320 8"]:
     """Taxels around each taxel on its own pad, anatomical order; −1 where there is none."""
-    table = np.full((NUM_TAXELS, 8), -1, dtype=np.int64)
-    steps = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
-    first = 0
+    tables, first = [], 0
     for shape in [TIP_SHAPE] * NUM_FINGERTIPS + [PALM_SHAPE]:
-        cells = np.full((shape[0] + 2, shape[1] + 2), -1, dtype=np.int64)
-        cells[1:-1, 1:-1] = first + np.arange(shape[0] * shape[1]).reshape(shape)
-        for column, (down, right) in enumerate(steps):
-            around = cells[1 + down : 1 + down + shape[0], 1 + right : 1 + right + shape[1]]
-            table[first : first + around.size, column] = around.ravel()
-        first += shape[0] * shape[1]
-    return table
+        cells = first + np.arange(shape[0] * shape[1]).reshape(shape)
+        around = sliding_window_view(np.pad(cells, 1, constant_values=-1), (3, 3)).reshape(-1, 9)
+        tables.append(np.delete(around, 4, axis=1))
+        first += cells.size
+    return np.concatenate(tables)
 
 
 _NEIGHBOURS = _neighbours()

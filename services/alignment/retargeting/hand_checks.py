@@ -7,7 +7,7 @@ from right.
 """
 
 from functools import lru_cache
-from itertools import combinations, pairwise, permutations, product
+from itertools import combinations, permutations, product
 from typing import Final
 
 import numpy as np
@@ -99,7 +99,7 @@ def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> fl
         ShapeError: not [T ≥ 1, 25, 3].
     """
     distances = _median_distances(seen_samples(keypoints_m, where=where))
-    sizes, misfits = _compared(distances, _places_of_orders())
+    sizes, misfits = _compared(distances, _orders()[1])
     size, misfit = float(sizes[0]), float(misfits[0])
     if np.isnan(misfit):
         raise InvalidInputError(
@@ -109,7 +109,7 @@ def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> fl
         )
     best = int(np.nanargmin(misfits))
     if misfits[best] < min(BETTER_ORDER * misfit, MAX_MISFIT):
-        name = _orders()[best][0]
+        name = _orders()[0][best]
         raise InvalidInputError(
             f"{where}: got nodes in another order: {name}; expected that of "
             "dextouch.hands.NODES (wrist, then thumb … little, each from the metacarpal to the "
@@ -243,37 +243,21 @@ def _compared(
 
 
 @lru_cache(maxsize=1)
-def _orders() -> tuple[tuple[str, tuple[int, ...]], ...]:
-    """Known orders of nodes, ours first: name, and our node at each place."""
-    orders = []
+def _orders() -> tuple[list[str], Int64[np.ndarray, "orders 25"]]:
+    """Known orders of nodes, ours first: names, and where each of our nodes is; −1 if absent."""
+    names, places = [], []
     for is_wrist_last, is_turned in product((False, True), repeat=2):
         for chains in permutations(CHAINS):
-            fingers: list[int] = []
-            for chain in chains:
-                nodes = chain_indices(chain)
-                fingers += reversed(nodes) if is_turned else nodes
-            holds = [*fingers, WRIST_NODE] if is_wrist_last else [WRIST_NODE, *fingers]
-            names = [*chains, "wrist"] if is_wrist_last else ["wrist", *chains]
-            name = ", ".join(names)
-            name += ", each from the tip to the metacarpal" if is_turned else ""
-            orders.append((name, tuple(holds)))
+            parts = [("wrist", [WRIST_NODE])]
+            fingers = [(c, chain_indices(c)[:: -1 if is_turned else 1]) for c in chains]
+            parts = fingers + parts if is_wrist_last else parts + fingers
+            turned = ", each from the tip to the metacarpal" if is_turned else ""
+            names.append(", ".join(name for name, _ in parts) + turned)
+            places.append(np.argsort([node for _, nodes in parts for node in nodes]))
     # The base of the metacarpal taken for the knuckle, and so on.
-    shifted = [-1] * NUM_KEYPOINTS
+    shifted = np.full(NUM_KEYPOINTS, -1)
     shifted[WRIST_NODE] = WRIST_NODE
     for chain in CHAINS:
         nodes = chain_indices(chain)
-        for place, node in pairwise(reversed(nodes)):
-            shifted[place] = node
-    orders.append(("every finger one joint off, without its tip", tuple(shifted)))
-    return tuple(orders)
-
-
-@lru_cache(maxsize=1)
-def _places_of_orders() -> Int64[np.ndarray, "orders 25"]:
-    """Index of each of our nodes in each known order; −1 if absent."""
-    places = np.full((len(_orders()), NUM_KEYPOINTS), -1)
-    for index, (_, holds) in enumerate(_orders()):
-        for place, node in enumerate(holds):
-            if node >= 0:
-                places[index, node] = place
-    return places
+        shifted[nodes[:-1]] = nodes[1:]
+    return [*names, "every finger one joint off, without its tip"], np.array([*places, shifted])

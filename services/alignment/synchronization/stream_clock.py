@@ -50,7 +50,7 @@ class _Dated:
     num_lost: int = 0
     num_steps: int = 0
     skew_ppm: float | None = None
-    residual_rms_ns: float | None = None
+    residual_rms_ms: float | None = None
     lateness_ns: float = 0.0
     has_unsure_stops: bool = False
 
@@ -84,14 +84,13 @@ def time_stream(
     # A sample not later than one before it is a repeat, or lies at the seam of a clock step.
     latest = np.maximum.accumulate(np.concatenate([t_host_ns[:1] - 1, t_host_ns[:-1]]))
     kept = np.flatnonzero(t_host_ns > latest)
-    rms_ns = dated.residual_rms_ns
     report = ClockReport(
         stream=descriptor.name,
         method=dated.method,
         skew_ppm=dated.skew_ppm,
         latency_ms=latency_ns / NS_PER_MS,
         latency_sigma_ms=None if latency_sigma_ns is None else latency_sigma_ns / NS_PER_MS,
-        residual_rms_ms=None if rms_ns is None else rms_ns / NS_PER_MS,
+        residual_rms_ms=dated.residual_rms_ms,
         num_samples=len(kept),
         num_dropped=dated.num_lost + len(batch) - len(kept),
         num_steps=dated.num_steps,
@@ -140,7 +139,7 @@ def _fitted(
         _num_lost(batch, descriptor),
         model.num_steps,
         model.skew_ppm,
-        model.residual_rms_ns,
+        model.residual_rms_ns / NS_PER_MS,
         model.lateness_ns,
         model.has_unsure_stops,
     )
@@ -155,14 +154,13 @@ def _counted(batch: SampleBatch, period_ns: int) -> _Dated:
     if not take.is_steady:
         return arrivals
     waited_ns = (batch.t_host_ns - take.t_host_ns).astype(np.float64)
-    rms_ns = float(np.sqrt(np.mean(waited_ns**2)))
     return _Dated(
         take.t_host_ns,
         "counting",
         take.num_lost,
         take.num_steps,
         take.skew_ppm,
-        rms_ns,
+        float(np.sqrt(np.mean(waited_ns**2))) / NS_PER_MS,
         lateness_ns(waited_ns, batch.t_host_ns),
     )
 

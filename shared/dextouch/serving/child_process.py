@@ -25,7 +25,7 @@ class ChildProcess:
     """A running child; `kill` is thread-safe, the other methods are not.
 
     Args:
-        module: to run, such as `services.alignment.worker`.
+        module: to run, such as `services.alignment.jobs`.
         arguments: of its command line.
         environment: variables in addition to this process's own.
     """

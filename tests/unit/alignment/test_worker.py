@@ -10,8 +10,8 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnavailableError
 from services.alignment.command_line import align_batch, not_aligned
+from services.alignment.jobs import AlignmentWorker
 from services.alignment.options import AlignmentOptions
-from services.alignment.worker import AlignmentWorker
 from tests.unit.alignment.recordings import write_recording
 
 OPTIONS = AlignmentOptions()
@@ -43,28 +43,28 @@ def test_one_process_aligns_refuses_dies_and_is_replaced(store):
         assert store.list() == [report.episode_id]
         assert told
         assert told[0].stage == "dating"
-        pid = worker.pid
+        pid = worker._child.pid
         with pytest.raises(InvalidInputError, match="head"):
             worker.run("headless", OPTIONS, told.append)
-        assert worker.pid == pid
+        assert worker._child.pid == pid
 
         def kill_it(_):
-            os.kill(worker.pid, signal.SIGKILL)
+            os.kill(worker._child.pid, signal.SIGKILL)
 
         with pytest.raises(UnavailableError, match=r"'other'.*killed.*ask for it again"):
             worker.run("other", OPTIONS, kill_it)
         assert len(store.list()) == 1
         assert worker.run("other", OPTIONS, told.append).created
-        assert worker.pid != pid
+        assert worker._child.pid != pid
     finally:
         worker.stop()
-    assert worker.pid is None
+    assert worker._child is None
 
 
 def test_stopping_from_another_thread_ends_it_at_once(store):
     worker = AlignmentWorker(str(store.root))
     worker.start()
-    process = psutil.Process(worker.pid)
+    process = psutil.Process(worker._child.pid)
     process.suspend()
     failed = []
 
