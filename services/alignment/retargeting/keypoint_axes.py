@@ -5,7 +5,7 @@ never turned by guess: only a calibration rotates them, and the result is checke
 """
 
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -22,18 +22,6 @@ from services.alignment.retargeting.wrist_frame import WristFrame, wrist_frame
 MAX_OFF_RAD: Final = float(np.deg2rad(20.0))
 # How far R Rᵀ of a stored transform may be from the identity.
 RIGID_TOLERANCE: Final = 1e-6
-
-
-class KeypointAxes(NamedTuple):
-    """Keypoints in wrist axes, and the palm's pose in them.
-
-    Attributes:
-        keypoints_m: [T, 25, 3], metres; not finite where a node was not seen.
-        frame: of the palm, compared with the mean one: size, sigma, turns of single samples.
-    """
-
-    keypoints_m: Float64[np.ndarray, "time 25 3"]
-    frame: WristFrame
 
 
 def calibrated_transform(
@@ -87,8 +75,8 @@ def to_wrist_axes(
 
 def hand_axes_check(
     keypoints_m: np.ndarray, side: Side, calibration: Mapping[str, Matrix]
-) -> KeypointAxes:
-    """Convert keypoints of one hand of a recording to wrist axes, and check them.
+) -> Float64[np.ndarray, "time 25 3"]:
+    """Keypoints of one hand of a recording in wrist axes, checked; not finite where not seen.
 
     Args:
         keypoints_m: [T ≥ 1, 25, 3], metres, order of `dextouch.hands.NODES`, in wrist axes or,
@@ -114,7 +102,7 @@ def hand_axes_check(
     off_rad = float(rotation_angle(R_wrist_palm))
     if off_rad > MAX_OFF_RAD:
         _refuse_axes(R_wrist_palm, off_rad, side, is_calibrated=T_keypoints_wrist is not None)
-    return KeypointAxes(keypoints, frame)
+    return keypoints
 
 
 def _refuse_axes(R: np.ndarray, off_rad: float, side: Side, *, is_calibrated: bool) -> None:

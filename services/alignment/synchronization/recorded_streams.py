@@ -6,7 +6,7 @@ they are: nothing is decoded.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -134,17 +134,15 @@ def date_stream(recording: RecordingReader, name: str) -> DatedStream:
         UnknownNameError: the recording has no such stream.
     """
     descriptor, calibration = recording.streams[name], recording.attributes.calibration
-    latency_ns = _nanoseconds(calibration, f"{name}_latency_ns")
     timing = time_stream(
         recording.stamps(name),
         descriptor,
-        latency_ns=round(latency_ns or 0.0),
+        latency_ns=round(_nanoseconds(calibration, f"{name}_latency_ns") or 0.0),
         latency_sigma_ns=_nanoseconds(calibration, f"{name}_latency_sigma_ns"),
     )
     convert: Conversion = np.asarray
     if descriptor.kind == "tactile" and descriptor.unit != "kPa":
-        raw = DatedStream(recording, descriptor, timing, np.asarray)
-        return _pressures(raw, calibration)
+        return _pressures(DatedStream(recording, descriptor, timing, convert), calibration)
     if descriptor.kind == "keypoints":
         descriptor = descriptor.model_copy(update={"dtype": "float64"})
         side, convert = descriptor.side, partial(np.asarray, dtype=np.float64)
@@ -205,20 +203,15 @@ def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:
     for piece in raw.pieces():
         survey.add(piece.values)
     refused = survey.refused()
-    numbers = np.bincount(refused, minlength=len(REASONS)).tolist()
-    counted = {
-        f"{name}_num_{reason}_taxels": float(number)
-        for reason, number in zip(REASONS[1:], numbers[1:], strict=True)
-        if number
-    }
-    return DatedStream(
-        raw.recording,
-        raw.descriptor.model_copy(
-            update={"shape": (NUM_TAXELS,), "dtype": "float32", "unit": "kPa"}
-        ),
-        raw.timing,
-        partial(glove.to_kpa, refused=refused),
-        quality={f"{name}_num_refused_taxels": float(np.count_nonzero(refused))} | counted,
+    quality = {f"{name}_num_refused_taxels": float(np.count_nonzero(refused))}
+    for state in np.unique(refused[refused > 0]).tolist():
+        quality[f"{name}_num_{REASONS[state]}_taxels"] = float(np.count_nonzero(refused == state))
+    in_kpa = {"shape": (NUM_TAXELS,), "dtype": "float32", "unit": "kPa"}
+    return replace(
+        raw,
+        descriptor=raw.descriptor.model_copy(update=in_kpa),
+        convert=partial(glove.to_kpa, refused=refused),
+        quality=quality,
         calibration={f"{name}_refused_taxels": matrix_rows(refused[None].astype(np.float64))},
     )
 
@@ -256,12 +249,12 @@ def _complete_blocks(
 ) -> Iterator[Block]:
     """Samples inside without NaN or infinity; those of the whole recording that have some count."""
     can_miss = stream.descriptor.numpy_dtype().kind == "f"
-    num_incomplete, index = 0, 0
+    num_incomplete = 0
     first, stop = (0, len(stream.t_ns)) if can_miss else inside
     for piece in stream.pieces(first, stop):
         values, t_ns = piece.values, piece.t_ns
-        numbers = np.arange(first + index, first + index + len(t_ns))
-        index += len(t_ns)
+        numbers = first + np.arange(len(t_ns))
+        first += len(t_ns)
         taken = (numbers >= inside[0]) & (numbers < inside[1])
         if can_miss:
             whole = np.isfinite(values).reshape(len(values), -1).all(axis=1)

@@ -51,8 +51,8 @@ def measure_person(options: argparse.Namespace) -> dict[str, object]:
     calibration = dict(taken.calibration)
     if (options.to / MATRICES_FILE).exists():
         calibration |= read_matrices(options.to)
-    axes = hand_axes_check(taken.batch.values, side, calibration)
-    profile = HandRetargeter(side).measure(axes.keypoints_m)
+    keypoints_m = hand_axes_check(taken.batch.values, side, calibration)
+    profile = HandRetargeter(side).measure(keypoints_m)
     name = profile_name(side)
     bones_mm = dict(zip(FINGERS, (profile.bone_m * 1e3).round(1).tolist(), strict=True))
     facts: dict[str, object] = {

@@ -14,7 +14,7 @@ from services.alignment.retargeting.keypoint_axes import (
     calibration_record,
     hand_axes_check,
 )
-from services.alignment.retargeting.wrist_frame import calibrate_wrist
+from services.alignment.retargeting.wrist_frame import calibrate_wrist, wrist_frame
 from tests.unit.alignment.tracked_hands import (
     any_rotation,
     flat_hand,
@@ -25,9 +25,9 @@ from tests.unit.alignment.tracked_hands import (
 SIDES = ("left", "right")
 
 
-def off_rad(checked):
+def off_rad(keypoints, side):
     """How far the palm is turned from the wrist's axes."""
-    return rotation_angle(checked.frame.T_tracker_wrist[:3, :3])
+    return rotation_angle(wrist_frame(keypoints, side).T_tracker_wrist[:3, :3])
 
 
 @pytest.mark.parametrize("side", SIDES)
@@ -36,8 +36,8 @@ def test_keypoints_in_wrist_axes_stay_as_they_are(side):
         rng = np.random.default_rng(seed)
         keypoints = of_another_person(moving_hand(side, rng), rng)
         checked = hand_axes_check(keypoints, side, {})
-        np.testing.assert_array_equal(checked.keypoints_m, keypoints)
-        assert off_rad(checked) < np.deg2rad(15)
+        np.testing.assert_array_equal(checked, keypoints)
+        assert off_rad(checked, side) < np.deg2rad(15)
 
 
 @pytest.mark.parametrize("side", SIDES)
@@ -60,11 +60,11 @@ def test_keypoints_in_other_axes_need_a_calibration(side):
         f"T_keypoints_{side}_wrist_{side}_sigma_rad",
     ]
     checked = hand_axes_check(tracked, side, record)
-    assert np.isnan(checked.keypoints_m[5, 3]).all()
-    assert np.isnan(checked.keypoints_m[6, 4]).all()
-    seen = np.isfinite(checked.keypoints_m).all(axis=-1)
+    assert np.isnan(checked[5, 3]).all()
+    assert np.isnan(checked[6, 4]).all()
+    seen = np.isfinite(checked).all(axis=-1)
     assert np.count_nonzero(~seen) == 2
-    assert np.abs(checked.keypoints_m - keypoints)[seen].max() < 2e-3
+    assert np.abs(checked - keypoints)[seen].max() < 2e-3
     # The other hand's calibration is not taken for this one's.
     other = "right" if side == "left" else "left"
     with pytest.raises(InvalidInputError, match="record the flat hand"):
@@ -77,7 +77,7 @@ def test_joints_of_a_turned_hand_are_those_of_the_hand():
     rng = np.random.default_rng(2)
     keypoints, R = moving_hand("right", rng, 20), any_rotation(rng)
     record = calibration_record(calibrate_wrist(flat_hand("right", rng) @ R.T, "right"), "right")
-    turned = hand_axes_check(keypoints @ R.T, "right", record).keypoints_m
+    turned = hand_axes_check(keypoints @ R.T, "right", record)
     direct = HandRetargeter("right").retarget(keypoints)
     np.testing.assert_allclose(
         HandRetargeter("right").retarget(turned).joints_rad, direct.joints_rad, atol=1e-4
@@ -88,8 +88,8 @@ def test_the_made_up_hands_of_mock_stations_are_hands_in_wrist_axes():
     made_up = [s for s in pattern_streams() if s.descriptor.kind == "keypoints"]
     assert len(made_up) == len(SIDES)
     for stream in made_up:
-        checked = hand_axes_check(stream.values, stream.descriptor.name.split("_")[1], {})
-        assert off_rad(checked) < 1e-6
+        side = stream.descriptor.name.split("_")[1]
+        assert off_rad(hand_axes_check(stream.values, side, {}), side) < 1e-6
         assert np.ptp(stream.values[:, NODE_INDEX["index", "tip"]], axis=0).max() > 0.05
 
 
@@ -178,7 +178,7 @@ def test_whatever_comes_is_an_answer_without_nan_or_a_refusal():
 
 
 def _checked_frame(keypoints):
-    return hand_axes_check(keypoints, "left", {}).frame
+    return wrist_frame(hand_axes_check(keypoints, "left", {}), "left")
 
 
 def _calibrated_frame(keypoints):
