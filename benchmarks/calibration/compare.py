@@ -15,7 +15,7 @@ from benchmarks.simulated.board_scenes import Scene, mount_difference
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert
-from services.alignment.calibration.twists import twist
+from services.alignment.calibration.motion import twist
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from services.alignment.calibration.hand_eye import BoardViews, project
 from services.alignment.calibration.intrinsics import CHESSBOARD, FoundBoards
-from services.alignment.calibration.twists import move
+from services.alignment.calibration.motion import move
 
 IMAGE_SIZE_PX = (1280, 720)
 K = np.array([[910.0, 0.0, 640.0], [0.0, 905.0, 360.0], [0.0, 0.0, 1.0]])

@@ -15,8 +15,7 @@ from dextouch.hands import (
 )
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.hands.skeleton import THUMB_JOINTS
-from services.alignment.retargeting.keypoint_axes import to_wrist_axes
-from services.alignment.retargeting.wrist_frame import wrist_frame
+from services.alignment.retargeting.wrist_frame import to_wrist_axes, wrist_frame
 
 RECORDING = Path(__file__).parents[3] / "shared/data/hands/right_hand_mediapipe_first_half.npy"
 RATE_HZ = 30.0

@@ -17,8 +17,7 @@ from services.alignment.calibration.hand_eye import (
     HandEyeNoise,
     solve_hand_eye,
 )
-from services.alignment.calibration.motion import DegenerateMotionError, park
-from services.alignment.calibration.twists import move, twist
+from services.alignment.calibration.motion import DegenerateMotionError, move, park, twist
 
 RECORDED_POSES = Path(__file__).parents[3] / "shared/data/hand_eye/pose_samples.json"
 NUM_SEEDS = 20

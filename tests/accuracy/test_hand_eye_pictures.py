@@ -14,7 +14,7 @@ from dextouch.geometry.rotations import rotation_from_vector
 from services.acquisition.devices import load_calibration
 from services.alignment.calibration.hand_eye import project
 from services.alignment.calibration.intrinsics import edge_width_px
-from services.alignment.calibration.twists import move
+from services.alignment.calibration.motion import move
 from services.cli.calibrate.boards import find_board, parse_board
 from services.cli.calibrate.command import main
 from services.cli.calibrate.record import write_entry

@@ -23,8 +23,8 @@ from dextouch.hands.actions import (
     relative_pose_9d,
 )
 from services.alignment.calibration.hand_eye import solve_hand_eye
+from services.alignment.calibration.motion import move
 from services.alignment.calibration.robot_base import solve_robot_base
-from services.alignment.calibration.twists import move
 from services.alignment.recording_error import pose_difference
 from tests.accuracy.test_robot_base import pairs
 

@@ -18,8 +18,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert
-from services.alignment.calibration.motion import Agreement
-from services.alignment.calibration.twists import adjoint, move, twist, twist_jacobian
+from services.alignment.calibration.motion import Agreement, adjoint, move, twist, twist_jacobian
 
 # Of the Gauss–Newton steps; below the smallest (rad, m) nothing changes that could be measured.
 MAX_ROUNDS = 30

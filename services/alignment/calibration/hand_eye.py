@@ -24,10 +24,11 @@ from services.alignment.calibration.motion import (
     AXIS_NAMES,
     DegenerateMotionError,
     Series,
+    adjoint,
     agreeing_views,
     checked_poses,
+    move,
 )
-from services.alignment.calibration.twists import adjoint, move
 
 TASK = "hand-eye"
 MIN_CORNERS = 4

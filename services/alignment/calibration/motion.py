@@ -1,9 +1,12 @@
-"""Closed-form calibration of two sensors that move together, and what their motion must show.
+"""Twists, closed-form calibration of two sensors that move together, and what they must show.
 
 With X = T_tracker_camera and Z = T_world_board every view says T_world_tracker · X · T_camera_board
 = Z. Two views give A X = X B for their relative motions; the rotation vectors of A and B differ by
 R_X alone (Park and Martin 1994), which gives the rotation; the translation is linear. Motions that
 do not determine the result are refused, and views that disagree with the others are left out.
+
+A twist is [..., 6]: rotation vector in rad, then translation in m. T · move(twist) turns T in its
+own frame about its own origin and shifts it along its own axes.
 """
 
 from itertools import combinations
@@ -14,8 +17,12 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert, transform
-from dextouch.geometry.rotations import rotation_angle, vector_from_rotation
-from services.alignment.calibration.twists import nearest_pose, nearest_rotation
+from dextouch.geometry.rotations import (
+    SERIES_ANGLE_RAD,
+    rotation_angle,
+    rotation_from_vector,
+    vector_from_rotation,
+)
 
 MIN_VIEWS = 4
 MAX_PAIRS = 5000
@@ -261,3 +268,67 @@ def _rms(errors: np.ndarray) -> Float64[np.ndarray, "2"]:
 def _told(errors: np.ndarray) -> str:
     rms = _rms(errors)
     return f"{np.rad2deg(rms[0]):.2f} degrees and {rms[1] * 1e3:.1f} mm"
+
+
+def hat(vectors: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
+    """Skew-symmetric (cross product) matrices of vectors [..., 3]."""
+    x, y, z = np.moveaxis(np.asarray(vectors, dtype=np.float64), -1, 0)
+    crossed = np.zeros((*x.shape, 3, 3))
+    crossed[..., 0, 1], crossed[..., 0, 2], crossed[..., 1, 2] = -z, y, -x
+    crossed[..., 1, 0], crossed[..., 2, 0], crossed[..., 2, 1] = z, -y, x
+    return crossed
+
+
+def adjoint(T_a_b: np.ndarray) -> Float64[np.ndarray, "*batch 6 6"]:
+    """Takes twists of frame b to frame a: T · move(v) = move(adjoint(T) @ v) · T to first order."""
+    R = T_a_b[..., :3, :3]
+    full = np.zeros((*R.shape[:-2], 6, 6))
+    full[..., :3, :3] = full[..., 3:, 3:] = R
+    full[..., 3:, :3] = hat(T_a_b[..., :3, 3]) @ R
+    return full
+
+
+def move(twists: np.ndarray) -> Float64[np.ndarray, "*batch 4 4"]:
+    """Transforms of twists [..., 6]; rotation and translation side by side, not a screw."""
+    return transform(rotation_from_vector(twists[..., :3]), twists[..., 3:])
+
+
+def twist(T: np.ndarray) -> Float64[np.ndarray, "*batch 6"]:
+    """Twists of transforms; the inverse of `move`."""
+    return np.concatenate([vector_from_rotation(T[..., :3, :3]), T[..., :3, 3]], axis=-1)
+
+
+def right_jacobian_inverse(vectors_rad: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
+    """Inverse right Jacobian of SO(3) at a rotation vector.
+
+    For angles below half a turn (Solà et al. 2018, A micro Lie theory, eq. 144).
+    """
+    angle = np.linalg.norm(vectors_rad, axis=-1)[..., None, None]
+    small = angle < SERIES_ANGLE_RAD
+    safe = np.where(small, 1.0, angle)
+    factor = np.where(
+        small,
+        1 / 12 + angle**2 / 720,
+        1 / safe**2 - (1 + np.cos(safe)) / (2 * safe * np.sin(safe)),
+    )
+    crossed = hat(vectors_rad)
+    return np.eye(3) + 0.5 * crossed + factor * (crossed @ crossed)
+
+
+def twist_jacobian(Ts: np.ndarray) -> Float64[np.ndarray, "n 6 6"]:
+    """Jacobian of the twists of transforms [n, 4, 4] by T · move(v)."""
+    J = np.zeros((len(Ts), 6, 6))
+    J[:, :3, :3] = right_jacobian_inverse(twist(Ts)[:, :3])
+    J[:, 3:, 3:] = Ts[:, :3, :3]
+    return J
+
+
+def nearest_pose(Ts: np.ndarray) -> Float64[np.ndarray, "4 4"]:
+    """Mean of poses [n, 4, 4]: rotation nearest to the mean matrix, mean translation."""
+    return transform(nearest_rotation(Ts[:, :3, :3].mean(axis=0)), Ts[:, :3, 3].mean(axis=0))
+
+
+def nearest_rotation(matrix: np.ndarray) -> Float64[np.ndarray, "3 3"]:
+    """The rotation nearest to a 3 by 3 matrix (orthogonal Procrustes)."""
+    U, _, Vt = np.linalg.svd(matrix)
+    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt

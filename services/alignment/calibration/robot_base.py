@@ -21,12 +21,12 @@ from services.alignment.calibration.motion import (
     AXIS_NAMES,
     DegenerateMotionError,
     Series,
+    adjoint,
     agreeing_views,
     checked_poses,
     missing_axes,
     view_errors,
 )
-from services.alignment.calibration.twists import adjoint
 
 TASK = "robot base"
 # Where the tracker's place is given, the effector must at least move so far in two directions.

@@ -16,7 +16,7 @@ from services.alignment.retargeting.hand_retargeter import (
     RetargetResult,
     RetargetStatus,
 )
-from services.alignment.retargeting.keypoint_axes import hand_axes_check
+from services.alignment.retargeting.wrist_frame import hand_axes_check
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import (
     GridPlacement,

@@ -23,7 +23,7 @@ from services.alignment.calibration.tactile_baseline import (
     TactileCalibration,
     TaxelSurvey,
 )
-from services.alignment.retargeting.keypoint_axes import (
+from services.alignment.retargeting.wrist_frame import (
     calibrated_transform,
     calibration_name,
     to_wrist_axes,

@@ -6,12 +6,12 @@ import numpy as np
 
 from dextouch.errors import InvalidInputError
 from services.alignment.retargeting.hand_profile import profile_name
-from services.alignment.retargeting.keypoint_axes import (
+from services.alignment.retargeting.wrist_frame import (
+    calibrate_wrist,
     calibration_name,
     calibration_record,
     hand_axes_check,
 )
-from services.alignment.retargeting.wrist_frame import calibrate_wrist
 from services.cli.calibrate.files import TakenStream, read_stream
 from services.cli.calibrate.record import MATRICES_FILE, read_matrices, write_entry
 

@@ -16,9 +16,9 @@ from services.alignment.calibration.bundle import (
     solve_bundle,
 )
 from services.alignment.calibration.hand_eye import BoardViews, polish, project, solve_hand_eye
-from services.alignment.calibration.motion import check_turns
-from services.alignment.calibration.twists import (
+from services.alignment.calibration.motion import (
     adjoint,
+    check_turns,
     hat,
     move,
     right_jacobian_inverse,

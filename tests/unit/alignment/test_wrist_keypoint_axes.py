@@ -10,11 +10,12 @@ from dextouch.hands import NODE_INDEX
 from dextouch.schemas import matrix_rows
 from services.acquisition.mocks.pattern import pattern_streams
 from services.alignment.retargeting import HandRetargeter
-from services.alignment.retargeting.keypoint_axes import (
+from services.alignment.retargeting.wrist_frame import (
+    calibrate_wrist,
     calibration_record,
     hand_axes_check,
+    wrist_frame,
 )
-from services.alignment.retargeting.wrist_frame import calibrate_wrist, wrist_frame
 from tests.unit.alignment.tracked_hands import (
     any_rotation,
     flat_hand,
