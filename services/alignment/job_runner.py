@@ -72,7 +72,9 @@ class JobRunner:
         async with self.queue.lock:
             for job in map(self.queue.get, at_work):
                 if job.state == "running":
-                    await self.queue.save_if_possible(job.interrupted())
+                    # An attempt that the service itself ends does not count.
+                    again = job.waiting(attempts=job.attempts - 1)
+                    await self.queue.save_if_possible(again)
         ended = asyncio.ensure_future(asyncio.to_thread(self._threads.shutdown))
         while not ended.done():
             # Repeated: a worker may have been about to start when it was stopped.
@@ -112,7 +114,7 @@ class JobRunner:
         options = self._settings.options
         job = AlignmentJob.new(episode_id_of(recording, options), recording_id, options)
         async with self.queue.lock:
-            await self.queue.add([job.failed(error)])
+            await self.queue.add([job.ended("failed", error=error)])
         logger.warning("alignment_failed", recording_id=recording_id, reason=error.message)
 
     async def wait(self, alignment_id: str) -> AlignmentJob:
@@ -135,7 +137,7 @@ class JobRunner:
                     f"alignment {alignment_id!r}: is {job.state}, expected one that waits or runs"
                 )
             if job.state != "cancelled":
-                await self.queue.save(job.cancelled())
+                await self.queue.save(job.ended("cancelled"))
             worker = self._at_work.get(alignment_id)
             if worker is not None:
                 # While holding the lock: otherwise the worker could have started the next job.
@@ -194,16 +196,17 @@ class JobRunner:
             report = await loop.run_in_executor(
                 self._threads, worker.run, job.recording_id, job.options, on_progress
             )
-            ended = job.done(report)
+            ended = job.ended("done", report=report)
         except DexTouchError as error:
-            ended = job.failed(error)
+            ended = job.ended("failed", error=error)
             if isinstance(error, UnavailableError):
                 # Remove what the process was writing beside the store's episodes.
                 await asyncio.to_thread(self._store.sweep)
         except Exception:
             # The job's supervisor: one broken recording must not end the service.
             logger.exception("alignment_crashed", recording_id=job.recording_id)
-            ended = job.failed(DexTouchError("unexpected error; see the service's log"))
+            broken = DexTouchError("unexpected error; see the service's log")
+            ended = job.ended("failed", error=broken)
         async with self.queue.lock:
             if not self.queue.is_current(job):
                 return

@@ -86,22 +86,29 @@ class AlignmentJob(FrozenModel):
         share = max(self.progress, progress.share)
         return self._with(progress=share, stage=progress.stage, stream=progress.stream)
 
-    def done(self, report: AlignmentReport) -> "AlignmentJob":
-        """Its episode is in the store."""
-        return self._ended("done", progress=1.0, report=report)
+    def ended(
+        self,
+        state: Literal["done", "failed", "cancelled"],
+        *,
+        report: AlignmentReport | None = None,
+        error: DexTouchError | None = None,
+    ) -> "AlignmentJob":
+        """Its episode is in the store, it failed for a reason, or it was cancelled."""
+        problem = error and problem_from_error(error, instance=self.alignment_id, request_id="")
+        return self._with(
+            state=state,
+            ended_at=_now(),
+            progress=1.0 if state == "done" else self.progress,
+            stage=None,
+            stream=None,
+            report=report,
+            problem=problem,
+        )
 
-    def failed(self, error: DexTouchError) -> "AlignmentJob":
-        """It ended without an episode, for this reason."""
-        problem = problem_from_error(error, instance=self.alignment_id, request_id="")
-        return self._ended("failed", problem=problem)
-
-    def cancelled(self) -> "AlignmentJob":
-        """The job was cancelled."""
-        return self._ended("cancelled")
-
-    def interrupted(self) -> "AlignmentJob":
-        """The service was stopped during this attempt, which therefore does not count."""
-        return self._waiting(attempts=self.attempts - 1)
+    def waiting(self, *, attempts: int) -> "AlignmentJob":
+        """It waits for its next attempt, after so many that count."""
+        again: dict[str, object] = {"stage": None, "stream": None, "started_at": None}
+        return self._with(state="waiting", attempts=attempts, progress=0.0, **again)
 
     def crashed(self, *, max_attempts: int) -> "AlignmentJob":
         """The service died during this attempt: wait for the next one, or fail if it was the last.
@@ -109,14 +116,14 @@ class AlignmentJob(FrozenModel):
         The job itself may be what kills the service, so it is not tried for ever.
         """
         if self.attempts < max_attempts:
-            return self._waiting(attempts=self.attempts)
+            return self.waiting(attempts=self.attempts)
         error = UnavailableError(
             f"recording {self.recording_id!r}: the alignment service died {self.attempts} times "
             "while it was aligned, so it is not tried again by itself; look into the service's log "
             "(out of memory?), then ask for it again",
             attempts=self.attempts,
         )
-        return self.failed(error)
+        return self.ended("failed", error=error)
 
     def with_eta(self) -> "AlignmentJob":
         """Estimates the remaining time from the time that the progress took so far."""
@@ -124,13 +131,6 @@ class AlignmentJob(FrozenModel):
             return self
         elapsed_s = max((_now() - self.started_at).total_seconds(), 0.0)
         return self._with(eta_s=elapsed_s * (1 - self.progress) / self.progress)
-
-    def _waiting(self, *, attempts: int) -> "AlignmentJob":
-        again: dict[str, object] = {"stage": None, "stream": None, "started_at": None}
-        return self._with(state="waiting", attempts=attempts, progress=0.0, **again)
-
-    def _ended(self, state: JobState, **changes: object) -> "AlignmentJob":
-        return self._with(state=state, ended_at=_now(), stage=None, stream=None, **changes)
 
     def _with(self, **changes: object) -> "AlignmentJob":
         return self.model_copy(update=changes)

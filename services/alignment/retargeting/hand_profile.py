@@ -71,15 +71,9 @@ class HandProfile:
         Columns: 3 bones (m), 3 knuckle coordinates (m), travel, knuckle sigma (m), the tracker's
         noise (m; the same in every row).
         """
-        return np.column_stack(
-            [
-                self.bone_m,
-                self.knuckle_m,
-                self.travel,
-                self.knuckle_sigma_m,
-                np.full(NUM_FINGERS, self.point_sigma_m),
-            ]
-        ).astype(np.float64)
+        noise_m = np.full(NUM_FINGERS, self.point_sigma_m)
+        columns = self.bone_m, self.knuckle_m, self.travel, self.knuckle_sigma_m, noise_m
+        return np.column_stack(columns).astype(np.float64)
 
     @classmethod
     def from_rows(cls, rows: Sequence[Sequence[float]]) -> "HandProfile":

@@ -99,7 +99,7 @@ async def test_last_state_of_a_job_is_loaded(opened):
 async def test_job_submitted_again_goes_to_the_end(opened):
     queue = await opened()
     await queue.add([new_job("a"), new_job("b")])
-    await queue.save(queue.get("a-episode").cancelled())
+    await queue.save(queue.get("a-episode").ended("cancelled"))
     await queue.add([new_job("a"), new_job("b")])
     assert ids(queue) == ["b", "a"]
     assert ids(await opened()) == ["b", "a"]
@@ -110,7 +110,7 @@ async def test_oldest_ended_jobs_are_forgotten(opened):
     for name in "abcd":
         await queue.add([new_job(name)])
         if name != "a":
-            await queue.save(queue.get(f"{name}-episode").cancelled())
+            await queue.save(queue.get(f"{name}-episode").ended("cancelled"))
     assert ids(queue) == ["a", "c", "d"]
     assert ids(await opened()) == ["a", "c", "d"]
 
@@ -123,7 +123,7 @@ async def test_full_disk_changes_nothing_but_facts(opened):
     with pytest.raises(StorageFullError, match="no space left"):
         await queue.add([large])
     assert ids(queue) == ["a"]
-    done = queue.get("a-episode").failed(UnavailableError("x" * 100_000))
+    done = queue.get("a-episode").ended("failed", error=UnavailableError("x" * 100_000))
     with pytest.raises(StorageFullError):
         await queue.save(done)
     assert queue.get("a-episode").state == "waiting"
