@@ -25,41 +25,37 @@ Record = Mapping[str, Sequence[Sequence[float]]]
 
 @dataclass(frozen=True)
 class TactileCalibration:
-    """counts = tare + gain · pressure for each of the raw cells of one glove of any maker.
+    """counts = tare + gain · pressure for each taxel of one glove of any maker.
 
     Attributes:
         side: of the glove.
-        tare_counts: of each raw cell, in the unit in which the glove sends its readings.
-        gain_counts_per_kpa: of each raw cell; above 0 where a measured taxel sits.
+        num_cells: numbers that the glove sends in each sample.
         cells: raw cell of each taxel in anatomical order, −1 where the glove has none.
+        tare_counts: of each taxel, in the unit in which the glove sends its readings.
+        gain_counts_per_kpa: of each taxel, above 0; 1 where it is not measured.
         state: why a taxel is not measured, index into `REASONS`; 0 where it is.
 
     Raises:
-        NonFiniteError: NaN or infinity.
         InvalidInputError: a gain that is not positive, or not one taxel that is measured.
     """
 
     side: Side
-    tare_counts: Float64[np.ndarray, " cells"]
-    gain_counts_per_kpa: Float64[np.ndarray, " cells"]
+    num_cells: int
     cells: Int64[np.ndarray, "320"]
+    tare_counts: Float64[np.ndarray, "320"]
+    gain_counts_per_kpa: Float64[np.ndarray, "320"]
     state: UInt8[np.ndarray, "320"]
 
     def __post_init__(self) -> None:
-        for name in ("tare_counts", "gain_counts_per_kpa"):
-            if not np.isfinite(getattr(self, name)).all():
-                raise NonFiniteError(f"tactile calibration {self.side}: {name} is not finite")
-        measured = self.state == OK
-        if not measured.any():
+        if not (self.state == OK).any():
             raise InvalidInputError(
                 f"tactile calibration {self.side}: refuses all 320 taxels; calibrate the glove "
                 "again, or leave its stream out"
             )
-        gains = self.gain_counts_per_kpa[self.cells[measured]]
-        if not (gains > 0).all():
+        if not (self.gain_counts_per_kpa > 0).all():
             raise InvalidInputError(
-                f"tactile calibration {self.side}: got a gain of {gains.min():g} counts/kPa, "
-                "expected all above 0"
+                f"tactile calibration {self.side}: got a gain of "
+                f"{self.gain_counts_per_kpa.min():g} counts/kPa, expected all above 0"
             )
 
     @classmethod
@@ -84,6 +80,7 @@ class TactileCalibration:
         Raises:
             InvalidInputError: a matrix of this side is missing, has the wrong shape or invalid
                 values.
+            NonFiniteError: NaN or infinity.
         """
         glove = stream or f"tactile_{side}"
         tare, gain = (
@@ -94,7 +91,8 @@ class TactileCalibration:
         state = np.full(NUM_TAXELS, ABSENT, dtype=np.uint8)
         has_cell = cells != NO_CELL
         state[has_cell] = _states(record, f"{glove}_taxel_state", num_cells)[cells[has_cell]]
-        return cls(side, tare, gain, cells, state)
+        gain = np.where(state == OK, gain[cells], 1.0)
+        return cls(side, num_cells, cells, tare[cells], gain, state)
 
     def to_kpa(
         self, counts: np.ndarray, *, refused: np.ndarray | None = None
@@ -109,8 +107,8 @@ class TactileCalibration:
         Raises:
             ShapeError: not [T, cells].
         """
-        offsets = self.taxels(counts).astype(np.float64) - self.tare_counts[self.cells]
-        taxels = np.maximum(offsets / self.gains(), 0.0)
+        offsets = self.taxels(counts).astype(np.float64) - self.tare_counts
+        taxels = np.maximum(offsets / self.gain_counts_per_kpa, 0.0)
         taxels[:, (self.state if refused is None else refused) != OK] = 0.0
         return taxels.astype(np.float32)
 
@@ -121,16 +119,11 @@ class TactileCalibration:
             ShapeError: not [T, cells].
         """
         raw = np.asarray(counts)
-        if raw.ndim != 2 or raw.shape[1] != len(self.tare_counts):
+        if raw.ndim != 2 or raw.shape[1] != self.num_cells:
             raise ShapeError(
-                f"counts of the {self.side} glove: got {raw.shape}, expected "
-                f"[T, {len(self.tare_counts)}]"
+                f"counts of the {self.side} glove: got {raw.shape}, expected [T, {self.num_cells}]"
             )
         return raw[:, self.cells]
-
-    def gains(self) -> Float64[np.ndarray, "320"]:
-        """Gains by taxel; 1 for refused taxels, whose gain is meaningless."""
-        return np.where(self.state == OK, self.gain_counts_per_kpa[self.cells], 1.0)
 
 
 class TaxelSurvey:
@@ -173,8 +166,8 @@ class TaxelSurvey:
         missing = 1.0 - self._num_finite / self._num_samples
         reasons[(reasons == OK) & (missing > MAX_MISSING)] = ABSENT
         still = self._low == self._high
-        tare_counts = calibration.tare_counts[calibration.cells]
-        offset_kpa = np.abs(self._first - tare_counts) / calibration.gains()
+        offset_counts = np.abs(self._first - calibration.tare_counts)
+        offset_kpa = offset_counts / calibration.gain_counts_per_kpa
         silent = (reasons == OK) & still & (offset_kpa > DEAD_OFFSET_KPA)
         reasons[silent] = np.where(self._first[silent] == 0, DEAD, STUCK)
         return reasons
@@ -189,6 +182,8 @@ def _row(record: Record, name: str, size: int) -> Float64[np.ndarray, " size"]:
     matrix = np.array(record[name], dtype=np.float64)
     if matrix.shape != (1, size):
         raise InvalidInputError(f"calibration {name!r}: got {matrix.shape}, expected (1, {size})")
+    if not np.isfinite(matrix).all():
+        raise NonFiniteError(f"calibration {name!r}: holds NaN or infinity; calibrate again")
     return matrix[0]
 
 
