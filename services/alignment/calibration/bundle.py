@@ -37,12 +37,7 @@ MAX_SIGMA_TRANSLATION_M = 0.01
 
 
 class Linearised(NamedTuple):
-    """Normal equations of a measurement, linearized at predicted poses.
-
-    Attributes:
-        information: [n, 6, 6].
-        gradient: [n, 6], of half the weighted squares.
-    """
+    """Normal equations of half the weighted squares of a measurement, at predicted poses."""
 
     information: Float64[np.ndarray, "n 6 6"]
     gradient: Float64[np.ndarray, "n 6"]
@@ -114,13 +109,10 @@ class Component:
 
 @dataclass(frozen=True)
 class Bundle:
-    """Result of the bundle adjustment.
+    """The mount X, the target's pose Z in the world, and how well they are known.
 
-    Attributes:
-        X: the mount.
-        Z: the target's pose in the world.
-        covariance: of the twists of X, then of Z (rad, m, in their own frames). Rows and columns
-            of a mount that was given are zero.
+    The covariance is of the twists of X, then of Z (rad, m, in their own frames); rows and columns
+    of a mount that was given are zero.
     """
 
     X: Float64[np.ndarray, "4 4"]
@@ -167,12 +159,9 @@ def weighted_bundle(
 def sensor_components(
     sensor: str, maps: np.ndarray, sigmas: tuple[float, float]
 ) -> dict[str, Component]:
-    """Rotation and translation noise of a pose sensor, in its own axes.
+    """Rotation and translation noise of a pose sensor, in its own axes; rad and m an axis.
 
-    Args:
-        sensor: for the names of the two components.
-        maps: [n, 6, 6] take its twists to those of the views.
-        sigmas: declared, rad and m an axis.
+    `maps` [n, 6, 6] take its twists to those of the views.
     """
     maps_T = np.swapaxes(maps, 1, 2)
     turns, shifts = maps[:, :, :3] @ maps_T[:, :3], maps[:, :, 3:] @ maps_T[:, 3:]
@@ -195,7 +184,7 @@ def estimate_sigmas(
     Args:
         left_over: [n, 6] twists of views that are not explained, before the last linear step.
         J: [n, 6, m] how they change with the m unknowns that are fitted.
-        components: the sources.
+        components: declared sources of noise.
     """
     M = np.stack([component.shapes for component in components])
     declared = np.log(np.square([component.sigma for component in components]))

@@ -55,24 +55,17 @@ class HandEyeNoise(TrackerNoise):
 
 @dataclass(frozen=True)
 class HandEyeResult(PoseEstimate):
-    """Where the camera sits on the tracker, and how well that is known.
-
-    Attributes:
-        T_tracker_camera: the mount.
-    """
+    """Where the camera sits on the tracker, and how well that is known."""
 
     T_tracker_camera: Float64[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True)
 class BoardViews:
-    """Detected corners of a board in several views, and the camera's intrinsics.
+    """Detected corners of a board in several views, and the camera's K and distortion.
 
-    Attributes:
-        points_board: a view each, [k ≥ 4, 3] corners in board coordinates (m).
-        pixels_px: a view each, [k, 2] where they were seen.
-        K: the camera's matrix.
-        distortion: k1 k2 p1 p2 k3.
+    `points_board` are [k ≥ 4, 3] corners of each view in board coordinates (m), `pixels_px` [k, 2]
+    where they were seen; the distortion is k1 k2 p1 p2 k3.
     """
 
     points_board: Sequence[np.ndarray]

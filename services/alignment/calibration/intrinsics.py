@@ -59,15 +59,11 @@ class CharucoBoard:
 
 @dataclass(frozen=True)
 class FoundBoards:
-    """Corners of one board on photos of one size.
+    """Corners of one board on photos of one size (width, height).
 
-    Attributes:
-        points_board: a photo each, [k, 3] corners in board coordinates (m).
-        pixels_px: a photo each, [k, 2] where they are.
-        image_size_px: width, height.
-        photos: indices of the photos on which the board was found.
-        num_photos: number of processed photos.
-        pattern: how the board is printed.
+    `points_board` are [k, 3] corners of each photo in board coordinates (m), `pixels_px` [k, 2]
+    where they are, `photos` the indices of those of `num_photos` on which the board was found;
+    `pattern` says how it is printed.
     """
 
     points_board: tuple[Float32[np.ndarray, "_ 3"], ...]
@@ -80,14 +76,11 @@ class FoundBoards:
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """A pinhole camera with distortion k1 k2 p1 p2 k3.
+    """A pinhole camera (K in px) with distortion k1 k2 p1 p2 k3, and standard deviations.
 
     Attributes:
-        K: the camera's matrix (px).
-        distortion: k1 k2 p1 p2 k3.
         sigma_fxfycxcy_px: standard deviations of fx fy cx cy; they show how good the calibration
             is. `rms_px` does not: it is as small for 8 views as for 40.
-        sigma_distortion: of the distortion.
         rms_px: of the residuals between corners and model, both axes together.
         rms_by_photo_px: the same by photo; a much larger one means that the photo is blurred or the
             board was bent.

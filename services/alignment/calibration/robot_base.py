@@ -46,11 +46,8 @@ class RobotBaseNoise(TrackerNoise):
 class RobotBaseResult(PoseEstimate):
     """Pose of the robot's base in the tracked world, and how well it is known.
 
-    Attributes:
-        T_world_base: the base.
-        T_effector_tracker: where the tracker sits; as given, or found.
-        rotation_rms_rad: how far the pairs turn the base from there.
-        translation_rms_m: how far they put it from there.
+    `T_effector_tracker`, where the tracker sits, is as given, or found. The two RMS are how far the
+    pairs turn and put the base from there.
     """
 
     T_world_base: Float64[np.ndarray, "4 4"]

@@ -56,13 +56,10 @@ BLOCK = 600
 
 @dataclass(frozen=True)
 class Level:
-    """Constant level of each cell over a take, in counts.
+    """Constant level of each cell over a take: mean of the readings without accidental contact.
 
-    Attributes:
-        mean_counts: mean of the readings, without accidental contact.
-        sigma_counts: of that middle: noise, slow noise and the rounding to whole counts.
-        noise_counts: standard deviation of one reading.
-        clipped: share of excluded readings, 0 … 1.
+    `sigma_counts` is of that mean: noise, slow noise and the rounding to whole counts;
+    `noise_counts` the standard deviation of one reading; `clipped` the share of excluded readings.
     """
 
     mean_counts: Float64[np.ndarray, "360"]
@@ -73,13 +70,10 @@ class Level:
 
 @dataclass(frozen=True)
 class TaxelTare:
-    """The zero of each of the 360 raw cells of one glove.
+    """The zero of each of the 360 raw cells of one glove: their level without load.
 
-    Attributes:
-        side: which glove.
-        level: what each cell reads without load.
-        restless: taxels (anatomical order) that moved during the take; few are tolerated.
-        num_samples: readings that were used.
+    `restless` taxels (anatomical order) moved during the take of so many samples; few are
+    tolerated.
     """
 
     side: Side
@@ -93,7 +87,7 @@ def measure_tare(rest_counts: np.ndarray, *, side: Side) -> TaxelTare:
 
     Args:
         rest_counts: [T ≥ 60, 360] raw counts in scan order.
-        side: which glove.
+        side: of the glove.
 
     Raises:
         InvalidInputError: too short, or the glove was touched or still settling.

@@ -53,13 +53,10 @@ def refused_edges(
 def refused_stretches(
     t_ns: np.ndarray, valid: Mapping[str, np.ndarray], taken: tuple[int, int], start_ns: int
 ) -> list[RefusedPart]:
-    """Steps of the grid that are not in the episode.
+    """Steps of the grid that are not in the episode, which has the steps `taken`: first, stop.
 
-    Args:
-        t_ns: of the steps, at least two, on the clock of `start_ns`.
-        valid: of each stream, whether it can be read at each step.
-        taken: first and one past the last step of the episode.
-        start_ns: of the recording.
+    `t_ns` are times of at least two steps on the clock of `start_ns`, the recording's start;
+    `valid` says of each stream whether it can be read at each step.
     """
     step_ns = int(t_ns[1] - t_ns[0])
 

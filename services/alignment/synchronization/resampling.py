@@ -32,13 +32,10 @@ def grid_times_ns(num_steps: int, rate_hz: float) -> Int64[np.ndarray, " n"]:
 def place_on_grid(
     t_ns: np.ndarray, grid_ns: np.ndarray, *, period_ns: int, max_gap_ns: int
 ) -> GridPlacement:
-    """Neighbours and weights of grid times.
+    """Neighbours and weights of grid times among samples of a nominal period.
 
-    Args:
-        t_ns: sample times, strictly increasing; fewer than two make every step invalid.
-        grid_ns: times of the steps.
-        period_ns: the stream's nominal period.
-        max_gap_ns: two samples further apart are not connected.
+    Sample times are strictly increasing; fewer than two make every step invalid. Two that are
+    further apart than `max_gap_ns` are not connected.
     """
     t_ns, grid_ns = np.asarray(t_ns, dtype=np.int64), np.asarray(grid_ns, dtype=np.int64)
     if t_ns.size < 2:

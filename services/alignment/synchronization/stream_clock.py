@@ -28,12 +28,9 @@ MIN_LATENESS_NS = 5e6
 
 @dataclass(frozen=True)
 class TimedStream:
-    """Times of the kept samples on the host's clock, with the report of the clock fit.
+    """Strictly increasing times on the host's clock, with the report of the clock fit.
 
-    Attributes:
-        kept: indices of the samples that have a time of their own; duplicates are dropped.
-        t_host_ns: their times on the host's clock, strictly increasing.
-        report: of the clock fit.
+    `kept` are indices of the samples that have a time of their own; duplicates are dropped.
     """
 
     kept: Int64[np.ndarray, " n"]
