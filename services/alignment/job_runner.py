@@ -36,7 +36,7 @@ class JobRunner:
         self._store, self._settings = store, settings
         max_open = settings.num_workers + settings.max_waiting
         self.queue = JobQueue(max_open=max_open, max_kept=settings.max_kept)
-        self._changed = asyncio.Condition()
+        self._changed = asyncio.Condition(self.queue.lock)
         self._workers = [
             AlignmentWorker(settings.store_url, settings.log_level)
             for _ in range(settings.num_workers)
@@ -98,9 +98,9 @@ class JobRunner:
             AlignmentJob.new(alignment_id, recording_id, options)
             for recording_id, alignment_id in ids.items()
         ]
-        async with self.queue.lock:
+        async with self._changed:
             await self.queue.add(jobs)
-        await self._announce()
+            self._changed.notify_all()
         return tuple(self.queue.get(alignment_id) for alignment_id in ids.values())
 
     async def refuse(self, recording_id: str, error: InvalidInputError) -> None:
@@ -130,7 +130,7 @@ class JobRunner:
             NotFoundError: not known here.
             ConflictError: it is done or has failed.
         """
-        async with self.queue.lock:
+        async with self._changed:
             job = self.queue.get(alignment_id)
             if job.state in {"done", "failed"}:
                 raise ConflictError(
@@ -142,7 +142,7 @@ class JobRunner:
             if worker is not None:
                 # While holding the lock: otherwise the worker could have started the next job.
                 await asyncio.to_thread(worker.stop)
-        await self._announce()
+            self._changed.notify_all()
         return self.queue.get(alignment_id)
 
     async def _warm_up(self) -> None:
@@ -158,29 +158,23 @@ class JobRunner:
     async def _work(self, worker: AlignmentWorker) -> None:
         """Run one job after another on one worker."""
         while True:
-            async with self._changed:
-                await self._changed.wait_for(lambda: self.queue.next() is not None)
             try:
                 job = await self._take(worker)
             except StorageError as error:
                 logger.warning("job_not_started", reason=error.message)
                 await asyncio.sleep(RETRY_AFTER_S)
                 continue
-            if job is None:
-                continue
             try:
                 await self._carry_out(job, worker)
             finally:
                 if self._at_work.get(job.alignment_id) is worker:
                     del self._at_work[job.alignment_id]
-            await self._announce()
 
-    async def _take(self, worker: AlignmentWorker) -> AlignmentJob | None:
-        """Start the job that has waited longest; None if another worker was faster."""
-        async with self.queue.lock:
-            waiting = self.queue.next()
-            if waiting is None:
-                return None
+    async def _take(self, worker: AlignmentWorker) -> AlignmentJob:
+        """Start the job that has waited longest, once there is one."""
+        async with self._changed:
+            waiting = await self._changed.wait_for(self.queue.next)
+            assert waiting is not None  # noqa: S101 - what was waited for
             job = waiting.started()
             await self.queue.save(job)
             self._at_work[job.alignment_id] = worker
@@ -207,16 +201,13 @@ class JobRunner:
             logger.exception("alignment_crashed", recording_id=job.recording_id)
             broken = DexTouchError("unexpected error; see the service's log")
             ended = job.ended("failed", error=broken)
-        async with self.queue.lock:
+        async with self._changed:
             if not self.queue.is_current(job):
                 return
             if ended.problem is not None:
                 reason = ended.problem.detail
                 logger.warning("alignment_failed", recording_id=job.recording_id, reason=reason)
             await self.queue.save_if_possible(ended)
-
-    async def _announce(self) -> None:
-        async with self._changed:
             self._changed.notify_all()
 
     def _stop_workers(self) -> None:

@@ -179,8 +179,8 @@ class HandRetargeter:
         tuning = replace(self.options, reacquire_after_s=lost_s).tuning()
         tables = (self._arrays, person, tuning, np.zeros(1, dtype=SCRATCH))
         result = self._follow(tables, (keypoints, elapsed_s), self._blank())
-        followed = result.solved.any(axis=0)
-        never = [f.chain for f, is_so in zip(self.hand.fingers, followed, strict=True) if not is_so]
+        fingers = zip(self.hand.fingers, result.solved.T, strict=True)
+        never = [finger.chain for finger, solved in fingers if not solved.any()]
         if never:
             raise InvalidInputError(
                 f"keypoints of the {self.hand.side} hand: {', '.join(never)} followed in no sample "

@@ -162,7 +162,7 @@ def measure_profile(keypoints_m: np.ndarray, hand: HandModel) -> HandProfile:
 
 
 def _check_seen(whole: np.ndarray, side: str) -> None:
-    never = [name for name, seen in zip(CHAINS, whole.any(axis=0), strict=True) if not seen]
+    never = [name for name, seen in zip(CHAINS, whole.T, strict=True) if not seen.any()]
     if never:
         raise InvalidInputError(
             f"keypoints of the {side} hand: no step shows all nodes of {', '.join(never)} with "
