@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from av.bitstream import BitStreamFilterContext
 
-from dextouch.bridges.lerobot import ExportOptions, dataset, export_lerobot
+from dextouch.bridges.lerobot import ExportOptions, export_lerobot, exporting
 from dextouch.bridges.lerobot.layout import action_names
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, ShapeError
@@ -185,10 +185,10 @@ def test_other_parameter_sets_start_another_file(store, folder):
 
 def test_large_files_are_followed_by_others(store, folder, monkeypatch):
     monkeypatch.setattr(
-        dataset, "CameraVideo", functools.partial(dataset.CameraVideo, file_bytes=1)
+        exporting, "CameraVideo", functools.partial(exporting.CameraVideo, file_bytes=1)
     )
-    monkeypatch.setattr(dataset.layout, "DATA_FILE_MB", 0)
-    monkeypatch.setattr(dataset, "ROWS_AT_ONCE", 1)
+    monkeypatch.setattr(exporting.layout, "DATA_FILE_MB", 0)
+    monkeypatch.setattr(exporting, "ROWS_AT_ONCE", 1)
     export_lerobot(two(store), folder, repo_id="touch")
     assert problems(folder) == []
     assert sorted(p.name for p in folder.glob("data/*/*")) == [

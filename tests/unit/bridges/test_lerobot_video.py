@@ -7,9 +7,16 @@ import numpy as np
 import pytest
 
 from dextouch.bridges.lerobot import ExportOptions, ImportOptions, export_lerobot, import_lerobot
-from dextouch.bridges.lerobot.exporting import decode_entry_points, encode_images, stored_units
 from dextouch.bridges.lerobot.rows import frames_of
-from dextouch.bridges.lerobot.video import CameraVideo, VideoSpan, read_images, read_units
+from dextouch.bridges.lerobot.video import (
+    CameraVideo,
+    VideoSpan,
+    decode_entry_points,
+    encode_images,
+    read_images,
+    read_units,
+    stored_units,
+)
 from dextouch.episodes import EpisodeStore, VideoSettings, is_keyframe
 from dextouch.errors import CorruptDataError, ShapeError
 from tests.unit.bridges.lerobot_episodes import SIZE_PX, make_episode, pictures
@@ -25,7 +32,7 @@ def store(tmp_path):
 
 def encoded(count, *, crf=20, group=2):
     settings = VideoSettings(crf=crf, preset="veryfast")
-    return encode_images(pictures(count), 15, ExportOptions(video=settings, group=group))
+    return encode_images(pictures(count), 15, settings, group)
 
 
 def decoded_alone(units):

@@ -1,32 +1,40 @@
 """Export of episodes to a LeRobotDataset v3.0 folder, which appears complete or not at all."""
 
+import json
 import re
 import shutil
+import sys
 import uuid
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Final, Literal
 
 import numpy as np
-from jaxtyping import UInt8
+import pyarrow as pa
+import pyarrow.parquet as pq
 
-from dextouch.bridges.lerobot.dataset import DatasetWriter
-from dextouch.bridges.lerobot.layout import IMAGES, Sidecar
-from dextouch.bridges.lerobot.rows import frames_of, images_at
-from dextouch.bridges.lerobot.statistics import Statistics, image_statistics, sample_places
-from dextouch.episodes import (
-    FULL_FORM,
-    EpisodeReader,
-    GopEncoder,
-    VideoSettings,
-    decoder_of_this_thread,
-    disk_errors,
-    is_keyframe,
+from dextouch.bridges.lerobot import layout
+from dextouch.bridges.lerobot.rows import EpisodeFrames, frames_of, images_at
+from dextouch.bridges.lerobot.statistics import (
+    Statistics,
+    combine,
+    image_statistics,
+    sample_places,
+    value_statistics,
 )
-from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, ShapeError
+from dextouch.bridges.lerobot.video import (
+    CameraVideo,
+    decode_entry_points,
+    encode_images,
+    stored_units,
+)
+from dextouch.episodes import EpisodeReader, VideoSettings, disk_errors, is_keyframe
+from dextouch.errors import ConflictError, InvalidInputError, ShapeError
 
+# Rows of the table of episodes that are written together.
+ROWS_AT_ONCE: Final = 100
 REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?")
 
 VIDEO = VideoSettings(crf=23, preset="veryfast")
@@ -81,15 +89,14 @@ def export_lerobot(
     if folder.exists():
         raise ConflictError(f"{folder}: exists already; choose another folder")
     partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.partial")
-    dataset: DatasetWriter | None = None
+    dataset: _Dataset | None = None
     with ExitStack() as stack:
         stack.callback(shutil.rmtree, partial, ignore_errors=True)
         for reader in readers:
             if dataset is None:
-                cameras = options.cameras or _cameras_of(reader)
-                dataset = _new_dataset(reader, partial, cameras, options)
+                dataset = _Dataset(partial, reader, options)
                 stack.callback(dataset.close)
-            _add_episode(dataset, reader, cameras, options)
+            dataset.add(reader)
         if dataset is None:
             raise InvalidInputError("export to LeRobot: got no episode, expected at least one")
         dataset.finish(repo_id)
@@ -98,31 +105,243 @@ def export_lerobot(
     return dataset.num_frames
 
 
-def _cameras_of(reader: EpisodeReader) -> tuple[str, ...]:
-    names = [name for name, stream in reader.streams.items() if stream.kind == "image"]
-    return tuple(sorted(names, key=lambda name: (name != "camera_head", name)))
+def _data_table(features: layout.Features, columns: Mapping[str, np.ndarray]) -> pa.Table:
+    """Rows of the data files from columns [n, *shape].
+
+    A feature of shape [1] is a plain value, one of another axis a fixed list, one of several axes
+    lists of lists.
+    """
+    table = {}
+    for name, values in columns.items():
+        shape = [] if features[name]["shape"] == [1] else features[name]["shape"]
+        column = pa.array(np.asarray(values, dtype=features[name]["dtype"]).reshape(-1))
+        kind = column.type
+        for size in reversed(shape):
+            column = pa.FixedSizeListArray.from_arrays(column, size)
+            kind = pa.list_(kind, size if len(shape) == 1 else -1)
+        table[name] = column.cast(kind)
+    return pa.Table.from_pydict(table)
 
 
-def _new_dataset(
-    reader: EpisodeReader, folder: Path, cameras: Sequence[str], options: ExportOptions
-) -> DatasetWriter:
-    rate_hz = reader.attributes.model_rate_hz
-    if options.fps is None and rate_hz != round(rate_hz):
-        raise InvalidInputError(
-            f"episode {reader.attributes.episode_id!r}: got a model rate of {rate_hz} Hz, LeRobot "
-            "counts whole frames a second; give fps="
+class _ParquetFiles:
+    """Numbered parquet files of one kind; each table becomes a row group."""
+
+    def __init__(self, folder: Path, template: str, *, file_bytes: int = sys.maxsize) -> None:
+        self._folder, self._template, self._file_bytes = folder, template, file_bytes
+        self._path, self._number = folder, -1
+        self._writer: pq.ParquetWriter | None = None
+
+    def append(self, table: pa.Table) -> int:
+        """Write a table and return the number of its file."""
+        with disk_errors(f"write a table of {self._folder}"):
+            if self._writer is None or self._path.stat().st_size >= self._file_bytes:
+                self.close()
+                self._number += 1
+                self._path = layout.numbered_path(self._folder, self._template, self._number)
+                self._writer = pq.ParquetWriter(self._path, table.schema, compression="snappy")
+            self._writer.write_table(table)
+        return self._number
+
+    def close(self) -> None:
+        """Complete the file that is open."""
+        if self._writer is not None:
+            with disk_errors(f"complete {self._path}"):
+                self._writer.close()
+            self._writer = None
+
+
+class _Dataset:
+    """Writes a new dataset episode by episode; `finish` writes the metadata.
+
+    The first episode decides about its cameras and whether its actions are commanded ones, beside
+    which measured ones are stored.
+    """
+
+    def __init__(self, folder: Path, first: EpisodeReader, options: ExportOptions) -> None:
+        rate_hz, streams = first.attributes.model_rate_hz, first.streams
+        if options.fps is None and rate_hz != round(rate_hz):
+            raise InvalidInputError(
+                f"episode {first.attributes.episode_id!r}: got a model rate of {rate_hz} Hz, "
+                "LeRobot counts whole frames a second; give fps="
+            )
+        self.fps = round(rate_hz) if options.fps is None else options.fps
+        if not 1 <= self.fps <= 1000:
+            raise InvalidInputError(f"fps: got {self.fps}, expected 1 … 1000")
+        self._folder, self._options = folder, options
+        names = [name for name, stream in streams.items() if stream.kind == "image"]
+        heads_first = sorted(names, key=lambda name: (name != "camera_head", name))
+        self._cameras = options.cameras or tuple(heads_first)
+        _check_cameras(first, self._cameras)
+        self._has_measured = "action_commanded" in streams
+        shapes = {name: streams[name].shape for name in self._cameras}
+        self._features = layout.dataset_features(shapes, self.fps, has_measured=self._has_measured)
+        self.num_frames = self._num_episodes = 0
+        self._tasks: dict[str, int] = {}
+        self._total: dict[str, Statistics] = {}
+        with disk_errors(f"create {folder}"):
+            folder.mkdir(parents=True)
+        self._data = _ParquetFiles(folder, layout.DATA_PATH, file_bytes=layout.DATA_FILE_MB << 20)
+        self._episodes = _ParquetFiles(folder, layout.EPISODES_PATH)
+        self._rows: list[dict[str, Any]] = []
+        self._videos = {
+            camera: CameraVideo(folder, layout.IMAGES + camera, fps=self.fps, shape=shape)
+            for camera, shape in shapes.items()
+        }
+
+    def add(self, reader: EpisodeReader) -> None:
+        """Write one episode."""
+        _check_cameras(reader, self._cameras)
+        attributes, frames = reader.attributes, frames_of(reader, self._cameras, self.fps)
+        where = f"episode {attributes.episode_id!r}"
+        if (frames.action_kind == "commanded") != self._has_measured:
+            raise InvalidInputError(
+                f"{where}: got {frames.action_kind} actions; export episodes with commanded "
+                "actions and those without into different datasets"
+            )
+        row: dict[str, Any] = {"episode_index": self._num_episodes, "length": len(frames)}
+        row["tasks"] = [attributes.instruction or attributes.task]
+        task_index = self._tasks.setdefault(row["tasks"][0], len(self._tasks))
+        columns = self._columns(frames, task_index)
+        statistics = {name: value_statistics(column) for name, column in columns.items()}
+        how: dict[str, Literal["remuxed", "encoded"]] = {}
+        for camera in self._cameras:
+            units, how[camera] = self._access_units(reader, camera, frames.image_indices[camera])
+            what, shape = f"{where}: {camera!r}", reader.streams[camera].shape
+            place = self._videos[camera].append(units, where=what)
+            key = f"videos/{layout.IMAGES}{camera}"
+            chunk_file = layout.file_place(place.file_number)
+            row[f"{key}/chunk_index"], row[f"{key}/file_index"] = chunk_file
+            row[f"{key}/from_timestamp"] = place.from_timestamp_s
+            row[f"{key}/to_timestamp"] = place.to_timestamp_s
+            entries = [data for data in units if is_keyframe(data)]
+            sampled = [entries[place] for place in sample_places(len(entries))]
+            images = decode_entry_points(sampled, shape, where=what)
+            statistics[layout.IMAGES + camera] = image_statistics(images)
+        file_number = self._data.append(_data_table(self._features, columns))
+        row["data/chunk_index"], row["data/file_index"] = layout.file_place(file_number)
+        row["dataset_from_index"] = self.num_frames
+        row["dataset_to_index"] = self.num_frames + len(frames)
+        for name, values in statistics.items():
+            self._total[name] = combine(self._total.get(name), values)
+            row.update({f"stats/{name}/{kind}": value.tolist() for kind, value in values.items()})
+        row["meta/episodes/chunk_index"] = row["meta/episodes/file_index"] = 0
+        sidecar = layout.Sidecar(
+            episode_index=self._num_episodes,
+            content_sha256=reader.content_sha256,
+            grid=frames.grid,
+            action_kind=frames.action_kind,
+            cameras=how,
+            attributes=attributes,
         )
-    _check_cameras(reader, cameras)
-    return DatasetWriter(
-        folder,
-        cameras={name: reader.streams[name].shape for name in cameras},
-        fps=round(rate_hz) if options.fps is None else options.fps,
-        has_measured="action_commanded" in reader.streams,
-        robot_type=options.robot_type,
+        name = layout.SIDECAR_PATH.format(episode_index=self._num_episodes)
+        self._write(name, json.dumps(sidecar.model_dump(mode="json"), indent=2) + "\n")
+        self._rows.append(row)
+        if len(self._rows) == ROWS_AT_ONCE:
+            self._write_rows()
+        self.num_frames += len(frames)
+        self._num_episodes += 1
+
+    def _access_units(
+        self, reader: EpisodeReader, camera: str, indices: np.ndarray
+    ) -> tuple[list[bytes], Literal["remuxed", "encoded"]]:
+        units = stored_units(reader, camera, indices)
+        if units is not None:
+            return units, "remuxed"
+        images, options = images_at(reader, camera, indices), self._options
+        return encode_images(images, self.fps, options.video, options.group), "encoded"
+
+    def _columns(self, frames: EpisodeFrames, task_index: int) -> dict[str, np.ndarray]:
+        frame_index = np.arange(len(frames), dtype=np.int64)
+        columns = frames.columns | {
+            "timestamp": (frame_index / self.fps).astype(np.float32),
+            "frame_index": frame_index,
+            "episode_index": np.full_like(frame_index, self._num_episodes),
+            "index": self.num_frames + frame_index,
+            "task_index": np.full_like(frame_index, task_index),
+        }
+        return {name: columns[name] for name in self._features if name in columns}
+
+    def close(self) -> None:
+        """Complete the data, video and episode files."""
+        for video in self._videos.values():
+            video.close()
+        self._write_rows()
+        self._data.close()
+        self._episodes.close()
+
+    def _write_rows(self) -> None:
+        if self._rows:
+            self._episodes.append(pa.Table.from_pylist(self._rows))
+            self._rows = []
+
+    def finish(self, repo_id: str) -> None:
+        """Complete the files and write the metadata; `repo_id` is the dataset's name.
+
+        Raises:
+            StorageError: the write failed.
+        """
+        self.close()
+        self._write_tasks()
+        statistics = {
+            name: {kind: value.tolist() for kind, value in values.items()}
+            for name, values in self._total.items()
+        }
+        for name, content in ((layout.STATS_FILE, statistics), (layout.INFO_FILE, self._info())):
+            self._write(name, json.dumps(content, indent=4, allow_nan=False) + "\n")
+        self._write(layout.CARD_FILE, _card(repo_id))
+
+    def _write_tasks(self) -> None:
+        """A table whose pandas index is the task's text."""
+        kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "str")}
+        described = [
+            {"name": n, "field_name": n, "pandas_type": p, "numpy_type": d, "metadata": None}
+            for n, (p, d) in kinds.items()
+        ]
+        header = {"index_columns": ["task"], "column_indexes": [], "columns": described}
+        numbers = pa.array(np.arange(len(self._tasks), dtype=np.int64))
+        texts = pa.array(list(self._tasks), pa.string())
+        table = pa.Table.from_pydict({"task_index": numbers, "task": texts})
+        path = self._folder / layout.TASKS_FILE
+        with disk_errors(f"write {path}"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(header)}), path)
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "codebase_version": layout.CODEBASE_VERSION,
+            "fps": self.fps,
+            "features": self._features,
+            "total_episodes": self._num_episodes,
+            "total_frames": self.num_frames,
+            "total_tasks": len(self._tasks),
+            "chunks_size": layout.CHUNK_FILES,
+            "data_files_size_in_mb": layout.DATA_FILE_MB,
+            "video_files_size_in_mb": layout.VIDEO_FILE_MB,
+            "data_path": layout.DATA_PATH,
+            "video_path": layout.VIDEO_PATH if self._videos else None,
+            "robot_type": self._options.robot_type,
+            "splits": {"train": f"0:{self._num_episodes}"},
+        }
+
+    def _write(self, name: str, text: str) -> None:
+        path = self._folder / name
+        with disk_errors(f"write {path}"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+
+
+def _card(repo_id: str) -> str:
+    front = (
+        "---\ntags:\n- LeRobot\nconfigs:\n- config_name: default\n"
+        "  data_files: data/*/*.parquet\n---\n"
+    )
+    return (
+        f"{front}\n# {repo_id}\n\nA LeRobotDataset {layout.CODEBASE_VERSION} exported from "
+        "DexTouch episodes. What LeRobot has no field for is in `meta/dextouch`.\n"
     )
 
 
-def _check_cameras(reader: EpisodeReader, cameras: Sequence[str]) -> None:
+def _check_cameras(reader: EpisodeReader, cameras: tuple[str, ...]) -> None:
     images = [name for name, stream in reader.streams.items() if stream.kind == "image"]
     missing = [name for name in cameras if name not in images]
     if missing:
@@ -137,84 +356,3 @@ def _check_cameras(reader: EpisodeReader, cameras: Sequence[str]) -> None:
                 f"camera {name!r}: got images of {height_px} x {width_px} pixels, expected even "
                 "sides; LeRobot's players need 4:2:0 video"
             )
-
-
-def _add_episode(
-    dataset: DatasetWriter, reader: EpisodeReader, cameras: Sequence[str], options: ExportOptions
-) -> None:
-    _check_cameras(reader, cameras)
-    frames = frames_of(reader, cameras, dataset.fps)
-    videos: dict[str, list[bytes]] = {}
-    statistics: dict[str, Statistics] = {}
-    how: dict[str, Literal["remuxed", "encoded"]] = {}
-    where = f"episode {reader.attributes.episode_id!r}"
-    for camera in cameras:
-        indices = frames.image_indices[camera]
-        units, how[camera] = stored_units(reader, camera, indices), "remuxed"
-        if units is None:
-            images, how[camera] = images_at(reader, camera, indices), "encoded"
-            units = encode_images(images, dataset.fps, options)
-        videos[camera] = units
-        entries = [data for data in units if is_keyframe(data)]
-        sampled = [entries[place] for place in sample_places(len(entries))]
-        statistics[IMAGES + camera] = image_statistics(
-            decode_entry_points(sampled, reader.streams[camera].shape, where=f"{where}: {camera!r}")
-        )
-    sidecar = Sidecar(
-        episode_index=dataset.num_episodes,
-        content_sha256=reader.content_sha256,
-        grid=frames.grid,
-        action_kind=frames.action_kind,
-        cameras=how,
-        attributes=reader.attributes,
-    )
-    dataset.append(frames, videos, statistics, sidecar)
-
-
-def stored_units(reader: EpisodeReader, camera: str, indices: np.ndarray) -> list[bytes] | None:
-    """The stored access units of a camera, where they can be remuxed without encoding.
-
-    None where the stream is not H.264, images are skipped or repeated, or the first one cannot be
-    decoded without those before it.
-    """
-    consecutive = bool((np.diff(indices) == 1).all())
-    if reader.streams[camera].unit != "h264" or not consecutive:
-        return None
-    units = reader.encoded_images(camera, int(indices[0]), int(indices[-1]) + 1)
-    return units if is_keyframe(units[0]) else None
-
-
-def encode_images(
-    images: Iterable[UInt8[np.ndarray, "h w 3"]], fps: int, options: ExportOptions
-) -> list[bytes]:
-    """RGB images of one size as H.264, one access unit each."""
-    encoder: GopEncoder | None = None
-    units = []
-    for image in images:
-        if encoder is None:
-            encoder = GopEncoder(
-                *image.shape[:2],
-                rate_hz=float(fps),
-                settings=options.video,
-                group_images=options.group,
-            )
-        units.append(encoder.encode(image))
-    return units
-
-
-def decode_entry_points(
-    access_units: Iterable[bytes], shape: tuple[int, ...], *, where: str
-) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Decode access units that are each decodable on their own to RGB images [h, w, 3].
-
-    Raises:
-        CorruptDataError: an access unit that cannot be decoded, or is of another size.
-    """
-    decoder = decoder_of_this_thread(*shape[:2])
-    for index, data in enumerate(access_units):
-        image = np.empty((1, *shape), dtype=np.uint8)
-        try:
-            decoder.decode([data], [0], FULL_FORM, image)
-        except CorruptDataError as error:
-            raise CorruptDataError(f"{where}: entry point {index} is damaged ({error})") from error
-        yield image[0]

@@ -1,4 +1,4 @@
-"""Videos of a dataset: H.264 muxed into mp4 files, and frame-exact reading of their spans."""
+"""Videos of a dataset: H.264 encoded, muxed into mp4 files, and read frame by frame."""
 
 import io
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,7 +16,16 @@ from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from dextouch.bridges.lerobot.layout import VIDEO_FILE_MB, VIDEO_PATH, numbered_path
-from dextouch.episodes import disk_errors, is_keyframe, parameter_sets
+from dextouch.episodes import (
+    FULL_FORM,
+    EpisodeReader,
+    GopEncoder,
+    VideoSettings,
+    decoder_of_this_thread,
+    disk_errors,
+    is_keyframe,
+    parameter_sets,
+)
 from dextouch.errors import CorruptDataError, LimitExceededError, NotFoundError, ShapeError
 
 MAX_SIDE_PX: Final = 8192
@@ -228,3 +237,53 @@ def _in_place(
         f"{span.path}: image {done} of {span.count} after {span.from_s:.3f} s is missing "
         f"(the next one is {place}); copy the dataset again"
     )
+
+
+def stored_units(reader: EpisodeReader, camera: str, indices: np.ndarray) -> list[bytes] | None:
+    """The stored access units of a camera, where they can be remuxed without encoding.
+
+    None where the stream is not H.264, images are skipped or repeated, or the first one cannot be
+    decoded without those before it.
+    """
+    consecutive = bool((np.diff(indices) == 1).all())
+    if reader.streams[camera].unit != "h264" or not consecutive:
+        return None
+    units = reader.encoded_images(camera, int(indices[0]), int(indices[-1]) + 1)
+    return units if is_keyframe(units[0]) else None
+
+
+def encode_images(
+    images: Iterable[UInt8[np.ndarray, "h w 3"]],
+    fps: int,
+    settings: VideoSettings,
+    group_images: int,
+) -> list[bytes]:
+    """RGB images of one size as H.264, one access unit each; every n-th begins a group."""
+    encoder: GopEncoder | None = None
+    units = []
+    for image in images:
+        if encoder is None:
+            size = image.shape[:2]
+            encoder = GopEncoder(
+                *size, rate_hz=float(fps), settings=settings, group_images=group_images
+            )
+        units.append(encoder.encode(image))
+    return units
+
+
+def decode_entry_points(
+    access_units: Iterable[bytes], shape: tuple[int, ...], *, where: str
+) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """Decode access units that are each decodable on their own to RGB images [h, w, 3].
+
+    Raises:
+        CorruptDataError: an access unit that cannot be decoded, or is of another size.
+    """
+    decoder = decoder_of_this_thread(*shape[:2])
+    for index, data in enumerate(access_units):
+        image = np.empty((1, *shape), dtype=np.uint8)
+        try:
+            decoder.decode([data], [0], FULL_FORM, image)
+        except CorruptDataError as error:
+            raise CorruptDataError(f"{where}: entry point {index} is damaged ({error})") from error
+        yield image[0]
