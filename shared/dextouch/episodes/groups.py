@@ -137,12 +137,6 @@ class GroupReader(Generic[A]):
             content_sha256=self.content_sha256,
         )
 
-    def array_sha256(self, name: str) -> str:
-        """The content hash of one array."""
-        if name not in self._contents.entries:
-            raise UnknownNameError("array", name, list(self._contents.entries))
-        return self._contents.entries[name].sha256
-
     def _check_span(self, what: str, name: str, start: int, stop: int) -> None:
         if not 0 <= start <= stop <= self.num_samples(name):
             raise InvalidInputError(

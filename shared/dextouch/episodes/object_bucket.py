@@ -7,7 +7,7 @@ import hashlib
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -177,14 +177,13 @@ class Bucket:
         # Blocks by key and version of their object, and number.
         self.cache = LruCache(options.cache_bytes)
         config: Any = options.model_dump(exclude=_NOT_PASSED_ON, exclude_none=True)
-        given = options.allow_http
-        client: Any = None if given is None else {"allow_http": given}
+        client: Any = options.model_dump(include={"allow_http"}, exclude_none=True)
         try:
             self._store = S3Store(
                 address.bucket,
                 prefix=address.prefix or None,
                 config=config,
-                client_options=client,
+                client_options=client or None,
                 retry_config={
                     "max_retries": options.max_retries,
                     "retry_timeout": timedelta(seconds=options.retry_timeout_s),
@@ -198,38 +197,30 @@ class Bucket:
 
     def get(self, key: str) -> bytes | None:
         """Contents of an object; None if it does not exist."""
-        try:
-            with self._errors("read", key):
-                return bytes(obstore.get(self._store, key).bytes())
-        except FileNotFoundError:
-            return None
+        with suppress(FileNotFoundError), self._errors("read", key):
+            return bytes(obstore.get(self._store, key).bytes())
+        return None
 
     def head(self, key: str) -> ObjectFacts | None:
         """Metadata of an object; None if it does not exist."""
-        try:
-            with self._errors("look at", key):
-                return _facts(obstore.head(self._store, key))
-        except FileNotFoundError:
-            # A HEAD response has no body that could tell a missing bucket from a missing key.
-            if self.get(key) is None:
-                return None
-            return self.head(key)
+        with suppress(FileNotFoundError), self._errors("look at", key):
+            return _facts(obstore.head(self._store, key))
+        # A HEAD response has no body that could tell a missing bucket from a missing key.
+        return None if self.get(key) is None else self.head(key)
 
     def tail(self, key: str, length: int) -> tuple[ObjectFacts, bytes] | None:
         """The last bytes of an object, all if it is shorter; None if it does not exist."""
-        try:
-            with self._errors("read", key):
-                try:
-                    found = obstore.get(self._store, key, options={"range": {"suffix": length}})
-                    return _facts(found.meta), bytes(found.bytes())
-                except BaseError:
-                    # A range of an empty object is invalid; services refuse it in different ways.
-                    facts = _facts(obstore.head(self._store, key))
-                    if facts.size == 0:
-                        return facts, b""
-                    raise
-        except FileNotFoundError:
-            return None
+        with suppress(FileNotFoundError), self._errors("read", key):
+            try:
+                found = obstore.get(self._store, key, options={"range": {"suffix": length}})
+                return _facts(found.meta), bytes(found.bytes())
+            except BaseError:
+                # A range of an empty object is invalid; services refuse it in different ways.
+                facts = _facts(obstore.head(self._store, key))
+                if facts.size == 0:
+                    return facts, b""
+                raise
+        return None
 
     def read(self, facts: ObjectFacts, start: int, stop: int) -> bytes:
         """Bytes start … stop−1 of an object, which must be unchanged since `facts` was read.

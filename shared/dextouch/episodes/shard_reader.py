@@ -158,24 +158,17 @@ class ShardReader:
             )
 
     def _check_claim(self, index: np.ndarray) -> None:
-        """Refuse more rows than the chunk's bytes can encode."""
+        """Refuse more rows than the chunks' bytes can encode."""
         entry, lengths = self._entry, index[:, 1].astype(np.int64)
-        if not len(lengths):
-            return
-        bound = int(lengths.min())
+        rows = np.full(len(lengths), entry.chunk_rows)
+        rows[-1:] = entry.shape[0] - (len(lengths) - 1) * entry.chunk_rows
+        needed = rows * (_H264_MIN_BYTES if entry.codec == "h264" else 1)
         if entry.codec == "zstd":
-            claimed = -(-self._chunk_bytes // _ZSTD_MAX_RATIO)
-        elif entry.codec == "h264":
-            full = lengths[: entry.shape[0] // entry.chunk_rows]
-            bound = int(full.min()) if len(full) else int(lengths[-1])
-            rows = entry.chunk_rows if len(full) else entry.shape[0]
-            claimed = rows * _H264_MIN_BYTES
-        else:
-            claimed = entry.chunk_rows
-        if claimed > bound:
+            needed[:] = -(-self._chunk_bytes // _ZSTD_MAX_RATIO)
+        if len(bad := np.flatnonzero(lengths < needed)):
             raise CorruptDataError(
-                f"{self._what}: storage chunks of {entry.chunk_rows} rows need at least {claimed} "
-                f"bytes, got one of {bound}"
+                f"{self._what}: storage chunks of {entry.chunk_rows} rows need at least "
+                f"{needed[bad[0]]} bytes, got one of {lengths[bad[0]]}"
             )
 
     def _read_index(self, file_size: int) -> np.ndarray:

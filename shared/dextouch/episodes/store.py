@@ -60,7 +60,7 @@ _OBJECT_SCHEME = "s3://"
 
 def open_storage(
     url: str | Path, storage_options: Mapping[str, str] | None, work_folder: str | Path | None
-) -> "LocalStorage | ObjectStorage":
+) -> "_LocalStorage | ObjectStorage":
     """Storage backend for a URL; see `EpisodeStore` for the arguments."""
     if isinstance(url, str) and url.startswith(_OBJECT_SCHEME):
         # Imported lazily, so that a local store does not need obstore.
@@ -78,7 +78,7 @@ def open_storage(
             f"episode store: got storage options or a work folder for {str(url)!r}, "
             "expected them with s3://bucket/prefix only"
         )
-    return LocalStorage(local_folder(url))
+    return _LocalStorage(local_folder(url))
 
 
 class EpisodeStore:
@@ -191,7 +191,7 @@ class EpisodeStore:
             NotFoundError: no such id.
         """
         self._storage.group(*_check(kind, item_id))
-        if for_good or not isinstance(self._storage, LocalStorage):
+        if for_good or not isinstance(self._storage, _LocalStorage):
             self._storage.delete(kind, item_id)
         else:
             put_into_trash(self.root, kind, item_id)
@@ -209,7 +209,7 @@ class EpisodeStore:
         return purge_trash(self._trash_root(), older_than_s=older_than_s)
 
     def _trash_root(self) -> Path:
-        if not isinstance(self._storage, LocalStorage):
+        if not isinstance(self._storage, _LocalStorage):
             raise InvalidInputError(
                 "trash: got a store in a bucket, expected one in a folder; what is deleted from a "
                 "bucket can only be restored from its older versions"
@@ -278,7 +278,7 @@ def local_folder(url: str | Path) -> Path:
     )
 
 
-class LocalStorage:
+class _LocalStorage:
     """Stores committed groups as `episodes/ID` and `recordings/ID` below one folder.
 
     The folder is created on the first write.
@@ -288,7 +288,6 @@ class LocalStorage:
         self.root = root
 
     def writer(self, kind: Kind, attributes: Attributes, options: WriteOptions) -> EpisodeWriter:
-        """Writer of a new group."""
         target = self._folder(kind, attributes_id(attributes))
         if target.exists():
             raise ConflictError(f"{kind} {target.name!r} exists already; choose another id")
@@ -296,27 +295,22 @@ class LocalStorage:
         return EpisodeWriter(stage=stage, target=target, attributes=attributes, options=options)
 
     def group(self, kind: Kind, item_id: str) -> LocalGroup:
-        """Files of a committed group."""
         if not self.exists(kind, item_id):
             raise NotFoundError(f"{kind} {item_id!r}: not in the store {self.root}")
         return LocalGroup(self._folder(kind, item_id))
 
     def exists(self, kind: Kind, item_id: str) -> bool:
-        """Whether an id is committed."""
         with disk_errors(f"look at {kind} {item_id}"):
             return (self._folder(kind, item_id) / COMMIT_FILE).is_file()
 
     def revision(self, kind: Kind, item_id: str) -> int:
-        """Modification time of the commit record in nanoseconds."""
         with disk_errors(f"look at {kind} {item_id}"):
             return (self.group(kind, item_id).folder / COMMIT_FILE).stat().st_mtime_ns
 
     def num_bytes(self, kind: Kind, item_id: str) -> int:
-        """Size of a committed group on disk."""
         return folder_bytes(self.group(kind, item_id).folder)
 
     def list(self, kind: Kind) -> list[str]:
-        """Sorted committed ids."""
         folder = self.root / f"{kind}s"
         with disk_errors(f"list {kind}s"):
             if not folder.is_dir():
@@ -350,14 +344,12 @@ class LocalStorage:
         return True
 
     def recover(self) -> builtins.list[RecoveredGroup]:
-        """Commit the stages of terminated writers, as far as they were written."""
         stages = abandoned_stages(self.root)
         found, failures = recover_all(stages, lambda stage: recover_stage(stage, self.root))
         raise_first(failures, found)
         return found
 
     def sweep(self) -> int:
-        """Remove stages that cannot be recovered and return their number."""
         with disk_errors("sweep"):
             return sweep_stages(self.root, ids_below(self.root))
 

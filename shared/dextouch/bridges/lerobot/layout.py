@@ -94,7 +94,11 @@ def _video_feature(shape: Sequence[int], fps: int) -> Feature:
 def dataset_features(
     cameras: Mapping[str, Sequence[int]], fps: int, *, has_measured: bool
 ) -> Features:
-    """Every feature of an export, by name; arguments are those of `DatasetWriter`."""
+    """Every feature of an export, by name.
+
+    `cameras` holds the shape [height, width, 3] of each camera's images; with `has_measured`
+    actions are commanded ones, and measured ones are stored beside them.
+    """
     names = action_names()
     pose, number = _feature("float32", [len(names)], names), _feature("int64", [1])
     features = {IMAGES + name: _video_feature(shape, fps) for name, shape in cameras.items()}

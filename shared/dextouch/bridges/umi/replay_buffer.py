@@ -276,7 +276,7 @@ def _episode(
     ):
         values = pose_from_transform(Ts_world)
         numbers[name] = GridNumbers("pose", "pose_m_wxyz", values, frame="world")
-    if COMMANDED in archive.arrays("data"):
+    if COMMANDED in archive:
         commanded = archive.read(COMMANDED, start, stop)
         numbers["action_commanded"] = GridNumbers("robot_state", "action", commanded)
     if attributes.domain == "robot":

@@ -196,11 +196,8 @@ class ZarrZipReader:
         """Close the file."""
         self._zip.close()
 
-    def arrays(self, group: str) -> list[str]:
-        """Names of the arrays of a group."""
-        ends = "/.zarray"
-        names = [n[: -len(ends)] for n in self._entries if n.endswith(ends)]
-        return sorted(n for n in names if n.rpartition("/")[0] == group)
+    def __contains__(self, name: str) -> bool:
+        return f"{name}/.zarray" in self._entries
 
     def attributes(self, name: str) -> dict[str, Any]:
         """`.zattrs` of a group or an array; empty where there are none."""
@@ -225,7 +222,7 @@ class ZarrZipReader:
         """
         if name not in self._arrays:
             key = f"{name}/.zarray"
-            if key not in self._entries:
+            if name not in self:
                 raise NotFoundError(f"{self._path}: holds no array {name!r}")
             try:
                 metadata = ArrayMetadata.model_validate_json(self._bytes(key, MAX_METADATA_BYTES))

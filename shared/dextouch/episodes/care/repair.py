@@ -15,7 +15,6 @@ from dextouch.episodes.care.inspection import (
     open_contents,
 )
 from dextouch.episodes.care.salvage import (
-    SalvagedStream,
     group_streams,
     spool_streams,
     stage_streams,
@@ -132,28 +131,13 @@ def _salvage(root: Path, kind: TrashKind, folder: Path, notes: tuple[str, ...]) 
             streams = group_streams(folder, attributes, entries)
         item_id = attributes_id(attributes)
         source = LineageEntry(kind=kind_of(attributes), id=item_id, sha256=sha256)
-        new_id, lost = _write_once(root, attributes, streams, source)
+        new_id, lost = write_salvaged(root, attributes, streams, source)
     except DexTouchError as error:
         # Often the inspection has already found the same.
         notes = tuple(dict.fromkeys((*notes, error.message)))
         return RepairReport(kind, folder.name, LEFT, notes=notes)
     put_into_trash(root, kind, folder.name)
     return RepairReport(kind, folder.name, SALVAGED, new_id, lost, notes)
-
-
-def _write_once(
-    root: Path, attributes: Attributes, streams: list[SalvagedStream], source: LineageEntry
-) -> tuple[str, dict[str, int]]:
-    """Write the readable samples, unless an interrupted repair has done so already."""
-    kind, item_id = kind_of(attributes), attributes_id(attributes)
-    for folder in sorted((root / f"{kind}s").glob(f"{item_id[:112]}-salvaged-*")):
-        try:
-            known = open_contents(LocalGroup(folder), kind)
-        except StorageError:
-            continue
-        if source in known.attributes.lineage:
-            return folder.name, {s.descriptor.name: s.num_lost for s in streams if s.num_lost}
-    return write_salvaged(root, attributes, streams, source)
 
 
 def _rewrite_metadata(files: LocalGroup, kind: Kind) -> None:

@@ -7,12 +7,15 @@ Nothing is filled in: a damaged storage chunk or sample is dropped with its stam
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import google_crc32c
 import numpy as np
 
+from dextouch.episodes.care.inspection import open_contents
 from dextouch.episodes.format import (
     GOP_IMAGES,
     STAMPS,
@@ -35,14 +38,14 @@ from dextouch.episodes.shard_reader import (
     ShardReader,
     decode_rows,
 )
-from dextouch.episodes.sources import LocalFile
+from dextouch.episodes.sources import LocalFile, LocalGroup
 from dextouch.episodes.spool_log import body_at, find_records, open_log
 from dextouch.episodes.spool_reader import body_of, read_batch
 from dextouch.episodes.staged_group import new_stage
 from dextouch.episodes.staging_recovery import free_id, ids_below
 from dextouch.episodes.writer import Block, write_blocks
 from dextouch.episodes.zstd import frame_bytes
-from dextouch.errors import CorruptDataError, InvalidInputError
+from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.schemas import LineageEntry
 from dextouch.streams import StreamDescriptor, check_batch, decode_body, encoded_values
 
@@ -170,6 +173,8 @@ def write_salvaged(
 ) -> tuple[str, dict[str, int]]:
     """Write the readable samples of a damaged item, the source, as a new group `ID-salvaged-N`.
 
+    If an interrupted repair has done so already, its group is returned.
+
     Returns:
         The new id, and the number of dropped samples by stream.
 
@@ -181,6 +186,10 @@ def write_salvaged(
     if not any(stream.kept.any() for stream in streams):
         raise InvalidInputError(f"{kind} {item_id!r}: no sample is intact; delete it")
     lost = {stream.descriptor.name: stream.num_lost for stream in streams if stream.num_lost}
+    for folder in sorted((root / f"{kind}s").glob(f"{item_id[:112]}-salvaged-*")):
+        with suppress(StorageError):
+            if source in open_contents(LocalGroup(folder), kind).attributes.lineage:
+                return folder.name, lost
     free = free_id(kind, item_id, "salvaged", ids_below(root))
     lineage = (*attributes.lineage, source)
     update = {f"{kind}_id": free, "recovered": True, "lineage": lineage}
@@ -206,19 +215,20 @@ def _streams(
         for part in stamps.values():
             kept &= part.rows_hold[:count]
         columns = {stamp: part.column()[:count] for stamp, part in stamps.items()}
-        read = _array_reader(values, columns)
+        read = partial(_read_rows, values, columns)
         found.append(SalvagedStream(stream, kept, read, values.entry.chunk_rows))
     return found
 
 
-def _array_reader(
-    values: _SalvagedArray, columns: Mapping[str, np.ndarray]
-) -> Callable[[int, int, np.ndarray], Block]:
-    def read(start: int, stop: int, kept: np.ndarray) -> Block:
-        rows = values.values(start // values.entry.chunk_rows)[: stop - start][kept]
-        return rows, {stamp: column[start:stop][kept] for stamp, column in columns.items()}
-
-    return read
+def _read_rows(
+    array: _SalvagedArray,
+    columns: Mapping[str, np.ndarray],
+    start: int,
+    stop: int,
+    kept: np.ndarray,
+) -> Block:
+    rows = array.values(start // array.entry.chunk_rows)[: stop - start][kept]
+    return rows, {stamp: column[start:stop][kept] for stamp, column in columns.items()}
 
 
 def _whole_groups(kept: np.ndarray, size: int) -> np.ndarray:
