@@ -85,13 +85,14 @@ class GroupContents(Generic[A]):
             if metadata != array_metadata(entry):
                 is_whole = False
                 yield None, f"{what}: {METADATA_FILE} is damaged"
-            num_chunks = len(self.shard(name).check_index())
+            shard = self.shard(name)
+            num_chunks = len(shard.check_index())
         except StorageError as error:
             yield None, error.message
             return
         for number in range(num_chunks):
             try:
-                payload = self.shard(name).payload(number)
+                payload = shard.payload(number)
                 digest.update(hashed_bytes(payload, entry, number, what))
             except StorageError as error:
                 is_whole = False
@@ -103,7 +104,7 @@ class GroupContents(Generic[A]):
             yield None, f"{what}: sha256 does not match"
 
 
-def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> bytes:
+def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> bytes | memoryview:
     """Bytes of a storage chunk that enter its array's hash.
 
     For images only their number and headers are checked, not the pixels.
@@ -114,7 +115,7 @@ def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> b
     where = f"{what}: storage chunk {number}"
     num_rows = min(entry.chunk_rows, entry.shape[0] - number * entry.chunk_rows)
     if entry.codec == "zstd":
-        return decode_rows(payload, entry, what=where)[:num_rows].tobytes()
+        return decode_rows(payload, entry, what=where)[:num_rows].data
     chunks = ImageChunks(entry.codec, entry.shape[1:], entry.chunk_rows, what)
     images = chunks.unpack(payload, number)
     if len(images) != num_rows:
