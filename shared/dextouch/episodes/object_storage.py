@@ -172,17 +172,6 @@ class ObjectGroup:
         return ObjectFile(self._bucket, f"{self._folder}/{name}")
 
 
-def open_object_storage(
-    url: str, storage_options: Mapping[str, str], work_folder: str | Path | None
-) -> "ObjectStorage":
-    """Open `s3://bucket/prefix?options` without contacting the service.
-
-    Raises:
-        InvalidInputError, UnknownNameError: an invalid address or option.
-    """
-    return ObjectStorage(Bucket(parse_address(url, storage_options, work_folder)))
-
-
 class UploadingWriter(EpisodeWriter):
     """Writes a group to the outbox in the work folder and uploads it on commit.
 
@@ -209,10 +198,19 @@ class UploadingWriter(EpisodeWriter):
 
 
 class ObjectStorage:
-    """Stores committed groups under the keys `episodes/ID/…` and `recordings/ID/…` of a bucket."""
+    """Stores committed groups under the keys `episodes/ID/…` and `recordings/ID/…` of a bucket.
 
-    def __init__(self, bucket: Bucket) -> None:
-        self._bucket, self._address = bucket, bucket.address
+    Opening one does not contact the service.
+
+    Raises:
+        InvalidInputError, UnknownNameError: an invalid address or option.
+    """
+
+    def __init__(
+        self, url: str, storage_options: Mapping[str, str], work_folder: str | Path | None
+    ) -> None:
+        self._address = parse_address(url, storage_options, work_folder)
+        self._bucket = Bucket(self._address)
         self.root = self._address.work_folder
         self._outbox = self.root / _OUTBOX
 

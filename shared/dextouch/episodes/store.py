@@ -58,29 +58,6 @@ if TYPE_CHECKING:
 _OBJECT_SCHEME = "s3://"
 
 
-def open_storage(
-    url: str | Path, storage_options: Mapping[str, str] | None, work_folder: str | Path | None
-) -> "_LocalStorage | ObjectStorage":
-    """Storage backend for a URL; see `EpisodeStore` for the arguments."""
-    if isinstance(url, str) and url.startswith(_OBJECT_SCHEME):
-        # Imported lazily, so that a local store does not need obstore.
-        try:
-            from dextouch.episodes.object_storage import open_object_storage
-        except ModuleNotFoundError as error:
-            if error.name != "obstore":
-                raise
-            raise UnavailableError(
-                "episode store: s3://… needs obstore; run `pip install 'dextouch-wm[s3]'`"
-            ) from error
-        return open_object_storage(url, storage_options or {}, work_folder)
-    if storage_options or work_folder is not None:
-        raise InvalidInputError(
-            f"episode store: got storage options or a work folder for {str(url)!r}, "
-            "expected them with s3://bucket/prefix only"
-        )
-    return _LocalStorage(local_folder(url))
-
-
 class EpisodeStore:
     """All episodes and recordings below one address.
 
@@ -104,7 +81,7 @@ class EpisodeStore:
         storage_options: Mapping[str, str] | None = None,
         work_folder: str | Path | None = None,
     ) -> None:
-        self._storage = open_storage(url, storage_options, work_folder)
+        self._storage = _open_storage(url, storage_options, work_folder)
         self.root = self._storage.root
 
     def writer(
@@ -247,6 +224,29 @@ class EpisodeStore:
         Stages that `recover` can complete are kept.
         """
         return self._storage.sweep()
+
+
+def _open_storage(
+    url: str | Path, storage_options: Mapping[str, str] | None, work_folder: str | Path | None
+) -> "_LocalStorage | ObjectStorage":
+    """Storage backend for a URL; see `EpisodeStore` for the arguments."""
+    if isinstance(url, str) and url.startswith(_OBJECT_SCHEME):
+        # Imported lazily, so that a local store does not need obstore.
+        try:
+            from dextouch.episodes.object_storage import ObjectStorage
+        except ModuleNotFoundError as error:
+            if error.name != "obstore":
+                raise
+            raise UnavailableError(
+                "episode store: s3://… needs obstore; run `pip install 'dextouch-wm[s3]'`"
+            ) from error
+        return ObjectStorage(url, storage_options or {}, work_folder)
+    if storage_options or work_folder is not None:
+        raise InvalidInputError(
+            f"episode store: got storage options or a work folder for {str(url)!r}, "
+            "expected them with s3://bucket/prefix only"
+        )
+    return _LocalStorage(local_folder(url))
 
 
 def _check(kind: Kind, item_id: str) -> tuple[Kind, str]:
