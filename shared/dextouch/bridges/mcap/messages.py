@@ -278,38 +278,24 @@ def _new_message(name: str) -> Any:  # noqa: ANN401
 
 def descriptor_set(name: str) -> bytes:
     """A serialized `FileDescriptorSet` of one message and all that it needs, dependencies first."""
-    needed: dict[str, FileDescriptorProto] = {}
+    files: dict[str, FileDescriptorProto] = {}
+    _collect(_pool().FindFileContainingSymbol(name), files)
+    return FileDescriptorSet(file=files.values()).SerializeToString()
 
-    def add(file: str) -> None:
-        for dependency in _files()[file].dependency:
-            add(dependency)
-        needed[file] = _files()[file]
 
-    add(_pool().FindFileContainingSymbol(name).name)
-    return FileDescriptorSet(file=needed.values()).SerializeToString()
+def _collect(file: FileDescriptor, files: dict[str, FileDescriptorProto]) -> None:
+    """Add a file to others, after all that it needs."""
+    for dependency in file.dependencies:
+        _collect(dependency, files)
+    if file.name not in files:
+        file.CopyToProto(files.setdefault(file.name, FileDescriptorProto()))
 
 
 @cache
 def _pool() -> Any:  # noqa: ANN401 - not an instance of the class that makes it
     """A pool beside the default one, whose messages of the same names lack our fields."""
-    pool = DescriptorPool()
-    for file in _files().values():
-        pool.Add(file)
-    return pool
-
-
-@cache
-def _files() -> dict[str, FileDescriptorProto]:
-    """All files by name, dependencies first."""
     files: dict[str, FileDescriptorProto] = {}
-
-    def add(file: FileDescriptor) -> None:
-        for dependency in file.dependencies:
-            add(dependency)
-        if file.name not in files:
-            file.CopyToProto(files.setdefault(file.name, FileDescriptorProto()))
-
-    add(CameraCalibration_pb2.DESCRIPTOR)
+    _collect(CameraCalibration_pb2.DESCRIPTOR, files)
     for module in (
         CompressedImage_pb2,
         CompressedVideo_pb2,
@@ -317,12 +303,15 @@ def _files() -> dict[str, FileDescriptorProto]:
         PosesInFrame_pb2,
         RawImage_pb2,
     ):
-        add(module.DESCRIPTOR)
+        _collect(module.DESCRIPTOR, files)
         _add_device_fields(files[module.DESCRIPTOR.name].message_type[0])
     for message, element, _ in ARRAYS.values():
         files[message] = _array_file(message, element, repeated=True)
     files[PACKED_ARRAY] = _array_file(PACKED_ARRAY, "bytes", repeated=False)
-    return {file.name: file for file in files.values()}
+    pool = DescriptorPool()
+    for file in files.values():
+        pool.Add(file)
+    return pool
 
 
 def _add_device_fields(message: DescriptorProto) -> None:
@@ -339,9 +328,10 @@ def _array_file(name: str, element: str, *, repeated: bool) -> FileDescriptorPro
         syntax="proto3",
     )
     message = file.message_type.add(name=short)
-    labels = (_ONE, _ONE, _MANY, _MANY if repeated else _ONE)
-    names = {"timestamp": "message", "frame_id": "string", "shape": "fixed32", "values": element}
-    for number, ((field, kind), label) in enumerate(zip(names.items(), labels, strict=True), 1):
+    kinds = {"timestamp": "message", "frame_id": "string", "shape": "fixed32", "values": element}
+    many = {"shape", "values"} if repeated else {"shape"}
+    for number, (field, kind) in enumerate(kinds.items(), 1):
+        label = _MANY if field in many else _ONE
         message.field.add(name=field, number=number, label=label, type=_type(kind))
     message.field[0].type_name = ".google.protobuf.Timestamp"
     _add_device_fields(message)

@@ -264,13 +264,10 @@ class ZarrZipReader:
                 f"{self._path}: got rows {start} … {stop} of {name}, expected within 0 … "
                 f"{metadata.shape[0]}"
             )
-        each, parts = metadata.chunks[0], []
-        for index in range(start // each, -(-stop // each)):
-            chunk = self._chunk(name, metadata, index)
-            parts.append(chunk[max(0, start - index * each) : stop - index * each])
-        if not parts:
-            return np.empty((0, *metadata.shape[1:]), dtype=metadata.dtype)
-        return np.concatenate(parts)
+        each, first = metadata.chunks[0], start // metadata.chunks[0]
+        empty = np.empty((0, *metadata.shape[1:]), dtype=metadata.dtype)
+        chunks = [self._chunk(name, metadata, n) for n in range(first, -(-stop // each))]
+        return np.concatenate([empty, *chunks])[start - first * each : stop - first * each]
 
     def _chunk(self, name: str, metadata: ArrayMetadata, index: int) -> np.ndarray:
         key = f"{name}/" + ".".join([str(index), *("0" for _ in metadata.shape[1:])])
