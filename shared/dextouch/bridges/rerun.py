@@ -49,7 +49,7 @@ def export_rrd(reader: Reader, path: Path, *, overwrite: bool = False) -> int:
     """
     attributes = reader.attributes
     with new_file(path, overwrite=overwrite) as path_partial:
-        stream = rr.RecordingStream(APPLICATION, recording_id=_id_of(reader))
+        stream = rr.RecordingStream(APPLICATION, recording_id=reader.item_id)
         try:
             stream.save(path_partial, default_blueprint=_blueprint(reader))
             words = json.dumps(json_ready(attributes), indent=2)
@@ -241,9 +241,3 @@ def _side(descriptor: StreamDescriptor) -> Side | None:
         return descriptor.side
     sides: tuple[Side, Side] = ("left", "right")
     return next((side for side in sides if descriptor.name.endswith(f"_{side}")), None)
-
-
-def _id_of(reader: Reader) -> str:
-    if isinstance(reader, EpisodeReader):
-        return reader.attributes.episode_id
-    return reader.attributes.recording_id

@@ -4,7 +4,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from dextouch.episodes.format import STAMPS, codec_of
+from dextouch.episodes.format import STAMPS, attributes_id, codec_of
 from dextouch.episodes.group_contents import GroupContents
 from dextouch.episodes.image_codecs import ImageChunks, transform_pixels
 from dextouch.episodes.video import FULL_FORM, ImageForm
@@ -26,6 +26,7 @@ class GroupReader(Generic[A]):
         self._contents: GroupContents[A] = contents
         self._kind, self._what = contents.kind, contents.what
         self.attributes: A = contents.attributes
+        self.item_id = attributes_id(contents.attributes)
         self.content_sha256 = contents.content_sha256
         self.streams: dict[str, StreamDescriptor] = {s.name: s for s in self.attributes.streams}
         self._whole: dict[str, np.ndarray] = {}
@@ -82,13 +83,46 @@ class GroupReader(Generic[A]):
             ShapeError: an `out` of another shape or dtype.
             CorruptDataError: damaged bytes.
         """
-        if self._stream(name).kind != "image":
-            raise InvalidInputError(f"{self._what}: {name!r} holds no images")
         stop = self.num_samples(name) if stop is None else stop
         self._check_span("images", name, start, stop)
         # A forged length must not be expanded to a list of numbers.
         self._contents.shard(name).check_index()
-        return self._pick_images(self._stream(name), np.arange(start, stop), form, out)
+        return self.images_at(name, np.arange(start, stop), form=form, out=out)
+
+    def images_at(
+        self,
+        name: str,
+        indices: np.ndarray,
+        *,
+        form: ImageForm = FULL_FORM,
+        out: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Images of a camera at non-decreasing indices; the rest and errors as of `images`."""
+        descriptor: StreamDescriptor = self._stream(name)
+        if descriptor.kind != "image":
+            raise InvalidInputError(f"{self._what}: {name!r} holds no images")
+        if len(indices):
+            self._check_span("images", name, int(indices[0]), int(indices[-1]) + 1)
+        shape = (len(indices), *form.shape(descriptor.shape))
+        if out is not None and (out.shape != shape or out.dtype != np.uint8):
+            raise ShapeError(
+                f"{descriptor.name}: out is {out.dtype} {out.shape}, not uint8 {shape}"
+            )
+        if codec_of(descriptor) == "zstd":
+            images = self._pick_plain(descriptor, indices, form)
+            if out is None:
+                return images
+            out[...] = images
+            return out
+        images = np.empty(shape, dtype=np.uint8) if out is None else out
+        unique, places = np.unique(indices, return_inverse=True)
+        if len(unique) == len(indices):
+            self._decode_images(descriptor, unique, form, images)
+        else:
+            once = np.empty((len(unique), *form.shape(descriptor.shape)), dtype=np.uint8)
+            self._decode_images(descriptor, unique, form, once)
+            images[...] = once[places]
+        return images
 
     def encoded_images(self, name: str, start: int, stop: int) -> list[bytes]:
         """Encoded images start … stop−1 of a `jpeg` or `h264` stream.
@@ -167,41 +201,12 @@ class GroupReader(Generic[A]):
     def _values(self, name: str, start: int, stop: int) -> np.ndarray:
         if self._codecs[name] == "zstd":
             return self._contents.shard(name).read(start, stop)
-        return self._pick_images(self.streams[name], np.arange(start, stop), FULL_FORM, None)
+        return self.images_at(name, np.arange(start, stop))
 
     def _image_chunks(self, descriptor: StreamDescriptor) -> ImageChunks:
         entry = self._contents.entries[descriptor.name]
         what = f"{self._what}: array {descriptor.name!r}"
         return ImageChunks(entry.codec, entry.shape[1:], entry.chunk_rows, what)
-
-    def _pick_images(
-        self,
-        descriptor: StreamDescriptor,
-        indices: np.ndarray,
-        form: ImageForm,
-        out: np.ndarray | None,
-    ) -> np.ndarray:
-        """Images at non-decreasing indices."""
-        shape = (len(indices), *form.shape(descriptor.shape))
-        if out is not None and (out.shape != shape or out.dtype != np.uint8):
-            raise ShapeError(
-                f"{descriptor.name}: out is {out.dtype} {out.shape}, not uint8 {shape}"
-            )
-        if codec_of(descriptor) == "zstd":
-            images = self._pick_plain(descriptor, indices, form)
-            if out is None:
-                return images
-            out[...] = images
-            return out
-        images = np.empty(shape, dtype=np.uint8) if out is None else out
-        unique, places = np.unique(indices, return_inverse=True)
-        if len(unique) == len(indices):
-            self._decode_images(descriptor, unique, form, images)
-        else:
-            once = np.empty((len(unique), *form.shape(descriptor.shape)), dtype=np.uint8)
-            self._decode_images(descriptor, unique, form, once)
-            images[...] = once[places]
-        return images
 
     def _pick_plain(
         self, descriptor: StreamDescriptor, indices: np.ndarray, form: ImageForm

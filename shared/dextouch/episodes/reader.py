@@ -161,9 +161,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         if not grid:
             return self.native_window(start, num_steps, cameras=cameras, form=form)
         nearest = {name: self._nearest(name, grid_ns[start:stop]) for name in cameras}
-        pictures = each_camera(
-            lambda name: self._pick_images(self.streams[name], nearest[name], form, None), cameras
-        )
+        pictures = each_camera(lambda name: self.images_at(name, nearest[name], form=form), cameras)
         left, right = (self._tactile(side, start, stop) for side in SIDES)
         return Window(
             images=pictures,

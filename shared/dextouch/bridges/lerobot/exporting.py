@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dextouch.bridges.lerobot import layout
-from dextouch.bridges.lerobot.rows import EpisodeFrames, frames_of, images_at
+from dextouch.bridges.lerobot.rows import EpisodeFrames, frames_of
 from dextouch.bridges.lerobot.statistics import (
     Statistics,
     combine,
@@ -30,6 +30,7 @@ from dextouch.bridges.lerobot.video import (
     encode_images,
     stored_units,
 )
+from dextouch.bridges.model_grid import BLOCK_IMAGES
 from dextouch.episodes import EpisodeReader, VideoSettings, disk_errors, is_keyframe
 from dextouch.errors import ConflictError, InvalidInputError, ShapeError
 
@@ -247,7 +248,9 @@ class _Dataset:
         units = stored_units(reader, camera, indices)
         if units is not None:
             return units, "remuxed"
-        images, options = images_at(reader, camera, indices), self._options
+        blocks = np.split(indices, range(BLOCK_IMAGES, len(indices), BLOCK_IMAGES))
+        images = (image for block in blocks for image in reader.images_at(camera, block))
+        options = self._options
         return encode_images(images, self.fps, options.video, options.group), "encoded"
 
     def _columns(self, frames: EpisodeFrames, task_index: int) -> dict[str, np.ndarray]:

@@ -1,14 +1,13 @@
 """Resampling of an episode to LeRobot frames: one row of state, action and touch per frame."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int64
 
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.layout import Grid
-from dextouch.bridges.model_grid import BLOCK_IMAGES
 from dextouch.episodes import EpisodeReader, mean_over_ranges, nearest_indices, step_ranges
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import bracket, interpolate_linear, interpolate_poses
@@ -19,7 +18,6 @@ from dextouch.hands.actions import (
     actions_from_poses,
     poses_from_actions,
 )
-from dextouch.images import decode_jpeg
 from dextouch.schemas import ActionKind
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
@@ -150,27 +148,3 @@ def _tactile(
             ranges = step_ranges(data.t_ref_ns, t_ns, 0, len(t_ns))
             kpa[:, hand], valid[:, hand] = mean_over_ranges(data.values, ranges)
     return kpa, valid
-
-
-def images_at(
-    reader: EpisodeReader, camera: str, indices: np.ndarray
-) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Stored images at ascending indices, decoded a block at a time.
-
-    Raises:
-        CorruptDataError: damaged bytes.
-    """
-    # JPEG images are decoded individually, so that skipped ones cost nothing.
-    is_jpeg = reader.streams[camera].unit == "jpeg"
-    for start in range(0, len(indices), BLOCK_IMAGES):
-        wanted = [int(index) for index in indices[start : start + BLOCK_IMAGES]]
-        first, stop = wanted[0], wanted[-1] + 1
-        if is_jpeg:
-            encoded = reader.encoded_images(camera, first, stop)
-            where = f"episode {reader.attributes.episode_id!r}: {camera!r} image"
-            for index in wanted:
-                yield decode_jpeg(encoded[index - first], where=f"{where} {index}")
-        else:
-            block = reader.images(camera, first, stop)
-            for index in wanted:
-                yield block[index - first]
