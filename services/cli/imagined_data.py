@@ -17,6 +17,7 @@ from rich.progress import track
 from dextouch.clients import RolloutClient
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.serving import configure_logging
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli.servers import served
 from services.cli.training_data import comma_separated, in_processes
@@ -41,18 +42,36 @@ def chosen_episodes(
     ]
 
 
-def imagine_all(episode_ids: Sequence[str], *, episodes: str, output: str, checkpoint: Path) -> int:
-    """Imagine robot episodes of a store, and return their number; existing results are kept."""
+def imagine_all(
+    episode_ids: Sequence[str],
+    *,
+    episodes: str,
+    output: str,
+    checkpoint: Path,
+    only_judged: bool = True,
+) -> list[str]:
+    """Imagine robot episodes of a store, and return the new ids; existing results are kept.
+
+    Args:
+        episode_ids: episodes to imagine.
+        episodes: store to read.
+        output: store to write.
+        checkpoint: checkpoint of a world model of either kind.
+        only_judged: whether a state model draws only the images that the success probe uses.
+    """
     source, target = EpisodeStore(episodes), EpisodeStore(output)
     torch.set_num_threads(1)
+    configure_logging(service="imagined", log_format="auto", level="warning")
     world = open_world(checkpoint)
     app = create_world_app({WORLD: world}, WorldServiceSettings(), name="imagined")
     with served({"imagined": app}) as urls, RolloutClient(urls["imagined"]) as client:
+        is_drawn_apart = only_judged and isinstance(world, StateWorld)
+        made = []
         for episode_id in track(episode_ids, description="imagined episodes"):
             reader = source.open(episode_id)
-            steps = judged_steps(reader) if isinstance(world, StateWorld) else None
-            imagine_episode(reader, client, WORLD, target, image_steps=steps)
-    return len(episode_ids)
+            steps = judged_steps(reader) if is_drawn_apart else None
+            made.append(imagine_episode(reader, client, WORLD, target, image_steps=steps))
+    return made
 
 
 def judged_steps(episode: EpisodeReader) -> set[int]:
@@ -105,7 +124,7 @@ def main(argv: Sequence[str]) -> int:
         checkpoint=arguments.checkpoint,
     )
     parts = [wanted[part :: arguments.jobs] for part in range(min(arguments.jobs, len(wanted)))]
-    count = sum(in_processes(imagine, parts, arguments.jobs))
+    count = sum(map(len, in_processes(imagine, parts, arguments.jobs)))
     print(f"{count} imagined")
     write_result(arguments.json, {"imagined": count})
     return 0

@@ -67,6 +67,9 @@ COMMANDS = {
         "train its baseline, for `python -m benchmarks evaluator --direct`",
         "evaluation.command_line:run_train_direct_judge",
     ),
+    "generate": Command(
+        "imagine demonstrations from the actions of recorded ones", "cli.generate:main"
+    ),
     "checkpoint": Command(
         "show the provenance and accuracy of a world model",
         "world_model.command_line:run_show",

@@ -46,8 +46,12 @@ def run_train_policy(arguments: list[str]) -> int:
     """Train the cloned policy and save it, optionally with an early checkpoint."""
     settings = load_settings(TrainPolicySettings, arguments)
     stores = [EpisodeStore(url) for url in settings.episodes]
+    episodes = read_cloning_episodes(*stores, tasks=settings.tasks, splits=settings.splits)
+    if settings.imagined:
+        generated = [EpisodeStore(url) for url in settings.imagined]
+        episodes += read_cloning_episodes(*generated, tasks=settings.tasks, origin="imagined")
     trained = train_cloned_policy(
-        read_cloning_episodes(*stores, tasks=settings.tasks),
+        episodes,
         settings.training,
         command=command_line("policy", arguments),
         early_at=settings.early_at,
@@ -183,6 +187,12 @@ def print_scores(report: Mapping[str, Any]) -> None:
     for row in report["policies"]:
         rates = "".join(f"{figure(row[world]):>10}" for world in worlds)
         print(f"{row['task']:<16}{row['policy']:<22}{rates}")
+    for task, rows in report["real_differences"].items() if not report["agreement"] else ():
+        print(f"\n{task}: differences of success rates")
+        for row in rows:
+            pair, (low, high) = f"{row['first']} - {row['second']}", row["interval"]
+            interval = f"({low:+.2f} … {high:+.2f})"
+            print(f"  {pair}: {row['difference']:+.2f} {interval}, p {figure(row['p'])}")
     for task, figures in report["agreement"].items():
         print(
             f"\n{task}: Pearson {figure(figures['pearson'])}, MMRV {figure(figures['mmrv'])} "

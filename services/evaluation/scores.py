@@ -203,10 +203,7 @@ class ClosedLoopReport:
             joined = _Compared(tuple(compared), scores, draws)
             found |= _entries(agreement)
             found["differences"] = {
-                world: [
-                    asdict(one) | {"interval": [one.interval.low, one.interval.high]}
-                    for one in paired_differences(compared, outcomes, generator)
-                ]
+                world: _differences(compared, outcomes, generator)
                 for world, outcomes in ((REAL, real), ("imagined", imagined))
             }
         found |= {
@@ -218,6 +215,12 @@ class ClosedLoopReport:
             },
         }
         return found, joined
+
+    def real_differences(self, task: str) -> list[dict[str, Any]]:
+        """Differences of pairs of policies in the real world, over starts that ended for all."""
+        outcomes = self.outcomes(REAL, task)
+        compared, real, _ = matched(self.policies, outcomes, outcomes)
+        return _differences(compared, real, np.random.default_rng(_SEED)) if real.size else []
 
     def probe_accuracy(self) -> float | str:
         """Share of real rollouts whose outcome the probe classifies correctly."""
@@ -239,6 +242,7 @@ class ClosedLoopReport:
                 task: task_comments([r for r in rows if r["task"] == task], found, str(first))
                 for task, found in agreement.items()
             },
+            "real_differences": {task: self.real_differences(task) for task in self.tasks},
             "agreement_of_other_worlds": {world: self.agreement(world) for world in others},
             "imagined_world": first,
             "probe_accuracy_on_real": self.probe_accuracy(),
@@ -246,6 +250,15 @@ class ClosedLoopReport:
             "rollouts": [asdict(score) for score in self.scores],
             "failures": [asdict(failure) for failure in self.failures],
         }
+
+
+def _differences(
+    policies: Sequence[str], outcomes: np.ndarray, generator: np.random.Generator
+) -> list[dict[str, Any]]:
+    return [
+        asdict(one) | {"interval": [one.interval.low, one.interval.high]}
+        for one in paired_differences(policies, outcomes, generator)
+    ]
 
 
 def _success_share(scores: Sequence[RolloutScore]) -> float:

@@ -14,7 +14,7 @@ from dextouch.serving import service_config
 from services.evaluation.direct_training import DirectSettings
 from services.evaluation.policies.cloning_training import CloningSettings
 from services.evaluation.success_probe_training import ProbeSettings
-from services.networks.training_settings import Stores, Tasks
+from services.networks.training_settings import Splits, Stores, Tasks
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 DEFAULT_POLICY = PRETRAINED / "behaviour_cloning.safetensors"
@@ -38,6 +38,10 @@ class TrainPolicySettings(BaseSettings):
         description="checkpoint to write",
     )
     tasks: Tasks = ()
+    splits: Splits = ()
+    imagined: tuple[str, ...] = Field(
+        default=(), description="stores of imagined episodes to train on, too, of all splits"
+    )
     early_at: float | None = Field(
         default=None,
         gt=0,

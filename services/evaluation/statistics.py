@@ -56,7 +56,7 @@ def _by_outcome(values: np.ndarray, success: np.ndarray) -> tuple[np.ndarray, np
     return values[positive], values[~positive]
 
 
-def wilson_interval(successes: float, trials: int, *, confidence: float = 0.95) -> Interval:
+def wilson_interval(successes: int | float, trials: int, *, confidence: float = 0.95) -> Interval:
     """Wilson score interval of a success rate, inside 0 … 1 (Wilson 1927).
 
     A trial that was repeated counts as one, with its share of successes.

@@ -4,6 +4,8 @@ from typing import Annotated
 
 from pydantic import Field
 
+from dextouch.episodes import Split
+
 Seed = Annotated[int, Field(description="seed of weights and sampling")]
 NumSteps = Annotated[int, Field(ge=1, description="training steps")]
 MaxSteps = Annotated[
@@ -23,3 +25,7 @@ Stores = Annotated[
     tuple[str, ...], Field(min_length=1, description="stores (folder or file:// URL)")
 ]
 Tasks = Annotated[tuple[str, ...], Field(description="tasks to train on; default: all")]
+Splits = Annotated[
+    tuple[Split, ...],
+    Field(description="A, B or C: thirds of all scenes to train on; default: all scenes"),
+]

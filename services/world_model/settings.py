@@ -17,6 +17,7 @@ from services.networks.training_settings import (
     MaxGradientNorm,
     MaxSteps,
     NumSteps,
+    Splits,
     Stores,
     Tasks,
     WarmupSteps,
@@ -62,6 +63,7 @@ class TrainSettings(FrozenModel):
     """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
 
     episodes: str = Field(description="URL or folder of the episode store to train on")
+    splits: Splits = ()
     heldout: str | None = Field(
         default=None, description="store to evaluate on; default: a tenth of `episodes`, by hash"
     )
@@ -152,6 +154,7 @@ class StateTrainSettings(FrozenModel):
 
     episodes: Stores
     tasks: Tasks = ()
+    splits: Splits = ()
     output: Path = Field(
         default=Path("runs/world_model/state.safetensors"), description="checkpoint to write"
     )

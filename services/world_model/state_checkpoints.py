@@ -5,6 +5,7 @@ from pathlib import Path
 
 from pydantic import Field, model_validator
 
+from dextouch.episodes import Split, split_of_scene
 from dextouch.frozen_model import FrozenModel
 from services.networks.weight_files import (
     half_weights,
@@ -48,7 +49,11 @@ class StateBounds(FrozenModel):
 
 
 class StateMetadata(FrozenModel):
-    """Provenance and measured accuracy of a state model, stored in its checkpoint."""
+    """Provenance and measured accuracy of a state model, stored in its checkpoint.
+
+    `training_seeds` are the first and last seed of every task, of the scenes in `training_splits`
+    (all splits if empty).
+    """
 
     format_version: int = FORMAT_VERSION
     name: str
@@ -64,8 +69,15 @@ class StateMetadata(FrozenModel):
     training_cpu_s: float
     num_training_episodes: int
     training_seeds: dict[str, tuple[int, int]]
+    training_splits: tuple[Split, ...] = ()
     data_hash: str
     metrics: dict[str, float] = Field(default={})
+
+    def may_have_seen(self, task: str, seed: int) -> bool:
+        """Whether a scene may be one of the training scenes."""
+        low, high = self.training_seeds.get(task, (0, -1))
+        splits = self.training_splits
+        return low <= seed <= high and (not splits or split_of_scene(task, seed) in splits)
 
     @model_validator(mode="after")
     def _names_and_boxes_fit_the_tasks(self) -> "StateMetadata":

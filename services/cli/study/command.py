@@ -158,8 +158,8 @@ def _write(
         page = ClosedLoopReport(
             report.scores, (world, *others), report.policies, report.failures
         ).to_report()
-        about = {"about": {"study": definition.name, "in": world}}
-        write_report(page | about, ReportPictures(), folder / f"report {world}.html")
+        title = f"{definition.name}: {world} and the real world"
+        write_report(page | {"title": title}, ReportPictures(), folder / f"report {world}.html")
     (folder / "tables.tex").write_text(latex_tables(report), encoding="utf-8")
     print_scores(figures)
     print_failures(figures, results.path)

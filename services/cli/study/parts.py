@@ -154,11 +154,11 @@ def refuse_training_seeds(definition: StudyDefinition) -> None:
             )
         if not is_state_checkpoint(path):
             continue
-        ranges = read_state_checkpoint(path).metadata.training_seeds
+        metadata = read_state_checkpoint(path).metadata
         for task in definition.tasks:
-            low, high = ranges.get(task, (0, -1))
-            trained = [seed for seed in definition.seeds if low <= seed <= high]
+            trained = [seed for seed in definition.seeds if metadata.may_have_seen(task, seed)]
             if trained:
+                low, high = metadata.training_seeds[task]
                 raise ConflictError(
                     f"world {name!r}: trained on task {task!r} with seeds {low} … {high}, and the "
                     f"study starts from seed {trained[0]}; choose another first_seed"

@@ -1,14 +1,14 @@
 """Training episodes of behaviour cloning: successful robot episodes at decision steps only."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses
 from services.evaluation.demonstrations import CAMERA
@@ -96,12 +96,19 @@ def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
     )
 
 
-def read_cloning_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[CloningEpisode]:
+def read_cloning_episodes(
+    *stores: EpisodeStore,
+    tasks: Sequence[str] = (),
+    splits: Collection[Split] = (),
+    origin: Literal["true", "imagined"] = "true",
+) -> list[CloningEpisode]:
     """Read the successful robot episodes of some stores, store by store in the order of ids.
 
     Args:
         stores: stores to read.
         tasks: tasks to read; empty for all.
+        splits: splits of the scenes; empty for all.
+        origin: whether true episodes are read or imagined ones, never both.
 
     Raises:
         NotFoundError: no such episode, or an empty store.
@@ -110,8 +117,12 @@ def read_cloning_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> l
     readers = robot_episodes(
         stores,
         tasks=tasks,
-        wanted=lambda about: bool(about.success) and about.origin != "imagined",
-        what="true robot episode that succeeded",
+        wanted=lambda about: (
+            bool(about.success)
+            and (about.origin == "imagined") == (origin == "imagined")
+            and is_in(about, splits)
+        ),
+        what=f"{origin} robot episode that succeeded",
     )
     return [read_cloning_episode(reader) for reader in readers]
 

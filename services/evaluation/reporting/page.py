@@ -1,8 +1,8 @@
 """HTML page of a report (the content of report.json) and its pictures, in one file.
 
-Every section is optional and omitted without data. The report may hold `about`, `stages`, `errors`,
-`world_model`, `policies`, `agreement` and `failures`; unknown keys only appear in the raw figures
-at the end.
+Every section is optional and omitted without data. The report may hold `title`, `about`, `stages`,
+`errors`, `world_model`, `policies`, `agreement` and `failures`; unknown keys only appear in the raw
+figures at the end.
 """
 
 import json
@@ -54,6 +54,7 @@ def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
     )
     environment.filters["figure"] = figure
     return environment.get_template("report.html.j2").render(
+        title=report.get("title", "DexTouch report"),
         about=report.get("about", {}),
         tiles=tiles(report),
         stages=stage_bars(report.get("stages", [])),

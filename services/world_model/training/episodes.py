@@ -1,12 +1,12 @@
 """Episodes of a store as arrays on the model grid, and their split by hash."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ActionKind
 from services.world_model.starts import CAMERA
@@ -15,7 +15,7 @@ from services.world_model.training.dataset import EpisodeArrays, TrainingEpisode
 E = TypeVar("E", bound=TrainingEpisode)
 
 
-def load_episodes(url: str) -> list[EpisodeArrays]:
+def load_episodes(url: str, *, splits: Collection[Split] = ()) -> list[EpisodeArrays]:
     """All episodes of a store, read once into memory.
 
     Raises:
@@ -23,9 +23,19 @@ def load_episodes(url: str) -> list[EpisodeArrays]:
         UnknownNameError: an episode without the head camera.
     """
     store = EpisodeStore(url)
-    episodes = [read_episode(store.open(episode_id)) for episode_id in store.list()]
+    episodes = [read_episode(store.open(one)) for one in training_ids(store, splits)]
     check_rates({episode.model_rate_hz for episode in episodes}, url)
     return episodes
+
+
+def training_ids(store: EpisodeStore, splits: Collection[Split] = ()) -> list[str]:
+    """Ids of the episodes to train on: those of some splits, and never imagined ones."""
+    return [
+        episode_id
+        for episode_id in store.list()
+        if (about := store.open(episode_id).attributes).origin != "imagined"
+        and is_in(about, splits)
+    ]
 
 
 def check_rates(rates_hz: set[float], url: str) -> None:

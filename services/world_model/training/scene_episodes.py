@@ -14,7 +14,7 @@ import numpy as np
 import structlog
 from jaxtyping import Float16, Float32, Float64, Int64, UInt8
 
-from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
 from dextouch.schemas import ActionKind
@@ -60,7 +60,9 @@ class SceneEpisode:
         return len(self.actions)
 
 
-def load_scene_episodes(url: str, *, tasks: Collection[str] | None = None) -> list[SceneEpisode]:
+def load_scene_episodes(
+    url: str, *, tasks: Collection[str] | None = None, splits: Collection[Split] = ()
+) -> list[SceneEpisode]:
     """Load the true episodes of a store, in the order of their ids.
 
     The number of skipped episodes is logged by reason.
@@ -68,6 +70,7 @@ def load_scene_episodes(url: str, *, tasks: Collection[str] | None = None) -> li
     Args:
         url: URL of the store.
         tasks: tasks to load; None for all.
+        splits: splits of the scenes; empty for all.
 
     Raises:
         InvalidInputError: no episode remains.
@@ -77,7 +80,8 @@ def load_scene_episodes(url: str, *, tasks: Collection[str] | None = None) -> li
     skipped: Counter[str] = Counter()
     for episode_id in sorted(store.list()):
         reader = store.open(episode_id)
-        if tasks is not None and reader.attributes.task not in tasks:
+        about = reader.attributes
+        if (tasks is not None and about.task not in tasks) or not is_in(about, splits):
             continue
         reason = _unfit(reader)
         if reason is None:

@@ -16,7 +16,7 @@ def load_split(
     """Training and held-out episodes of the settings' stores; held-out ones are in memory."""
     if settings.streaming:
         return _stream_split(settings)
-    episodes = load_episodes(settings.episodes)
+    episodes = load_episodes(settings.episodes, splits=settings.splits)
     if settings.heldout is None:
         return split_by_hash(episodes, heldout_percent=settings.heldout_percent)
     return episodes, load_episodes(settings.heldout)
@@ -25,7 +25,7 @@ def load_split(
 def _stream_split(
     settings: TrainSettings,
 ) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
-    episodes = index_episodes(settings.episodes)
+    episodes = index_episodes(settings.episodes, splits=settings.splits)
     if settings.heldout is not None:
         return episodes, load_episodes(settings.heldout)
     trained, heldout = split_by_hash(episodes, heldout_percent=settings.heldout_percent)

@@ -122,6 +122,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         training_cpu_s=round(cpu_s, 1),
         num_training_episodes=len(training),
         training_seeds=_seed_ranges(training),
+        training_splits=settings.splits,
         data_hash=data_hash,
         metrics=measured.figures,
     )
@@ -175,7 +176,9 @@ def _episodes(settings: StateTrainSettings) -> list[SceneEpisode]:
     return [
         episode
         for url in settings.episodes
-        for episode in load_scene_episodes(url, tasks=settings.tasks or None)
+        for episode in load_scene_episodes(
+            url, tasks=settings.tasks or None, splits=settings.splits
+        )
     ]
 
 

@@ -5,7 +5,7 @@ and only the span of the window.
 """
 
 import multiprocessing
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Collection, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore, Split
 from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.schemas import ActionKind
 from services.world_model.network.inputs import PredictionRequest
@@ -27,7 +27,7 @@ from services.world_model.training.dataset import (
     fingerprint,
     stack_windows,
 )
-from services.world_model.training.episodes import check_rates, read_episode
+from services.world_model.training.episodes import check_rates, read_episode, training_ids
 
 # Open readers per process; each holds an episode's timestamps and actions.
 MAX_OPEN_READERS = 512
@@ -90,8 +90,8 @@ class StoredEpisode:
         return Window(request, images, read.tactile_kpa, read.tactile_valid)
 
 
-def index_episodes(url: str) -> list[StoredEpisode]:
-    """All episodes of a store; each is read once to hash its content.
+def index_episodes(url: str, *, splits: Collection[Split] = ()) -> list[StoredEpisode]:
+    """The true episodes of a store, optionally of some splits; each is read once to be hashed.
 
     Raises:
         InvalidInputError: the store is empty, mixes model rates, or lacks the image of a step.
@@ -100,7 +100,7 @@ def index_episodes(url: str) -> list[StoredEpisode]:
     # The episode of an id may have changed since it was last read.
     _reader.cache_clear()
     episodes, rates_hz = [], set()
-    for episode_id in EpisodeStore(url).list():
+    for episode_id in training_ids(EpisodeStore(url), splits):
         # Uses the cached readers, so that processes forked later inherit them open.
         arrays = read_episode(_reader(url, episode_id))
         rates_hz.add(arrays.model_rate_hz)

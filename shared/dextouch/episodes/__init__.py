@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from dextouch.episodes.rollout_episode import write_rollout as write_rollout
     from dextouch.episodes.sources import GroupFiles as GroupFiles
     from dextouch.episodes.sources import LocalGroup as LocalGroup
+    from dextouch.episodes.splits import SPLITS as SPLITS
+    from dextouch.episodes.splits import Split as Split
+    from dextouch.episodes.splits import is_in as is_in
+    from dextouch.episodes.splits import split_of as split_of
+    from dextouch.episodes.splits import split_of_scene as split_of_scene
     from dextouch.episodes.store import EpisodeStore as EpisodeStore
     from dextouch.episodes.store import local_folder as local_folder
     from dextouch.episodes.stream_writer import WriteOptions as WriteOptions

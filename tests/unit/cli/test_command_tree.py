@@ -14,7 +14,8 @@ from services.cli import main
 
 COMMANDS = """
 align report, align retarget, align run, align serve,
-checkpoint, dashboard, demo, doctor, evaluate, export, import, rate report, rate serve, serve,
+checkpoint, dashboard, demo, doctor, evaluate, export, generate, import,
+rate report, rate serve, serve,
 station calibrate camera, station calibrate glove, station calibrate hand-eye,
 station calibrate latency, station calibrate profile, station calibrate robot-base,
 station calibrate show, station calibrate wrist, station serve,

@@ -51,6 +51,16 @@ def test_agreement_by_hand():
     assert found["bias"] == pytest.approx(0.25 / 3)
 
 
+def test_differences_of_the_real_world_need_no_imagined_one():
+    alone = report({"real": GOOD["real"]}).to_report()
+    assert alone["real_differences"] == report(GOOD).to_report()["real_differences"]
+    rows = {(r["first"], r["second"]): r for r in alone["real_differences"]["stand"]}
+    # By hand: a beats b in two of four starts; of four sign patterns, two are as extreme.
+    row = rows["a", "b"]
+    assert (row["difference"], row["p"]) == (0.5, 0.5)
+    assert row["interval"][0] < 0.5 < row["interval"][1]
+
+
 def test_a_world_without_spread_is_undefined_in_plain_json():
     whole = report(GOOD).to_report()
     copy = whole["agreement_of_other_worlds"]["copy"]["stand"]

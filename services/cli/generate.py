@@ -1,0 +1,175 @@
+"""Generate demonstrations: the actions of recorded robot episodes, imagined by a world model.
+
+Every imagined episode keeps the first observation and the actions of its source, a robot episode
+that the world model was not trained on; images and touch after the first step are the model's. Its
+`success` is that of the source. Training commands leave imagined episodes out; `dextouch train
+policy` takes stores of them as --imagined. Existing results are kept, so that an interrupted run
+can be repeated.
+"""
+
+import argparse
+import os
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.episodes import SPLITS, EpisodeReader, EpisodeStore, is_in
+from dextouch.errors import ConflictError, NotFoundError
+from services.cli.imagined_data import imagine_all, positive, seed_range
+from services.cli.training_data import comma_separated, in_processes
+from services.evaluation.reporting import PredictionPicture, ReportPictures, write_report
+from services.generation.demonstrations import CAMERA
+from services.world_model.checkpoints import default_checkpoint, read_checkpoint
+from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
+from services.world_model.training.dataset import fingerprint
+from services.world_model.training.episodes import read_episode
+
+_NUM_MOMENTS = 8
+_EPILOG = """\
+example:
+  dextouch train state --episodes runs/episodes --splits B,C --output runs/robot.safetensors
+  dextouch generate --episodes runs/episodes --split A --checkpoint runs/robot.safetensors \\
+    --store runs/generated --strips runs/generated.html
+"""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run `dextouch generate`."""
+    options = _parser().parse_args(list(arguments))
+    source = EpisodeStore(options.episodes)
+    wanted = chosen_sources(source, options)
+    refuse_trained_sources(source, wanted, options.checkpoint)
+    imagine = partial(
+        imagine_all,
+        episodes=options.episodes,
+        output=options.store,
+        checkpoint=options.checkpoint,
+        only_judged=False,
+    )
+    parts = [wanted[part :: options.jobs] for part in range(min(options.jobs, len(wanted)))]
+    made = [one for part in in_processes(imagine, parts, options.jobs) for one in part]
+    target = EpisodeStore(options.store)
+    num_bytes = sum(target.open(one).verify().num_bytes for one in made)
+    print(
+        f"{len(made)} episodes imagined and verified, {num_bytes / 1e6:.1f} MB in {options.store}"
+    )
+    if options.strips is not None:
+        pictures = [
+            _picture(source, target.open(one)) for one in sorted(made)[: options.num_strips]
+        ]
+        about = {"world model": options.checkpoint.name, "episodes": len(made)}
+        page = {"title": "Recorded and imagined episodes", "about": about}
+        write_report(page, ReportPictures(predictions=tuple(pictures)), options.strips)
+        print(f"strips of truth and imagination: {options.strips}")
+    write_result(options.json, {"episodes": sorted(made), "num_bytes": num_bytes})
+    return 0
+
+
+def chosen_sources(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
+    """Ids of the robot episodes to imagine, spread evenly over tasks.
+
+    Raises:
+        NotFoundError: there is none.
+    """
+    by_task: dict[str, list[str]] = {}
+    tasks = options.tasks or None
+    for episode_id in sorted(store.list()):
+        about = store.open(episode_id).attributes
+        if (
+            about.domain == "robot"
+            and about.origin != "imagined"
+            and (about.success or options.with_failures)
+            and (tasks is None or about.task in tasks)
+            and (options.seeds is None or about.seed in options.seeds)
+            and is_in(about, (options.split,) if options.split else ())
+        ):
+            by_task.setdefault(about.task, []).append(episode_id)
+    if not by_task:
+        raise NotFoundError(
+            f"generate: no robot episode of the requested tasks, seeds and split in "
+            f"{options.episodes}; record some with `dextouch train data`"
+        )
+    longest = max(map(len, by_task.values()))
+    in_turn = [ids[k] for k in range(longest) for ids in by_task.values() if k < len(ids)]
+    return in_turn[: options.count]
+
+
+def refuse_trained_sources(store: EpisodeStore, wanted: Sequence[str], checkpoint: Path) -> None:
+    """Refuse sources that the world model was trained on.
+
+    Raises:
+        ConflictError: there is one.
+    """
+    if is_state_checkpoint(checkpoint):
+        metadata = read_state_checkpoint(checkpoint).metadata
+        about = {one: store.open(one).attributes for one in wanted}
+        trained = [
+            one
+            for one, it in about.items()
+            if it.seed is not None and metadata.may_have_seen(it.task, it.seed)
+        ]
+    else:
+        prints = set(read_checkpoint(checkpoint).metadata.train_fingerprints)
+        trained = [one for one in wanted if fingerprint(read_episode(store.open(one))) in prints]
+    if trained:
+        raise ConflictError(
+            f"generate: {checkpoint.name} was trained on the scenes of {len(trained)} of "
+            f"{len(wanted)} sources, such as {trained[0]!r}; choose another --split or --seeds",
+            episodes=trained,
+        )
+
+
+def _picture(source: EpisodeStore, imagined: EpisodeReader) -> PredictionPicture:
+    about = imagined.attributes
+    (true_id,) = {one.id for one in about.lineage if one.kind == "episode"}
+    truth, steps = source.open(true_id), imagined.num_steps
+    true = truth.window(0, steps, cameras=(CAMERA,))
+    predicted = imagined.window(0, steps, cameras=(CAMERA,))
+    shown = np.unique(np.linspace(0, steps - 1, _NUM_MOMENTS).round().astype(int))
+    return PredictionPicture(
+        f"{about.task}: {true_id}",
+        shown / about.model_rate_hz,
+        true.images[CAMERA][shown],
+        predicted.images[CAMERA][shown],
+        true.tactile_kpa[shown],
+        predicted.tactile_kpa[shown],
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = CommandParser(prog="dextouch generate", description=__doc__, epilog=_EPILOG)
+    add = parser.add_argument
+    add("--episodes", required=True, metavar="URL", help="store of the robot episodes to imagine")
+    add("--store", required=True, metavar="URL", help="store for the imagined episodes")
+    add(
+        "--checkpoint",
+        type=Path,
+        default=default_checkpoint(),
+        metavar="PATH",
+        help="world model (default: the package's)",
+    )
+    add("--split", choices=SPLITS, help="only scenes of this split (default: all)")
+    add("--tasks", type=comma_separated, metavar="TASK,…", help="default: all")
+    add("--seeds", type=seed_range, metavar="FIRST:LAST+1", help="default: all")
+    add("--count", type=positive, metavar="N", help="at most so many, evenly over tasks")
+    add("--with-failures", action="store_true", help="also imagine episodes that failed")
+    add("--strips", type=Path, metavar="PATH", help="HTML page of truth above imagination")
+    add(
+        "--num-strips",
+        type=positive,
+        default=12,
+        metavar="N",
+        help="episodes on that page (%(default)s)",
+    )
+    add(
+        "--jobs",
+        type=positive,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="processes (default: one per core)",
+    )
+    add_json(parser)
+    return parser
