@@ -1,7 +1,12 @@
 """Simulated devices that send real packets, and the building blocks for mocks of other devices."""
 
-from services.acquisition.mocks.edits import PacketEdits, Pinned, without_first
-from services.acquisition.mocks.faults import DeviceFaults, FaultScript
+from services.acquisition.mocks.faults import (
+    DeviceFaults,
+    FaultScript,
+    PacketEdits,
+    Pinned,
+    without_first,
+)
 from services.acquisition.mocks.place import MockPair, MockPlace, serial_mock
 from services.acquisition.mocks.ports import HidPort, MockPort, PtyPort, SocketPort
 from services.acquisition.mocks.replay import MockDevice, PacketSource, ReplayStream, at_rate

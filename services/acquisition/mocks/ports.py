@@ -13,18 +13,129 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Protocol, runtime_checkable
 
 from dextouch.errors import DeviceError
-from services.acquisition.mocks.link import KEEP_UP_TIMEOUT_S, Link, WatchedTransport
 from services.acquisition.transports.ports import (
     HidDevice,
     HidTransport,
     SerialTransport,
     SocketTransport,
     Transport,
+    TransportInfo,
 )
 
 # A host that is merely busy loses nothing, as behind a real device with buffers of its own.
-SEND_TIMEOUT_S = KEEP_UP_TIMEOUT_S
+SEND_TIMEOUT_S = 20.0
 HID_RING_REPORTS = 63
+# What a device says to what the host writes.
+Answer = Callable[[bytes], list[bytes]]
+
+
+class Link:
+    """State of the host's end as seen by a mock: `is_open` once the host has opened the device."""
+
+    def __init__(self) -> None:
+        self.is_open = False
+        self._changed = threading.Condition()
+        self._ahead = 0
+
+    def set_open(self, *, is_open: bool) -> None:
+        """The host opens or closes."""
+        with self._changed:
+            self.is_open = is_open
+            self._ahead = 0
+            self._changed.notify_all()
+
+    def add_sent(self, num_bytes: int) -> None:
+        """The device sends."""
+        with self._changed:
+            self._ahead += num_bytes
+
+    def add_consumed(self, num_bytes: int) -> None:
+        """The host has read, stamped and processed."""
+        with self._changed:
+            self._ahead -= num_bytes
+            self._changed.notify_all()
+
+    def wait_consumed(self) -> None:
+        """Block until the host has processed everything, or closed.
+
+        Raises:
+            DeviceError: it does neither for 20 s.
+        """
+        self._wait(lambda: self._ahead <= 0, "left {ahead} bytes unread")
+
+    def wait_closed(self) -> None:
+        """Block until the host has noticed that the device is gone.
+
+        Raises:
+            DeviceError: it does not for 20 s.
+        """
+        self._wait(lambda: False, "did not detect the unplugging")
+
+    def _wait(self, is_done: Callable[[], bool], failing: str) -> None:
+        with self._changed:
+            if not self._changed.wait_for(lambda: is_done() or not self.is_open, SEND_TIMEOUT_S):
+                text = failing.format(ahead=self._ahead)
+                raise DeviceError(f"mock device: the host {text} for {SEND_TIMEOUT_S:.0f} s")
+
+
+class WatchedTransport:
+    """The host's transport, telling the mock how far the host is.
+
+    What a read returned counts as processed when the reader comes back for more: by then it has
+    been stamped, decoded and recorded.
+
+    Args:
+        transport: the host's end.
+        link: of the mock.
+        on_open: called when the host has opened the device.
+        on_write: takes how many bytes the host has just written, in the host's thread.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        link: Link,
+        *,
+        on_open: Callable[[], None] | None = None,
+        on_write: Callable[[int], None] | None = None,
+    ) -> None:
+        self._transport = transport
+        self._link = link
+        self._on_open = on_open
+        self._on_write = on_write
+        self._pending = 0
+
+    @property
+    def info(self) -> TransportInfo:
+        """Where it leads."""
+        return self._transport.info
+
+    def open(self) -> None:
+        """Open and tell."""
+        self._transport.open()
+        self._pending = 0
+        self._link.set_open(is_open=True)
+        if self._on_open is not None:
+            self._on_open()
+
+    def read(self) -> bytes:
+        """Tell, then read."""
+        self._link.add_consumed(self._pending)
+        self._pending = 0
+        data = self._transport.read()
+        self._pending = len(data)
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Write, and tell."""
+        self._transport.write(data)
+        if self._on_write is not None:
+            self._on_write(len(data))
+
+    def close(self) -> None:
+        """Close and tell."""
+        self._transport.close()
+        self._link.set_open(is_open=False)
 
 
 @runtime_checkable
@@ -62,7 +173,7 @@ class PtyPort:
 
     has_bit_errors = True
 
-    def __init__(self, name: str, answer: Callable[[bytes], list[bytes]] | None = None) -> None:
+    def __init__(self, name: str, answer: Answer | None = None) -> None:
         self.link = Link()
         self._name = name
         self._answer = answer
@@ -200,16 +311,12 @@ class ReportPort:
 
     has_bit_errors = False
 
-    def __init__(
-        self,
-        device: ReportDevice,
-        transport: Transport,
-        answer: Callable[[bytes], list[bytes]] | None,
-    ) -> None:
+    def __init__(self, device: ReportDevice, transport: Transport, answer: Answer | None) -> None:
         self.link = Link()
         self.device = device
+        self._answer = answer
         if answer is not None:
-            device.on_write = lambda report: self._send_all(answer(report))
+            device.on_write = self._hear
         self.transport = WatchedTransport(transport, self.link)
 
     def plug(self) -> None:
@@ -228,31 +335,36 @@ class ReportPort:
             self.link.add_sent(-len(unit))
         return taken
 
-    def _send_all(self, reports: list[bytes]) -> None:
-        for report in reports:
-            self.send(report)
+    def _hear(self, report: bytes) -> None:
+        for unit in self._answer(report) if self._answer is not None else []:
+            self.send(unit)
 
 
 class HidPort(ReportPort):
     """A HID device whose host end is the real HID transport on a `FakeHid`."""
 
-    def __init__(self, name: str, answer: Callable[[bytes], list[bytes]] | None = None) -> None:
+    def __init__(self, name: str, answer: Answer | None = None) -> None:
         device = FakeHid()
         transport = HidTransport(device.open, address=f"mock:{name}", serial_number=name)
         super().__init__(device, transport, answer)
 
 
 class SocketPort:
-    """A device behind a socket: every connection of the host is a new pair."""
+    """A device behind a socket: every connection of the host is a new pair.
+
+    Args:
+        name: of the device.
+        on_open: called when the host has connected.
+    """
 
     has_bit_errors = False
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, on_open: Callable[[], None] | None = None) -> None:
         self.link = Link()
         self._plugged = False
         self._device_end: socket.socket | None = None
         transport = SocketTransport(self._connect, address=f"mock:{name}")
-        self.transport = WatchedTransport(transport, self.link, on_open=self._on_open)
+        self.transport = WatchedTransport(transport, self.link, on_open=on_open)
 
     def plug(self) -> None:
         """Accept connections."""
@@ -286,6 +398,3 @@ class SocketPort:
         self._device_end, host_end = socket.socketpair()
         self._device_end.settimeout(SEND_TIMEOUT_S)
         return host_end
-
-    def _on_open(self) -> None:
-        """The host has connected."""

@@ -15,18 +15,16 @@ from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.drivers.packets import SEQUENCE_MODULUS
-from services.acquisition.mocks.edits import (
+from services.acquisition.mocks.faults import (
+    DeviceFaults,
     Edit,
     OurPacketEdits,
     PacketEdits,
     Pinned,
-    halve_units,
-)
-from services.acquisition.mocks.faults import (
-    DeviceFaults,
     Schedule,
     boot_time_ns,
     flip_bits,
+    halve_units,
     lose_bytes,
     make_schedule,
 )

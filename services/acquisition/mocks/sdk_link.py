@@ -63,7 +63,8 @@ class BridgePort(SocketPort):
     """
 
     def __init__(self, name: str, hello: Callable[[], bytes]) -> None:
-        super().__init__(name)
+        # The hello that waits in every new connection counts as sent.
+        super().__init__(name, on_open=lambda: self.link.add_sent(len(hello())))
         self.life: PeriodicCall | None = None
         self._hello = hello
 
@@ -78,10 +79,6 @@ class BridgePort(SocketPort):
         if self.life is not None:
             self.life.stop()
         super().unplug()
-
-    def _on_open(self) -> None:
-        """Count the hello that waits in every new connection as sent."""
-        self.link.add_sent(len(self._hello()))
 
     def _connect(self) -> socket.socket:
         host_end = super()._connect()

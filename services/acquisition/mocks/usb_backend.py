@@ -5,14 +5,14 @@ Descriptors hold what the transport and pyusb ask for; their other fields are 0.
 
 import errno
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
 
 from usb.backend import IBackend
 from usb.core import USBError, USBTimeoutError
 
-from services.acquisition.mocks.ports import ReportDevice, ReportPort
+from services.acquisition.mocks.ports import Answer, ReportDevice, ReportPort
 from services.acquisition.transports.usb import UsbAddress, UsbTransport
 
 FIFO_REPORTS = 32
@@ -212,7 +212,7 @@ class MockUsbBackend(IBackend):
 class UsbPort(ReportPort):
     """A USB device whose host end is the real USB transport over the real pyusb."""
 
-    def __init__(self, name: str, answer: Callable[[bytes], list[bytes]] | None = None) -> None:
+    def __init__(self, name: str, answer: Answer | None = None) -> None:
         device = UsbDeviceModel(vendor_id=0x1209, product_id=0xDEC7, serial_number=name)
         address = UsbAddress(device.vendor_id, device.product_id, name)
         transport = UsbTransport(address, backend=MockUsbBackend(device))

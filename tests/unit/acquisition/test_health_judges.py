@@ -13,7 +13,7 @@ from services.acquisition.drivers.image_quality import ImageQuality
 from services.acquisition.glove_record import GloveRecord
 from services.acquisition.health.cells import TaxelJudge, count_taxels, neighbour_share
 from services.acquisition.health.link import TrackingJudge
-from services.acquisition.health.samples import SampleQueue
+from services.acquisition.health.monitor import SampleQueue
 from services.acquisition.health.values import CameraJudge, FiniteJudge, PoseJudge
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.supervisor import StreamCounters

@@ -7,7 +7,7 @@ from jaxtyping import Float32
 
 from dextouch.tactile.layout import NUM_TAXELS
 from services.acquisition.devices.justfloat_glove.driver import TAIL, JustFloatGloveDecoder
-from services.acquisition.mocks.edits import PacketEdits, Pinned, without_first
+from services.acquisition.mocks.faults import PacketEdits, Pinned, without_first
 from services.acquisition.mocks.place import MockPair, MockPlace, serial_mock
 from services.acquisition.mocks.replay import ReplayStream
 

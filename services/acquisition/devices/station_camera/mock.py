@@ -17,9 +17,8 @@ from services.acquisition.devices.station_camera.capture import (
 )
 from services.acquisition.devices.station_camera.driver import StationCamera
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.link import Link
 from services.acquisition.mocks.place import MockPair
-from services.acquisition.mocks.ports import ReportDevice
+from services.acquisition.mocks.ports import Link, ReportDevice
 from services.acquisition.mocks.replay import MockDevice, ReplayStream
 
 UNIT_HEADER = struct.Struct("<qHH")

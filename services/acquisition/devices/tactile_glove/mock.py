@@ -29,7 +29,7 @@ from services.acquisition.drivers.packets import (
     PacketDecoder,
     encode_packet,
 )
-from services.acquisition.mocks.edits import OurPacketEdits, Pinned, edit_ours
+from services.acquisition.mocks.faults import OurPacketEdits, Pinned, edit_ours
 from services.acquisition.mocks.place import MockPair, MockPlace
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng

@@ -23,7 +23,7 @@ from services.acquisition.devices.wuji_glove.driver import (
     WujiGloveDecoder,
     crc16,
 )
-from services.acquisition.mocks.edits import PacketEdits, Pinned, without_first
+from services.acquisition.mocks.faults import PacketEdits, Pinned, without_first
 from services.acquisition.mocks.place import MockPair, MockPlace, serial_mock
 from services.acquisition.mocks.replay import ReplayStream, at_rate
 
