@@ -1,8 +1,9 @@
-"""Recorder of a station: the state machine of an operator's actions, one take at a time."""
+"""Recorder of a station: one take at a time, in a spool that outlives the process."""
 
 import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -10,9 +11,10 @@ from secrets import token_hex
 
 import structlog
 
+from dextouch.clocks import PathLatency
 from dextouch.episodes import disk_errors
 from dextouch.episodes.spool import SpoolWriter
-from dextouch.errors import ConflictError
+from dextouch.errors import ConflictError, StorageError
 from dextouch.schemas import (
     Matrix,
     RecorderAction,
@@ -23,12 +25,15 @@ from dextouch.schemas import (
     TakeCheck,
     TakePrompt,
 )
+from dextouch.streams import H264_UNIT, EncodedBatch, Sample, SampleBatch
 from services.acquisition.clock import StationClock
-from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.image_encoding import GroupGate
+from services.acquisition.health import HealthMonitor
 from services.acquisition.memory import give_back_free_memory
 from services.acquisition.path_latency import add_latencies
-from services.acquisition.supervisor import check_free_space
-from services.acquisition.take import Take, TakeOptions
+from services.acquisition.supervisor import SpoolFlusher, SpoolSafety, check_free_space
+from services.acquisition.take_check import DeviceEvents, TakeWatch
 
 logger = structlog.get_logger(__name__)
 
@@ -49,6 +54,103 @@ NEXT: Mapping[RecorderAction, RecorderState] = {
     "discard": "discarded",
     "rerecord": "armed",
 }
+
+
+@dataclass(frozen=True)
+class TakeOptions:
+    """How takes are kept, and who knows what happens to devices besides their drivers.
+
+    `device_events` gives, by device, counts of named events since the station's start (those of the
+    drivers if None); `health` provides the findings of the station in the meantime, `latencies` the
+    measured path delays of streams whose delay the calibration does not name.
+    """
+
+    safety: SpoolSafety = field(default_factory=SpoolSafety)
+    device_events: Callable[[], DeviceEvents] | None = None
+    health: HealthMonitor | None = None
+    latencies: Callable[[], Mapping[str, PathLatency]] = dict
+
+
+class Take:
+    """One running or ended take: reader threads append to its spool, a thread of its own flushes.
+
+    The only lock that readers take is held for the write of one append: data is encoded before, and
+    other threads wait for the disk.
+
+    Args:
+        spool: new, of this take.
+        watch: of its streams and devices.
+        clock: of the station.
+        safety: of the spool.
+    """
+
+    def __init__(
+        self, spool: SpoolWriter, watch: TakeWatch, *, clock: StationClock, safety: SpoolSafety
+    ) -> None:
+        self.spool = spool
+        self.watch = watch
+        self._failure: str | None = None
+        self._lock = threading.RLock()
+        self._gates = {s.name: GroupGate() for s in spool.attributes.streams if s.unit == H264_UNIT}
+        self._flusher = SpoolFlusher(
+            spool.path, safety=safety, clock=clock, on_tick=watch.look, on_failure=self._end
+        )
+
+    def accept(self, readings: Readings) -> None:
+        """Append new readings (called by the reader threads); nothing after the end.
+
+        A stream's readings come from one thread, so its bytes are made before the lock is taken.
+        """
+        if self.watch.has_ended:
+            return
+        encoded = [self._encode(name, samples) for name, samples in readings.items()]
+        with self._lock:
+            try:
+                for record, samples in encoded:
+                    if record is not None and not self.watch.has_ended:
+                        self.spool.append_record(record)
+                        self.watch.streams[record.stream_name].add(samples)
+            except StorageError as error:
+                self._end(error)
+
+    def _encode(self, name: str, samples: list[Sample]) -> tuple[EncodedBatch | None, list[Sample]]:
+        if name in self._gates:
+            # Of video only what can be looked at without what came before the take.
+            samples = self._gates[name].admit(samples)
+        if not samples:
+            return None, samples
+        return self.spool.encode(name, SampleBatch.from_samples(samples)), samples
+
+    def end(self) -> TakeCheck:
+        """Accept no more readings, flush the spool to the disk and check the take."""
+        self._end()
+        self._flusher.join()
+        self.watch.look()
+        if self._failure is None:
+            try:
+                self.spool.flush()
+            except StorageError as error:
+                self._failure = error.message
+        return self.watch.check()
+
+    def release(self) -> None:
+        """Give threads and files back; what was spooled stays as it is."""
+        self._end()
+        self._flusher.join()
+        self.spool.abandon()
+
+    def problems(self) -> tuple[str, ...]:
+        """What ended or disturbed the take as a whole."""
+        failure = (self._failure,) if self._failure else ()
+        return (*failure, *self.watch.host_problems())
+
+    def _end(self, error: StorageError | None = None) -> None:
+        with self._lock:
+            if error is not None and not self.watch.has_ended:
+                self._failure = error.message
+                logger.error("stop_take_by_disk", error=error.message)
+            self.watch.end()
+            self._flusher.cancel()
 
 
 class Recorder:
@@ -104,8 +206,10 @@ class Recorder:
                 actions=ACTIONS[self._state],
                 recording_id=self._recording_id(),
                 prompt=self._prompt,
-                duration_s=take.duration_s if take else None,
-                num_samples={n: c.num_samples for n, c in take.streams.items()} if take else {},
+                duration_s=take.watch.duration_s if take else None,
+                num_samples={n: c.num_samples for n, c in take.watch.streams.items()}
+                if take
+                else {},
                 problems=self._problems(),
                 check=self._check,
             )
@@ -181,7 +285,7 @@ class Recorder:
 
     def _settle(self) -> None:
         """A take that ended because of the disk is checked on the next request."""
-        if self._state == "recording" and self.take is not None and self.take.has_ended:
+        if self._state == "recording" and self.take is not None and self.take.watch.has_ended:
             self._stop()
             self._state = "checking"
             self._done.add("stop")
@@ -212,7 +316,9 @@ class Recorder:
             self.spool_root.mkdir(parents=True, exist_ok=True)
         check_free_space(self.spool_root, self._options.safety)
         spool = SpoolWriter(self.spool_root / attributes.recording_id, attributes)
-        self.take = Take(spool, drivers=self._drivers, clock=self._clock, options=self._options)
+        count, health = self._options.device_events, self._options.health
+        watch = TakeWatch(self._drivers, self._clock, device_events=count, health=health)
+        self.take = Take(spool, watch, clock=self._clock, safety=self._options.safety)
         self._done = set()
         logger.info("start_take", recording_id=attributes.recording_id)
 
@@ -232,8 +338,8 @@ class Recorder:
         changed = {
             "calibration": add_latencies(known, measured, stated=self._stated),
             "success": how.success,
-            "ledger": take.ledger(),
-            "quality": take.quality(),
+            "ledger": take.watch.ledger(),
+            "quality": take.watch.quality(),
         }
         spool.set_attributes(spool.attributes.model_copy(update=changed))
         spool.close()

@@ -16,9 +16,9 @@ from services.acquisition.drivers.image_encoding import GroupPreview
 from services.acquisition.glove_record import NO_CELL, glove_record
 from services.acquisition.health import HealthMonitor
 from services.acquisition.path_latency import PathWatch
-from services.acquisition.recorder import Recorder
+from services.acquisition.recorder import Recorder, TakeOptions
 from services.acquisition.supervisor import DeviceSupervisor, SpoolSafety
-from services.acquisition.take import DeviceEvents, TakeOptions
+from services.acquisition.take_check import DeviceEvents
 
 CONNECT_TIMEOUT_S = 10.0
 MAX_AGE_NS = 500_000_000

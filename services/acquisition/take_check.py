@@ -1,17 +1,19 @@
-"""What is said of a take after its end: whether it is complete, its ledger and its quality.
+"""What happens during a take, and what is said of it: its check, its ledger and its quality.
 
 Completeness is judged by the take's own samples. What the station's health found meanwhile adds
 warnings to the check, entries to the ledger and figures to the quality.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 from dextouch.schemas import LedgerEntry, StreamTake, TakeCheck, TakeProblem
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS
+from services.acquisition.clock import HostWatch, StationClock
+from services.acquisition.drivers.base import Driver
 from services.acquisition.health import CODES, HealthMonitor, count_taxels
 from services.acquisition.supervisor import StreamCounters
 
@@ -35,6 +37,7 @@ IN_THE_CHECK: dict[str, tuple[str, ...]] = {
     "taxels_stuck": ("stuck_taxels",),
     "taxels_saturated": ("saturated_taxels",),
 }
+DeviceEvents = Mapping[str, Mapping[str, int]]
 Problem = tuple[str, Literal["WARN", "ERROR"], str]
 
 
@@ -199,55 +202,135 @@ class TakeFindings:
         return found
 
 
-def check_take(
-    facts: Sequence[StreamFacts], duration_s: float, findings: TakeFindings
-) -> TakeCheck:
-    """Judge a take: complete means no problem of level ERROR."""
-    own = [_problem(fact.descriptor.name, p) for fact in facts for p in fact.problems()]
-    streams = tuple(
-        StreamTake(
-            stream=fact.descriptor.name,
-            num_samples=fact.counters.num_samples,
-            rate_hz=fact.rate_hz,
-            largest_gap_s=fact.largest_gap_s,
-            lost=fact.events["lost"],
-            crc_errors=fact.events["crc_errors"],
+class TakeWatch:
+    """What happens to the streams, devices and host of a take, from now until `end`.
+
+    Args:
+        drivers: whose streams are recorded, by name.
+        clock: of the station.
+        device_events: by device, counts of named events since the station's start; those of the
+            drivers if None.
+        health: of the station.
+
+    Attributes:
+        streams: counters by name of the samples that the take keeps.
+    """
+
+    def __init__(
+        self,
+        drivers: Mapping[str, Driver],
+        clock: StationClock,
+        *,
+        device_events: Callable[[], DeviceEvents] | None = None,
+        health: HealthMonitor | None = None,
+    ) -> None:
+        self.streams = {
+            d.name: StreamCounters() for driver in drivers.values() for d in driver.descriptors
+        }
+        self._drivers = drivers
+        self._clock = clock
+        self._count = device_events or (
+            lambda: {name: driver.events() for name, driver in drivers.items()}
         )
-        for fact in facts
-    )
-    found = findings.problems([stream.stream for stream in streams], own)
-    return TakeCheck(
-        complete=all(problem.level != "ERROR" for problem in own),
-        duration_s=duration_s,
-        streams=streams,
-        problems=(*own, *found),
-    )
+        self._started_ns = clock.now_ns()
+        self._stopped_ns: int | None = None
+        self._before = self._count()
+        self._facts: list[StreamFacts] = []
+        self._host = HostWatch(clock)
+        self._findings = TakeFindings(health, self._started_ns)
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether what comes is no longer of the take."""
+        return self._stopped_ns is not None
 
-def take_ledger(facts: Sequence[StreamFacts]) -> list[LedgerEntry]:
-    """Counted events of the take, for the recording's attributes."""
-    entries = []
-    for fact in facts:
-        counted = {**fact.events, **fact.taxels(), "packets": 0}
-        name = fact.descriptor.name
-        entries += [LedgerEntry(stream=name, event=e, count=n) for e, n in counted.items() if n]
-    return entries
+    @property
+    def duration_s(self) -> float:
+        """Length up to now, or up to the end."""
+        stop_ns = self._clock.now_ns() if self._stopped_ns is None else self._stopped_ns
+        return (stop_ns - self._started_ns) / 1e9
 
+    def look(self) -> None:
+        """Notice what does not last; called repeatedly during the take and once after its end."""
+        self._host.look()
+        self._findings.look()
 
-def take_quality(facts: Sequence[StreamFacts]) -> dict[str, float]:
-    """Figures of a take by stream, for the recording's `quality`; the episode takes them over."""
-    quality: dict[str, float] = {}
-    for fact in facts:
-        name, rate_hz = fact.descriptor.name, fact.rate_hz
-        quality[f"{name}_largest_gap_s"] = fact.largest_gap_s
-        if rate_hz is not None:
-            quality[f"{name}_rate_hz"] = rate_hz
-        if fact.descriptor.capabilities.sequence:
-            quality[f"{name}_loss_ratio"] = fact.loss_ratio
-        judged = {event: fact.events[event] for event in fact.judged}
-        for event, count in {**judged, **fact.taxels()}.items():
-            quality[f"{name}_num_{event}"] = float(count)
-    return quality
+    def end(self) -> None:
+        """Freeze what is known at this moment, once."""
+        if self.has_ended:
+            return
+        self._findings.end()
+        after, stopped_ns = self._count(), self._clock.now_ns()
+        for name, driver in self._drivers.items():
+            before = self._before[name]
+            events = {event: count - before[event] for event, count in after[name].items()}
+            # What was missing before the take and came in it is no loss of the take, nor a gain.
+            events["lost"] = max(0, events["lost"])
+            judged = driver.events().keys() - vars(driver.statistics).keys()
+            span_ns = (self._started_ns, stopped_ns)
+            self._facts += [
+                StreamFacts(d, self.streams[d.name], events, span_ns, judged)
+                for d in driver.descriptors
+            ]
+        self._stopped_ns = stopped_ns
+
+    def host_problems(self) -> tuple[str, ...]:
+        """What the host did to the take as a whole."""
+        return self._host.problems()
+
+    def check(self) -> TakeCheck:
+        """Judge the ended take: complete means no problem of level ERROR."""
+        own = [_problem(fact.descriptor.name, p) for fact in self._facts for p in fact.problems()]
+        streams = tuple(
+            StreamTake(
+                stream=fact.descriptor.name,
+                num_samples=fact.counters.num_samples,
+                rate_hz=fact.rate_hz,
+                largest_gap_s=fact.largest_gap_s,
+                lost=fact.events["lost"],
+                crc_errors=fact.events["crc_errors"],
+            )
+            for fact in self._facts
+        )
+        return TakeCheck(
+            complete=all(problem.level != "ERROR" for problem in own),
+            duration_s=self.duration_s,
+            streams=streams,
+            problems=(*own, *self._findings.problems(self.streams, own)),
+        )
+
+    def ledger(self) -> tuple[LedgerEntry, ...]:
+        """Everything that was noticed during the take, counted."""
+        entries = []
+        for fact in self._facts:
+            counted = {**fact.events, **fact.taxels(), "packets": 0}
+            name = fact.descriptor.name
+            entries += [LedgerEntry(stream=name, event=e, count=n) for e, n in counted.items() if n]
+        entries += [
+            LedgerEntry(stream=name, event=event, count=e.count, first_t_host_ns=e.first_t_host_ns)
+            for name in self.streams
+            for event, e in self._host.events.items()
+            if e.count
+        ]
+        known = {(entry.stream, entry.event) for entry in entries}
+        # Where the devices count the same event themselves, their count is the exact one.
+        found = self._findings.entries(self.streams)
+        return (*entries, *(e for e in found if (e.stream, e.event) not in known))
+
+    def quality(self) -> dict[str, float]:
+        """Figures of the ended take by stream; the episode takes them over."""
+        quality = self._findings.quality()
+        for fact in self._facts:
+            name, rate_hz = fact.descriptor.name, fact.rate_hz
+            quality[f"{name}_largest_gap_s"] = fact.largest_gap_s
+            if rate_hz is not None:
+                quality[f"{name}_rate_hz"] = rate_hz
+            if fact.descriptor.capabilities.sequence:
+                quality[f"{name}_loss_ratio"] = fact.loss_ratio
+            judged = {event: fact.events[event] for event in fact.judged}
+            for event, count in {**judged, **fact.taxels()}.items():
+                quality[f"{name}_num_{event}"] = float(count)
+        return quality
 
 
 def _problem(stream: str, problem: Problem) -> TakeProblem:

@@ -17,9 +17,8 @@ from services.acquisition.health import HealthCollector, HealthMonitor
 from services.acquisition.health.station import PathJudge
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.path_latency import MAX_BACK_OFF, PathWatch, add_latencies
-from services.acquisition.recorder import Recorder
+from services.acquisition.recorder import Recorder, TakeOptions
 from services.acquisition.supervisor import DeviceSupervisor
-from services.acquisition.take import TakeOptions
 from tests.unit.acquisition.health_blocks_made import block, judged
 
 SECOND_NS = 1_000_000_000

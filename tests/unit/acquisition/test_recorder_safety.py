@@ -18,9 +18,8 @@ from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort
-from services.acquisition.recorder import Recorder
+from services.acquisition.recorder import Recorder, TakeOptions
 from services.acquisition.supervisor import SpoolSafety
-from services.acquisition.take import TakeOptions
 
 PROMPT = TakePrompt(task="stand_bottle", instruction="stand the bottle up")
 ANYWAY = SaveTake(accept_incomplete=True)
