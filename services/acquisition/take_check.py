@@ -214,6 +214,7 @@ class TakeWatch:
 
     Attributes:
         streams: counters by name of the samples that the take keeps.
+        has_ended: whether what comes is no longer of the take.
     """
 
     def __init__(
@@ -227,27 +228,23 @@ class TakeWatch:
         self.streams = {
             d.name: StreamCounters() for driver in drivers.values() for d in driver.descriptors
         }
+        self.has_ended = False
         self._drivers = drivers
         self._clock = clock
         self._count = device_events or (
             lambda: {name: driver.events() for name, driver in drivers.items()}
         )
         self._started_ns = clock.now_ns()
-        self._stopped_ns: int | None = None
+        self._stopped_ns = 0
         self._before = self._count()
         self._facts: list[StreamFacts] = []
         self._host = HostWatch(clock)
         self._findings = TakeFindings(health, self._started_ns)
 
     @property
-    def has_ended(self) -> bool:
-        """Whether what comes is no longer of the take."""
-        return self._stopped_ns is not None
-
-    @property
     def duration_s(self) -> float:
         """Length up to now, or up to the end."""
-        stop_ns = self._clock.now_ns() if self._stopped_ns is None else self._stopped_ns
+        stop_ns = self._stopped_ns if self.has_ended else self._clock.now_ns()
         return (stop_ns - self._started_ns) / 1e9
 
     def look(self) -> None:
@@ -260,19 +257,19 @@ class TakeWatch:
         if self.has_ended:
             return
         self._findings.end()
-        after, stopped_ns = self._count(), self._clock.now_ns()
+        after, self._stopped_ns = self._count(), self._clock.now_ns()
         for name, driver in self._drivers.items():
             before = self._before[name]
             events = {event: count - before[event] for event, count in after[name].items()}
             # What was missing before the take and came in it is no loss of the take, nor a gain.
             events["lost"] = max(0, events["lost"])
             judged = driver.events().keys() - vars(driver.statistics).keys()
-            span_ns = (self._started_ns, stopped_ns)
+            span_ns = (self._started_ns, self._stopped_ns)
             self._facts += [
                 StreamFacts(d, self.streams[d.name], events, span_ns, judged)
                 for d in driver.descriptors
             ]
-        self._stopped_ns = stopped_ns
+        self.has_ended = True
 
     def host_problems(self) -> tuple[str, ...]:
         """What the host did to the take as a whole."""

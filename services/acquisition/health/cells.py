@@ -22,7 +22,7 @@ from services.acquisition.devices.tactile_glove.driver import FULL_SCALE_COUNTS
 from services.acquisition.drivers.base import CellLayout, Decoder, TellsCells
 from services.acquisition.glove_record import NO_CELL, GloveRecord, mapped_cells
 from services.acquisition.health.codes import CODES
-from services.acquisition.health.levels import Evaluation, Finding
+from services.acquisition.health.evaluation import Evaluation, Finding
 
 RECENT_NS = 500_000_000
 MIN_RECENT_SPAN_NS = 400_000_000

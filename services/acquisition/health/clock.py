@@ -12,8 +12,7 @@ from dextouch.clocks import CountingClock, OnlineClock
 from dextouch.errors import InvalidInputError
 from dextouch.streams import StreamDescriptor
 from services.acquisition.health.codes import CODES
-from services.acquisition.health.levels import Evaluation
-from services.acquisition.health.samples import Block, Rolling
+from services.acquisition.health.evaluation import Block, Evaluation, Rolling
 
 STEP_NS = 4_000_000
 HOUR_NS = 3_600_000_000_000

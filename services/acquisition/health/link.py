@@ -6,8 +6,13 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from dextouch.streams import StreamDescriptor
-from services.acquisition.health.levels import Evaluation, Finding
-from services.acquisition.health.samples import WINDOW_NS, CountWindow, Rolling
+from services.acquisition.health.evaluation import (
+    WINDOW_NS,
+    CountWindow,
+    Evaluation,
+    Finding,
+    Rolling,
+)
 from services.acquisition.supervisor import DeviceSupervisor
 
 GAP_PERIODS = 3

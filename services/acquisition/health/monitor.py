@@ -20,7 +20,8 @@ from services.acquisition.glove_record import glove_record, is_ours
 from services.acquisition.health.cells import TaxelJudge, cell_judge
 from services.acquisition.health.clock import ClockJudge, CountingJudge
 from services.acquisition.health.codes import CODES
-from services.acquisition.health.levels import (
+from services.acquisition.health.evaluation import (
+    Block,
     Board,
     Evaluation,
     EventLog,
@@ -29,7 +30,6 @@ from services.acquisition.health.levels import (
     worst,
 )
 from services.acquisition.health.link import LinkJudge, TrackingJudge
-from services.acquisition.health.samples import Block
 from services.acquisition.health.station import CalibrationJudge, PathJudge
 from services.acquisition.health.values import CameraJudge, FiniteJudge, PoseJudge
 from services.acquisition.path_latency import PathWatch

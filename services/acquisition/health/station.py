@@ -11,8 +11,7 @@ import numpy as np
 from dextouch.schemas import Matrix
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_RAW_TAXELS
-from services.acquisition.health.levels import Evaluation, Finding
-from services.acquisition.health.samples import CountWindow
+from services.acquisition.health.evaluation import CountWindow, Evaluation, Finding
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
 

@@ -4,8 +4,7 @@ import numpy as np
 
 from dextouch.streams import StreamDescriptor
 from services.acquisition.drivers.base import Driver
-from services.acquisition.health.levels import Evaluation
-from services.acquisition.health.samples import Rolling
+from services.acquisition.health.evaluation import Evaluation, Rolling
 
 MAX_SPEED_M_S = 5.0
 REST_SPEED_M_S = 0.02

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from services.acquisition.health.levels import Evaluation
-from services.acquisition.health.samples import Block
+from services.acquisition.health.evaluation import Block, Evaluation
 
 SECOND_NS = 10**9
 

@@ -12,7 +12,7 @@ from services.acquisition.devices.tactile_glove.driver import TactileGloveDecode
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health import CODES, DiskJudge, HealthCollector, HealthMonitor
 from services.acquisition.health.codes import table
-from services.acquisition.health.levels import Board, Finding, Hysteresis
+from services.acquisition.health.evaluation import Board, Finding, Hysteresis
 from services.acquisition.health.station import CalibrationJudge
 from services.acquisition.mocks.ports import HidPort, PtyPort
 from services.acquisition.station import LiveView

@@ -2,7 +2,7 @@
 
 import tracemalloc
 
-from services.acquisition.health.levels import MAX_EVENTS, EventLog
+from services.acquisition.health.evaluation import MAX_EVENTS, EventLog
 
 
 def test_events_come_out_as_they_went_in():

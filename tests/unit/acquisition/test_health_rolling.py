@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from services.acquisition.health.samples import MIN_ROLLING, Rolling
+from services.acquisition.health.evaluation import MIN_ROLLING, Rolling
 
 
 def test_only_the_last_span_is_kept_whatever_comes(rng):
