@@ -1,10 +1,9 @@
 """Made-up streams of two moving, pressing hands."""
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.geometry import pinhole_matrix
 from dextouch.geometry.rotations import rotation_from_vector
@@ -25,31 +24,27 @@ ROUND_S = 8.0
 
 def pattern_streams(round_s: float = ROUND_S) -> list[ReplayStream]:
     """All human streams of one round; the end meets the beginning."""
+
+    def turns_rad(rate_hz: float) -> Float64[np.ndarray, " n"]:
+        count = round(rate_hz * round_s)
+        return 2 * np.pi * np.arange(count) / count
+
+    images, poses_rad = _images(turns_rad(30.0)), turns_rad(100.0)
+    head = _poses(0.2 * np.sin(poses_rad), np.array([0.0, -0.2, 1.5]))
     streams = []
     for index, side in enumerate(SIDES):
-        phase_rad = np.pi * index
-
-        def tactile(turn_rad: np.ndarray, phase_rad: float = phase_rad) -> np.ndarray:
-            return _pressures(turn_rad + phase_rad)
-
-        def keypoints(turn_rad: np.ndarray, side: Side = side) -> np.ndarray:
-            return _keypoints(turn_rad, side)
-
-        def wrist(turn_rad: np.ndarray, x_m: float = 0.4 * index - 0.2) -> np.ndarray:
-            return _poses(turn_rad, np.array([x_m, 0.3, 1.0]))
-
+        pressures = _pressures(turns_rad(60.0) + np.pi * index)
+        wrist = _poses(poses_rad, np.array([0.4 * index - 0.2, 0.3, 1.0]))
         streams += [
-            _stream(f"tactile_{side}", "tactile", (60.0, "kPa"), round_s, tactile),
-            _stream(f"keypoints_{side}", "keypoints", (120.0, "m"), round_s, keypoints),
-            _stream(f"wrist_{side}", "pose", (100.0, "pose_m_wxyz"), round_s, wrist),
-            _stream(f"camera_wrist_{side}", "image", (30.0, "rgb8"), round_s, _images),
+            _stream(f"tactile_{side}", "tactile", (60.0, "kPa"), pressures),
+            _stream(
+                f"keypoints_{side}", "keypoints", (120.0, "m"), _keypoints(turns_rad(120.0), side)
+            ),
+            _stream(f"wrist_{side}", "pose", (100.0, "pose_m_wxyz"), wrist),
+            _stream(f"camera_wrist_{side}", "image", (30.0, "rgb8"), images),
         ]
-
-    def head(turn_rad: np.ndarray) -> np.ndarray:
-        return _poses(0.2 * np.sin(turn_rad), np.array([0.0, -0.2, 1.5]))
-
-    streams.append(_stream("head", "pose", (100.0, "pose_m_wxyz"), round_s, head))
-    streams.append(_stream("camera_head", "image", (30.0, "rgb8"), round_s, _images))
+    streams.append(_stream("head", "pose", (100.0, "pose_m_wxyz"), head))
+    streams.append(_stream("camera_head", "image", (30.0, "rgb8"), images))
     return streams
 
 
@@ -60,16 +55,10 @@ def pattern_calibration() -> dict[str, Matrix]:
 
 
 def _stream(
-    name: str,
-    kind: StreamKind,
-    rate_and_unit: tuple[float, str],
-    round_s: float,
-    make: Callable[[np.ndarray], np.ndarray],
+    name: str, kind: StreamKind, rate_and_unit: tuple[float, str], values: np.ndarray
 ) -> ReplayStream:
     rate_hz, unit = rate_and_unit
-    count = round(rate_hz * round_s)
-    t_ns: Int64[np.ndarray, " n"] = np.rint(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
-    values = make(2 * np.pi * np.arange(count) / count)
+    t_ns = np.rint(np.arange(len(values)) * (1e9 / rate_hz)).astype(np.int64)
     descriptor = StreamDescriptor.model_validate(
         {
             "name": name,
