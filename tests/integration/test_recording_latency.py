@@ -14,8 +14,8 @@ from dextouch.schemas import TakePrompt
 from services.acquisition.clock import RealClock
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
+from services.acquisition.recorder import Take
 from services.acquisition.station import LiveView
-from services.acquisition.take import Take
 from tests.integration.recording_streams import human_streams
 
 ROOT = Path(__file__).parents[2]
