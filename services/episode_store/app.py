@@ -11,7 +11,6 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import StorageError
 from dextouch.serving import create_service_app, serve
 from services.episode_store.catalog import Catalog
-from services.episode_store.committing import CommitProcess
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Intake, StorageLimits
 from services.episode_store.reading import StoreReader
@@ -24,31 +23,10 @@ logger = structlog.get_logger(__name__)
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     """Create the application of one store; recovers data of crashed writers at startup."""
     store = EpisodeStore(settings.store_url)
-    commit = CommitProcess(settings.store_url) if settings.commit_in_process else None
-    ingest = Ingest(
-        store,
-        sync=settings.sync_uploads,
-        max_open_uploads=settings.max_open_uploads,
-        commit=commit,
-    )
-    catalog = Catalog(store)
-    reader = StoreReader(
-        store,
-        max_window_steps=settings.max_window_steps,
-        max_answer_bytes=settings.max_answer_bytes,
-    )
-    limits = StorageLimits(
-        ingest.folder,
-        recordings=catalog.bytes_by_station,
-        quota_bytes=settings.quota_bytes_per_station,
-        min_free_bytes=settings.min_free_bytes,
-    )
-    intake = Intake(
-        ingest,
-        limits,
-        max_batches=settings.max_batches_in_flight,
-        max_bytes=settings.max_bytes_in_flight,
-    )
+    catalog, reader = Catalog(store), StoreReader(store, settings)
+    ingest = Ingest(store, settings)
+    limits = StorageLimits(ingest.folder, settings, recordings=catalog.bytes_by_station)
+    intake = Intake(ingest, limits, settings)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -59,8 +37,6 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
             yield
         finally:
             ingest.close()
-            if commit is not None:
-                commit.close()
 
     app = create_service_app(
         name="episode_store",

@@ -24,7 +24,8 @@ from dextouch.schemas import (
     RecordingStatus,
 )
 from dextouch.streams import read_batch
-from services.episode_store.committing import Commit, commit_spool
+from services.episode_store.committing import Commit, CommitProcess, commit_spool
+from services.episode_store.settings import EpisodeStoreSettings
 
 logger = structlog.get_logger(__name__)
 
@@ -73,23 +74,18 @@ class Ingest:
 
     Args:
         store: destination of finished recordings; unfinished ones are in a folder below it.
-        sync: whether batches are synced to disk before they are acknowledged.
-        max_open_uploads: number of uploads with open files; others are reopened on demand.
-        commit: commits a complete upload; None commits synchronously.
+        settings: of the service.
+        commit: commits a complete upload; None as the settings say.
     """
 
     def __init__(
-        self,
-        store: EpisodeStore,
-        *,
-        sync: bool,
-        max_open_uploads: int,
-        commit: Commit | None = None,
+        self, store: EpisodeStore, settings: EpisodeStoreSettings, *, commit: Commit | None = None
     ) -> None:
         self._store = store
         self.folder = store.root / UPLOADS
-        self._sync, self._max_open = sync, max_open_uploads
-        self._commit = commit or partial(commit_spool, store)
+        self._sync, self._max_open = settings.sync_uploads, settings.max_open_uploads
+        self._process = CommitProcess(settings.store_url) if settings.commit_in_process else None
+        self._commit = commit or self._process or partial(commit_spool, store)
         self._open: OrderedDict[str, SpoolWriter] = OrderedDict()
         self._locks = KeyedLocks(patience_s=PATIENCE_S)
         self._guard = threading.Lock()
@@ -178,10 +174,12 @@ class Ingest:
         return True
 
     def close(self) -> None:
-        """Close all files; uploads continue after a restart."""
+        """Close all files, after a running commit; uploads continue after a restart."""
         with self._guard:
             while self._open:
                 self._open.popitem()[1].abandon()
+        if self._process is not None:
+            self._process.close()
 
     def _move(self, spool: SpoolWriter, body: FinishRecording) -> None:
         known = spool.attributes

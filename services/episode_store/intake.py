@@ -27,6 +27,7 @@ from dextouch.schemas import (
 )
 from dextouch.streams import MAX_BATCH_BYTES
 from services.episode_store.ingest import Ingest, idle_seconds
+from services.episode_store.settings import EpisodeStoreSettings
 
 logger = structlog.get_logger(__name__)
 
@@ -106,21 +107,19 @@ class StorageLimits:
 
     Args:
         folder: of the unfinished uploads.
+        settings: with the quota and the reserve.
         recordings: bytes of finished recordings by station.
-        quota_bytes: of one station; None is unlimited.
-        min_free_bytes: the reserve.
     """
 
     def __init__(
         self,
         folder: Path,
+        settings: EpisodeStoreSettings,
         *,
         recordings: Callable[[], dict[str, int]],
-        quota_bytes: int | None,
-        min_free_bytes: int,
     ) -> None:
         self._folder, self._recordings = folder, recordings
-        self._quota, self._min_free = quota_bytes, min_free_bytes
+        self._quota, self._min_free = settings.quota_bytes_per_station, settings.min_free_bytes
         self._guard = threading.Lock()
         self._accounts: dict[str, _Account] = {
             path.name: _Account(attributes.station, folder_bytes(path))
@@ -237,14 +236,17 @@ class StorageLimits:
 class Intake:
     """Passes every upload through the limits to the ingest, and updates metrics.
 
-    Batches are written by `max_batches` threads of their own; reads and commits use others.
+    Batches are written by threads of their own; reads and commits use others.
     """
 
     def __init__(
-        self, ingest: Ingest, limits: StorageLimits, *, max_batches: int, max_bytes: int
+        self, ingest: Ingest, limits: StorageLimits, settings: EpisodeStoreSettings
     ) -> None:
         self._ingest, self._limits = ingest, limits
-        self._admission = Admission(max_requests=max_batches, max_bytes=max_bytes)
+        max_batches = settings.max_batches_in_flight
+        self._admission = Admission(
+            max_requests=max_batches, max_bytes=settings.max_bytes_in_flight
+        )
         self._threads = anyio.CapacityLimiter(max_batches)
         self._batches = Counter(
             "dextouch_store_batches",

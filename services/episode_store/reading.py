@@ -12,6 +12,7 @@ from dextouch.errors import LimitExceededError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import ActionKind, EpisodeDetail, RecordingAttributes
 from dextouch.streams import pack
+from services.episode_store.settings import EpisodeStoreSettings
 
 # To be incremented whenever the same query gives other bytes.
 ANSWER_VERSION = 1
@@ -57,11 +58,9 @@ class Answer:
 class StoreReader:
     """Reads for the routes, with conditional requests and size limits, checked before reading."""
 
-    def __init__(
-        self, store: EpisodeStore, *, max_window_steps: int, max_answer_bytes: int
-    ) -> None:
+    def __init__(self, store: EpisodeStore, settings: EpisodeStoreSettings) -> None:
         self._store = store
-        self._max_steps, self._max_bytes = max_window_steps, max_answer_bytes
+        self._max_steps, self._max_bytes = settings.max_window_steps, settings.max_answer_bytes
 
     def episode(self, episode_id: str) -> EpisodeDetail:
         """Attributes, length and hash."""

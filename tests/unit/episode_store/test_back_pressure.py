@@ -79,9 +79,10 @@ def test_admission_bounds_requests_and_bytes():
         pass
 
 
-def test_the_reserve_stays_free_but_for_finishing(tmp_path, monkeypatch, attributes):
+def test_the_reserve_stays_free_but_for_finishing(tmp_path, settings, monkeypatch, attributes):
     folder = tmp_path / "not" / "there" / ".uploads"
-    limits = StorageLimits(folder, recordings=dict, quota_bytes=None, min_free_bytes=1000)
+    changed = settings.model_copy(update={"min_free_bytes": 1000})
+    limits = StorageLimits(folder, changed, recordings=dict)
     assert limits.free_bytes() > 0
     monkeypatch.setattr(intake_module, "free_bytes_of", lambda _: 1500)
     limits.check_batch("take-1", 500)
@@ -191,7 +192,8 @@ def test_a_station_keeps_to_its_quota(start, attributes, batch_of, settings):
     send("take-2", 0)
     store = EpisodeStore(settings.store_url)
     folder = store.root / ".uploads"
-    limits = StorageLimits(folder, recordings=dict, quota_bytes=quota, min_free_bytes=0)
+    changed = settings.model_copy(update={"quota_bytes_per_station": quota})
+    limits = StorageLimits(folder, changed, recordings=dict)
     with pytest.raises(StorageFullError):
         limits.check_batch("take-1", 45_000)
     limits.check_batch("take-2", 45_000)
@@ -271,9 +273,7 @@ def test_a_recording_that_is_being_finished_says_come_again(
         assert go_on.wait(30)
         return {}
 
-    ours = Ingest(
-        EpisodeStore(settings.store_url), sync=False, max_open_uploads=4, commit=slow_commit
-    )
+    ours = Ingest(EpisodeStore(settings.store_url), settings, commit=slow_commit)
     for name in ("take-1", "take-2"):
         ours.create(attributes.model_copy(update={"recording_id": name}))
     data = [encode_batch(attributes.streams[0], batch_of(5 * n, 5), number=n) for n in range(2)]

@@ -28,8 +28,8 @@ def commit(settings):
 
 
 @pytest.fixture
-def ingest(store, commit, attributes, batch_of):
-    ours = Ingest(store, sync=False, max_open_uploads=4, commit=commit)
+def ingest(store, settings, commit, attributes, batch_of):
+    ours = Ingest(store, settings, commit=commit)
     for name in ("take-1", "take-2"):
         take = attributes.model_copy(update={"recording_id": name})
         ours.create(take)

@@ -33,8 +33,8 @@ def store(settings):
 
 
 @pytest.fixture
-def ingest(store):
-    ours = Ingest(store, sync=False, max_open_uploads=2)
+def ingest(store, settings):
+    ours = Ingest(store, settings.model_copy(update={"max_open_uploads": 2}))
     yield ours
     ours.close()
 
@@ -180,12 +180,12 @@ def test_only_complete_uploads_finish(ingest, store, attributes, send):
         send(ingest, 1)
 
 
-def test_a_restart_keeps_what_was_acknowledged(store, attributes, send, batch_of):
-    first = Ingest(store, sync=False, max_open_uploads=2)
+def test_a_restart_keeps_what_was_acknowledged(store, settings, attributes, send, batch_of):
+    first = Ingest(store, settings)
     first.create(attributes)
     send(first, 0)
     first.close()
-    second = Ingest(store, sync=False, max_open_uploads=2)
+    second = Ingest(store, settings)
     assert second.status("take-1").next_batch == {"glove_left": 1, "wrist_left": 0}
     assert send(second, 0).replayed
     send(second, 1)
@@ -193,8 +193,10 @@ def test_a_restart_keeps_what_was_acknowledged(store, attributes, send, batch_of
     assert_complete(store, batch_of, 10)
 
 
-def test_a_crash_before_the_answer_counts_once(store, attributes, send, batch_of, monkeypatch):
-    first = Ingest(store, sync=False, max_open_uploads=2)
+def test_a_crash_before_the_answer_counts_once(
+    store, settings, attributes, send, batch_of, monkeypatch
+):
+    first = Ingest(store, settings)
     first.create(attributes)
     send(first, 0)
     with monkeypatch.context() as patch:
@@ -203,7 +205,7 @@ def test_a_crash_before_the_answer_counts_once(store, attributes, send, batch_of
         with pytest.raises(KeyboardInterrupt):
             send(first, 1)
     first.close()
-    second = Ingest(store, sync=False, max_open_uploads=2)
+    second = Ingest(store, settings)
     assert second.status("take-1").next_batch["glove_left"] == 2
     assert send(second, 1).replayed
     finish(second, 2)
@@ -215,16 +217,16 @@ def _die(*_args, **_kwargs):
 
 
 def test_a_crash_after_the_commit_is_finished_by_repeating(
-    store, attributes, send, batch_of, monkeypatch
+    store, settings, attributes, send, batch_of, monkeypatch
 ):
-    first = Ingest(store, sync=False, max_open_uploads=2)
+    first = Ingest(store, settings)
     first.create(attributes)
     send(first, 0)
     with monkeypatch.context() as patch:
         patch.setattr(ingest_module.shutil, "rmtree", _die)
         with pytest.raises(KeyboardInterrupt):
             finish(first, 1)
-    second = Ingest(store, sync=False, max_open_uploads=2)
+    second = Ingest(store, settings)
     finish(second, 1)
     assert_complete(store, batch_of, 5)
     assert not (store.root / ".uploads" / "take-1").exists()
