@@ -63,7 +63,7 @@ def test_an_upload_encodes_no_sample_again_and_the_store_checks_it_once():
     assert {name: walk.num_calls(name) for name in once} == dict.fromkeys(once, 1)
     assert walk.num_calls("check_batch", threads="MainThread") == 0
     assert walk.num_calls("encode_body") == 0
-    assert len(walk.files) <= 28, walk.files
+    assert len(walk.files) <= 19, walk.files
 
 
 def test_the_clock_is_one_package():

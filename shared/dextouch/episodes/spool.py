@@ -6,27 +6,31 @@ Images of `jpeg` and `h264` streams are object arrays of bytes.
 
 import os
 import shutil
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+
+import numpy as np
+from pydantic import ValidationError
 
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, try_lock, write_file
 from dextouch.episodes.spool_log import (
     LOG_FILE,
-    LogRecords,
     SpoolLogWriter,
-    body_at,
-    open_log,
-    read_records,
-)
-from dextouch.episodes.spool_reader import (
-    CLOSED_FILE,
-    RECORDING_FILE,
-    SpoolReader,
-    read_attributes,
     read_batch,
+    read_bodies,
+    read_records,
+    trusted_records,
 )
-from dextouch.errors import ConflictError, InvalidInputError, StorageError, UnknownNameError
+from dextouch.errors import (
+    ConflictError,
+    CorruptDataError,
+    InvalidInputError,
+    NotFoundError,
+    StorageError,
+    UnknownNameError,
+)
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import (
     MAX_STREAMS,
@@ -35,9 +39,147 @@ from dextouch.streams import (
     check_batch,
     check_follows,
     encode_samples,
+    sample_ends,
 )
 
 __all__ = ["LOG_FILE", "SpoolReader", "SpoolWriter", "read_attributes"]
+
+RECORDING_FILE = "recording.json"
+CLOSED_FILE = "closed"
+DEFAULT_BATCH_SAMPLES = 60
+
+
+class SpoolReader:
+    """Reads the complete records of a spool, even while it is being written.
+
+    The log is scanned on first access; records appended later are not visible.
+
+    Raises:
+        NotFoundError: no spool there.
+        CorruptDataError: its attributes are damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._where = path, f"spool {path.name!r}"
+        self.attributes = read_attributes(path)
+        self.closed = (path / CLOSED_FILE).exists()
+        self.streams = {d.name: d for d in self.attributes.streams}
+        self._rows: dict[str, np.ndarray] | None = None
+
+    def num_samples(self, stream_name: str) -> int:
+        """Number of samples of a stream when the log was scanned.
+
+        Raises:
+            UnknownNameError: no such stream.
+            CorruptDataError: damage other than a torn tail.
+        """
+        return int(self._stream_rows(stream_name)["num_samples"].sum())
+
+    def read(self, stream_name: str, start: int = 0, stop: int | None = None) -> SampleBatch:
+        """Samples start … stop-1 of a stream, verified.
+
+        Raises:
+            InvalidInputError: outside the stream.
+            CorruptDataError: a payload does not match its checksum.
+        """
+        stop = self.num_samples(stream_name) if stop is None else stop
+        rows, skipped = self._span(stream_name, start, stop)
+        batch = read_batch(self.path, self.streams[stream_name], rows)
+        wanted = slice(skipped, skipped + stop - start)
+        return SampleBatch(*(column[wanted] for column in vars(batch).values()))
+
+    def body(self, stream_name: str, start: int, stop: int) -> bytes:
+        """The bytes of samples start … stop-1 as they lie in the log; raises as `read`."""
+        rows, skipped = self._span(stream_name, start, stop)
+        descriptor, count = self.streams[stream_name], int(rows["num_samples"].sum())
+        body = b"".join(read_bodies(self.path, descriptor, rows))
+        if count == stop - start:
+            return body
+        ends = [0, *sample_ends(descriptor, body, count, where=self._where)]
+        return body[ends[skipped] : ends[skipped + stop - start]]
+
+    def appended(self, stream_name: str, number: int) -> bytes:
+        """The bytes of one append, numbered from 0.
+
+        Raises:
+            InvalidInputError: no such append.
+            CorruptDataError: they do not match their checksum.
+        """
+        rows = self._stream_rows(stream_name)
+        if not 0 <= number < len(rows):
+            raise InvalidInputError(
+                f"{stream_name}: got append {number}, expected within 0 … {len(rows) - 1}"
+            )
+        (body,) = read_bodies(self.path, self.streams[stream_name], rows[number : number + 1])
+        return body
+
+    def batches(
+        self, stream_name: str, *, num_samples: int = DEFAULT_BATCH_SAMPLES
+    ) -> Iterator[SampleBatch]:
+        """Iterate over batches of fixed size; batch n is always the same.
+
+        A spool that is still written yields only full batches; a closed one also the last, partial
+        batch.
+        """
+        total = self.num_samples(stream_name)
+        for start in range(0, total, num_samples):
+            stop = start + num_samples
+            if stop <= total or self.closed:
+                yield self.read(stream_name, start, min(stop, total))
+
+    def _span(self, stream_name: str, start: int, stop: int) -> tuple[np.ndarray, int]:
+        """The records with samples start … stop-1, and the number of samples in them before."""
+        rows, total = self._stream_rows(stream_name), self.num_samples(stream_name)
+        if not 0 <= start <= stop <= total:
+            raise InvalidInputError(
+                f"{stream_name}: got samples {start} … {stop}, expected within 0 … {total}"
+            )
+        first = int(np.searchsorted(rows["first_sample"], start, side="right")) - 1
+        last = int(np.searchsorted(rows["first_sample"], stop, side="left"))
+        rows = rows[max(0, first) : max(0, first, last)]
+        return rows, start - int(rows["first_sample"][0]) if len(rows) else 0
+
+    def _stream_rows(self, name: str) -> np.ndarray:
+        if name not in self.streams:
+            raise UnknownNameError("stream", name, list(self.streams))
+        if self._rows is None:
+            rows = read_records(self.path).rows
+            if len(rows) and int(rows["stream"].max()) >= len(self.streams):
+                raise CorruptDataError(
+                    f"{self._where}: its log has a stream number "
+                    f"{int(rows['stream'].max())}, {RECORDING_FILE} has {len(self.streams)} streams"
+                )
+            self._rows = {
+                stream: rows[rows["stream"] == number] for number, stream in enumerate(self.streams)
+            }
+        return self._rows[name]
+
+
+def read_attributes(path: Path) -> RecordingAttributes:
+    """Attributes of a spool's recording.
+
+    Raises:
+        NotFoundError: no spool there.
+        CorruptDataError: attributes that cannot be read.
+    """
+    with disk_errors(f"open spool {path.name}"):
+        if not (path / RECORDING_FILE).is_file():
+            raise NotFoundError(f"spool {path.name!r}: there is none in {path.parent}")
+        text = (path / RECORDING_FILE).read_bytes()
+    try:
+        return RecordingAttributes.model_validate_json(text)
+    except ValidationError as error:
+        raise CorruptDataError(f"spool {path.name!r}: {RECORDING_FILE}: {error}") from error
+
+
+@dataclass
+class _Appended:
+    """What a spool holds of a stream; the last stamp is a lower bound of the next one."""
+
+    number: int
+    num_samples: int = 0
+    num_batches: int = 0
+    last_t_host_ns: int | None = None
 
 
 class SpoolWriter:
@@ -67,14 +209,13 @@ class SpoolWriter:
     ) -> None:
         self.path, self.attributes = path, attributes
         self._sync = sync
-        self._streams = {d.name: number for number, d in enumerate(attributes.streams)}
-        self._num_samples = dict.fromkeys(self._streams, 0)
-        self._num_batches = dict.fromkeys(self._streams, 0)
-        # The last stamp of each stream, a lower bound of the next one.
-        self._last_t_host_ns: dict[str, int | None] = dict.fromkeys(self._streams)
+        self._streams = {d.name: _Appended(number) for number, d in enumerate(attributes.streams)}
         if not resume:
             _create(path, attributes)
-        self._lock = _lock(path)
+        lock = try_lock(path)
+        if lock is None:
+            raise ConflictError(f"spool {path.name!r}: another process is writing it")
+        self._lock = lock
         try:
             self._log = SpoolLogWriter(path, end=self._resume() if resume else None)
         except BaseException:
@@ -125,7 +266,7 @@ class SpoolWriter:
             UnknownNameError: no such stream.
             InvalidInputError: a batch that does not fit the stream.
         """
-        descriptor = self.attributes.streams[self._number(stream_name)]
+        descriptor = self.attributes.streams[self._stream(stream_name).number]
         if len(batch):
             return encode_samples(descriptor, batch)
         check_batch(descriptor, batch)
@@ -142,11 +283,9 @@ class SpoolWriter:
             InvalidInputError: it begins before the last sample of its stream.
             StorageFullError: no space; everything appended before stays.
         """
-        name = record.stream_name
-        check_follows(name, record.first_t_host_ns, self._last_t_host_ns[name])
-        place = self._log.append(
-            record, stream=self._number(name), first_sample=self._num_samples[name]
-        )
+        stream = self._stream(record.stream_name)
+        check_follows(record.stream_name, record.first_t_host_ns, stream.last_t_host_ns)
+        place = self._log.append(record, stream=stream.number, first_sample=stream.num_samples)
         self._is_dirty = True
         if flush:
             try:
@@ -154,19 +293,17 @@ class SpoolWriter:
             except StorageError:
                 self._log.undo(place)
                 raise
-        self._num_samples[name] += record.num_samples
-        self._num_batches[name] += 1
-        self._last_t_host_ns[name] = record.last_t_host_ns
+        stream.num_samples += record.num_samples
+        stream.num_batches += 1
+        stream.last_t_host_ns = record.last_t_host_ns
 
     def num_samples(self, stream_name: str) -> int:
         """Number of samples of a stream in the spool."""
-        self._number(stream_name)
-        return self._num_samples[stream_name]
+        return self._stream(stream_name).num_samples
 
     def num_batches(self, stream_name: str) -> int:
         """Number of appends of a stream."""
-        self._number(stream_name)
-        return self._num_batches[stream_name]
+        return self._stream(stream_name).num_batches
 
     def flush(self) -> None:
         """Sync appended records to disk (unless opened with `sync=False`)."""
@@ -221,23 +358,22 @@ class SpoolWriter:
         else:
             self.abandon()
 
-    def _number(self, name: str) -> int:
+    def _stream(self, name: str) -> _Appended:
         if name not in self._streams:
             raise UnknownNameError("stream", name, list(self._streams))
         return self._streams[name]
 
     def _resume(self) -> int:
         """Count the samples of an existing log; returns where it goes on."""
-        records = _trusted_records(self.path)
+        records = trusted_records(self.path)
         with disk_errors(f"resume spool {self.path.name}"):
             (self.path / CLOSED_FILE).unlink(missing_ok=True)
-        for name, number in self._streams.items():
-            rows = records.rows[records.rows["stream"] == number]
-            self._num_samples[name] = int(rows["num_samples"].sum())
-            self._num_batches[name] = len(rows)
+        for stream in self._streams.values():
+            rows = records.rows[records.rows["stream"] == stream.number]
+            stream.num_samples, stream.num_batches = int(rows["num_samples"].sum()), len(rows)
             if len(rows):
-                last = read_batch(self.path, self.attributes.streams[number], rows[-1:])
-                self._last_t_host_ns[name] = int(last.t_host_ns[-1])
+                last = read_batch(self.path, self.attributes.streams[stream.number], rows[-1:])
+                stream.last_t_host_ns = int(last.t_host_ns[-1])
         return records.end
 
 
@@ -261,28 +397,3 @@ def _create(path: Path, attributes: RecordingAttributes) -> None:
         unborn.mkdir(parents=True)
         write_file(unborn / RECORDING_FILE, attributes.model_dump_json().encode())
         unborn.rename(path)
-
-
-def _trusted_records(path: Path) -> LogRecords:
-    """The records of a log without those at its end whose body never reached the disk."""
-    if not (path / LOG_FILE).exists():
-        # The process died before it created the log.
-        SpoolLogWriter(path).close()
-    records = read_records(path)
-    num_rows = len(records.rows)
-    with open_log(path) as data:
-        while num_rows and body_at(data, records.rows[num_rows - 1]) is None:
-            num_rows -= 1
-    return replace(records, rows=records.rows[:num_rows])
-
-
-def _lock(path: Path) -> int:
-    """Lock a spool exclusively; the returned descriptor holds the lock until it is closed.
-
-    Raises:
-        ConflictError: another process is writing or recovering it.
-    """
-    lock = try_lock(path)
-    if lock is None:
-        raise ConflictError(f"spool {path.name!r}: another process is writing it")
-    return lock

@@ -10,7 +10,9 @@ import os
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import google_crc32c
@@ -18,7 +20,15 @@ import numpy as np
 
 from dextouch.episodes.files import disk_errors, write_parts
 from dextouch.errors import CorruptDataError, StorageError
-from dextouch.streams import EncodedBatch
+from dextouch.streams import (
+    ENCODED_UNITS,
+    EncodedBatch,
+    SampleBatch,
+    StreamDescriptor,
+    decode_body,
+    encode_body,
+    encoded_values,
+)
 
 LOG_FILE = "batches.log"
 LOG_MAGIC = b"DXTBLOG\x02"
@@ -182,11 +192,11 @@ def body_at(data: LogBytes, row: np.void) -> bytes | None:
     return body if whole else None
 
 
-def read_bodies(folder: Path, rows: np.ndarray) -> Iterator[bytes]:
-    """Iterate over the bodies of records.
+def read_bodies(folder: Path, descriptor: StreamDescriptor, rows: np.ndarray) -> Iterator[bytes]:
+    """Iterate over the bodies of records of one stream.
 
     Raises:
-        CorruptDataError: a body does not match its checksum.
+        CorruptDataError: a body does not match its checksum, or is that of another stream.
     """
     with open_log(folder) as data:
         for row in rows:
@@ -196,7 +206,48 @@ def read_bodies(folder: Path, rows: np.ndarray) -> Iterator[bytes]:
                     f"log of spool {folder.name!r}: the record at byte {int(row['offset'])} does "
                     "not match its checksum; the file is damaged, restore it from a copy"
                 )
-            yield body
+            yield body_of(descriptor, row, body, where=f"spool {folder.name!r}")
+
+
+def read_batch(folder: Path, descriptor: StreamDescriptor, rows: np.ndarray) -> SampleBatch:
+    """The samples in consecutive records of one stream, verified; raises as `read_bodies`."""
+    where, counts = f"spool {folder.name!r}", rows["num_samples"].tolist()
+    bodies = read_bodies(folder, descriptor, rows)
+    if descriptor.unit not in ENCODED_UNITS or not counts:
+        return decode_body(descriptor, b"".join(bodies), sum(counts), where=where)
+    # Images are large, and not copied once more.
+    found = map(partial(decode_body, descriptor, where=where), bodies, counts)
+    return SampleBatch(*map(np.concatenate, zip(*(vars(b).values() for b in found), strict=True)))
+
+
+def body_of(descriptor: StreamDescriptor, row: np.void, body: bytes, *, where: str) -> bytes:
+    """The body of a record; that of one of format 1, which holds columns, in today's layout.
+
+    Raises:
+        CorruptDataError: the record was written for another stream.
+    """
+    count = int(row["num_samples"])
+    # Of one sample both layouts are the same.
+    if not row["in_columns"] or count == 1:
+        return body
+    stamps, rest = body[: 24 * count], body[24 * count :]
+    is_encoded, ends = descriptor.unit in ENCODED_UNITS, [-1]
+    if not is_encoded:
+        ends = [count * descriptor.sample_bytes()]
+    elif len(rest) >= 4 * count:
+        lengths = np.frombuffer(rest, "<u4", count)
+        ends = [4 * count, *(4 * count + np.cumsum(lengths, dtype=np.int64)).tolist()]
+    if len(rest) != ends[-1]:
+        raise CorruptDataError(
+            f"{where}: a record of {len(body)} bytes is not that of {count} samples of "
+            f"{descriptor.name!r}; it was written for another stream"
+        )
+    if is_encoded:
+        values = encoded_values([rest[low:high] for low, high in pairwise(ends)])
+    else:
+        values = np.frombuffer(rest, descriptor.numpy_dtype()).reshape(count, *descriptor.shape)
+    hosts, devices, numbers = np.frombuffer(stamps, "<i8").reshape(3, count)
+    return encode_body(descriptor, SampleBatch(hosts, devices, numbers, values))
 
 
 def _header_at(data: LogBytes, place: int) -> tuple[int, ...] | None:
@@ -280,3 +331,16 @@ class SpoolLogWriter:
     def _cut(self, size: int) -> None:
         os.ftruncate(self._file, size)
         os.lseek(self._file, size, os.SEEK_SET)
+
+
+def trusted_records(folder: Path) -> LogRecords:
+    """The records of a log without those at its end whose body never reached the disk."""
+    if not (folder / LOG_FILE).exists():
+        # The process died before it created the log.
+        SpoolLogWriter(folder).close()
+    records = read_records(folder)
+    num_rows = len(records.rows)
+    with open_log(folder) as data:
+        while num_rows and body_at(data, records.rows[num_rows - 1]) is None:
+            num_rows -= 1
+    return replace(records, rows=records.rows[:num_rows])

@@ -25,8 +25,8 @@ from dextouch.episodes.format import (
 from dextouch.episodes.group_contents import GroupContents, read_group
 from dextouch.episodes.journal import damaged_payload, log_paths, part_path, read_rows, scan_rows
 from dextouch.episodes.sources import GroupFiles, LocalGroup
+from dextouch.episodes.spool import RECORDING_FILE, read_attributes
 from dextouch.episodes.spool_log import body_at, find_records, open_log
-from dextouch.episodes.spool_reader import RECORDING_FILE, read_attributes
 from dextouch.episodes.staged_group import STAGE_FILE, STAGING, read_stage
 from dextouch.episodes.trash import HOMES
 from dextouch.errors import StorageError

@@ -42,7 +42,7 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.group_contents import get_metadata
 from dextouch.episodes.sources import GroupFiles, LocalGroup
-from dextouch.episodes.spool_reader import read_attributes
+from dextouch.episodes.spool import read_attributes
 from dextouch.episodes.staged_group import STAGING, read_stage, unheld_folders
 from dextouch.episodes.staging_recovery import recover_stage
 from dextouch.episodes.trash import TrashKind, put_into_trash

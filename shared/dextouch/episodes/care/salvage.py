@@ -39,8 +39,7 @@ from dextouch.episodes.shard_reader import (
     decode_rows,
 )
 from dextouch.episodes.sources import LocalFile, LocalGroup
-from dextouch.episodes.spool_log import body_at, find_records, open_log
-from dextouch.episodes.spool_reader import body_of, read_batch
+from dextouch.episodes.spool_log import body_at, body_of, find_records, open_log, read_batch
 from dextouch.episodes.staged_group import new_stage
 from dextouch.episodes.staging_recovery import free_id, ids_below
 from dextouch.episodes.writer import Block, write_blocks
