@@ -18,26 +18,18 @@ from dextouch.serving import server_options
 
 BACKLOG = 128
 START_TIMEOUT_S = 60.0
+START_CHECK_S = 0.01
 
 
 class Server(uvicorn.Server):
     """Server of one service that leaves signal handling to its owner."""
 
-    def __init__(self, config: uvicorn.Config) -> None:
-        super().__init__(config)
-        self.answers = asyncio.Event()
-
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start and signal completion.
-
-        Raises:
-            UnavailableError: the service's own start failed; its log says why.
-        """
+        """Start; a failure ends this server instead of the whole process."""
         try:
             await super().startup(sockets)
-        except SystemExit as error:  # uvicorn would end the whole process
+        except SystemExit as error:
             raise UnavailableError("the service did not start") from error
-        self.answers.set()
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -134,8 +126,8 @@ def stop_on_signals(stop: asyncio.Event) -> None:
 
 
 async def _announce(servers: Sequence[Server], on_ready: Callable[[], None]) -> None:
-    for server in servers:
-        await server.answers.wait()
+    while not all(server.started for server in servers):  # noqa: ASYNC110 - uvicorn has no event
+        await asyncio.sleep(START_CHECK_S)
     on_ready()
 
 

@@ -18,9 +18,11 @@ from dextouch.schemas import (
     CameraLive,
     EpisodeDetail,
     EpisodeList,
+    EpisodeSummary,
     HealthLevel,
     RecorderStatus,
     RecordingList,
+    RecordingSummary,
     SaveTake,
     StationHealth,
     TakeName,
@@ -75,7 +77,7 @@ class TakeView(FrozenModel):
     task: str
     domain: str
     operator: str | None
-    consent: bool | None
+    consent: bool | None = None
     outcome: str
     size: str
     clocks: str = ""
@@ -175,13 +177,9 @@ class Feeds:
             TakeView(
                 kind="episode",
                 name=item.episode_id,
-                task=item.task,
-                domain=item.domain,
-                operator=item.operator,
-                consent=None,
-                outcome=OUTCOMES[item.success],
                 size=f"{item.duration_s:.1f} s, {item.num_steps} steps",
                 clocks=self._clocks[item.episode_id],
+                **_labels(item),
             )
             for item in reversed(episodes.episodes)
         ]
@@ -189,13 +187,10 @@ class Feeds:
             TakeView(
                 kind="recording",
                 name=item.recording_id,
-                task=item.task,
-                domain=item.domain,
-                operator=item.operator,
-                consent=item.consent,
-                outcome=OUTCOMES[item.success],
                 size=f"{item.duration_s:.1f} s, {sum(item.num_samples.values())} samples, "
                 f"{len(item.num_samples)} streams",
+                consent=item.consent,
+                **_labels(item),
             )
             for item in reversed(recordings.recordings)
         ]
@@ -241,6 +236,11 @@ class Feeds:
             return [topic_message("taxels_lost", error.message)]
         pressures = {side: arrays.get(f"tactile_{side}") for side in SIDES}
         return [taxel_message(side, kpa) for side, kpa in pressures.items() if kpa is not None]
+
+
+def _labels(item: EpisodeSummary | RecordingSummary) -> dict[str, Any]:
+    labels = item.model_dump(include={"task", "domain", "operator"})
+    return labels | {"outcome": OUTCOMES[item.success]}
 
 
 async def _last_page(form: type[Page], store: Upstream, path: str) -> Page:

@@ -96,19 +96,19 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
     """Run all stages and return the contents of `report.json`; `folder` is for scratch."""
     stages, truths = Stages(), EpisodeStore(folder / "truth")
     with stages.stage("truth", "recording the truth in the physics twin"):
-        truth = recording.make_truth(plan, folder / "truth")
+        originals, demonstrations = recording.make_truth(plan, folder / "truth")
     if plan.train:
         with stages.stage("train", "training world model, policy and probe"):
             models = scoring.train_models(plan.output / "trained")
     else:
         models = scoring.committed_models()
     with served(_apps(folder / "alignments", models.world_model)) as urls:
-        takes: dict[str, recording.Take] = {
-            domain: _take(truths.open(episode_id), folder / "spool", seed, urls, stages)
-            for seed, (domain, episode_id) in enumerate(truth.takes.items())
-        }
+        takes: dict[str, recording.Take] = {}
+        for seed, original in enumerate(map(truths.open, originals)):
+            taken = _take(original, folder / "spool", seed, urls, stages)
+            takes[original.attributes.domain] = taken
         with stages.stage("predict", "predicting held-out scenes with the world model"):
-            scenes = [read_scene(truths.open(episode_id)) for episode_id in truth.demonstrations]
+            scenes = [read_scene(truths.open(episode_id)) for episode_id in demonstrations]
             scoring.refuse_trained(models.training_seeds, (scene.start.seed for scene in scenes))
             prediction = measure_prediction(models.world_model, scenes)
         with stages.stage("judge", "scoring policies in the twin and in the world model"):

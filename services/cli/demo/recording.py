@@ -63,14 +63,6 @@ CALIBRATION = TakePrompt(task="calibration", instruction="press all taxels")
 
 
 @dataclass(frozen=True)
-class Truth:
-    """Ids of the true episodes: the two takes, and demonstrations to predict."""
-
-    takes: dict[Domain, str]
-    demonstrations: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class Take:
     """A recorded and aligned take with its end-to-end errors."""
 
@@ -80,13 +72,17 @@ class Take:
     clock_residuals_ms: dict[str, np.ndarray]
 
 
-def make_truth(plan: DemoPlan, store_folder: Path) -> Truth:
-    """Record the true episodes in the twin, on all cores."""
+def make_truth(plan: DemoPlan, store_folder: Path) -> tuple[list[str], list[str]]:
+    """Record the true episodes in the twin, on all cores.
+
+    Returns:
+        Ids of the two takes, and of demonstrations to predict.
+    """
     store = str(store_folder)
-    takes = {
-        domain: Order(task, domain, plan.take_seed, TakeOptions(), store)
+    takes = [
+        Order(task, domain, plan.take_seed, TakeOptions(), store)
         for domain, task in RECORDED.items()
-    }
+    ]
     # At least two scenes, so that the actions of another one are available.
     scenes = range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + plan.num_predicted)
     demonstrations = [
@@ -95,16 +91,13 @@ def make_truth(plan: DemoPlan, store_folder: Path) -> Truth:
         for task in TASKS
         for seed in scenes
     ]
-    orders = [*takes.values(), *demonstrations]
+    orders = takes + demonstrations
     with Progress("episodes", len(orders)) as progress:
         for answer in in_processes(make_episode, orders, min(MAX_PROCESSES, os.cpu_count() or 1)):
             if answer.refusal is not None:
                 raise InvalidInputError(f"{answer.episode_id}: {answer.refusal}")
             progress.advance()
-    return Truth(
-        {domain: order.episode_id for domain, order in takes.items()},
-        tuple(order.episode_id for order in demonstrations),
-    )
+    return [order.episode_id for order in takes], [order.episode_id for order in demonstrations]
 
 
 def record_take(

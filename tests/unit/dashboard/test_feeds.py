@@ -1,12 +1,15 @@
 """Feeds turn what services answer into views, and absence into words, never into old numbers."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from dashboard_fakes import PRESSURES, broken_upstream
 
 from dextouch.errors import ConflictError, NotFoundError, UnknownNameError
+from services.dashboard import app
 from services.dashboard.feeds import Feeds
 from services.dashboard.settings import DashboardSettings
 
@@ -217,3 +220,10 @@ async def test_lost_taxels_are_said():
     feeds = Feeds({"acquisition": broken_upstream("acquisition")}, DashboardSettings())
     (message,) = await feeds.topics["taxels"].newest()
     assert json.loads(message)["topic"] == "taxels_lost"
+
+
+def test_the_page_draws_every_topic(feeds):
+    page = Path(app.STATIC / "main.js").read_text(encoding="utf-8")
+    handlers = page.split("const topics = {")[1].split("\n};")[0]
+    # Taxels are bytes, with a handler of their own.
+    assert set(feeds.topics) - {"taxels"} <= set(re.findall(r"^  (\w+):", handlers, re.MULTILINE))
