@@ -1,20 +1,29 @@
-"""Command `dextouch station calibrate camera`: intrinsics from photos of a board."""
+"""Command `dextouch station calibrate camera`: intrinsics from photos of a board.
+
+The photos lie in a folder, or are collected first: from a watched folder or a running station.
+"""
 
 import argparse
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 
-from dextouch.errors import NotFoundError
+from dextouch.clients import HttpLink
+from dextouch.errors import InvalidInputError, NotFoundError, StaleDataError
 from services.alignment.calibration.intrinsics import CameraCalibration, calibrate_found
 from services.cli.calibrate.advice import Coverage, camera_coverage
 from services.cli.calibrate.boards import (
     SUFFIXES,
+    Board,
     BoardView,
     Lens,
     Photos,
+    decode_photo,
+    find_board,
     parse_board,
     photo_paths,
     read_photos,
@@ -25,10 +34,29 @@ from services.cli.calibrate.record import named_matrix, read_matrices, write_ent
 
 # OpenCV's pixel origin is the centre of the first pixel, DexTouch's its corner.
 PIXEL_SHIFT_PX = 0.5
+LIVE_PERIOD_S = 0.2
+WATCH_PERIOD_S = 1.0
+# A board that moved by more between two live images is motion-blurred (0.5 px at 6 px).
+MAX_MOTION_PX = 1.5
+# Views nearer to a kept one than this share of the image diagonal are redundant.
+MIN_NEWS = 0.04
+MAX_VIEWS = 60
+# Number of live images without a new view (4 s and more) after which a hint is printed.
+TELL_AFTER_IMAGES = 20
+
+Arrivals = Iterator[tuple[str, bytes]]
+Wait = Callable[[float], None]
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, object]:
-    """Calibrate from the photos of a folder; coverage and advice are written in any case."""
+    """Calibrate from the photos of a folder; coverage and advice are written in any case.
+
+    With `--url` or `--watch` photos are collected first.
+    """
+    if options.watch and options.url is not None:
+        raise InvalidInputError("got --watch and --url, expected one of the two")
+    if options.watch or options.url is not None:
+        _collect(options, parse_board(options.board))
     paths = photo_paths(options.photos)
     if not paths:
         raise NotFoundError(f"{options.photos}: holds no photo; expected {', '.join(SUFFIXES)}")
@@ -121,3 +149,130 @@ def read_lens(folder: Path, camera: str) -> tuple[Lens, tuple[int, int]]:
         ) from error
     K[:2, 2] -= PIXEL_SHIFT_PX
     return Lens(K, distortion[0]), (int(width_px), int(height_px))
+
+
+class Session:
+    """Growing set of views of one camera, with its coverage picture in the calibration folder."""
+
+    def __init__(self, board: Board, folder: Path, camera_name: str) -> None:
+        self.views: list[BoardView] = []
+        self.todo: tuple[str, ...] = ("hold the board in front of the camera",)
+        self.board, self._folder, self._camera = board, folder, camera_name
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether coverage is sufficient, or the maximum number of views is reached."""
+        return not self.todo or len(self.views) >= MAX_VIEWS
+
+    def is_new(self, view: BoardView, photo: np.ndarray) -> bool:
+        """Whether the view differs enough from all kept ones."""
+        needed_px = MIN_NEWS * float(np.hypot(*photo.shape))
+        return all(motion_px(view, kept) > needed_px for kept in self.views)
+
+    def keep(self, view: BoardView, photo: np.ndarray) -> None:
+        """Add a view, redraw the picture and print advice."""
+        self.views.append(view)
+        size_px = (photo.shape[1], photo.shape[0])
+        coverage, path = write_coverage(self.views, size_px, self._folder, self._camera)
+        if coverage.todo != self.todo or len(self.views) == 1:
+            print(f"{len(self.views)} views ({path}); next: {'; '.join(coverage.todo) or 'done'}")
+        self.todo = coverage.todo
+
+
+def motion_px(a: BoardView, b: BoardView) -> float:
+    """Mean displacement of common corners; infinity if there are none."""
+    pixels_b = dict(zip(map(tuple, b.points_board.tolist()), b.pixels, strict=True))
+    pairs = zip(map(tuple, a.points_board.tolist()), a.pixels, strict=True)
+    moved = [np.linalg.norm(pixel - pixels_b[at]) for at, pixel in pairs if at in pixels_b]
+    return float(np.mean(moved)) if moved else float("inf")
+
+
+def follow_folder(session: Session, arrivals: Arrivals) -> None:
+    """Process photos as they appear in a folder, until coverage is sufficient."""
+    for name, data in arrivals:
+        photo = decode_photo(data, where=name)
+        view = find_board(name, photo, session.board)
+        if view is None or view.is_blurred:
+            print(f"{name}: {'no board' if view is None else 'blurred, left out'}")
+        else:
+            session.keep(view, photo)
+        if session.is_enough:
+            return
+
+
+def collect_live(session: Session, arrivals: Arrivals, photos: Path) -> int:
+    """Keep JPEG images of a static board in new positions in a folder; returns their number."""
+    photos.mkdir(parents=True, exist_ok=True)
+    before: BoardView | None = None
+    first = len(list(photos.glob("live_*.jpg")))
+    num_kept = num_idle = 0
+    for name, data in arrivals:
+        photo = decode_photo(data, where=name)
+        view = find_board(name, photo, session.board)
+        still = view is not None and before is not None and motion_px(view, before) <= MAX_MOTION_PX
+        if view is None:
+            why = "no board in the last image; does --board match this board?"
+        elif not still or view.is_blurred:
+            why = "the board in the last image moves or is blurred; hold it still"
+        elif not session.is_new(view, photo):
+            why = "the board is where it was; hold it elsewhere"
+        else:
+            why, num_idle = "", 0
+            (photos / f"live_{first + num_kept:04d}.jpg").write_bytes(data)
+            num_kept += 1
+            session.keep(view, photo)
+        before = view
+        if session.is_enough:
+            break
+        num_idle += bool(why)
+        if why and num_idle % TELL_AFTER_IMAGES == 0:
+            print(why)
+    return num_kept
+
+
+def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:
+    """Yield the photos of a folder, then new ones, indefinitely."""
+    seen: set[Path] = set()
+    while True:
+        for path in photo_paths(folder):
+            if path not in seen:
+                seen.add(path)
+                yield path.name, path.read_bytes()
+        wait(WATCH_PERIOD_S)
+
+
+def station_arrivals(newest: Callable[[], bytes], *, wait: Wait = time.sleep) -> Arrivals:
+    """Yield new images of a station's camera at 5 Hz, indefinitely, skipping repeated ones.
+
+    `newest` requests the newest JPEG image, `wait` sleeps between requests.
+    """
+    last = b""
+    for number in count():
+        try:
+            data = newest()
+        except StaleDataError:
+            # The camera pauses; an old image would look like a static board.
+            data = b""
+        if data and data != last:
+            last = data
+            yield f"live image {number}", data
+        wait(LIVE_PERIOD_S)
+
+
+def _collect(options: argparse.Namespace, board: Board) -> None:
+    """Collect until coverage is sufficient, or Ctrl-C."""
+    session = Session(board, options.to, options.camera)
+    print("Ctrl-C ends the collection and calibrates with the photos so far")
+    try:
+        if options.url is None:
+            follow_folder(session, folder_arrivals(options.photos))
+            return
+        link = HttpLink(options.url, api_key=options.key)
+        path = f"/v1/live/cameras/camera_{options.camera}"
+
+        def newest() -> bytes:
+            return link.request("GET", path, accept="image/jpeg").body
+
+        collect_live(session, station_arrivals(newest), options.photos)
+    except KeyboardInterrupt:
+        print(f"stopped with {len(session.views)} views")

@@ -122,7 +122,7 @@ examples:
 
 # What each command measures, its longer help, and `module:function` that runs it.
 _COMMANDS = {
-    "camera": ("photos of a board → K and distortion of a camera", _CAMERA, "live:calibrate"),
+    "camera": ("photos of a board → K and distortion of a camera", _CAMERA, "camera:calibrate"),
     "hand-eye": ("photos and poses → camera on its tracker", _HAND_EYE, "mounts:calibrate_mount"),
     "glove": ("rest and known pressures → tare, gain, faults", _GLOVE, "glove:calibrate"),
     "wrist": ("flat hand → wrist axes of a glove's keypoints", _WRIST, "hands:measure_wrist"),

@@ -16,7 +16,7 @@ from dextouch.errors import (
 )
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.cli.calibrate import advice, boards, live
+from services.cli.calibrate import advice, boards, camera
 from services.cli.calibrate.command import main
 from tests.unit.cli.rendered_boards import (
     BOARD,
@@ -108,9 +108,9 @@ def test_live_views_are_kept_only_when_still_and_new(tmp_path):
     here, there = board_at([-0.1, 0, 0.5], [0, 0.4, 0]), board_at([0.1, 0, 0.5], [0, -0.4, 0])
     moving = board_at([0, 0, 0.5], [0, 0, 0])
     images = [jpeg(T) for T in (here, here, here, moving, there, there)]
-    session = live.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
+    session = camera.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
     arrivals = ((f"live {index}", data) for index, data in enumerate(images))
-    num_kept = live.collect_live(session, arrivals, tmp_path / "photos")
+    num_kept = camera.collect_live(session, arrivals, tmp_path / "photos")
     assert num_kept == 2
     kept = sorted((tmp_path / "photos").glob("*.jpg"))
     assert [path.read_bytes() for path in kept] == [images[1], images[5]]
@@ -127,16 +127,16 @@ def test_live_views_are_kept_only_when_still_and_new(tmp_path):
 )
 def test_live_images_that_add_nothing_are_told_now_and_then(image, words, tmp_path, capsys):
     data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()
-    session = live.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
-    num_images = 2 * live.TELL_AFTER_IMAGES + 3
-    live.collect_live(session, ((f"{i}", data) for i in range(num_images)), tmp_path / "photos")
+    session = camera.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
+    num_images = 2 * camera.TELL_AFTER_IMAGES + 3
+    camera.collect_live(session, ((f"{i}", data) for i in range(num_images)), tmp_path / "photos")
     assert capsys.readouterr().out.count(words) == 2
 
 
 def test_a_watched_folder_is_read_once_and_left_when_the_views_suffice(tmp_path):
     views = good_views()
     photos = write_photos(tmp_path / "photos", views[:10])
-    session = live.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
+    session = camera.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
     waits, later = count(), iter(range(10, 25))
 
     def wait(_):
@@ -144,7 +144,7 @@ def test_a_watched_folder_is_read_once_and_left_when_the_views_suffice(tmp_path)
         index = next(later)
         cv2.imwrite(str(photos / f"photo_{index:02d}.png"), render(views[index]))
 
-    live.follow_folder(session, live.folder_arrivals(photos, wait=wait))
+    camera.follow_folder(session, camera.folder_arrivals(photos, wait=wait))
     assert session.is_enough
     assert [view.name for view in session.views] == [f"photo_{i:02d}.png" for i in range(25)]
     assert next(waits) == 15
@@ -154,13 +154,13 @@ def test_blurred_photos_are_named_and_do_not_count(tmp_path, capsys):
     photo = render(board_at([0, 0, 0.4], [0, 0, 0]))
     pair = [cv2.imencode(".png", image)[1].tobytes() for image in (photo, smeared(photo, (6, 0)))]
     named = list(zip(("sharp", "moved"), pair, strict=True))
-    session = live.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
-    live.follow_folder(session, iter(named))
+    session = camera.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
+    camera.follow_folder(session, iter(named))
     assert [view.name for view in session.views] == ["sharp"]
     assert "moved: blurred, left out" in capsys.readouterr().out
     # The board stands still, but the image is blurred all the same: out of focus, say.
     still = iter([("a", pair[1]), ("b", pair[1])])
-    assert live.collect_live(session, still, tmp_path / "live") == 0
+    assert camera.collect_live(session, still, tmp_path / "live") == 0
     photos = tmp_path / "photos"
     photos.mkdir()
     for name, data in named:
@@ -180,7 +180,7 @@ def test_station_images_come_once_each_and_pauses_are_no_images():
             raise StaleDataError("the newest image is 1 s old")
         return body
 
-    arrivals = live.station_arrivals(newest, wait=lambda _: None)
+    arrivals = camera.station_arrivals(newest, wait=lambda _: None)
     assert [next(arrivals)[1], next(arrivals)[1]] == [b"a", b"b"]
 
 
