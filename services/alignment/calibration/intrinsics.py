@@ -159,12 +159,21 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
         np.eye(3),
         np.zeros(5),
     )
-    sigma = np.asarray(sigma, dtype=np.float64).ravel()
-    K = np.asarray(K, dtype=np.float64)
-    _check_views(
-        rotation_from_vector(np.array(turns, dtype=np.float64).reshape(-1, 3)),
-        float(max(sigma[0] / K[0, 0], sigma[1] / K[1, 1])),
-    )
+    sigma, K = np.asarray(sigma, dtype=np.float64).ravel(), np.asarray(K, dtype=np.float64)
+    relative = float(max(sigma[0] / K[0, 0], sigma[1] / K[1, 1]))
+    normals = rotation_from_vector(np.array(turns, dtype=np.float64).reshape(-1, 3))[:, :, 2]
+    # Largest angle between two directions of the board.
+    spread_rad = float(np.arccos(np.clip(normals @ normals.T, -1, 1)).max())
+    if spread_rad < MIN_TILT_SPREAD_RAD or not relative <= MAX_FOCAL_SIGMA:
+        raise DegenerateMotionError(
+            f"intrinsics: the board's directions differ by {np.rad2deg(spread_rad):.0f} degrees "
+            f"at most and the focal length is known to {relative:.1%}; expected at least "
+            f"{np.rad2deg(MIN_TILT_SPREAD_RAD):.0f} degrees and {MAX_FOCAL_SIGMA:.0%}: take photos "
+            "with the board tilted by 20 to 45 degrees about both its axes",
+            spread_deg=float(np.rad2deg(spread_rad)),
+            relative_sigma=relative,
+        )
+    cells = np.concatenate(found.pixels_px) / np.array(found.image_size_px) * 4
     return CameraCalibration(
         K=K,
         distortion=np.asarray(distortion, dtype=np.float64).ravel()[:5],
@@ -172,7 +181,7 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
         sigma_distortion=sigma[4:9],
         rms_px=float(rms_px),
         rms_by_photo_px=np.asarray(by_photo, dtype=np.float64).ravel(),
-        coverage=_coverage(found.pixels_px, found.image_size_px),
+        coverage=len(np.unique(cells.astype(int).clip(0, 3), axis=0)) / 16,
         used_images=found.photos,
     )
 
@@ -271,27 +280,6 @@ def _charuco(board: CharucoBoard) -> dict[str, Detector]:
     if board.rows % 2:
         return {EITHER_CHARUCO: detector(legacy=False)}
     return {CHARUCO: detector(legacy=False), LEGACY_CHARUCO: detector(legacy=True)}
-
-
-def _coverage(pixels_px: Sequence[np.ndarray], image_size_px: tuple[int, int]) -> float:
-    cells = np.concatenate(list(pixels_px)) / np.array(image_size_px) * 4
-    return len(np.unique(cells.astype(int).clip(0, 3), axis=0)) / 16
-
-
-def _check_views(Rs_camera_board: np.ndarray, relative: float) -> None:
-    """Refuse views that do not determine the focal length, known to a `relative` sigma."""
-    normals = Rs_camera_board[:, :, 2]
-    # Largest angle between two directions of the board.
-    spread_rad = float(np.arccos(np.clip(normals @ normals.T, -1, 1)).max())
-    if spread_rad < MIN_TILT_SPREAD_RAD or not relative <= MAX_FOCAL_SIGMA:
-        raise DegenerateMotionError(
-            f"intrinsics: the board's directions differ by {np.rad2deg(spread_rad):.0f} degrees "
-            f"at most and the focal length is known to {relative:.1%}; expected at least "
-            f"{np.rad2deg(MIN_TILT_SPREAD_RAD):.0f} degrees and {MAX_FOCAL_SIGMA:.0%}: take photos "
-            "with the board tilted by 20 to 45 degrees about both its axes",
-            spread_deg=float(np.rad2deg(spread_rad)),
-            relative_sigma=relative,
-        )
 
 
 def _widths_px(

@@ -175,7 +175,14 @@ def agreeing_views(series: Series, mount: np.ndarray | None = None) -> Agreement
             check_sides(used, errors)
         ratios = (errors / np.maximum(np.median(errors, axis=0), EXACT)).max(axis=1)
         if ratios.max() <= OUTLIER_RATIO:
-            _check_noise(series.task, errors)
+            rms = _rms(errors)
+            if rms[0] > MAX_ROTATION_RMS_RAD or rms[1] > MAX_TRANSLATION_RMS_M:
+                raise InvalidInputError(
+                    f"{series.task}: the views contradict each other by {_told(errors)} RMS, "
+                    f"expected at most {np.rad2deg(MAX_ROTATION_RMS_RAD):.0f} degrees and "
+                    f"{MAX_TRANSLATION_RMS_M * 1e3:.0f} mm; check that both series were taken at "
+                    "the same times and the target did not move"
+                )
             left_out = tuple(sorted(set(range(num_views)) - set(views.tolist())))
             return Agreement(used, views, left_out, X, Z, mount is not None)
         if len(views) <= min_views:
@@ -248,17 +255,6 @@ def check_sides(series: Series, errors: np.ndarray) -> None:
         f"mount is then {length_m * 1e3:.0f} mm long); pass the inverse of each matrix of {name}",
         inverted=name,
     )
-
-
-def _check_noise(task: str, errors: np.ndarray) -> None:
-    """Refuse views that contradict each other by more than any noise."""
-    rms = _rms(errors)
-    if rms[0] > MAX_ROTATION_RMS_RAD or rms[1] > MAX_TRANSLATION_RMS_M:
-        raise InvalidInputError(
-            f"{task}: the views contradict each other by {_told(errors)} RMS, expected at most "
-            f"{np.rad2deg(MAX_ROTATION_RMS_RAD):.0f} degrees and {MAX_TRANSLATION_RMS_M * 1e3:.0f} "
-            "mm; check that both series were taken at the same times and the target did not move"
-        )
 
 
 def _rms(errors: np.ndarray) -> Float64[np.ndarray, "2"]:

@@ -5,7 +5,7 @@ evidence: its neighbours (or the others under the same known pressure) moved, an
 nothing around it moved it stays `unproven`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -162,31 +162,37 @@ def classify_taxels(
 
     The takes are raw counts [T, 360] each; the rest take may be among them.
     """
+    side, level = tare.side, tare.level
     evidence, silent, moves = (np.zeros(NUM_TAXELS, dtype=np.int64) for _ in range(3))
-    zero = select_taxels(tare.level.mean_counts, side=tare.side)
-    needed = np.maximum(
-        MIN_MOVE_SIGMAS * select_taxels(tare.level.noise_counts, side=tare.side), MIN_MOVE_COUNTS
-    )
-    for counts in _blocks(takes, tare.side):
-        moved = np.abs(counts - zero)
-        around = _least_neighbour(moved)
-        told = around >= needed
-        evidence += told.sum(axis=0)
-        silent += (told & (moved < SILENT_RATIO * around)).sum(axis=0)
-        moves += (moved >= needed).sum(axis=0)
+    zero = select_taxels(level.mean_counts, side=side)
+    noise = select_taxels(level.noise_counts, side=side)
+    needed = np.maximum(MIN_MOVE_SIGMAS * noise, MIN_MOVE_COUNTS)
+    for take in takes:
+        # In pieces, since eight neighbours of every reading would not fit in memory.
+        for start in range(0, len(take), BLOCK):
+            block = np.asarray(take[start : start + BLOCK], dtype=np.float64)
+            moved = np.abs(select_taxels(block, side=side) - zero)
+            around = _least_neighbour(moved)
+            told = around >= needed
+            evidence += told.sum(axis=0)
+            silent += (told & (moved < SILENT_RATIO * around)).sum(axis=0)
+            moves += (moved >= needed).sum(axis=0)
     is_silent = (evidence >= MIN_EVIDENCE) & (silent >= MIN_SILENT * evidence)
     is_silent &= moves < MIN_OWN_MOVES
     states = np.full(NUM_TAXELS, UNPROVEN, dtype=np.uint8)
     states[(moves >= MIN_OWN_MOVES) | ((evidence >= MIN_EVIDENCE) & ~is_silent)] = OK
-    states[is_silent] = kind_of_silence(takes, tare.side)[is_silent]
-    states[_always_full(takes, tare.side, full_scale_counts)] = SATURATED
+    states[is_silent] = kind_of_silence(takes, side)[is_silent]
+    usual = select_taxels(np.min([np.median(take, axis=0) for take in takes], axis=0), side=side)
+    states[usual >= SATURATED_RATIO * full_scale_counts] = SATURATED
     return states
 
 
 def kind_of_silence(takes: Sequence[np.ndarray], side: Side) -> UInt8[np.ndarray, "320"]:
     """`STUCK` for taxels that keep one value other than zero in all takes, else `DEAD`."""
-    lowest = select_taxels(np.min([np.min(take, axis=0) for take in takes], axis=0), side=side)
-    highest = select_taxels(np.max([np.max(take, axis=0) for take in takes], axis=0), side=side)
+    lowest, highest = (
+        select_taxels(most([most(take, axis=0) for take in takes], axis=0), side=side)
+        for most in (np.min, np.max)
+    )
     return np.where((lowest == highest) & (lowest != 0), STUCK, DEAD).astype(np.uint8)
 
 
@@ -227,21 +233,6 @@ def _neighbours() -> Int64[np.ndarray, "320 8"]:
 
 _NEIGHBOURS = _neighbours()
 _NUM_NEIGHBOURS = (_NEIGHBOURS >= 0).sum(axis=1)
-
-
-def _always_full(
-    takes: Sequence[np.ndarray], side: Side, full_scale_counts: float
-) -> Bool[np.ndarray, "320"]:
-    lowest = np.min([np.median(take, axis=0) for take in takes], axis=0)
-    return select_taxels(lowest, side=side) >= SATURATED_RATIO * full_scale_counts
-
-
-def _blocks(takes: Sequence[np.ndarray], side: Side) -> Iterator[Float64[np.ndarray, "time 320"]]:
-    """Pieces of the takes, since eight neighbours of every reading would not fit in memory."""
-    for take in takes:
-        for start in range(0, len(take), BLOCK):
-            block = np.asarray(take[start : start + BLOCK], dtype=np.float64)
-            yield select_taxels(block, side=side)
 
 
 def _least_neighbour(moved: Float64[np.ndarray, "time 320"]) -> Float64[np.ndarray, "time 320"]:
