@@ -52,6 +52,20 @@ MIN_CURL: Final = 0.15
 MIN_THUMB_HEIGHT_M: Final = 0.003
 
 
+def checked_keypoints(
+    keypoints_m: np.ndarray, *, where: str = "keypoints"
+) -> Float64[np.ndarray, "time 25 3"]:
+    """The keypoints as contiguous float64.
+
+    Raises:
+        ShapeError: not [T ≥ 1, 25, 3].
+    """
+    keypoints = np.ascontiguousarray(keypoints_m, dtype=np.float64)
+    if keypoints.ndim != 3 or keypoints.shape[1:] != (NUM_KEYPOINTS, 3) or not len(keypoints):
+        raise ShapeError(f"{where}: got shape {keypoints.shape}, expected [T ≥ 1, 25, 3]")
+    return keypoints
+
+
 def seen_nodes(keypoints_m: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
     """A copy of keypoints in which nodes with any invalid coordinate are NaN throughout."""
     nodes = np.array(keypoints_m, dtype=np.float64)
@@ -68,10 +82,7 @@ def seen_samples(keypoints_m: np.ndarray, *, where: str) -> Float64[np.ndarray, 
         ShapeError: not [T ≥ 1, 25, 3].
         InvalidInputError: no sample shows four nodes of the palm.
     """
-    keypoints = np.asarray(keypoints_m)
-    if keypoints.ndim != 3 or keypoints.shape[1:] != (NUM_KEYPOINTS, 3) or not len(keypoints):
-        raise ShapeError(f"{where}: got shape {keypoints.shape}, expected [T ≥ 1, 25, 3]")
-    looked_at = seen_nodes(thinned(keypoints, MAX_LOOKED_AT))
+    looked_at = seen_nodes(thinned(checked_keypoints(keypoints_m, where=where), MAX_LOOKED_AT))
     num_seen = np.isfinite(looked_at[:, PALM_NODES, 0]).sum(axis=1)
     if not (num_seen >= MIN_PALM_NODES).any():
         raise InvalidInputError(

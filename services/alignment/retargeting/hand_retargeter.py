@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float64, UInt8
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.hands.robot_hand import HandModel, RobotHand
+from services.alignment.retargeting.hand_checks import checked_keypoints
 from services.alignment.retargeting.hand_profile import HandProfile
 from services.alignment.retargeting.profile_fit import (
-    checked_keypoints,
     measure_profile,
     person_arrays,
     robot_bone_m,

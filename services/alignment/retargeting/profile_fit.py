@@ -3,10 +3,10 @@
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.errors import InvalidInputError
 from dextouch.hands import CHAINS, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import HandModel
-from services.alignment.retargeting.hand_checks import thinned
+from services.alignment.retargeting.hand_checks import checked_keypoints, thinned
 from services.alignment.retargeting.hand_profile import (
     BONE_RANGE_M,
     NUM_FINGERS,
@@ -104,18 +104,6 @@ def _chains_of(hand: HandModel) -> list[int]:
 def robot_bone_m(hand: HandModel) -> Float64[np.ndarray, "fingers 3"]:
     """Lengths from knuckle to PIP, DIP and tip of a robot hand at zero angles."""
     return np.asarray(np.linalg.norm(np.diff(zero_points_m(hand), axis=1), axis=-1))
-
-
-def checked_keypoints(keypoints_m: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
-    """The keypoints as contiguous float64.
-
-    Raises:
-        ShapeError: not [T ≥ 1, 25, 3].
-    """
-    keypoints = np.ascontiguousarray(keypoints_m, dtype=np.float64)
-    if keypoints.ndim != 3 or keypoints.shape[1:] != (NUM_KEYPOINTS, 3) or not len(keypoints):
-        raise ShapeError(f"keypoints: got shape {keypoints.shape}, expected [T ≥ 1, 25, 3]")
-    return keypoints
 
 
 def measure_profile(keypoints_m: np.ndarray, hand: HandModel) -> HandProfile:
