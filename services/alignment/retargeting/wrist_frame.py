@@ -243,7 +243,22 @@ def hand_axes_check(
     R_wrist_palm = frame.T_tracker_wrist[:3, :3]
     off_rad = float(rotation_angle(R_wrist_palm))
     if off_rad > MAX_OFF_RAD:
-        _refuse_axes(R_wrist_palm, off_rad, side, is_calibrated=T_keypoints_wrist is not None)
+        axis = np.round(vector_from_rotation(R_wrist_palm) / off_rad, 2).tolist()
+        fingers = np.round(-R_wrist_palm[:, 2], 2).tolist()
+        told = (
+            f"record the flat hand and run dextouch station calibrate wrist --side {side}, which "
+            f"makes the calibration {calibration_name(side)!r}"
+            if T_keypoints_wrist is None
+            else f"the calibration {calibration_name(side)!r} does not fit this recording: lay the "
+            "hand flat and calibrate again, the glove may have slipped"
+        )
+        raise InvalidInputError(
+            f"{where}: got keypoints that are turned by {np.rad2deg(off_rad):.0f} degrees about "
+            f"{axis} from the wrist's axes (the palm points along {fingers}, expected [0, 0, -1] "
+            f"within {np.rad2deg(MAX_OFF_RAD):.0f} degrees); {told}",
+            fault="axes",
+            off_deg=float(np.rad2deg(off_rad)),
+        )
     return keypoints
 
 
@@ -329,22 +344,3 @@ def _bends_rad(samples: np.ndarray) -> Float64[np.ndarray, "time 4"]:
     rest = fingers[:, :, 4] - fingers[:, :, 2]
     sine = np.linalg.norm(np.cross(first, rest), axis=-1)
     return np.asarray(np.arctan2(sine, (first * rest).sum(axis=-1)))
-
-
-def _refuse_axes(R: np.ndarray, off_rad: float, side: Side, *, is_calibrated: bool) -> None:
-    axis = np.round(vector_from_rotation(R) / off_rad, 2).tolist()
-    fingers = np.round(-R[:, 2], 2).tolist()
-    told = (
-        f"the calibration {calibration_name(side)!r} does not fit this recording: lay the hand "
-        "flat and calibrate again, the glove may have slipped"
-        if is_calibrated
-        else f"record the flat hand and run dextouch station calibrate wrist --side {side}, which "
-        f"makes the calibration {calibration_name(side)!r}"
-    )
-    raise InvalidInputError(
-        f"keypoints_{side}: got keypoints that are turned by {np.rad2deg(off_rad):.0f} degrees "
-        f"about {axis} from the wrist's axes (the palm points along {fingers}, expected "
-        f"[0, 0, -1] within {np.rad2deg(MAX_OFF_RAD):.0f} degrees); {told}",
-        fault="axes",
-        off_deg=float(np.rad2deg(off_rad)),
-    )

@@ -1,6 +1,6 @@
 """Hand trajectories and 67-D actions at the steps of the model's grid."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -101,22 +101,17 @@ def make_actions(
         joints_rad, quality = retarget_hands(gridded.streams, gridded.at, calibration)
     else:
         joints_rad, quality = gridded.vectors("joints_measured"), {}
-    trajectory = _trajectory((left, right, head), joints_rad)
+    by_side = np.split(joints_rad, 2, axis=1)
+    trajectory = HandTrajectory(left, right, by_side[0], by_side[1], head)
     anchor = trajectory.anchor(0)
     commanded = None
     if all(name in gridded.streams for name in COMMANDED_STREAMS):
-        wrists = [gridded.poses(f"wrist_{side}_commanded") for side in SIDES]
+        left, right = (gridded.poses(f"wrist_{side}_commanded") for side in SIDES)
+        by_side = np.split(gridded.vectors("joints_commanded"), 2, axis=1)
         # Nobody commands the head: where it was is where it should have been.
-        wanted = _trajectory((*wrists, head), gridded.vectors("joints_commanded"))
+        wanted = HandTrajectory(left, right, by_side[0], by_side[1], head)
         commanded = actions_from_poses(wanted, anchor)
     return GridActions(anchor, actions_from_poses(trajectory, anchor), commanded, quality)
-
-
-def _trajectory(poses: Sequence[np.ndarray], joints_rad: np.ndarray) -> HandTrajectory:
-    """From the poses of left wrist, right wrist and head, and 40 joint angles."""
-    left, right, head = poses
-    joints_left_rad, joints_right_rad = np.split(joints_rad, 2, axis=1)
-    return HandTrajectory(left, right, joints_left_rad, joints_right_rad, head)
 
 
 def retarget_hands(
