@@ -5,7 +5,7 @@ Every step of a job is committed to disk before anyone hears of it; only progres
 
 import asyncio
 import fcntl
-import json
+import re
 import sqlite3
 import threading
 from collections.abc import Iterable, Iterator, Sequence
@@ -36,6 +36,7 @@ LOCK_FILE = "lock"
 # Where earlier versions kept jobs, and its name once they have been imported.
 JSON_LINES_FILE = "jobs.jsonl"
 IMPORTED_FILE = "jobs.jsonl.imported"
+JSON_LINE = re.compile(rb'\{"crc32c":(\d{1,10}),"job":(.*)\}')
 SCHEMA_VERSION = 1
 SCHEMA = """
 CREATE TABLE jobs (
@@ -319,12 +320,10 @@ def _read_json_lines(path: Path) -> list[AlignmentJob]:
     jobs: dict[str, AlignmentJob] = {}
     for number, line in enumerate(lines, start=1):
         where = f"{path}, line {number} of {len(lines)}"
-        try:
-            crc32c = int(json.loads(line)["crc32c"])
-            body = line[line.index(b'"job":') + 6 : -1]
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise CorruptDataError(f"{where}: not a line of jobs; {MOVE_AWAY}") from error
-        job = _checked(body, crc32c, where)
+        match = JSON_LINE.fullmatch(line)
+        if match is None:
+            raise CorruptDataError(f"{where}: not a line of jobs; {MOVE_AWAY}")
+        job = _checked(match[2], int(match[1]), where)
         if job.alignment_id in jobs and jobs[job.alignment_id].state in ENDED:
             # Submitted again: it goes to the end of the queue.
             del jobs[job.alignment_id]
