@@ -7,25 +7,28 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.command_line import CommandParser, add_json
 from dextouch.episodes import EpisodeStore
 from services.cli.study.parts import (
-    PolicyFactory,
     connect,
+    demonstrator,
     refuse_training_seeds,
     served_worlds,
 )
-from services.evaluation.command_line import instructions_for, print_failures, print_scores
-from services.evaluation.reporting import ReportPictures, write_report
-from services.evaluation.reporting.latex import latex_tables
-from services.evaluation.scores import ClosedLoopReport
+from services.evaluation.command_line import (
+    EXIT_FAILED,
+    instructions_for,
+    print_failures,
+    print_scores,
+)
 from services.evaluation.settings import DEFAULT_PROBE
-from services.evaluation.studies.definition import StudyDefinition, read_definition
-from services.evaluation.studies.engine import StudyParts, cells_of, run_study, study_report
+from services.evaluation.studies.definition import read_definition
+from services.evaluation.studies.engine import StudyParts, cells_of, run_study
+from services.evaluation.studies.policies import PolicyFactory
+from services.evaluation.studies.reports import REPORT_FILE, write_reports
 from services.evaluation.studies.results import StudyHeader, StudyResults
 from services.evaluation.success_probe import SuccessProbe
 
-EXIT_FAILED = 1
 _RUN_EPILOG = """\
 example:
   dextouch study run study.toml
@@ -53,7 +56,7 @@ def main(arguments: list[str]) -> int:
     """Run `dextouch study COMMAND`.
 
     Returns:
-        0, or 1 if a rollout failed.
+        0, or 1 if a rollout failed or has no result yet.
     """
     options = _parser().parse_args(arguments)
     run: Any = options.run
@@ -105,7 +108,7 @@ def _run(options: argparse.Namespace) -> int:
     probe_path = definition.probe or DEFAULT_PROBE
     probe = SuccessProbe.load(probe_path)
     instructions = instructions_for(definition.tasks, probe.metadata.settings["instructions"])
-    policies = PolicyFactory(definition)
+    policies = PolicyFactory(definition, partial(demonstrator, definition))
     policies.load()
     with served_worlds(definition) as addresses:
         digests = {"definition": definition.digest, "probe": _file_digest(probe_path)}
@@ -115,7 +118,7 @@ def _run(options: argparse.Namespace) -> int:
         results = StudyResults.create_or_resume(folder, header)
         num_cells = sum(1 for _ in cells_of(definition))
         print(f"{definition.name}: {len(results.outcomes)} of {num_cells} rollouts have a result")
-        report = run_study(
+        run_study(
             definition,
             results,
             StudyParts(
@@ -128,40 +131,20 @@ def _run(options: argparse.Namespace) -> int:
             ),
             retry_failed=options.retry_failed,
         )
-    return _write(folder, definition, results, report, options.json)
+    return _finish(results, options.json)
 
 
 def _report(options: argparse.Namespace) -> int:
-    results = StudyResults.read(options.folder)
-    definition = StudyDefinition.model_validate(results.header.definition)
-    report = study_report(definition, results)
-    return _write(options.folder, definition, results, report, options.json)
+    return _finish(StudyResults.read(options.folder), options.json)
+
+
+def _finish(results: StudyResults, json_path: Path | None) -> int:
+    figures = write_reports(results, json_path)
+    print_scores(figures)
+    print_failures(figures, results.path)
+    print(f"\nreport: {results.path.with_name(REPORT_FILE)}")
+    return EXIT_FAILED if figures["failures"] else 0
 
 
 def _file_digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _write(
-    folder: Path,
-    definition: StudyDefinition,
-    results: StudyResults,
-    report: ClosedLoopReport,
-    json_path: Path | None,
-) -> int:
-    figures = report.to_report()
-    figures["study"] = {"name": definition.name, "digests": results.header.digests}
-    for path in (folder / "report.json", json_path):
-        write_result(path, figures, allow_nan=False)
-    for world in definition.imagined:
-        others = tuple(name for name in definition.imagined if name != world)
-        page = ClosedLoopReport(
-            report.scores, (world, *others), report.policies, report.failures
-        ).to_report()
-        title = f"{definition.name}: {world} and the real world"
-        write_report(page | {"title": title}, ReportPictures(), folder / f"report {world}.html")
-    (folder / "tables.tex").write_text(latex_tables(report), encoding="utf-8")
-    print_scores(figures)
-    print_failures(figures, results.path)
-    print(f"\nreport: {folder / 'report.json'}")
-    return EXIT_FAILED if report.failures else 0

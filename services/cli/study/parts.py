@@ -3,21 +3,14 @@
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from copy import copy
 from dataclasses import dataclass
 
-from dextouch.clients import Policy, RolloutClient
-from dextouch.episodes import EpisodeStore
+from dextouch.clients import RolloutClient
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.serving import ChildProcess
-from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.policies.hold import HoldPolicy
-from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import ReplayPolicy
-from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.scores import REAL
-from services.evaluation.settings import DEFAULT_POLICY
-from services.evaluation.studies.definition import PolicyChoice, StudyDefinition, WorldChoice
+from services.evaluation.studies.definition import StudyDefinition, WorldChoice
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.twin.scripted_actions import scripted_actions
 from services.twin.settings import TwinSettings
@@ -91,50 +84,6 @@ def connect(addresses: Mapping[str, Address], connections: ExitStack) -> StudyWo
     return StudyWorlds.ask(real, opened)
 
 
-class PolicyFactory:
-    """Creates the policies of a study; data that all share is read once.
-
-    Raises:
-        UnknownNameError: a script or task that the twin does not know.
-        NotFoundError, CorruptDataError: a file or store that cannot be read.
-    """
-
-    def __init__(self, definition: StudyDefinition) -> None:
-        self._definition = definition
-        self._replays: dict[str, ReplayPolicy] = {}
-        for name, choice in definition.policies.items():
-            if choice.script is not None:
-                self._replays[name] = _scripted(definition, choice.script)
-            if choice.replay is not None:
-                store = EpisodeStore(choice.replay)
-                self._replays[name] = ReplayPolicy.of(
-                    robot_episodes([store], tasks=definition.tasks)
-                )
-
-    def load(self) -> dict[str, Policy]:
-        """All policies by name, each with a state of its own."""
-        return {name: self._load(name, one) for name, one in self._definition.policies.items()}
-
-    def training_starts(self) -> dict[str, tuple[str, ...]]:
-        """Digests of training starts of bundled and cloned policies, by description."""
-        return {
-            f"policy {name!r}": BehaviourCloningPolicy.load(
-                choice.checkpoint or DEFAULT_POLICY
-            ).metadata.training_starts
-            for name, choice in self._definition.policies.items()
-            if choice.builtin == "behaviour-cloning"
-        }
-
-    def _load(self, name: str, choice: PolicyChoice) -> Policy:
-        if choice.factory is not None:
-            return PolicySource.parse(f"{name}={choice.factory}").load(choice.arguments)
-        if name in self._replays:
-            return copy(self._replays[name])
-        if choice.builtin == "hold":
-            return HoldPolicy()
-        return BehaviourCloningPolicy.load(choice.checkpoint or DEFAULT_POLICY)
-
-
 def refuse_training_seeds(definition: StudyDefinition) -> None:
     """Refuse starts whose task and seed a world model was trained on.
 
@@ -165,8 +114,12 @@ def refuse_training_seeds(definition: StudyDefinition) -> None:
                 )
 
 
-def _scripted(definition: StudyDefinition, script: str) -> ReplayPolicy:
-    """The twin's demonstrator, planned for all starts without simulation."""
+def demonstrator(definition: StudyDefinition, script: str) -> ReplayPolicy:
+    """The twin's demonstrator, planned for all starts without simulation.
+
+    Raises:
+        UnknownNameError: no such script or task.
+    """
     stages = {task: Stage(task, "robot", TwinSettings()) for task in definition.tasks}
     return ReplayPolicy(
         {

@@ -1,0 +1,64 @@
+"""Policies of a study."""
+
+from collections.abc import Callable
+from copy import copy
+
+from dextouch.clients import Policy
+from dextouch.episodes import EpisodeStore
+from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
+from services.evaluation.policies.hold import HoldPolicy
+from services.evaluation.policies.outside import PolicySource
+from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.robot_episodes import robot_episodes
+from services.evaluation.settings import DEFAULT_POLICY
+from services.evaluation.studies.definition import PolicyChoice, StudyDefinition
+
+
+class PolicyFactory:
+    """Creates the policies of a study; data that all share is read once.
+
+    Args:
+        definition: of the study.
+        demonstrator: creates the policy of a `script`.
+
+    Raises:
+        UnknownNameError: a script or task that the twin does not know.
+        NotFoundError, CorruptDataError: a file or store that cannot be read.
+    """
+
+    def __init__(
+        self, definition: StudyDefinition, demonstrator: Callable[[str], ReplayPolicy]
+    ) -> None:
+        self._definition = definition
+        self._replays: dict[str, ReplayPolicy] = {}
+        for name, choice in definition.policies.items():
+            if choice.script is not None:
+                self._replays[name] = demonstrator(choice.script)
+            if choice.replay is not None:
+                store = EpisodeStore(choice.replay)
+                self._replays[name] = ReplayPolicy.of(
+                    robot_episodes([store], tasks=definition.tasks)
+                )
+
+    def load(self) -> dict[str, Policy]:
+        """All policies by name, each with a state of its own."""
+        return {name: self._load(name, one) for name, one in self._definition.policies.items()}
+
+    def training_starts(self) -> dict[str, tuple[str, ...]]:
+        """Digests of training starts of bundled and cloned policies, by description."""
+        return {
+            f"policy {name!r}": BehaviourCloningPolicy.load(
+                choice.checkpoint or DEFAULT_POLICY
+            ).metadata.training_starts
+            for name, choice in self._definition.policies.items()
+            if choice.builtin == "behaviour-cloning"
+        }
+
+    def _load(self, name: str, choice: PolicyChoice) -> Policy:
+        if choice.factory is not None:
+            return PolicySource.parse(f"{name}={choice.factory}").load(choice.arguments)
+        if name in self._replays:
+            return copy(self._replays[name])
+        if choice.builtin == "hold":
+            return HoldPolicy()
+        return BehaviourCloningPolicy.load(choice.checkpoint or DEFAULT_POLICY)
