@@ -1,8 +1,7 @@
-"""Reader threads of devices, with reconnection and ordering, and the flush thread of the spool."""
+"""Reader threads of devices, with reconnection, and the flush thread of the spool."""
 
 import os
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from jaxtyping import UInt16
 from dextouch.episodes import disk_errors
 from dextouch.episodes.spool import LOG_FILE
 from dextouch.errors import DeviceError, InvalidInputError, StorageError, StorageFullError
-from dextouch.streams import Sample, StreamDescriptor
+from dextouch.streams import Sample
 from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.drivers.base import Driver, Readings
 
@@ -40,8 +39,6 @@ EVENTS = (
     "driver_failure",
 )
 Sink = Callable[[Readings], None]
-# Packets that overtake each other do so within a few; a restarted device jumps further.
-WINDOW_SAMPLES = 64
 MEBIBYTE = 2**20
 
 
@@ -107,7 +104,6 @@ class DeviceSupervisor:
         self.last_error: str | None = None
         self.streams = {d.name: StreamCounters() for d in driver.descriptors}
         self._events = dict.fromkeys(EVENTS, 0)
-        self._guards = {d.name: SequenceGuard(d) for d in driver.descriptors}
         self._sink = sink
         # The last message that was logged, when, and how often it came since it was new.
         self._logged = NOTHING_LOGGED
@@ -132,12 +128,7 @@ class DeviceSupervisor:
 
     def events(self) -> dict[str, int]:
         """Counts of all that happened to the device since the start, by name."""
-        events = {**self.driver.events(), **self._events}
-        for guard in self._guards.values():
-            # All streams of a device come in the same packets; each guard has seen all of these.
-            events["repeated"] = max(events["repeated"], guard.repeated)
-            events["late"] = max(events["late"], guard.late)
-        return events
+        return {**self.driver.events(), **self._events}
 
     def count(self, readings: Readings) -> None:
         """Count new samples (called by the reader thread)."""
@@ -167,16 +158,11 @@ class DeviceSupervisor:
         self.connected.set()
         self._release_waiter()
         while not self._stopping.is_set():
-            readings = self._in_order(self.driver.read())
-            if readings:
+            if readings := self.driver.read():
                 # A loss of a device that gave something is new, whatever it says.
                 self._logged = NOTHING_LOGGED
                 self.count(readings)
                 self._sink(readings)
-
-    def _in_order(self, readings: Readings) -> Readings:
-        admitted = {name: self._guards[name].admit(samples) for name, samples in readings.items()}
-        return {name: samples for name, samples in admitted.items() if samples}
 
     def _count_loss(self, error: DeviceError) -> None:
         event = error.details.get("event")
@@ -216,56 +202,6 @@ class DeviceSupervisor:
             if self._waiter is not None:
                 self._waiter.close()
                 self._waiter = None
-
-
-class SequenceGuard:
-    """Drops samples that a link delivers twice or out of order.
-
-    The samples of a stream must be in the order in which they were taken. Duplicate and late
-    samples are counted and dropped; a dropped sample leaves a gap. Samples of a restarted device
-    (another counter *and* another clock) are kept. Streams of devices without sequence numbers
-    cannot be checked and are kept unchanged.
-
-    Args:
-        descriptor: of the stream.
-    """
-
-    def __init__(self, descriptor: StreamDescriptor) -> None:
-        capabilities = descriptor.capabilities
-        self.repeated = 0
-        self.late = 0
-        self._judges = capabilities.sequence and capabilities.device_time
-        self._modulus = 1 << capabilities.sequence_bits
-        self._period_ns = descriptor.period_ns()
-        # Sequence and device time of the newest samples that passed.
-        self._passed: deque[tuple[int, int]] = deque(maxlen=WINDOW_SAMPLES)
-
-    def admit(self, samples: Sequence[Sample]) -> list[Sample]:
-        """The samples to keep, in order."""
-        if not self._judges:
-            return list(samples)
-        return [sample for sample in samples if self._passes(sample)]
-
-    def _passes(self, sample: Sample) -> bool:
-        if self._passed:
-            last_sequence, last_t_device_ns = self._passed[-1]
-            back = (last_sequence - sample.sequence) % self._modulus
-            if back < WINDOW_SAMPLES and self._is_old(sample, back, last_t_device_ns):
-                return False
-        self._passed.append((sample.sequence, sample.t_device_ns))
-        return True
-
-    def _is_old(self, sample: Sample, back: int, last_t_device_ns: int) -> bool:
-        """Whether a sample with a small step back is one of the same run of the device."""
-        if (sample.sequence, sample.t_device_ns) in self._passed:
-            self.repeated += 1
-            return True
-        # The very first packet may be late, too; a restarted device's clock falls further back.
-        oldest_ns = min(self._passed[0][1], last_t_device_ns - 2 * back * self._period_ns)
-        if oldest_ns < sample.t_device_ns < last_t_device_ns:
-            self.late += 1
-            return True
-        return False
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ Readings = dict[str, list[Sample]]
 
 @runtime_checkable
 class Decoder(Protocol):
-    """Bytes of one device → samples by stream."""
+    """Bytes of one device → samples by stream, in the order in which they were taken."""
 
     @property
     def statistics(self) -> DecoderStatistics:

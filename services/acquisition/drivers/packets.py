@@ -3,6 +3,7 @@
 import struct
 import zlib
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -48,8 +49,9 @@ class DecoderStatistics:
 class SequenceCounter:
     """Counts lost, late and repeated packets and restarts by a sequence number of so many bits.
 
-    A decreasing number is a late packet if it is missing among the last 64, otherwise a restart of
-    the device.
+    A decreasing number is a late packet if it is missing among the last 64, a repeated one if it
+    came among these at the same time of the device, otherwise a restart of the device. The frames
+    of a `FrameSearch` that are late or repeated are left out, which leaves a gap.
     """
 
     def __init__(self, statistics: DecoderStatistics, *, bits: int) -> None:
@@ -58,45 +60,56 @@ class SequenceCounter:
         self._last: int | None = None
         # Numbers behind the last one that have not come, and whether they are counted as lost.
         self._missing: dict[int, bool] = {}
-        self._is_cut = False
+        # Number and device time of the newest packets.
+        self._came: deque[tuple[int, int | None]] = deque(maxlen=LATE_PACKETS)
 
     def reset(self) -> None:
         """The link was lost: what was overtaken or repeated cannot come any more."""
         self._missing.clear()
-        self._is_cut = True
+        self._came.clear()
 
-    def count(self, sequence: int, *, is_restarted: bool = False) -> bool:
+    def count(
+        self, sequence: int, *, t_device_ns: int | None = None, is_restarted: bool = False
+    ) -> None:
         """One packet came.
 
         Args:
             sequence: its number.
+            t_device_ns: its time, if the device has a clock.
             is_restarted: the device's clock says that it started anew, so the number may be any.
-
-        Returns:
-            Whether it is new: neither late nor repeated.
         """
         statistics = self._statistics
         statistics.packets += 1
+        came = (sequence, t_device_ns)
         if self._last is None:
             self._begin(sequence)
-            return True
+            self._came.append(came)
+            return
         step = (sequence - self._last) % self._modulus
         if sequence in self._missing:
             # Its clock steps back, too, which alone would look like a restart.
             statistics.late += 1
             statistics.lost -= self._missing.pop(sequence)
-            return False
-        if step == 0 and not (is_restarted or self._is_cut):
+            self._came.append(came)
+            return
+        if self._is_repeated(came) and not (is_restarted and t_device_ns is None):
             statistics.repeated += 1
-            return False
+            return
         if 0 < step < self._modulus // 2 and not is_restarted:
             statistics.lost += step - 1
             self._go_on(sequence, step)
         else:
             statistics.restarts += 1
             self._begin(sequence)
-        self._is_cut = False
-        return True
+        self._came.append(came)
+
+    def _is_repeated(self, came: tuple[int, int | None]) -> bool:
+        if self._last is None or (self._last - came[0]) % self._modulus >= LATE_PACKETS:
+            return False
+        if came[1] is None:
+            # An earlier number may be that of a restarted device.
+            return bool(self._came) and came == self._came[-1]
+        return came in self._came
 
     def _begin(self, sequence: int) -> None:
         """The first packet of a run; those that it overtook nobody missed."""
@@ -177,12 +190,12 @@ class FrameSearch(PortionedSearch[Found]):
         position = 0
         while (start := data.find(self._mark, position)) >= 0:
             self.statistics.resync_bytes += start - position
+            num_old = self.statistics.late + self.statistics.repeated
             taken = self._take(data, start)
             if taken is not None:
-                packet, size = taken
-                if packet is not None:
-                    found.append(packet)
-                position = start + size
+                if num_old == self.statistics.late + self.statistics.repeated:
+                    found.append(taken[0])
+                position = start + taken[1]
             elif self._needed:
                 return found, start
             else:
@@ -194,11 +207,10 @@ class FrameSearch(PortionedSearch[Found]):
         return found, rest
 
     @abstractmethod
-    def _take(self, data: bytes, position: int) -> tuple[Found | None, int] | None:
+    def _take(self, data: bytes, position: int) -> tuple[Found, int] | None:
         """The frame at `position` and its size; None when there is none, or not yet.
 
-        A frame that carries nothing new may be given as None. Where there is none yet, `_needed` is
-        set to the length that `data` must have first.
+        In the latter case `_needed` is set to the length that `data` must have first.
         """
 
 
@@ -261,7 +273,7 @@ class PacketDecoder(FrameSearch[Packet]):
         super().reset()
         self._sequence.reset()
 
-    def _take(self, data: bytes, position: int) -> tuple[Packet | None, int] | None:
+    def _take(self, data: bytes, position: int) -> tuple[Packet, int] | None:
         start = position + HEADER.size
         if len(data) < start:
             self._needed = start
@@ -281,9 +293,9 @@ class PacketDecoder(FrameSearch[Packet]):
         if CRC.unpack_from(data, end)[0] != zlib.crc32(memoryview(data)[position:end]):
             self.statistics.crc_errors += 1
             return None
-        packet = None
-        if magic != self._magic or self._sequence.count(sequence):
-            packet = Packet(version, source, sequence, t_device_ns, data[start:end], magic)
+        if magic == self._magic:
+            self._sequence.count(sequence, t_device_ns=t_device_ns)
+        packet = Packet(version, source, sequence, t_device_ns, data[start:end], magic)
         return packet, OVERHEAD + length
 
 

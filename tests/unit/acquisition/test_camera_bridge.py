@@ -31,7 +31,7 @@ def pictures(count):
     return np.repeat(np.stack(waves)[..., None], 3, axis=3).astype(np.uint8)
 
 
-def packets(count, encoding="h264", *, lost=(), images=None):
+def packets(count, encoding="h264", *, lost=(), images=None, boot_ns=0):
     images = pictures(count) if images is None else images
     descriptor = StreamDescriptor(
         name="camera_head",
@@ -47,7 +47,7 @@ def packets(count, encoding="h264", *, lost=(), images=None):
         unit
         for index in range(count)
         if index not in lost
-        for unit in source.units(index, 100 + index, index * PERIOD_NS)
+        for unit in source.units(index, 100 + index, boot_ns + index * PERIOD_NS)
     ]
 
 
@@ -127,7 +127,8 @@ def test_quality_of_a_bridges_images(encoding):
     assert driver.quality.num_images == 40
     assert driver.quality.num_checked == {"rgb8": 14, "jpeg": 4}[encoding]
     assert not driver.quality.frozen
-    decoded(decoder, packets(5, encoding, images=np.repeat(pictures(1), 5, axis=0)))
+    still = np.repeat(pictures(1), 5, axis=0)
+    decoded(decoder, packets(5, encoding, images=still, boot_ns=10**9))
     assert driver.quality.frozen
 
 

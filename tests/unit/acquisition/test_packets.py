@@ -21,10 +21,10 @@ from services.acquisition.drivers.packets import (
 )
 
 
-def glove_packet(sequence, rng, *, version=1, source=SOURCES["left"]):
+def glove_packet(sequence, rng, *, version=1, source=SOURCES["left"], boot_ns=10**9):
     counts = rng.integers(0, 65536, 360, dtype=np.uint16)
     payload = counts.astype("<u2").tobytes()
-    return encode_packet(MAGIC, Packet(version, source, sequence, 10**9 + sequence, payload))
+    return encode_packet(MAGIC, Packet(version, source, sequence, boot_ns + sequence, payload))
 
 
 def flip_bits(data, rate, rng):
@@ -107,8 +107,10 @@ def test_lost_bytes_cost_one_packet(rng):
 
 
 def test_sequence_wraps_and_restarts(rng):
-    sequences = [2**32 - 2, 2**32 - 1, 0, 2, 2, 0]
-    _, statistics = decode(b"".join(glove_packet(s, rng) for s in sequences), [])
+    sequences = [2**32 - 2, 2**32 - 1, 0, 2, 2]
+    packets = [glove_packet(s, rng) for s in sequences] + [glove_packet(0, rng, boot_ns=0)]
+    samples, statistics = decode(b"".join(packets), [])
+    assert [sample[0] for sample in samples] == [2**32 - 2, 2**32 - 1, 0, 2, 0]
     assert statistics == DecoderStatistics(packets=6, lost=1, repeated=1, restarts=1)
 
 
@@ -135,6 +137,24 @@ def test_a_packet_that_was_overtaken_is_late_and_no_loss(sequences, expected):
     for sequence in sequences:
         counter.count(sequence)
     assert statistics == DecoderStatistics(packets=len(sequences), **expected)
+
+
+@pytest.mark.parametrize(
+    ("packets", "expected"),
+    [
+        # Once more behind a newer one, which a number alone does not tell from a restart.
+        ([(5, 50), (6, 60), (5, 50), (7, 70)], {"repeated": 1}),
+        ([(5, 50), (6, 60), (5, 3), (6, 13)], {"restarts": 1}),
+        ([(5, 50), (5, 60), (6, 70)], {"restarts": 1}),
+        ([(5, 50), (7, 70), (6, 60), (6, 60), (8, 80)], {"late": 1, "repeated": 1}),
+    ],
+)
+def test_the_devices_time_tells_a_repeated_packet_from_a_restart(packets, expected):
+    statistics = DecoderStatistics()
+    counter = SequenceCounter(statistics, bits=32)
+    for sequence, t_device_ns in packets:
+        counter.count(sequence, t_device_ns=t_device_ns)
+    assert statistics == DecoderStatistics(packets=len(packets), **expected)
 
 
 @settings(max_examples=100, deadline=None)

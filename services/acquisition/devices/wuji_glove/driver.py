@@ -80,7 +80,9 @@ class WujiFrames(FrameSearch[WujiPacket]):
             self.statistics.suspects += 1
             return None
         sequence, time_ms = STAMPS.unpack_from(packet, CRC_OFFSET - STAMPS.size)
-        self._sequence.count(sequence, is_restarted=self._went_back(time_ms))
+        self._sequence.count(
+            sequence, t_device_ns=time_ms * TICK_NS, is_restarted=self._went_back(time_ms)
+        )
         return WujiPacket(hand, sequence, time_ms, cells), PACKET_BYTES
 
     def _went_back(self, time_ms: int) -> bool:
