@@ -5,7 +5,6 @@ when a station names them. Every folder beside this file is one of ours, with or
 installation: its `driver` holds `KIND`.
 """
 
-import json
 import pkgutil
 import re
 import sys
@@ -15,7 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
-from pydantic import BeforeValidator, SerializeAsAny, TypeAdapter, ValidationError
+from pydantic import BeforeValidator, SerializeAsAny, TypeAdapter
 
 from dextouch.errors import DexTouchError, InvalidInputError, UnknownNameError
 from dextouch.schemas import Matrix
@@ -62,17 +61,16 @@ def device_kind(name: str) -> DeviceKind[Any]:
     if not found:
         raise UnknownNameError("kind of device", name, kind_names())
     if len(found) > 1:
-        packages = ", ".join(f"{package_of(point)} ({point.value})" for point in found)
+        packages = ", ".join(f"{_package_of(point)} ({point.value})" for point in found)
         raise InvalidInputError(
             f"kind of device {name!r}: got {len(found)} packages that provide it, {packages}; "
             f"expected one: uninstall the others, or rename their entry points of the group "
             f"{ENTRY_POINT_GROUP!r}"
         )
-    return _checked(found[0], _load(found[0]))
+    return _load(found[0])
 
 
-def package_of(point: EntryPoint) -> str:
-    """The name of the package that an entry point comes with."""
+def _package_of(point: EntryPoint) -> str:
     return OWN_PACKAGE if point.dist is None else point.dist.name
 
 
@@ -89,46 +87,33 @@ def _points(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     return (*ours, *others.values())
 
 
-def _load(point: EntryPoint) -> object:
+def _load(point: EntryPoint) -> DeviceKind[Any]:
+    """Refuse what cannot be imported, or is no `DeviceKind` with this name."""
     try:
-        return point.load()
+        loaded: object = point.load()
     except IMPORT_FAILURES as error:
-        raise InvalidInputError(
-            f"{_where(point)}: got {type(error).__name__}: {error}, expected a module that can be "
-            f"imported; fix or uninstall package {package_of(point)}"
-        ) from error
-
-
-def _checked(point: EntryPoint, loaded: object) -> DeviceKind[Any]:
-    """Refuse an object that is not a `DeviceKind` with this name."""
+        got = f"{type(error).__name__}: {error}"
+        raise _wrong(point, got, "a module that can be imported") from error
     if not isinstance(loaded, DeviceKind):
         raise _wrong(point, f"{type(loaded).__name__}", "a services.acquisition.devices.DeviceKind")
     if loaded.name != point.name or not NAME.fullmatch(loaded.name):
         raise _wrong(point, f"a kind named {loaded.name!r}", f"the entry point's name {point.name}")
     if not (isinstance(loaded.settings, type) and issubclass(loaded.settings, DeviceSettings)):
         raise _wrong(point, f"settings {loaded.settings!r}", "a class derived from DeviceSettings")
-    field = loaded.settings.model_fields["kind"]
-    if get_args(field.annotation) != (loaded.name,):
-        raise _wrong(
-            point,
-            f"settings whose kind is {field.annotation}",
-            f'kind: Literal["{loaded.name}"] = "{loaded.name}"',
-        )
+    kind = loaded.settings.model_fields["kind"].annotation
+    if get_args(kind) != (loaded.name,):
+        expected = f'kind: Literal["{loaded.name}"] = "{loaded.name}"'
+        raise _wrong(point, f"settings whose kind is {kind}", expected)
     if not callable(loaded.build):
         raise _wrong(point, f"build = {loaded.build!r}", "a function of settings and clock")
     return loaded
 
 
-def _where(point: EntryPoint) -> str:
-    return (
-        f"kind of device {point.name!r} of package {package_of(point)} "
-        f"(entry point {point.value} of group {ENTRY_POINT_GROUP})"
-    )
-
-
 def _wrong(point: EntryPoint, got: str, expected: str) -> InvalidInputError:
+    package = _package_of(point)
     return InvalidInputError(
-        f"{_where(point)}: got {got}, expected {expected}; fix package {package_of(point)}"
+        f"kind of device {point.name!r} of package {package} (entry point {point.value} of group "
+        f"{ENTRY_POINT_GROUP}): got {got}, expected {expected}; fix or uninstall package {package}"
     )
 
 
@@ -165,7 +150,16 @@ def build_drivers(devices: Sequence[DeviceSettings], clock: StationClock) -> lis
             f"station: got devices {names}, expected at least one and no two alike; "
             "set DEXTOUCH_ACQUISITION_DEVICES or DEXTOUCH_ACQUISITION_MOCK"
         )
-    _refuse_shared_streams(drivers)
+    owners: dict[str, str] = {}
+    for driver in drivers:
+        for descriptor in driver.descriptors:
+            owner = owners.setdefault(descriptor.name, driver.name)
+            if owner != driver.name:
+                raise InvalidInputError(
+                    f"station: stream {descriptor.name!r} is given by {owner!r} and by "
+                    f"{driver.name!r}, expected one device a stream; leave one of them out, or "
+                    "name the streams that robot_state shall give (`streams`)"
+                )
     return drivers
 
 
@@ -180,19 +174,6 @@ def _build(device: DeviceSettings, clock: StationClock) -> Driver:
     return driver
 
 
-def _refuse_shared_streams(drivers: Sequence[Driver]) -> None:
-    owners: dict[str, str] = {}
-    for driver in drivers:
-        for descriptor in driver.descriptors:
-            owner = owners.setdefault(descriptor.name, driver.name)
-            if owner != driver.name:
-                raise InvalidInputError(
-                    f"station: stream {descriptor.name!r} is given by {owner!r} and by "
-                    f"{driver.name!r}, expected one device a stream; leave one of them out, or "
-                    "name the streams that robot_state shall give (`streams`)"
-                )
-
-
 def load_calibration(path: Path | None) -> dict[str, Matrix]:
     """Named matrices of a JSON file; none without a file.
 
@@ -202,6 +183,6 @@ def load_calibration(path: Path | None) -> dict[str, Matrix]:
     if path is None:
         return {}
     try:
-        return _MATRICES.validate_python(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, ValidationError) as error:
+        return _MATRICES.validate_json(path.read_bytes())
+    except (OSError, ValueError) as error:
         raise InvalidInputError(f"calibration {path}: no JSON of matrices ({error})") from error

@@ -242,8 +242,8 @@ class TactileGlove(Driver):
         self._side: Side = side
         self._serial_number = serial_number
         self._numbers = itertools.count(1)
-        self._asked: set[int] = set()
-        self._replies: dict[int, tuple[Packet, int]] = {}
+        # The requests under way, and the replies to them with their arrivals.
+        self._asked: dict[int, tuple[Packet, int] | None] = {}
         self._answered = threading.Condition()
         self._writing = threading.Lock()
         self._held: Readings = {}
@@ -301,7 +301,16 @@ class TactileGlove(Driver):
     def _ask(self, command: Command) -> Answer:
         for _ in range(NUM_ATTEMPTS):
             number = next(self._numbers) % SEQUENCE_MODULUS
-            t_asked_ns, reply = self._ask_once(number, encode_request(command, request=number))
+            try:
+                with self._writing:
+                    self._asked[number] = None
+                    t_asked_ns = self._clock.now_ns()
+                    self.transport.write(encode_request(command, request=number))
+                reply = self._await(number)
+            finally:
+                # Also replies that arrive too late: a station sends requests for months.
+                with self._answered:
+                    del self._asked[number]
             if reply is not None:
                 packet, t_answered_ns = reply
                 return Answer(self._body(command, packet), packet, t_asked_ns, t_answered_ns)
@@ -311,45 +320,32 @@ class TactileGlove(Driver):
             device=self.name,
         )
 
-    def _ask_once(self, number: int, data: bytes) -> tuple[int, tuple[Packet, int] | None]:
-        try:
-            with self._writing:
-                self._asked.add(number)
-                t_asked_ns = self._clock.now_ns()
-                self.transport.write(data)
-            return t_asked_ns, self._await(number)
-        finally:
-            # Also replies that arrived too late: a station sends requests for months.
-            with self._answered:
-                self._asked.discard(number)
-                self._replies.pop(number, None)
-
     def _await(self, number: int) -> tuple[Packet, int] | None:
         """The reply; read here if this is the reading thread, else that one brings it."""
         if self._reader in (None, threading.get_ident()):
-            return self._read_until(number)
-        with self._answered:
-            self._answered.wait_for(lambda: number in self._replies, ANSWER_TIMEOUT_NS * 1e-9)
-            return self._replies.pop(number, None)
+            self._read_until(number)
+        else:
+            with self._answered:
+                self._answered.wait_for(lambda: self._asked[number], ANSWER_TIMEOUT_NS * 1e-9)
+        return self._asked[number]
 
-    def _read_until(self, number: int) -> tuple[Packet, int] | None:
+    def _read_until(self, number: int) -> None:
         end_ns = self._clock.now_ns() + ANSWER_TIMEOUT_NS
         num_silent = 0
-        while number not in self._replies:
+        while self._asked[number] is None:
             if num_silent >= MAX_SILENT_READS or self._clock.now_ns() > end_ns:
-                return None
+                return
             data = self.transport.read()
             num_silent = 0 if data else num_silent + 1
             if data:
                 for name, samples in self.decoder.decode(data, self._clock.now_ns()).items():
                     self._held.setdefault(name, []).extend(samples)
-        return self._replies.pop(number)
 
     def _accept(self, packet: Packet, t_host_ns: int) -> None:
         """A reply came (called by the decoder); unexpected replies are ignored."""
         with self._answered:
             if packet.sequence in self._asked:
-                self._replies[packet.sequence] = (packet, t_host_ns)
+                self._asked[packet.sequence] = (packet, t_host_ns)
                 self._answered.notify_all()
 
     def _body(self, command: Command, packet: Packet) -> bytes:
