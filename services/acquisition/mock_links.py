@@ -5,14 +5,7 @@ from typing import Literal
 from pydantic import Field, field_validator
 
 from dextouch.frozen_model import FrozenModel
-from services.acquisition.devices.registry import kind_names
-
-# How the kinds of gloves of this package were called before they were kinds.
-GLOVE_PROTOCOLS = {
-    "dextouch": "tactile_glove",
-    "wuji": "wuji_glove",
-    "justfloat": "justfloat_glove",
-}
+from services.acquisition.devices.registry import OLD_PROTOCOLS, kind_names
 
 
 class MockLinks(FrozenModel):
@@ -48,7 +41,7 @@ class MockLinks(FrozenModel):
     @field_validator("gloves")
     @classmethod
     def _is_known(cls, gloves: str) -> str:
-        known = sorted({*GLOVE_PROTOCOLS, *kind_names()})
+        known = sorted({*OLD_PROTOCOLS, *kind_names()})
         if gloves not in known:
             raise ValueError(f"got {gloves!r}, expected a kind of glove: {', '.join(known)}")
-        return GLOVE_PROTOCOLS.get(gloves, gloves)
+        return OLD_PROTOCOLS.get(gloves, gloves)

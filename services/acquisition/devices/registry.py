@@ -40,8 +40,12 @@ IMPORT_FAILURES = (
     RuntimeError,
     DexTouchError,
 )
-# Until now these gloves were `tactile_glove` with a `protocol`; such settings are still read.
-OLD_PROTOCOLS = {"wuji": "wuji_glove", "justfloat": "justfloat_glove"}
+# How kinds of gloves were called before they were kinds: `tactile_glove` with such a `protocol`.
+OLD_PROTOCOLS = {
+    "dextouch": "tactile_glove",
+    "wuji": "wuji_glove",
+    "justfloat": "justfloat_glove",
+}
 _MATRICES = TypeAdapter(dict[str, Matrix])
 
 

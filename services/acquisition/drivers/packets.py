@@ -4,7 +4,7 @@ import struct
 import zlib
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -264,7 +264,15 @@ class PacketDecoder(FrameSearch[Packet]):
         others: Mapping[bytes, tuple[int, int]] | None = None,
     ) -> None:
         self._sizes = {**(others or {}), magic: (min_payload, max_payload)}
-        super().__init__(_common_start(list(self._sizes)))
+        # One search finds every kind.
+        start = magic
+        while not all(other.startswith(start) for other in self._sizes):
+            start = start[:-1]
+        if not start:
+            raise InvalidInputError(
+                f"magics {list(self._sizes)}: got no common start, expected one byte or more"
+            )
+        super().__init__(start)
         self._magic = magic
         self._sequence = SequenceCounter(self.statistics, bits=SEQUENCE_BITS)
 
@@ -297,17 +305,3 @@ class PacketDecoder(FrameSearch[Packet]):
             self._sequence.count(sequence, t_device_ns=t_device_ns)
         packet = Packet(version, source, sequence, t_device_ns, data[start:end], magic)
         return packet, OVERHEAD + length
-
-
-def _common_start(magics: Sequence[bytes]) -> bytes:
-    """Common prefix of all magics, so that one search finds every kind.
-
-    Raises:
-        InvalidInputError: nothing.
-    """
-    shortest = MAGIC_SIZE
-    while len({magic[:shortest] for magic in magics}) > 1:
-        shortest -= 1
-    if shortest == 0:
-        raise InvalidInputError(f"magics {magics}: got no common start, expected one byte or more")
-    return magics[0][:shortest]

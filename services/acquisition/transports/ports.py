@@ -161,19 +161,16 @@ def find_port(serial_number: str) -> str:
 
     ports = list_ports.comports()
     found = sorted(port.device for port in ports if port.serial_number == serial_number)
-    if not found:
-        present = ", ".join(sorted(p.serial_number for p in ports if p.serial_number)) or "none"
-        raise DeviceError(
-            f"serial device {serial_number!r} is not plugged in; present: {present}",
-            serial_number=serial_number,
-        )
-    if len(found) > 1:
-        raise DeviceError(
-            f"serial device {serial_number!r}: got {len(found)} devices with this number "
-            f"({', '.join(found)}), expected one; name the port instead",
-            serial_number=serial_number,
-        )
-    return found[0]
+    if len(found) == 1:
+        return found[0]
+    present = ", ".join(sorted(p.serial_number for p in ports if p.serial_number)) or "none"
+    raise DeviceError(
+        f"serial device {serial_number!r}: got {len(found)} devices with this number "
+        f"({', '.join(found)}), expected one; name the port instead"
+        if found
+        else f"serial device {serial_number!r} is not plugged in; present: {present}",
+        serial_number=serial_number,
+    )
 
 
 class SerialTransport(HandleTransport["serial.Serial"]):

@@ -19,17 +19,7 @@ MAGIC = b"DXRS"
 NUM_JOINTS = 40
 NOMINAL_RATE_HZ = 100.0
 DEVICE = "robot_state"
-# The order in the packet: all float64.
-STREAM_SIZES = {
-    "joints_measured": NUM_JOINTS,
-    "joints_commanded": NUM_JOINTS,
-    "wrist_left": 7,
-    "wrist_right": 7,
-    "wrist_left_commanded": 7,
-    "wrist_right_commanded": 7,
-}
-PAYLOAD = struct.Struct(f"<{sum(STREAM_SIZES.values())}d")
-_NUMBER = np.dtype("<f8")
+# In the order of the packet: all float64.
 RobotStream = Literal[
     "joints_measured",
     "joints_commanded",
@@ -38,6 +28,11 @@ RobotStream = Literal[
     "wrist_left_commanded",
     "wrist_right_commanded",
 ]
+STREAM_SIZES: dict[str, int] = {
+    name: NUM_JOINTS if name.startswith("joints") else 7 for name in get_args(RobotStream)
+}
+PAYLOAD = struct.Struct(f"<{sum(STREAM_SIZES.values())}d")
+_NUMBER = np.dtype("<f8")
 
 
 def robot_descriptor(stream: str) -> StreamDescriptor:

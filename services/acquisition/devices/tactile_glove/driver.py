@@ -368,11 +368,10 @@ class TactileGloveSettings(GloveSettings):
     """Our glove on a serial line.
 
     With serial number and port, the port is opened and the glove there must say that it has the
-    number. `protocol` has this one value; older settings named other gloves by it.
+    number.
     """
 
     kind: Literal["tactile_glove"] = "tactile_glove"
-    protocol: Literal["dextouch"] = "dextouch"
 
 
 def build(settings: TactileGloveSettings, clock: StationClock) -> TactileGlove:
