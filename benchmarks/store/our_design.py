@@ -44,7 +44,7 @@ class OurDesign:
 
     def missing(self) -> str | None:
         """What the store needs for H.264, where it is not there."""
-        needs = ("dextouch.episodes.video", "av") if self.unit == "h264" else ()
+        needs = ("dextouch.episodes.image_codecs", "av") if self.unit == "h264" else ()
         for module in needs:
             if importlib.util.find_spec(module) is None:
                 return f"module {module} (pip install 'dextouch-wm[store]')"

@@ -17,6 +17,14 @@ if TYPE_CHECKING:
     from dextouch.episodes.format import check_id as check_id
     from dextouch.episodes.format import shard_path as shard_path
     from dextouch.episodes.format import stream_arrays as stream_arrays
+    from dextouch.episodes.image_codecs import FULL_FORM as FULL_FORM
+    from dextouch.episodes.image_codecs import GopEncoder as GopEncoder
+    from dextouch.episodes.image_codecs import ImageForm as ImageForm
+    from dextouch.episodes.image_codecs import VideoSettings as VideoSettings
+    from dextouch.episodes.image_codecs import check_video_size as check_video_size
+    from dextouch.episodes.image_codecs import decoder_of_this_thread as decoder_of_this_thread
+    from dextouch.episodes.image_codecs import is_keyframe as is_keyframe
+    from dextouch.episodes.image_codecs import parameter_sets as parameter_sets
     from dextouch.episodes.reader import EpisodeReader as EpisodeReader
     from dextouch.episodes.reader import RecordingReader as RecordingReader
     from dextouch.episodes.rollout_episode import write_rollout as write_rollout
@@ -32,14 +40,6 @@ if TYPE_CHECKING:
     from dextouch.episodes.stream_writer import WriteOptions as WriteOptions
     from dextouch.episodes.trash import TRASH_KINDS as TRASH_KINDS
     from dextouch.episodes.trash import TrashKind as TrashKind
-    from dextouch.episodes.video import FULL_FORM as FULL_FORM
-    from dextouch.episodes.video import GopEncoder as GopEncoder
-    from dextouch.episodes.video import ImageForm as ImageForm
-    from dextouch.episodes.video import VideoSettings as VideoSettings
-    from dextouch.episodes.video import check_video_size as check_video_size
-    from dextouch.episodes.video import decoder_of_this_thread as decoder_of_this_thread
-    from dextouch.episodes.video import is_keyframe as is_keyframe
-    from dextouch.episodes.video import parameter_sets as parameter_sets
     from dextouch.episodes.window import NativeWindow as NativeWindow
     from dextouch.episodes.window import StreamData as StreamData
     from dextouch.episodes.window import Window as Window

@@ -26,7 +26,7 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.episodes.journal import log_paths, part_path, read_rows
-from dextouch.episodes.shard_reader import ShardReader, decode_rows
+from dextouch.episodes.shards import ShardReader, decode_rows
 from dextouch.episodes.sources import ByteSource, GroupFiles, LocalFile, LocalGroup
 from dextouch.episodes.staged_group import read_stage
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError

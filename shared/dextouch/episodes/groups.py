@@ -6,8 +6,7 @@ import numpy as np
 
 from dextouch.episodes.format import STAMPS, attributes_id, codec_of
 from dextouch.episodes.group_contents import GroupContents
-from dextouch.episodes.image_codecs import ImageChunks, transform_pixels
-from dextouch.episodes.video import FULL_FORM, ImageForm
+from dextouch.episodes.image_codecs import FULL_FORM, ImageChunks, ImageForm, transform_pixels
 from dextouch.errors import CorruptDataError, InvalidInputError, ShapeError, UnknownNameError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes, Verification
 from dextouch.streams import StreamDescriptor

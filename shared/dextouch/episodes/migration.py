@@ -25,7 +25,7 @@ from dextouch.episodes.format import (
     sha256_hex,
     shard_path,
 )
-from dextouch.episodes.shard_reader import ShardReader
+from dextouch.episodes.shards import ShardReader
 from dextouch.episodes.sources import GroupFiles
 from dextouch.episodes.writer import Block
 from dextouch.errors import CorruptDataError, StorageError

@@ -10,7 +10,7 @@ from jaxtyping import Int64
 
 from dextouch.episodes.format import STAMPS
 from dextouch.episodes.groups import GroupReader
-from dextouch.episodes.video import FULL_FORM, ImageForm
+from dextouch.episodes.image_codecs import FULL_FORM, ImageForm
 from dextouch.episodes.window import (
     NativeWindow,
     StreamData,

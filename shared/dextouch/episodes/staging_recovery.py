@@ -33,8 +33,7 @@ from dextouch.episodes.journal import (
     read_payload,
     read_rows,
 )
-from dextouch.episodes.shard_reader import CRC_BYTES, decode_rows
-from dextouch.episodes.shard_writer import finish_shard
+from dextouch.episodes.shards import CRC_BYTES, decode_rows, finish_shard
 from dextouch.episodes.sources import LocalGroup
 from dextouch.episodes.staged_group import (
     STAGE_FILE,

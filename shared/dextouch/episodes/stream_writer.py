@@ -16,9 +16,14 @@ from dextouch.episodes.format import (
     codec_of,
     stream_arrays,
 )
-from dextouch.episodes.image_codecs import pack_chunk
-from dextouch.episodes.shard_writer import ShardWriter
-from dextouch.episodes.video import GopEncoder, VideoSettings, check_video_size, is_keyframe
+from dextouch.episodes.image_codecs import (
+    GopEncoder,
+    VideoSettings,
+    check_video_size,
+    is_keyframe,
+    pack_chunk,
+)
+from dextouch.episodes.shards import ShardWriter
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, StorageError
 from dextouch.frozen_model import FrozenModel
 from dextouch.images import DEFAULT_QUALITY, encode_jpeg

@@ -13,8 +13,7 @@ from zarr.core.array_spec import ArraySpec
 from zarr.core.buffer import Buffer, NDBuffer
 
 from dextouch.episodes.format import ZARR_CODECS, Codec
-from dextouch.episodes.image_codecs import ImageChunks
-from dextouch.episodes.video import FULL_FORM
+from dextouch.episodes.image_codecs import FULL_FORM, ImageChunks
 from dextouch.errors import InvalidInputError
 
 

@@ -1,6 +1,5 @@
 """Exports against the public specification, and their values against their episodes."""
 
-import functools
 import json
 
 import av
@@ -9,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 from av.bitstream import BitStreamFilterContext
 
-from dextouch.bridges.lerobot import ExportOptions, export_lerobot, exporting
+from dextouch.bridges.lerobot import ExportOptions, export_lerobot, exporting, video
 from dextouch.bridges.lerobot.layout import action_names
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, ShapeError
@@ -184,9 +183,7 @@ def test_other_parameter_sets_start_another_file(store, folder):
 
 
 def test_large_files_are_followed_by_others(store, folder, monkeypatch):
-    monkeypatch.setattr(
-        exporting, "CameraVideo", functools.partial(exporting.CameraVideo, file_bytes=1)
-    )
+    monkeypatch.setattr(video, "VIDEO_FILE_MB", 0)
     monkeypatch.setattr(exporting.layout, "DATA_FILE_MB", 0)
     monkeypatch.setattr(exporting, "ROWS_AT_ONCE", 1)
     export_lerobot(two(store), folder, repo_id="touch")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.bridges.lerobot.statistics import (
+from dextouch.bridges.lerobot.frames import (
     QUANTILES,
     SAMPLED_SIDE_PX,
     combine,

@@ -11,7 +11,7 @@ import numpy as np
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.format import canonical_json, sha256_hex
-from dextouch.episodes.shard_reader import with_crc
+from dextouch.episodes.shards import with_crc
 
 ID = "stand-bottle-0003"
 VIDEO, STILLS, TOUCH = "camera_head", "camera_wrist_left", "tactile_left"

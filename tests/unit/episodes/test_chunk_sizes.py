@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from dextouch.episodes import WriteOptions, stream_arrays
 from dextouch.episodes.format import array_metadata, canonical_json, decode_commit
-from dextouch.episodes.shard_reader import with_crc
+from dextouch.episodes.shards import with_crc
 from dextouch.errors import CorruptDataError
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import StreamDescriptor

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dextouch.episodes.shard_reader import with_crc
+from dextouch.episodes.shards import with_crc
 from dextouch.errors import CorruptDataError, StorageError
 from dextouch.images import encode_jpeg
 from tests.unit.episodes.hostile_group import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numcodecs.zstd import Zstd
 
-from dextouch.episodes.shard_reader import with_crc
+from dextouch.episodes.shards import with_crc
 from dextouch.episodes.zstd import frame_bytes
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError
 from tests.unit.episodes.hostile_group import (

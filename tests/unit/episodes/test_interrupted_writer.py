@@ -13,7 +13,7 @@ import pytest
 
 from dextouch.episodes import EpisodeStore, WriteOptions, staged_group
 from dextouch.episodes.journal import JournalWriter
-from dextouch.episodes.shard_writer import ShardWriter
+from dextouch.episodes.shards import ShardWriter
 from dextouch.errors import (
     ConflictError,
     InvalidInputError,

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dextouch.episodes import shard_reader
+from dextouch.episodes import shards
 from dextouch.episodes.format import ArrayEntry
-from dextouch.episodes.shard_reader import ShardReader, decode_rows, with_crc
+from dextouch.episodes.shards import ShardReader, decode_rows, with_crc
 from dextouch.episodes.sources import LocalFile
 from dextouch.episodes.zstd import compress
 from dextouch.errors import CorruptDataError, StorageError
@@ -75,7 +75,7 @@ def replace(path: Path, data: bytes) -> None:
 
 @pytest.mark.parametrize("span_bytes", [1, 500, 1 << 21])
 def test_every_span_of_rows_equals_the_array(reader, monkeypatch, span_bytes):
-    monkeypatch.setattr(shard_reader, "_SPAN_BYTES", span_bytes)
+    monkeypatch.setattr(shards, "_SPAN_BYTES", span_bytes)
     for start in range(len(VALUES) + 1):
         for stop in range(start, len(VALUES) + 1, 7):
             rows = reader.read(start, stop)
@@ -98,7 +98,7 @@ def test_a_window_fetches_its_storage_chunks_at_once_and_no_others(reader, sourc
 
 def test_much_is_fetched_in_bounded_pieces(reader, source, monkeypatch):
     lengths = reader.check_index()[:, 1].tolist()
-    monkeypatch.setattr(shard_reader, "_SPAN_BYTES", lengths[0] + lengths[1])
+    monkeypatch.setattr(shards, "_SPAN_BYTES", lengths[0] + lengths[1])
     source.reads.clear()
     reader.read()
     assert [length for _, length in source.reads] == [sum(lengths[:2]), sum(lengths[2:])]

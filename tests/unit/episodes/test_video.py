@@ -17,8 +17,7 @@ from dextouch.episodes import (
     is_keyframe,
 )
 from dextouch.episodes.files import make_held_folder
-from dextouch.episodes.image_codecs import ImageChunks, pack_chunk, transform_pixels
-from dextouch.episodes.video import GopDecoder
+from dextouch.episodes.image_codecs import GopDecoder, ImageChunks, pack_chunk, transform_pixels
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,

@@ -16,10 +16,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dextouch.bridges.lerobot import layout
-from dextouch.bridges.lerobot.rows import EpisodeFrames, frames_of
-from dextouch.bridges.lerobot.statistics import (
+from dextouch.bridges.lerobot.frames import (
+    EpisodeFrames,
     Statistics,
     combine,
+    frames_of,
     image_statistics,
     sample_places,
     value_statistics,

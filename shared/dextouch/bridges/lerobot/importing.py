@@ -12,7 +12,7 @@ from jaxtyping import Int64
 from pydantic import ValidationError
 
 from dextouch.bridges.lerobot import layout
-from dextouch.bridges.lerobot.rows import WORLD
+from dextouch.bridges.lerobot.frames import WORLD
 from dextouch.bridges.lerobot.source import DatasetInfo, EpisodeEntry, FeatureInfo, LeRobotFolder
 from dextouch.bridges.lerobot.video import read_images, read_units
 from dextouch.bridges.model_grid import (

@@ -45,21 +45,12 @@ class CameraVideo:
     """The mp4 files of one camera, one episode after the other.
 
     Access units are muxed unchanged. A new file starts when the next episode, which is never split,
-    would make the file larger than `file_bytes`, or was encoded with other parameter sets than the
+    would make the file larger than VIDEO_FILE_MB, or was encoded with other parameter sets than the
     file's header holds. `shape` is [height, width, 3].
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        key: str,
-        *,
-        fps: int,
-        shape: Sequence[int],
-        file_bytes: int = VIDEO_FILE_MB << 20,
-    ) -> None:
+    def __init__(self, folder: Path, key: str, *, fps: int, shape: Sequence[int]) -> None:
         self._folder, self._key, self._fps, self._shape = folder, key, fps, tuple(shape)
-        self._file_bytes = file_bytes
         self._file_number = -1
         self._num_images = self._num_bytes = 0
         self._parameters = b""
@@ -77,7 +68,7 @@ class CameraVideo:
         if not parameters:
             raise CorruptDataError(f"{where}: does not begin with an IDR image and its headers")
         size = sum(map(len, access_units))
-        full = self._num_bytes + size > self._file_bytes
+        full = self._num_bytes + size > VIDEO_FILE_MB << 20
         if self._file is None or full or parameters != self._parameters:
             self._file = self._new_file(access_units[0], where=where)
             self._parameters = parameters

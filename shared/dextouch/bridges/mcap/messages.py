@@ -89,10 +89,10 @@ class MessageCodec:
     def _constant(self) -> Any:  # noqa: ANN401
         descriptor, sent = self.descriptor, self._empty()
         if self.message == FRAME_TRANSFORM:
-            sent.parent_frame_id = _parent_of(descriptor)
+            sent.parent_frame_id = descriptor.frame or "world"
             sent.child_frame_id = _frame_of(descriptor)
         elif self.message == POSES_IN_FRAME:
-            sent.frame_id = _parent_of(descriptor)
+            sent.frame_id = descriptor.frame or "world"
         else:
             sent.frame_id = _frame_of(descriptor)
         if self._is_encoded:
@@ -265,11 +265,6 @@ def _frame_of(descriptor: StreamDescriptor) -> str:
     if descriptor.kind == "pose":
         return "camera_head" if descriptor.name == "head" else descriptor.name
     return descriptor.frame or descriptor.name
-
-
-def _parent_of(descriptor: StreamDescriptor) -> str:
-    """The parent frame of a pose stream."""
-    return descriptor.frame or "world"
 
 
 def _new_message(name: str) -> Any:  # noqa: ANN401

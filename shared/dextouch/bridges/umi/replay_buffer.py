@@ -33,6 +33,9 @@ MAX_STEPS: Final = 100_000
 MODEL_CAMERAS: Final = ("camera_wrist_left", "camera_wrist_right", "camera_head")
 ENDS: Final = "meta/episode_ends"
 COMMANDED: Final = "data/action_commanded"
+# Images of a camera by its number, and their times minus those of the steps.
+CAMERA_ARRAY: Final = "data/camera{}_rgb"
+CAMERA_DT_ARRAY: Final = "data/camera{}_dt_ns"
 ATTRIBUTES_KEY: Final = "dextouch"
 LAYOUT_VERSION: Final = 1
 BLOCK_STEPS = 32
@@ -53,16 +56,6 @@ NUMBERS: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
     "data/action": ("<f8", (67,)),
     "data/t_ref_ns": ("<i8", ()),
 }
-
-
-def _camera_array(index: int) -> str:
-    """Name of the image array of a camera."""
-    return f"data/camera{index}_rgb"
-
-
-def _camera_dt_array(index: int) -> str:
-    """Name of the array of image time minus step time, for a camera."""
-    return f"data/camera{index}_dt_ns"
 
 
 def export_umi(readers: Iterable[EpisodeReader], path: Path, *, overwrite: bool = False) -> int:
@@ -106,7 +99,9 @@ def export_umi(readers: Iterable[EpisodeReader], path: Path, *, overwrite: bool 
             "": {"layout": "UMI replay buffer, two hands, with touch"},
             "meta": {ATTRIBUTES_KEY: about},
         }
-        writer.finish(texts | {_camera_array(i): {"stream": n} for i, n in enumerate(cameras)})
+        writer.finish(
+            texts | {CAMERA_ARRAY.format(i): {"stream": n} for i, n in enumerate(cameras)}
+        )
     return ends[-1]
 
 
@@ -127,8 +122,8 @@ def _append(writer: ZarrZipWriter, reader: EpisodeReader, cameras: tuple[str, ..
         count = min(BLOCK_STEPS, reader.num_steps - start)
         window = reader.window(start, count, cameras=cameras)
         for index, camera in enumerate(cameras):
-            writer.append(_camera_array(index), window.images[camera], chunk_rows=1)
-            writer.append(_camera_dt_array(index), window.image_dt_ns[camera])
+            writer.append(CAMERA_ARRAY.format(index), window.images[camera], chunk_rows=1)
+            writer.append(CAMERA_DT_ARRAY.format(index), window.image_dt_ns[camera])
         writer.append("data/tactile", window.tactile_kpa)
         writer.append("data/tactile_valid", window.tactile_valid)
 
@@ -241,7 +236,7 @@ def _ends(archive: ZarrZipReader, path: Path, meta: _Meta) -> list[int]:
     if shape != (num_episodes,):
         raise CorruptDataError(f"{path}: {ENDS} has shape {shape}, expected ({num_episodes},)")
     ends = archive.read(ENDS, 0, num_episodes)
-    names = [*NUMBERS, *(_camera_array(index) for index in range(len(meta.cameras)))]
+    names = [*NUMBERS, *(CAMERA_ARRAY.format(index) for index in range(len(meta.cameras)))]
     rows = {name: archive.metadata(name).shape[0] for name in names}
     rising = bool((np.diff(ends, prepend=0) > 0).all())
     if ends.dtype != np.int64 or not rising or set(rows.values()) != {int(ends[-1])}:
@@ -286,8 +281,8 @@ def _episode(
     numbers |= tactile_numbers(tactile, archive.read("data/tactile_valid", start, stop))
     images = {}
     for index, camera in enumerate(cameras):
-        name = _camera_array(index)
-        stamps = t_ref_ns + archive.read(_camera_dt_array(index), start, stop)
+        name = CAMERA_ARRAY.format(index)
+        stamps = t_ref_ns + archive.read(CAMERA_DT_ARRAY.format(index), start, stop)
         shape = archive.metadata(name).shape[1:]
         images[camera] = GridImages(
             shape, stamps, partial(_images, archive, name, rows), frame=camera

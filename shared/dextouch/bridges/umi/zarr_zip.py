@@ -22,7 +22,7 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 import zstandard
 from jaxtyping import Shaped
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from dextouch.episodes import disk_errors
 from dextouch.errors import (
@@ -46,12 +46,6 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 Size = Annotated[int, Field(ge=1, le=1 << 20)]
 
 
-class _Codec(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="allow")
-
-    id: str
-
-
 class ArrayMetadata(FrozenModel):
     """`.zarray` of one array; only the features modelled here are supported."""
 
@@ -59,7 +53,7 @@ class ArrayMetadata(FrozenModel):
     shape: tuple[Annotated[int, Field(ge=0, le=MAX_ROWS)], ...] = Field(min_length=1, max_length=6)
     chunks: tuple[Size, ...] = Field(min_length=1, max_length=6)
     dtype: Literal["|b1", "|u1", "<u2", "<i8", "<f4", "<f8"]
-    compressor: _Codec | None
+    compressor: dict[str, Any] | None
     fill_value: float | bool | None = 0
     order: Literal["C"] = "C"
     filters: None = None
@@ -233,11 +227,11 @@ class ZarrZipReader:
         return self._arrays[name]
 
     def _check(self, name: str, metadata: ArrayMetadata) -> None:
-        compressor = metadata.compressor
-        if compressor is not None and compressor.id != "zstd":
+        codec = None if metadata.compressor is None else metadata.compressor.get("id")
+        if metadata.compressor is not None and codec != "zstd":
             raise StorageError(
-                f"{self._path}: {name} is compressed as {compressor.id!r}, expected 'zstd' or "
-                "none; write it again with that compressor"
+                f"{self._path}: {name} is compressed as {codec!r}, expected 'zstd' or none; write "
+                "it again with that compressor"
             )
         if metadata.chunks[1:] != metadata.shape[1:]:
             raise CorruptDataError(

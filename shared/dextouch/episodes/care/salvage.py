@@ -32,7 +32,7 @@ from dextouch.episodes.format import (
 from dextouch.episodes.group_contents import hashed_bytes
 from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.episodes.journal import part_path, scan_rows
-from dextouch.episodes.shard_reader import (
+from dextouch.episodes.shards import (
     CRC_BYTES,
     INDEX_ENTRY_BYTES,
     ShardReader,
