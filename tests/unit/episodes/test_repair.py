@@ -122,6 +122,17 @@ def test_of_a_truncated_file_the_front_is_kept(store, folder, truth, name, kept)
     check_salvaged(store, truth, {name: list(range(kept, len(truth[name])))})
 
 
+@pytest.mark.parametrize("name", [TOUCH, VIDEO, f"{STILLS}_t_ref_ns"])
+@pytest.mark.parametrize("cut", [-16, -32, -6, 16])
+def test_an_index_that_is_cut_or_shifted_names_no_other_chunk(store, folder, truth, name, cut):
+    """An entry of the index takes 16 bytes: the others then look right at another number."""
+    path = shard_of(folder, name)
+    data = path.read_bytes()
+    path.write_bytes(data[:cut] if cut < 0 else data + bytes(cut))
+    assert repair_group(store.root, "episode", ID).lost == {}
+    check_salvaged(store, truth, {})
+
+
 def test_a_lost_file_costs_its_stream(store, folder, truth):
     shard_of(folder, TOUCH).unlink()
     assert repair_group(store.root, "episode", ID).lost == {TOUCH: len(truth[TOUCH])}

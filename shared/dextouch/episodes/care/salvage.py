@@ -314,15 +314,17 @@ def _salvaged_index(source: LocalFile, entry: ArrayEntry) -> np.ndarray:
     places = [[0, 0]] * num_chunks
     if limit >= 0:
         places = np.frombuffer(data, "<u8", 2 * num_chunks, limit).reshape(-1, 2).tolist()
-    found, end, stuck = [], 0, -1
+    found, sure, end, stuck, follows = [], 0, 0, -1, True
     for offset, length in places:
         place, is_inside = (offset, length), offset + length <= limit
-        if not is_inside or not _is_intact(data[offset : offset + length]):
+        # Behind a chunk that was found lies the next one: a cut index names others.
+        is_right = is_inside and (offset == sure if follows else offset > sure)
+        if not is_right or not _is_intact(data[offset : offset + length]):
             place = (end, _chunk_bytes(data, end, entry) if end != stuck else 0)
-        if place[1]:
-            end = sum(place)
+        follows = place[1] > 0
+        if follows:
+            sure = end = sum(place)
         else:
-            # Never back, so that no chunk is found twice.
             place, stuck, end = (0, 0), end, max(end, offset + length if is_inside else 0)
         found.append(place)
     return np.array(found, dtype=np.uint64).reshape(-1, 2)
