@@ -35,9 +35,6 @@ class LowerHull:
     def __init__(self) -> None:
         self._vertices: deque[tuple[float, float]] = deque()
 
-    def __len__(self) -> int:
-        return len(self._vertices)
-
     def __iter__(self) -> Iterator[tuple[float, float]]:
         """Vertices in order of x."""
         return iter(self._vertices)
@@ -75,10 +72,7 @@ class LowerHull:
             vertices.popleft()
 
     def supporting_line(self, x_s: float) -> Line:
-        """The hull's edge that spans `x_s` (outside the points: the nearest edge).
-
-        A single vertex gives a horizontal line.
-        """
+        """The hull's edge that spans `x_s`, or the nearest; horizontal for a single vertex."""
         vertices = self._vertices
         if len(vertices) < 2:
             x, y = vertices[0]

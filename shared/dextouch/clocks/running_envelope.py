@@ -145,13 +145,7 @@ class RunningEnvelope:
         return 0.0 if self._line is None else self._line.at(x_s)
 
     def add(self, x_s: float, y_ns: float, now_s: float) -> float:
-        """Add a point and return the line's value there, in ns.
-
-        Args:
-            x_s: device time.
-            y_ns: apparent offset, arrival minus device time.
-            now_s: arrival.
-        """
+        """Add a point (device time, apparent offset, arrival); returns the line there, in ns."""
         if self._line is None:
             offset_ns = self._follow(x_s, y_ns)
         else:

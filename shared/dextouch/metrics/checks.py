@@ -11,15 +11,7 @@ def checked_pair(
 ) -> tuple[Float64[np.ndarray, "..."], Float64[np.ndarray, "..."]]:
     """Validate two arrays of equal shape and return them as float64.
 
-    Args:
-        first: one side of the comparison.
-        second: the other side, of the same shape.
-        what: name in error messages.
-        tail: expected last axes; None stands for any length of at least one.
-
-    Raises:
-        ShapeError: different shapes, an unexpected tail, or nothing to compare.
-        NonFiniteError: NaN or infinity on either side.
+    `tail` are the expected last axes; None stands for any length of at least one.
     """
     a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if a.shape != b.shape:

@@ -137,7 +137,13 @@ class RolloutStart:
 
 
 def check_observation(observation: Observation, *, where: str) -> None:
-    """Validate an observation with `check_observation_arrays`."""
+    """Check that the arrays of an observation are consistent and finite.
+
+    Raises:
+        ShapeError: inconsistent dtypes, lengths or shapes.
+        NonFiniteError: in touch, actions or object poses.
+        DegenerateRotationError: an object's quaternion is not of length 1.
+    """
     arrays = {name: getattr(observation, name) for name in ARRAYS}
     check_observation_arrays(**arrays, where=where)
 
@@ -150,13 +156,7 @@ def check_observation_arrays(
     object_poses: np.ndarray | None = None,
     where: str,
 ) -> None:
-    """Check that the arrays of an observation are consistent and finite.
-
-    Raises:
-        ShapeError: inconsistent dtypes, lengths or shapes.
-        NonFiniteError: in touch, actions or object poses.
-        DegenerateRotationError: an object's quaternion is not of length 1.
-    """
+    """Check arrays before they become an observation."""
     num_steps = len(tactile_kpa) if tactile_kpa.ndim else 0
     if num_steps == 0:
         raise ShapeError(f"{where}: got 0 steps, expected at least 1")

@@ -56,11 +56,7 @@ Refuse = Callable[[Request, DexTouchError | HTTPException], Response]
 
 
 def canonical_host(text: str) -> str:
-    """A host name as browsers write it: in lower case, an IPv6 address short and without brackets.
-
-    Raises:
-        ValueError: not a host name, or one with a port.
-    """
+    """A host name as browsers write it: in lower case, IPv6 addresses short, without brackets."""
     name = text.lower()
     if HOST_NAME.fullmatch(name):
         return name
@@ -74,11 +70,7 @@ def canonical_host(text: str) -> str:
 
 
 def canonical_origin(text: str) -> str:
-    """An origin as browsers write it: in lower case, without the default port of its scheme.
-
-    Raises:
-        ValueError: not an origin.
-    """
+    """An origin as browsers write it: in lower case, without the default port of its scheme."""
     parts = ORIGIN.fullmatch(text.lower())
     if parts is None or int(parts[4] or 0) > 65535:
         raise ValueError(

@@ -2,8 +2,7 @@
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -177,23 +176,16 @@ class RedisState:
         await self._client.aclose()
 
     async def _call(self, *command: Argument) -> Any:  # noqa: ANN401 - Redis answers by command
-        task = asyncio.current_task()
-        cancels_before = 0 if task is None else task.cancelling()
-        with self._as_our_errors():
-            answer = await self._client.execute_command(*command)  # type: ignore[no-untyped-call]
-        if task is not None and task.cancelling() > cancels_before:
-            # redis-py 8.1 loses a cancellation that arrives while it acquires a connection.
-            raise asyncio.CancelledError
-        return answer
+        return await self._answer(self._client.execute_command(*command))  # type: ignore[no-untyped-call]
 
     async def _run(self, script: AsyncScript, key: str, *arguments: Argument) -> Any:  # noqa: ANN401
-        with self._as_our_errors():
-            return await script(keys=[REDIS_PREFIX + key], args=list(arguments))
+        return await self._answer(script(keys=[REDIS_PREFIX + key], args=list(arguments)))
 
-    @contextmanager
-    def _as_our_errors(self) -> Iterator[None]:
+    async def _answer(self, pending: Awaitable[Any]) -> Any:  # noqa: ANN401
+        task = asyncio.current_task()
+        cancels_before = 0 if task is None else task.cancelling()
         try:
-            yield
+            answer = await pending
         except (RedisConnectionError, RedisTimeoutError, OSError) as error:
             raise UnavailableError(
                 f"redis at {self._where}: {type(error).__name__}: {error}; is the server running?",
@@ -203,6 +195,10 @@ class RedisState:
             raise StorageError(f"redis at {self._where}: {error}") from error
         except RedisError as error:
             raise UnavailableError(f"redis at {self._where}: {error}", retry_after_s=1) from error
+        if task is not None and task.cancelling() > cancels_before:
+            # redis-py 8.1 loses a cancellation that arrives while it acquires a connection.
+            raise asyncio.CancelledError
+        return answer
 
 
 StateStore = MemoryState | RedisState

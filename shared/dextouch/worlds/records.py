@@ -69,13 +69,7 @@ class RecordStore:
 
     @asynccontextmanager
     async def place(self, rollout_id: str, *, limit: int) -> AsyncIterator[int]:
-        """Reserve a slot for a rollout that is starting; yields the version to compute it from.
-
-        The slot is released if the block fails.
-
-        Raises:
-            LimitExceededError: `limit` rollouts are active or starting.
-        """
+        """Reserve a slot, unless the block fails; yields the version to compute the record from."""
         key, ttl_s = KEY_PREFIX + rollout_id, max(self._ttl_s, PLACE_TTL_S)
         async with AsyncExitStack() as failed:
             # Also where the reply is lost although the slot was written.
@@ -96,10 +90,7 @@ class RecordStore:
             await self._store.delete(key)
 
     async def write(self, record: RolloutRecord) -> int:
-        """Replace the version that the record was computed from (compare and set).
-
-        Returns the new version; raises ConflictError where another one is stored.
-        """
+        """Replace the version that the record was computed from, and return the new one."""
         return await self._store.set(
             KEY_PREFIX + record.info.id,
             record.to_bytes(),

@@ -78,7 +78,7 @@ def test_hull_memory_is_bounded():
     hull = LowerHull()
     for n in range(5000):
         hull.add(n * 0.01, float(n * n))
-    assert len(hull) <= MAX_VERTICES
+    assert len(list(hull)) <= MAX_VERTICES
 
 
 @pytest.mark.parametrize(
