@@ -39,7 +39,7 @@ def test_actions_are_checked_once_on_each_side_of_http(name, chunk):
 
 
 def test_an_action_chunk_passes_through_few_files(chunk):
-    assert len(chunk.files) <= 19, chunk.files
+    assert len(chunk.files) <= 15, chunk.files
 
 
 def test_a_glove_packet_is_checked_counted_and_encoded_once():

@@ -7,12 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import FastAPI
-from pydantic import (
-    AfterValidator,
-    Field,
-    ValidationError,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, CliApp, CliSettingsSource, SettingsConfigDict
 
 from dextouch.command_line import CommandParser
@@ -29,7 +24,6 @@ MAX_WEBSOCKET_BYTES = 2**16
 _NO_DEFAULT = re.compile(r"\s*\((default: (null|\(\)|\{\})|default factory: [^)]*)\)$")
 _PLACEHOLDERS = {"int": "N", "float": "X", "Path": "PATH"}
 _LIST = re.compile(r"tuple\[(.+),\.\.\.\]")
-
 
 HostName = Annotated[str, AfterValidator(canonical_host)]
 Origin = Annotated[str, AfterValidator(canonical_origin)]
