@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from dextouch.schemas.episodes import json_ready as json_ready
     from dextouch.schemas.episodes import matrix_rows as matrix_rows
     from dextouch.schemas.observations import EVERYTHING as EVERYTHING
-    from dextouch.schemas.observations import Doubt as Doubt
     from dextouch.schemas.observations import Observation as Observation
     from dextouch.schemas.observations import ReturnSelector as ReturnSelector
     from dextouch.schemas.observations import RolloutAnswer as RolloutAnswer
@@ -39,6 +38,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.observations import encode_observation as encode_observation
     from dextouch.schemas.observations import encode_start as encode_start
     from dextouch.schemas.observations import start_from as start_from
+    from dextouch.schemas.observations import validate_fields as validate_fields
     from dextouch.schemas.problems import CLASS_OF_STATUS as CLASS_OF_STATUS
     from dextouch.schemas.problems import PROBLEM_MEDIA_TYPE as PROBLEM_MEDIA_TYPE
     from dextouch.schemas.problems import Health as Health
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from dextouch.schemas.problems import first_problems as first_problems
     from dextouch.schemas.problems import problem_from_error as problem_from_error
     from dextouch.schemas.problems import status_of as status_of
-    from dextouch.schemas.problems import validate_fields as validate_fields
     from dextouch.schemas.recordings import ID_TAKEN as ID_TAKEN
     from dextouch.schemas.recordings import BatchReceipt as BatchReceipt
     from dextouch.schemas.recordings import ExpireUploads as ExpireUploads
@@ -62,6 +61,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.recordings import UploadSummary as UploadSummary
     from dextouch.schemas.rollouts import MAX_SEED as MAX_SEED
     from dextouch.schemas.rollouts import ActionKind as ActionKind
+    from dextouch.schemas.rollouts import Doubt as Doubt
     from dextouch.schemas.rollouts import ForkRequest as ForkRequest
     from dextouch.schemas.rollouts import RolloutInfo as RolloutInfo
     from dextouch.schemas.rollouts import StartRequest as StartRequest

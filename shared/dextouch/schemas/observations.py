@@ -2,17 +2,17 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
-from pydantic import Field, field_validator, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
 from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
-from dextouch.schemas.problems import validate_fields
-from dextouch.schemas.rollouts import ActionKind, RolloutInfo, StartRequest
+from dextouch.schemas.problems import first_problems
+from dextouch.schemas.rollouts import ActionKind, Doubt, RolloutInfo, StartRequest
 from dextouch.streams import pack, unpack
 
 # Tolerance of the norm of a unit quaternion in float32.
@@ -21,6 +21,7 @@ ARRAYS = ("images", "tactile_kpa", "action_reached", "object_poses")
 IMAGE_PREFIX = "image/"
 ANCHOR_NAMES = tuple(AnchorPoses.__dataclass_fields__)
 RIGID_TOLERANCE = 1e-6
+ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 class ReturnSelector(FrozenModel):
@@ -45,33 +46,6 @@ class ReturnSelector(FrozenModel):
 
 
 EVERYTHING: Final = ReturnSelector()
-
-
-class Doubt(FrozenModel):
-    """Uncertainty of an imagining world about its prediction.
-
-    Both numbers are non-negative, and comparable within one world digest only.
-
-    Attributes:
-        disagreement: between several predictions of the same steps.
-        distance: of the rollout from the training distribution.
-        outside: whether the world's own bound is exceeded, so that the prediction is unreliable.
-        reason: why it is outside; None otherwise.
-    """
-
-    disagreement: float = Field(ge=0, allow_inf_nan=False)
-    distance: float = Field(ge=0, allow_inf_nan=False)
-    outside: bool = False
-    reason: str | None = Field(default=None, min_length=1, max_length=500)
-
-    @model_validator(mode="after")
-    def _a_reason_if_outside(self) -> "Doubt":
-        if self.outside != (self.reason is not None):
-            raise ValueError(
-                f"got outside {self.outside} with reason {self.reason!r}, expected a reason where "
-                "outside is true and none where it is not"
-            )
-        return self
 
 
 @dataclass(frozen=True)
@@ -385,3 +359,17 @@ def _array(arrays: Mapping[str, np.ndarray], name: str, where: str) -> np.ndarra
         listed = ", ".join(sorted(arrays)) or "none"
         raise InvalidInputError(f"{where}: array {name!r} is missing; got: {listed}")
     return arrays[name]
+
+
+def validate_fields(model: type[ModelT], fields: object, *, where: str) -> ModelT:
+    """A model of decoded fields, or of JSON as bytes.
+
+    Raises:
+        InvalidInputError: wrong fields; the message begins with `where`.
+    """
+    try:
+        if isinstance(fields, bytes):
+            return model.model_validate_json(fields)
+        return model.model_validate(fields)
+    except ValidationError as error:
+        raise InvalidInputError(f"{where}: {first_problems(error)}") from error

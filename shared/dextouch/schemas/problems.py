@@ -1,6 +1,6 @@
 """Bodies that every service gives: problems (RFC 9457) from and to our errors, and probes."""
 
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json, to_json
@@ -23,7 +23,6 @@ from dextouch.frozen_model import FrozenModel
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:dextouch:error:"
-ModelT = TypeVar("ModelT", bound=BaseModel)
 
 # Names of the error constructor's own parameters.
 RESERVED = frozenset({"self", "message"})
@@ -149,17 +148,3 @@ def first_problems(error: ValidationError, *, limit: int = 5) -> str:
         f"{item['msg'].removeprefix('Value error, ')}"
         for item in items
     )
-
-
-def validate_fields(model: type[ModelT], fields: object, *, where: str) -> ModelT:
-    """A model of decoded fields, or of JSON as bytes.
-
-    Raises:
-        InvalidInputError: wrong fields; the message begins with `where`.
-    """
-    try:
-        if isinstance(fields, bytes):
-            return model.model_validate_json(fields)
-        return model.model_validate(fields)
-    except ValidationError as error:
-        raise InvalidInputError(f"{where}: {first_problems(error)}") from error

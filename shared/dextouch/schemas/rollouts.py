@@ -1,8 +1,8 @@
-"""Schemas of rollouts without arrays: world descriptions, start and fork requests, progress."""
+"""Schemas of rollouts without arrays: worlds, requests to start and fork, progress and doubt."""
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from dextouch.frozen_model import FrozenModel
 
@@ -73,3 +73,30 @@ class RolloutInfo(FrozenModel):
     last_step: int
     ttl_s: float
     ended: str | None = Field(default=None, exclude_if=lambda reason: reason is None)
+
+
+class Doubt(FrozenModel):
+    """Uncertainty of an imagining world about its prediction.
+
+    Both numbers are non-negative, and comparable within one world digest only.
+
+    Attributes:
+        disagreement: between several predictions of the same steps.
+        distance: of the rollout from the training distribution.
+        outside: whether the world's own bound is exceeded, so that the prediction is unreliable.
+        reason: why it is outside; None otherwise.
+    """
+
+    disagreement: float = Field(ge=0, allow_inf_nan=False)
+    distance: float = Field(ge=0, allow_inf_nan=False)
+    outside: bool = False
+    reason: str | None = Field(default=None, min_length=1, max_length=500)
+
+    @model_validator(mode="after")
+    def _a_reason_if_outside(self) -> "Doubt":
+        if self.outside != (self.reason is not None):
+            raise ValueError(
+                f"got outside {self.outside} with reason {self.reason!r}, expected a reason where "
+                "outside is true and none where it is not"
+            )
+        return self
