@@ -101,10 +101,7 @@ def find_wrong_stamps(device: np.ndarray) -> Int64[np.ndarray, " k"]:
 
     Only for regular devices; for others none are found.
     """
-    if len(device) < 3:
-        return np.empty(0, dtype=np.int64)
-    stamps = _Stamps(device)
-    if not stamps.is_regular:
+    if len(device) < 3 or not (stamps := _Stamps(device)).is_regular:
         return np.empty(0, dtype=np.int64)
     period_ns = max(stamps.period_ns, 1.0)
     both_ns = (device[2:] - device[:-2]).astype(np.float64)

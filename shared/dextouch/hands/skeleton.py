@@ -20,17 +20,13 @@ THUMB_JOINTS: Final = ("metacarpal", "proximal", "distal", "tip")
 FINGER_JOINTS: Final = ("metacarpal", "proximal", "intermediate", "distal", "tip")
 
 
-def _nodes() -> tuple[tuple[str, str], ...]:
-    nodes = [(WRIST, WRIST)]
-    for chain in CHAINS:
-        joints = THUMB_JOINTS if chain == "thumb" else FINGER_JOINTS
-        nodes.extend((chain, joint) for joint in joints)
-    return tuple(nodes)
-
-
 # (chain, joint) of each keypoint. A node sits at the *base* of its bone: "proximal" is the
 # anatomical MCP joint, "intermediate" the PIP, "distal" the DIP (of the thumb: the IP).
-NODES: Final = _nodes()
+NODES: Final = (
+    (WRIST, WRIST),
+    *(("thumb", joint) for joint in THUMB_JOINTS),
+    *((chain, joint) for chain in CHAINS[1:] for joint in FINGER_JOINTS),
+)
 NUM_KEYPOINTS: Final = len(NODES)
 NODE_INDEX: Final = {node: index for index, node in enumerate(NODES)}
 FINGER_CHAINS: Final = CHAINS[1:]

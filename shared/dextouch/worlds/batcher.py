@@ -92,13 +92,9 @@ class WorldWorker(Generic[State]):
     def _take_batch(self) -> list[StepJob[State]]:
         """The oldest pending chunk and, up to the limit, others of its length."""
         num_steps = len(self._waiting[0].actions)
-        batch: list[StepJob[State]] = []
-        others: deque[StepJob[State]] = deque()
-        while self._waiting:
-            job = self._waiting.popleft()
-            fits = len(job.actions) == num_steps and len(batch) < self._max_batch
-            (batch if fits else others).append(job)
-        self._waiting = others
+        fitting = [job for job in self._waiting if len(job.actions) == num_steps]
+        batch = fitting[: self._max_batch]
+        self._waiting = deque(job for job in self._waiting if job not in batch)
         return batch
 
     async def _run(self, batch: Sequence[StepJob[State]]) -> None:
