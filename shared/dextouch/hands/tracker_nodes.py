@@ -6,7 +6,7 @@ and some are shifted by one joint; the names of a chain are interpreted together
 """
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -121,29 +121,16 @@ def _in_our_words(nodes: Sequence[Node]) -> list[Node | None]:
     """Translate nodes to our names; None for a palm. Unknown names are unchanged."""
     lowered = [(chain.lower(), joint.lower()) for chain, joint in nodes]
     named = [(_CHAIN_WORDS.get(chain, chain), joint) for chain, joint in lowered]
-    words = {
-        chain: _joint_words(chain, [joint for other, joint in named if other == chain])
-        for chain in CHAINS
-    }
-    translated: list[Node | None] = []
-    for chain, joint in named:
-        if _PALM in (chain, joint):
-            translated.append(None)
-        elif (chain, joint) in _WRIST_WORDS:
-            translated.append((WRIST, WRIST))
-        else:
-            translated.append((chain, words.get(chain, {}).get(joint, joint)))
-    return translated
-
-
-def _joint_words(chain: str, joints: Sequence[str]) -> Mapping[str, str]:
-    """Translation of a chain's joint names, if all belong to one other naming scheme."""
-    is_thumb = chain == "thumb"
-    ours = THUMB_JOINTS if is_thumb else FINGER_JOINTS
-    for words in _THUMB_WORDS if is_thumb else _FINGER_WORDS:
-        if set(words) == set(joints):
-            return dict(zip(words, ours[-len(words) :], strict=True))
-    return {}
+    words: dict[Node, Node] = dict.fromkeys(_WRIST_WORDS, (WRIST, WRIST))
+    for chain in CHAINS:
+        is_thumb = chain == "thumb"
+        ours = THUMB_JOINTS if is_thumb else FINGER_JOINTS
+        given = {joint for other, joint in named if other == chain}
+        for scheme in _THUMB_WORDS if is_thumb else _FINGER_WORDS:
+            if set(scheme) == given:
+                joints = zip(scheme, ours[-len(scheme) :], strict=True)
+                words |= {(chain, theirs): (chain, joint) for theirs, joint in joints}
+    return [None if _PALM in node else words.get(node, node) for node in named]
 
 
 def nodes_of_tree(tree: Sequence[TreeNode]) -> list[Node]:
