@@ -18,7 +18,7 @@ from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_
 from dextouch.hands.hand_files.elements import Element, read_elements
 from dextouch.hands.hand_files.mapping import FingerMapping, WristMapping, read_mapping
 from dextouch.hands.hand_files.mjcf import MjcfModel
-from dextouch.hands.hand_files.urdf import Joint, Link, UrdfModel, vector3
+from dextouch.hands.hand_files.urdf import Joint, UrdfModel, vector3
 from dextouch.hands.robot_hand import FingerTable, HandModel, JointRow
 from dextouch.hands.skeleton import CHAINS
 
@@ -126,21 +126,25 @@ def _finger_table(
     else:
         raise UnknownNameError(f"link in {where} tip:", tip.link_name, list(model.parents))
     base, links = _links_between(model, bases, link, where)
-    steps = [model.link(name) for name in links]
-    _check_joints(steps, finger, model.source, where)
     rows: list[JointRow] = []
     T_frame_link = bases[base]
-    for step in steps:
+    for step in [model.link(name) for name in links]:
         T_frame_link = T_frame_link @ step.T_parent_link
         for joint in step.joints:
             row, T_frame_link = _hinge(joint, T_frame_link, where)
             rows.append(row)
+    names = [row.name for row in rows]
+    if names != list(finger.joints):
+        raise InvalidInputError(
+            f"{where}: got joints {list(finger.joints)}, but between wrist and tip {model.source} "
+            f"has {names}; list exactly those, from the wrist outwards"
+        )
+    for what in ("knuckle", "pip", "dip"):
+        if getattr(finger, what) not in names:
+            raise UnknownNameError(f"{what} of {where}", getattr(finger, what), names)
+    points = (names.index(finger.knuckle), names.index(finger.pip), names.index(finger.dip))
     tip_m = apply(T_frame_link @ T_link_tip, np.array([tip.offset_m]))[0]
-    knuckle, pip, dip = (
-        _index(finger, name, f"{what} of {where}")
-        for what, name in (("knuckle", finger.knuckle), ("pip", finger.pip), ("dip", finger.dip))
-    )
-    return FingerTable(finger.chain, tuple(rows), vector3(tip_m), (knuckle, pip, dip))
+    return FingerTable(finger.chain, tuple(rows), vector3(tip_m), points)
 
 
 def _links_between(
@@ -163,31 +167,18 @@ def _links_between(
     return link, links[::-1]
 
 
-def _check_joints(steps: list[Link], finger: FingerMapping, source: str, where: str) -> None:
-    joints = [joint for step in steps for joint in step.joints]
-    for joint in joints:
-        if joint.refusal is not None:
-            raise InvalidInputError(
-                f"{joint.where}: {joint.refusal}; fingers are chains of hinges that move on their "
-                f"own ({where}); make it fixed in the model, or leave the finger out"
-            )
-        if joint.limits_rad is None:
-            raise InvalidInputError(
-                f"{joint.where}: got no limits, expected a lowest and a highest angle; write them "
-                "into the model"
-            )
-    names = tuple(joint.name for joint in joints)
-    if names != finger.joints:
-        raise InvalidInputError(
-            f"{where}: got joints {list(finger.joints)}, but between wrist and tip {source} "
-            f"has {list(names)}; list exactly those, from the wrist outwards"
-        )
-
-
 def _hinge(joint: Joint, T_frame_link: np.ndarray, where: str) -> tuple[JointRow, np.ndarray]:
     """A hinge's row, and T_hinge_link, the link's pose in the hinge's rotated frame."""
+    if joint.refusal is not None:
+        raise InvalidInputError(
+            f"{joint.where}: {joint.refusal}; fingers are chains of hinges that move on their "
+            f"own ({where}); make it fixed in the model, or leave the finger out"
+        )
     if joint.limits_rad is None:
-        raise InvalidInputError(f"{where}: joint {joint.name!r} has no limits")
+        raise InvalidInputError(
+            f"{joint.where}: got no limits, expected a lowest and a highest angle; write them "
+            "into the model"
+        )
     anchor = np.array(joint.anchor_m)
     # At the joint's zero angle, which may differ from the angle of the file's reference pose.
     R_undrawn = rotation_from_vector(-joint.zero_rad * np.array(joint.axis))
@@ -196,12 +187,6 @@ def _hinge(joint: Joint, T_frame_link: np.ndarray, where: str) -> tuple[JointRow
     position_m = vector3(T_frame_hinge[:3, 3])
     row = JointRow(joint.name, position_m, (w, x, y, z), joint.axis, joint.limits_rad)
     return row, transform(np.eye(3), -anchor)
-
-
-def _index(finger: FingerMapping, name: str, what: str) -> int:
-    if name not in finger.joints:
-        raise UnknownNameError(what, name, list(finger.joints))
-    return finger.joints.index(name)
 
 
 def _length_m(finger: FingerTable) -> float:
