@@ -120,14 +120,19 @@ class DeviceCounter:
             self._choose(has_time=t_device_ns is not None, has_sequence=sequence is not None)
         if self.source == "arrival":
             return None
-        if self.source == "device" and t_device_ns is not None:
-            return self._unwrap(t_device_ns, t_host_ns)
-        if self.source == "sequence" and sequence is not None:
-            return self._unwrap(sequence * self._period_ns, t_host_ns)
-        raise InvalidInputError(
-            f"online clock: a sample at {t_host_ns} ns came without its {self.source} stamp, "
-            "which earlier samples had; expected the same fields in every sample of a stream"
-        )
+        count_ns = t_device_ns
+        if self.source == "sequence":
+            count_ns = None if sequence is None else sequence * self._period_ns
+        if count_ns is None:
+            raise InvalidInputError(
+                f"online clock: a sample at {t_host_ns} ns came without its {self.source} stamp, "
+                "which earlier samples had; expected the same fields in every sample of a stream"
+            )
+        if self._modulus_ns is not None and self._last is not None:
+            expected_ns = self._last[0] + t_host_ns - self._last[1]
+            count_ns = nearest_congruent(count_ns, expected_ns, self._modulus_ns)
+        self._last = (count_ns, t_host_ns)
+        return count_ns
 
     def _choose(self, *, has_time: bool, has_sequence: bool) -> None:
         if self._descriptor is None:
@@ -146,11 +151,3 @@ class DeviceCounter:
             return
         # A wider counter never wraps.
         self._modulus_ns = 2**bits * unit_ns if bits <= 62 else None
-
-    def _unwrap(self, count_ns: int, t_host_ns: int) -> int:
-        straight = count_ns
-        if self._modulus_ns is not None and self._last is not None:
-            expected_ns = self._last[0] + t_host_ns - self._last[1]
-            straight = nearest_congruent(count_ns, expected_ns, self._modulus_ns)
-        self._last = (straight, t_host_ns)
-        return straight

@@ -84,21 +84,16 @@ def contact_mae(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
 
 def contact_iou(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
     """Intersection over union of contact taxels; 1 when neither side has contact."""
-    a, b = _pair(predicted_kpa, true_kpa, "contact IoU")
-    both, either = _overlap(a, b)
+    both, either = _overlap(predicted_kpa, true_kpa, "contact IoU")
     return both / either if either else 1.0
 
 
 def contact_f1(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
     """2 TP / (2 TP + FP + FN) of contact taxels; 1 when neither side has contact."""
-    a, b = _pair(predicted_kpa, true_kpa, "contact F1")
-    both, either = _overlap(a, b)
+    both, either = _overlap(predicted_kpa, true_kpa, "contact F1")
     return 2 * both / (both + either) if either else 1.0
 
 
-def _overlap(a: np.ndarray, b: np.ndarray) -> tuple[int, int]:
-    touched_a, touched_b = in_contact(a), in_contact(b)
-    return (
-        int(np.count_nonzero(touched_a & touched_b)),
-        int(np.count_nonzero(touched_a | touched_b)),
-    )
+def _overlap(predicted: np.ndarray, true: np.ndarray, what: str) -> tuple[int, int]:
+    a, b = (in_contact(kpa) for kpa in _pair(predicted, true, what))
+    return int(np.count_nonzero(a & b)), int(np.count_nonzero(a | b))
