@@ -71,19 +71,6 @@ class Answer:
     device_s: float = 0.0
 
 
-@dataclass(frozen=True)
-class _ChunkRequest:
-    """A validated chunk and the requested part of its observation."""
-
-    actions: Float64[np.ndarray, "steps 67"]
-    selector: ReturnSelector
-
-    def sha256(self) -> str:
-        """Hash of the request, for replay detection."""
-        asked = self.selector.model_dump_json().encode()
-        return hashlib.sha256(asked + self.actions.astype("<f8").tobytes()).hexdigest()
-
-
 class RolloutService:
     """All rollouts of one process; several processes may share one store.
 
@@ -167,8 +154,10 @@ class RolloutService:
             worker = self._worker_of(record.info)
             description = worker.world.description
             check_selector(selector, description)
-            request = _ChunkRequest(check_chunk(actions, description), selector)
-            replayed = _replay(record, chunk, request)
+            checked = check_chunk(actions, description)
+            asked = selector.model_dump_json().encode() + checked.astype("<f8").tobytes()
+            sha256 = hashlib.sha256(asked).hexdigest()
+            replayed = _replay(record, chunk, sha256)
             if replayed is not None:
                 logger.info("chunk_replayed", rollout_id=rollout_id, chunk=chunk)
                 return replayed
@@ -180,12 +169,12 @@ class RolloutService:
                     f"{self.limits.max_chunks}; start a new one"
                 )
             try:
-                return await self._advance(record, worker, request)
+                return await self._advance(record, worker, checked, selector, sha256)
             except EndedError as error:
                 raise await self._end(record, error) from error
             except ConflictError:
                 # Another process was faster: its response is valid if the request was the same.
-                replayed = _replay(await self._records.read(rollout_id), chunk, request)
+                replayed = _replay(await self._records.read(rollout_id), chunk, sha256)
                 if replayed is None:
                     raise
                 return replayed
@@ -219,7 +208,12 @@ class RolloutService:
             worker.close()
 
     async def _advance(
-        self, stored: RolloutRecord, worker: WorldWorker[Any], request: _ChunkRequest
+        self,
+        stored: RolloutRecord,
+        worker: WorldWorker[Any],
+        actions: Float64[np.ndarray, "steps 67"],
+        selector: ReturnSelector,
+        request_sha256: str,
     ) -> Answer:
         """Compute a chunk and commit its record."""
         before = stored.info
@@ -227,14 +221,14 @@ class RolloutService:
         if held != stored.version:
             state = await worker.call(worker.world.restore, stored.snapshot)
         seed = chunk_seed(before.seed, before.next_chunk, before.world_digest)
-        outcome = await worker.step(StepJob(state, request.actions, seed, request.selector))
-        seen, num_steps = outcome.stepped.observation, len(request.actions)
+        outcome = await worker.step(StepJob(state, actions, seed, selector))
+        seen, num_steps = outcome.stepped.observation, len(actions)
         check_answer(
             seen,
             worker.world.description,
             first_step=before.last_step + 1,
             num_steps=num_steps,
-            selector=request.selector,
+            selector=selector,
         )
         info = before.model_copy(
             update={
@@ -243,9 +237,8 @@ class RolloutService:
             }
         )
         told = outcome.stepped.info
-        payload = encode_answer(info, seen, tactile=request.selector.tactile, info=told)
-        sha256 = request.sha256()
-        record = RolloutRecord(info, outcome.snapshot, sha256, payload, stored.version)
+        payload = encode_answer(info, seen, tactile=selector.tactile, info=told)
+        record = RolloutRecord(info, outcome.snapshot, request_sha256, payload, stored.version)
         version = await self._records.write(record)
         self._keep(info.id, version, outcome.stepped.state)
         return Answer(payload, queued_s=outcome.queued_s, device_s=outcome.device_s)
@@ -300,13 +293,13 @@ def _over(info: RolloutInfo) -> EndedError:
     )
 
 
-def _replay(record: RolloutRecord, chunk: int, request: _ChunkRequest) -> Answer | None:
+def _replay(record: RolloutRecord, chunk: int, request_sha256: str) -> Answer | None:
     """The stored response if the request is a repetition; None if the chunk is the next one."""
     info = record.info
     if chunk == info.next_chunk:
         return None
     is_newest = chunk == info.next_chunk - 1
-    if is_newest and record.request_sha256 == request.sha256():
+    if is_newest and record.request_sha256 == request_sha256:
         return Answer(record.payload, replayed=True)
     why = "again with another body" if is_newest else "out of turn"
     raise ConflictError(
