@@ -37,7 +37,6 @@ MOVED_SHARE = 0.01
 LOADED_SHARE = 0.05
 # With fewer loaded cells than these, nothing can be said about one of them.
 MIN_LOADED = 8
-_NEVER = np.iinfo(np.int64).max
 MOVED_KPA = 1.0
 # About as much, where the glove's gain is not known.
 MOVED_COUNTS = 40
@@ -49,13 +48,8 @@ MAX_TOUCHED_SHARE = 0.25
 _SCAN_COLUMNS = 20
 
 
-class _CellHistory(ABC):
-    """State of each cell from all samples so far, and the readings of the last 0.5 s.
-
-    Args:
-        full_scale: the largest reading.
-        noun: what the cells are called.
-    """
+class _CellCheck(ABC):
+    """State of each cell from all samples so far, and the readings of the last 0.5 s."""
 
     def __init__(self, full_scale: float, noun: str) -> None:
         self._noun = noun
@@ -65,7 +59,7 @@ class _CellHistory(ABC):
         self._recent = np.empty((0, 1))
         self._changed_ns = np.zeros(1, dtype=np.int64)
         self._around_ns = np.zeros(1, dtype=np.int64)
-        self._pinned_ns = np.full(1, _NEVER)
+        self._below_ns = np.zeros(1, dtype=np.int64)
         self._silent = np.zeros(1, dtype=np.bool_)
 
     def __call__(self, evaluation: Evaluation) -> None:
@@ -87,25 +81,20 @@ class _CellHistory(ABC):
 
     def _add(self, values: np.ndarray, t_ns: np.ndarray) -> None:
         if not len(self._recent_ns):
-            self._recent, self._changed_ns = values[:0], t_ns[:1]
+            self._recent = values[:0]
+            self._changed_ns = self._below_ns = t_ns[:1]
         before = self._recent[-1:] if len(self._recent) else values[:1]
         changed = np.diff(values, axis=0, prepend=before) != 0
-        latest_ns = t_ns[len(t_ns) - 1 - np.argmax(changed[::-1], axis=0)]
-        self._changed_ns = np.where(changed.any(axis=0), latest_ns, self._changed_ns)
+        self._changed_ns = _latest_ns(changed, t_ns, self._changed_ns)
+        self._below_ns = _latest_ns(~(values >= self._top), t_ns, self._below_ns)
         self._silent = self._silent & ~changed.any(axis=0)
-        # Where the present run at the top began: after the last reading below it.
-        below = ~(values >= self._top)
-        index = len(t_ns) - np.argmax(below[::-1], axis=0)
-        began_ns = t_ns[np.minimum(index, len(t_ns) - 1)]
-        began_ns = np.where(below.any(axis=0), began_ns, np.minimum(self._pinned_ns, t_ns[0]))
-        self._pinned_ns = np.where(below[-1], _NEVER, began_ns)
         all_ns, rows = np.append(self._recent_ns, t_ns), np.concatenate([self._recent, values])
         kept = all_ns >= all_ns[-1] - RECENT_NS
         self._recent_ns, self._recent = all_ns[kept], rows[kept]
 
     def _saturated(self) -> Bool[np.ndarray, " cells"]:
         """Cells at full scale for longer than a second."""
-        return self._pinned_ns <= self._recent_ns[-1] - SATURATED_NS
+        return self._below_ns < self._recent_ns[-1] - SATURATED_NS
 
     def _quiet(self) -> Bool[np.ndarray, " cells"]:
         """Cells without a change for 5 s."""
@@ -137,7 +126,7 @@ class _CellHistory(ABC):
                 evaluation.judge(code, count / num_cells, f"{count} {self._noun} {word}")
 
 
-class TaxelJudge(_CellHistory):
+class TaxelJudge(_CellCheck):
     """Checks the 320 taxels of our own glove from its raw counts.
 
     Args:
@@ -225,7 +214,7 @@ def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellJudg
     return CellJudge(layout, used)
 
 
-class CellJudge(_CellHistory):
+class CellJudge(_CellCheck):
     """Checks the cells of another manufacturer's glove.
 
     On a known grid a cell is silent when it does not change while its neighbours move: dead at
@@ -313,6 +302,12 @@ def neighbour_share(moved: Bool[np.ndarray, "320"]) -> Float64[np.ndarray, "320"
     """Share of the up to 8 neighbours on its pad that moved, for each taxel."""
     tips, palm = (share_around(pads, np.ones_like(pads)) for pads in split_pads(moved))
     return join_pads(tips, palm)
+
+
+def _latest_ns(flags: np.ndarray, t_ns: np.ndarray, before_ns: np.ndarray) -> np.ndarray:
+    """When each cell was flagged last; what it was before where it is not flagged now."""
+    last_ns = t_ns[len(t_ns) - 1 - np.argmax(flags[::-1], axis=0)]
+    return np.where(flags.any(axis=0), last_ns, before_ns)
 
 
 def share_around(moved: np.ndarray, exists: np.ndarray) -> np.ndarray:

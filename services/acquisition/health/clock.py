@@ -113,27 +113,21 @@ class ClockJudge:
             numbers = _signed(numbers, capabilities.sequence_bits, 1)
         else:
             numbers = np.ones_like(numbers)
-        if stamps[1].min() < 0:
-            self._note_departures(t_host_ns, numbers != 1)
-            return []
-        device_ns = _signed(device_ns, capabilities.device_time_bits, capabilities.tick_ns)
-        off_ns = np.abs(device_ns - numbers * period_ns)
-        departed = (off_ns > DEPARTURE_NS + capabilities.tick_ns) | (numbers < 1)
-        self._note_departures(t_host_ns, departed)
-        offsets_ns = self._drift_ns + np.cumsum(host_ns - device_ns)
-        self._drift_ns = int(offsets_ns[-1]) if len(offsets_ns) else self._drift_ns
-        self._offsets.add(t_host_ns, offsets_ns, int(stamps[0, -1]))
-        if not capabilities.sequence:
-            return []
-        off_sequence = off_ns > STEP_NS + RATE_SHARE * period_ns * (numbers - 1)
-        off_host = np.abs(device_ns - host_ns) > STEP_NS
-        jumped = off_sequence & off_host & (numbers > 0)
-        return [int(t_ns) for t_ns in t_host_ns[jumped]]
-
-    def _note_departures(self, t_host_ns: np.ndarray, departed: np.ndarray) -> None:
-        """Remember when samples were last not as far apart as their numbers say."""
+        departed, jumped = numbers != 1, np.zeros(len(numbers), dtype=np.bool_)
+        if stamps[1].min() >= 0:
+            device_ns = _signed(device_ns, capabilities.device_time_bits, capabilities.tick_ns)
+            off_ns = np.abs(device_ns - numbers * period_ns)
+            departed = (off_ns > DEPARTURE_NS + capabilities.tick_ns) | (numbers < 1)
+            offsets_ns = np.cumsum(np.append(self._drift_ns, host_ns - device_ns))
+            self._drift_ns = int(offsets_ns[-1])
+            self._offsets.add(t_host_ns, offsets_ns[1:], int(stamps[0, -1]))
+            off_sequence = off_ns > STEP_NS + RATE_SHARE * period_ns * (numbers - 1)
+            off_host = np.abs(device_ns - host_ns) > STEP_NS
+            jumped = off_sequence & off_host & (numbers > 0) & capabilities.sequence
         if departed.any():
+            # Samples were not as far apart as their numbers say.
             self._departed_ns = int(t_host_ns[departed][-1])
+        return [int(t_ns) for t_ns in t_host_ns[jumped]]
 
     def _skew_ppm(self, t_host_ns: int) -> float:
         """The line's slope; of a young clock only where the edges of all parts bear it out."""
