@@ -1,8 +1,9 @@
 """A device that plays a stream of an episode as packets."""
 
 import heapq
+import threading
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
@@ -133,6 +134,8 @@ class MockDevice:
             partial(self._edits.pin, cells=cells, how=how) for how, cells in pinned.items() if cells
         ]
         self._next_sequence = faults.first_sequence
+        # The device numbers all that it sends, in the order in which it sends it.
+        self._numbering = threading.Lock()
         # The place in the ledger and the units of a packet that the next one overtakes.
         self._held: tuple[int, list[bytes]] | None = None
         self._start_host_ns = 0
@@ -162,7 +165,8 @@ class MockDevice:
             if not waiter.wait_until(start_host_ns + event.t_ns):
                 return False
             if event.sample_index is not None:
-                self._send(event.sample_index, schedule)
+                with self._numbering:
+                    self._send(event.sample_index, schedule)
             elif event.plug:
                 self.port.plug()
             else:
@@ -189,9 +193,18 @@ class MockDevice:
         )
         return heapq.merge(packets, edges, key=attrgetter("t_ns"))
 
-    def _send(self, index: int, schedule: Schedule) -> None:
+    def send_aside(self, make: Callable[[int], bytes]) -> None:
+        """Send what is made of the next sequence number; it has no ledger entry."""
+        with self._numbering:
+            self.port.send(make(self._take_number()))
+
+    def _take_number(self) -> int:
         sequence = self._next_sequence
         self._next_sequence = (sequence + 1) % SEQUENCE_MODULUS
+        return sequence
+
+    def _send(self, index: int, schedule: Schedule) -> None:
+        sequence = self._take_number()
         t_device_ns = int(schedule.t_device_ns[index])
         fate, flips = Fate.SENT, 0
         if schedule.is_unplugged[index] or not self.port.link.is_open:

@@ -8,20 +8,13 @@ from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 from services.acquisition.clock import PeriodicCall, StationClock, VirtualClock
-from services.acquisition.drivers.packets import (
-    SEQUENCE_MODULUS,
-    SOURCES,
-    VERSION,
-    Packet,
-    encode_packet,
-)
+from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.sdk_link import (
     BridgeDecoder,
     BridgeDriver,
     BridgeHello,
     FrameConvention,
 )
-from services.acquisition.mocks.faults import DeviceFaults, Schedule
 from services.acquisition.mocks.place import MockPair, TrackerPlace
 from services.acquisition.mocks.ports import SEND_TIMEOUT_S, SocketPort
 from services.acquisition.mocks.replay import MockDevice, PacketSource
@@ -87,47 +80,23 @@ class BridgePort(SocketPort):
         return host_end
 
 
-class BridgedDevice(MockDevice):
-    """A device behind a bridge process, which shows that it lives while the device says nothing.
-
-    Only on a real clock: with a virtual one, time stands while nothing is sent.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        *,
-        source: BridgeSource,
-        port: BridgePort,
-        faults: DeviceFaults,
-        seed: int,
-    ) -> None:
-        super().__init__(name, source=source, port=port, faults=faults, seed=seed)
-        self._magic = source.magic
-        # The bridge numbers all that it sends, in the order in which it sends it.
-        self._numbering = threading.Lock()
-
-    def show_life(self) -> None:
-        """Send one heartbeat, which has a sequence number but no ledger entry."""
-        with self._numbering:
-            sequence = self._next_sequence
-            self._next_sequence = (sequence + 1) % SEQUENCE_MODULUS
-            self.port.send(sign_of_life(self._magic, sequence, 0))
-
-    def _send(self, index: int, schedule: Schedule) -> None:
-        with self._numbering:
-            super()._send(index, schedule)
-
-
 def bridged_pair(
     name: str, source: BridgeSource, decoder: BridgeDecoder, place: TrackerPlace
 ) -> MockPair:
-    """A simulated device behind a bridge, and the driver that asks the bridge for it."""
+    """A simulated device behind a bridge, and the driver that asks the bridge for it.
+
+    The bridge shows that it lives while the device says nothing; not on a virtual clock, whose time
+    stands while nothing is sent.
+    """
     port, clock = BridgePort(name, source.hello), place.clock
-    device = BridgedDevice(name, source=source, port=port, faults=place.faults, seed=place.seed)
+    device = MockDevice(name, source=source, port=port, faults=place.faults, seed=place.seed)
+
+    def show_life() -> None:
+        device.send_aside(lambda sequence: sign_of_life(source.magic, sequence, 0))
+
     if not isinstance(clock, VirtualClock):
         port.life = PeriodicCall(
-            device.show_life, period_ns=LIFE_PERIOD_NS, clock=clock, name="bridge-life"
+            show_life, period_ns=LIFE_PERIOD_NS, clock=clock, name="bridge-life"
         )
     driver = BridgeDriver(name, transport=port.transport, decoder=decoder, clock=clock)
     return MockPair(device, driver)
