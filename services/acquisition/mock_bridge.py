@@ -5,6 +5,7 @@ line of JSON with its port to the standard output once it listens.
 """
 
 import argparse
+import itertools
 import json
 import sys
 
@@ -15,8 +16,9 @@ from services.acquisition.clock import RealClock
 from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.sdk_link import BridgeServer, BridgeSource
+from services.acquisition.mocks.pattern import ROUND_S, pattern_streams
+from services.acquisition.mocks.replay import MockDevice
+from services.acquisition.mocks.sdk_link import BridgeServer, BridgeSource, signs_of_life
 
 
 def pattern_source(kind: str, place: str, *, seed: int) -> BridgeSource:
@@ -41,10 +43,18 @@ def main() -> None:
     if is_hand != (options.kind == "finger_tracker"):
         parser.error(f"a {options.kind} cannot sit at {options.place!r}")
     source = pattern_source(options.kind, options.place, seed=options.seed)
-    with BridgeServer(source, clock=RealClock(), port=options.port) as server:
-        sys.stdout.write(json.dumps({"port": server.port}) + "\n")
-        sys.stdout.flush()
-        server.play()
+    server, clock = BridgeServer(source.hello, port=options.port), RealClock()
+    device = MockDevice(
+        "bridge", source=source, port=server, faults=DeviceFaults(), seed=options.seed
+    )
+    server.plug()
+    signs_of_life(device, source.magic, clock).start()
+    sys.stdout.write(json.dumps({"port": server.port}) + "\n")
+    sys.stdout.flush()
+    start_ns, waiter = clock.now_ns(), clock.waiter(drives_time=True)
+    for lap in itertools.count():
+        offset_ns = round(lap * ROUND_S * 1e9)
+        device.play(clock, waiter, start_host_ns=start_ns, offset_ns=offset_ns)
 
 
 if __name__ == "__main__":

@@ -145,11 +145,6 @@ class MockPort(Protocol):
     link: Link
     has_bit_errors: bool
 
-    @property
-    def transport(self) -> Transport:
-        """The host's end, not opened."""
-        ...
-
     def send(self, unit: bytes) -> bool:
         """Send bytes or one report; False when the host's buffer was full."""
         ...

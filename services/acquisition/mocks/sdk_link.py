@@ -1,7 +1,6 @@
 """Simulated SDK processes behind a bridge: local sockets that say the same to every station."""
 
 import contextlib
-import itertools
 import socket
 import threading
 from collections.abc import Callable
@@ -16,7 +15,7 @@ from services.acquisition.drivers.sdk_link import (
     FrameConvention,
 )
 from services.acquisition.mocks.place import MockPair, TrackerPlace
-from services.acquisition.mocks.ports import SEND_TIMEOUT_S, SocketPort
+from services.acquisition.mocks.ports import SEND_TIMEOUT_S, Link, SocketPort
 from services.acquisition.mocks.replay import MockDevice, PacketSource
 
 # A left-handed sender in centimetres, and OpenVR's own frame: y up, looking along −z.
@@ -80,24 +79,24 @@ class BridgePort(SocketPort):
         return host_end
 
 
+def signs_of_life(device: MockDevice, magic: bytes, clock: StationClock) -> PeriodicCall:
+    """A thread that shows the bridge of a device to live while the device says nothing."""
+
+    def show_life() -> None:
+        device.send_aside(lambda sequence: sign_of_life(magic, sequence, 0))
+
+    return PeriodicCall(show_life, period_ns=LIFE_PERIOD_NS, clock=clock, name="bridge-life")
+
+
 def bridged_pair(
     name: str, source: BridgeSource, decoder: BridgeDecoder, place: TrackerPlace
 ) -> MockPair:
-    """A simulated device behind a bridge, and the driver that asks the bridge for it.
-
-    The bridge shows that it lives while the device says nothing; not on a virtual clock, whose time
-    stands while nothing is sent.
-    """
+    """A simulated device behind a bridge, and the driver that asks the bridge for it."""
     port, clock = BridgePort(name, source.hello), place.clock
     device = MockDevice(name, source=source, port=port, faults=place.faults, seed=place.seed)
-
-    def show_life() -> None:
-        device.send_aside(lambda sequence: sign_of_life(source.magic, sequence, 0))
-
+    # With a virtual clock, time stands while nothing is sent.
     if not isinstance(clock, VirtualClock):
-        port.life = PeriodicCall(
-            show_life, period_ns=LIFE_PERIOD_NS, clock=clock, name="bridge-life"
-        )
+        port.life = signs_of_life(device, source.magic, clock)
     driver = BridgeDriver(name, transport=port.transport, decoder=decoder, clock=clock)
     return MockPair(device, driver)
 
@@ -106,62 +105,52 @@ class BridgeServer:
     """A bridge process's socket: says hello to every connection and sends all of them the same.
 
     Args:
-        source: what is said.
-        clock: paces the samples.
+        hello: the first line of a connection.
         port: to listen on; any free one if 0.
     """
 
-    def __init__(self, source: BridgeSource, *, clock: StationClock, port: int = 0) -> None:
-        self._source = source
-        self._clock = clock
+    has_bit_errors = False
+
+    def __init__(self, hello: Callable[[], bytes], *, port: int = 0) -> None:
+        self.link = Link()
+        self._hello = hello
         self._lock = threading.Lock()
         self._connections: list[socket.socket] = []
-        self._sequence = 0
-        self._t_sent_ns = clock.now_ns()
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port = int(self._listener.getsockname()[1])
         self._accepting = threading.Thread(target=self._accept, name="bridge-accept", daemon=True)
-        self._life = PeriodicCall(
-            self._show_life, period_ns=LIFE_PERIOD_NS, clock=clock, name="bridge-life"
-        )
 
-    def __enter__(self) -> "BridgeServer":
+    def plug(self) -> None:
+        """Accept connections."""
+        # It sends to whoever hears it, and to nobody.
+        self.link.set_open(is_open=True)
         self._accepting.start()
-        self._life.start()
-        return self
 
-    def __exit__(self, *_: object) -> None:
+    def unplug(self) -> None:
+        """End, as a process does: for good."""
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         self._accepting.join()
-        self._life.stop()
         self.disconnect()
 
     def disconnect(self) -> None:
-        """Close all connections, as a process does that ends."""
+        """Close all connections."""
         with self._lock:
             for connection in self._connections:
                 connection.close()
             self._connections.clear()
 
-    def send_sample(self, index: int, t_device_ns: int) -> None:
-        """Send one sample to every connection."""
+    def send(self, unit: bytes) -> bool:
+        """Send to every connection."""
         with self._lock:
-            for unit in self._source.units(index, self._sequence, t_device_ns):
-                self._send(unit)
-
-    def play(self) -> None:
-        """Send the whole source in its own time, round and round."""
-        waiter = self._clock.waiter(drives_time=True)
-        t_ns = self._source.t_ns
-        round_ns = int(t_ns[-1] + t_ns[-1] // max(1, len(t_ns) - 1))
-        start_ns = self._clock.now_ns()
-        for number in itertools.count():
-            for index, sample_ns in enumerate(t_ns):
-                due_ns = start_ns + number * round_ns + int(sample_ns)
-                waiter.wait_until(due_ns)
-                self.send_sample(index, due_ns)
+            for connection in list(self._connections):
+                try:
+                    connection.sendall(unit)
+                except OSError:  # the station has gone
+                    connection.close()
+                    self._connections.remove(connection)
+        return True
 
     def _accept(self) -> None:
         while True:
@@ -172,21 +161,5 @@ class BridgeServer:
             connection.settimeout(SEND_TIMEOUT_S)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             with self._lock, contextlib.suppress(OSError):
-                connection.sendall(self._source.hello())
+                connection.sendall(self._hello())
                 self._connections.append(connection)
-
-    def _show_life(self) -> None:
-        now_ns = self._clock.now_ns()
-        with self._lock:
-            if now_ns - self._t_sent_ns >= LIFE_PERIOD_NS:
-                self._send(sign_of_life(self._source.magic, self._sequence, now_ns))
-
-    def _send(self, unit: bytes) -> None:
-        self._sequence += 1
-        self._t_sent_ns = self._clock.now_ns()
-        for connection in list(self._connections):
-            try:
-                connection.sendall(unit)
-            except OSError:  # the station has gone
-                connection.close()
-                self._connections.remove(connection)

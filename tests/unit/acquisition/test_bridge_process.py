@@ -14,8 +14,10 @@ from dextouch.errors import DeviceError, StaleDataError
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.mock_bridge import pattern_source
+from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.sdk_link import BridgeServer
+from services.acquisition.mocks.replay import MockDevice
+from services.acquisition.mocks.sdk_link import BridgeServer, signs_of_life
 from services.acquisition.settings import AcquisitionSettings
 
 # The promises are tried by `make slow`; the default run must not need an idle machine.
@@ -59,11 +61,33 @@ def kind(request):
     return request.param
 
 
+class Bridge:
+    """A bridge process's server and device, played by hand."""
+
+    def __init__(self, kind):
+        self.source = pattern_source(kind, DEVICES[kind][0], seed=0)
+        self.server = BridgeServer(self.source.hello)
+        faults = DeviceFaults()
+        self.device = MockDevice("b", source=self.source, port=self.server, faults=faults, seed=0)
+
+    def send_sample(self, index, t_device_ns):
+        self.device.send_aside(lambda n: b"".join(self.source.units(index, n, t_device_ns)))
+
+
 @pytest.fixture
-def server(kind):
-    source = pattern_source(kind, DEVICES[kind][0], seed=0)
-    with BridgeServer(source, clock=RealClock()) as running:
-        yield running
+def bridge(kind):
+    made = Bridge(kind)
+    life = signs_of_life(made.device, made.source.magic, RealClock())
+    made.server.plug()
+    life.start()
+    yield made
+    life.stop()
+    made.server.unplug()
+
+
+@pytest.fixture
+def server(bridge):
+    return bridge.server
 
 
 def test_a_bridge_without_samples_still_lives(kind, server, monkeypatch):
@@ -78,12 +102,12 @@ def test_a_bridge_without_samples_still_lives(kind, server, monkeypatch):
     driver.close()
 
 
-def test_two_stations_hear_the_same(kind, server):
-    drivers = [driver_of(kind, server.port) for _ in range(2)]
+def test_two_stations_hear_the_same(kind, bridge):
+    drivers = [driver_of(kind, bridge.server.port) for _ in range(2)]
     for driver in drivers:
         driver.open()
     for index in range(5):
-        server.send_sample(index, 10**12 + index * 10**7)
+        bridge.send_sample(index, 10**12 + index * 10**7)
     values = [[s.values.tobytes() for s in read_samples(driver, 5)] for driver in drivers]
     assert len(values[0]) == 5
     assert values[0] == values[1]
