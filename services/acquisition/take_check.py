@@ -149,7 +149,8 @@ class TakeFindings:
 
     def look(self) -> None:
         """Update the worst value of each figure; called repeatedly during the take."""
-        for stream in self._health.report().streams if self._health else ():
+        health = self._health  # Another thread may end the take meanwhile.
+        for stream in health.report().streams if health else ():
             for figure, value in stream.figures.items():
                 name = f"{stream.stream}_worst_{figure}"
                 if figure not in OTHER_FIGURES and abs(value) >= abs(self._worst.get(name, 0.0)):
