@@ -10,6 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import dropwhile
 from typing import Literal
 
 import numpy as np
@@ -97,8 +98,7 @@ class EncodingQueue:
         self._encoder, self._name = encoder, name
         self._waiting: deque[concurrent.futures.Future[Sample]] = deque()
         self._thread: concurrent.futures.ThreadPoolExecutor | None = None
-        self._begun = 0
-        self._wanted = 0
+        self._is_group_wanted = False
         self._lock = threading.Lock()
 
     def prepare(self) -> None:
@@ -109,7 +109,7 @@ class EncodingQueue:
     def begin_group(self) -> None:
         """The next image that is put begins a group."""
         with self._lock:
-            self._wanted += 1
+            self._is_group_wanted = True
 
     def put(self, image: Sample) -> bool:
         """Queue an image, whose pixels must not change any more; False when it was dropped.
@@ -126,7 +126,7 @@ class EncodingQueue:
                 max_workers=1, thread_name_prefix=f"encode-{self._name}"
             )
         with self._lock:
-            begins, self._begun = self._begun != self._wanted, self._wanted
+            begins, self._is_group_wanted = self._is_group_wanted, False
         self._waiting.append(self._thread.submit(self._encode, image, begins))
         return True
 
@@ -164,12 +164,10 @@ class GroupGate:
 
     def admit(self, samples: Sequence[Sample]) -> list[Sample]:
         """Those of the samples that can be decoded within the take."""
-        admitted = []
-        for sample in samples:
-            self._is_open = self._is_open or is_keyframe(sample.values.item())
-            if self._is_open:
-                admitted.append(sample)
-        return admitted
+        if not self._is_open:
+            samples = list(dropwhile(lambda s: not is_keyframe(s.values.item()), samples))
+            self._is_open = bool(samples)
+        return list(samples)
 
 
 class GroupPreview:
