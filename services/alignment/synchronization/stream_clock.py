@@ -129,11 +129,14 @@ def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:
 def _fitted(
     device_ns: np.ndarray, batch: SampleBatch, descriptor: StreamDescriptor, method: ClockMethod
 ) -> _Dated:
-    model = fit_clock(device_ns, batch.t_host_ns)
+    model, num_lost = fit_clock(device_ns, batch.t_host_ns), 0
+    if not (batch.sequence == NO_SEQUENCE).any():
+        bits = descriptor.capabilities.sequence_bits
+        num_lost = find_lost_samples(batch.sequence, bits=bits).num_missing
     return _Dated(
         model.to_host_ns(device_ns, batch.t_host_ns),
         method,
-        _num_lost(batch, descriptor),
+        num_lost,
         model.num_steps,
         model.skew_ppm,
         model.residual_rms_ns / NS_PER_MS,
@@ -168,9 +171,3 @@ def _unwrap(
     if bits * np.log(2) + np.log(unit_ns) > 62 * np.log(2):
         return counts_ns.astype(np.int64)
     return unwrap_counter(counts_ns, modulus=2**bits * unit_ns, hint=batch.t_host_ns)
-
-
-def _num_lost(batch: SampleBatch, descriptor: StreamDescriptor) -> int:
-    if (batch.sequence == NO_SEQUENCE).any():
-        return 0
-    return find_lost_samples(batch.sequence, bits=descriptor.capabilities.sequence_bits).num_missing
