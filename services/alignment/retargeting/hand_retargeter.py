@@ -14,8 +14,6 @@ from services.alignment.retargeting.hand_profile import HandProfile
 from services.alignment.retargeting.profile_fit import (
     measure_profile,
     person_arrays,
-    robot_bone_m,
-    unknown_person,
 )
 from services.alignment.retargeting.solver import arrays
 from services.alignment.retargeting.solver.arrays import (
@@ -98,7 +96,7 @@ class HandRetargeter:
         self._is_joint = joint_places(self.hand)
         self._tuning = self.options.tuning()
         self._live = self.options.tuning(is_live=True)
-        self._person = self._person_of(profile)
+        self._person = person_arrays(profile, self.hand)
         self._memory = self._blank()
         self._was_sent = False
         # Buffers of `step`, which is called often.
@@ -173,7 +171,7 @@ class HandRetargeter:
         elapsed_s = _elapsed_s(len(keypoints), t_s)
         person = self._person
         if self.profile is None:
-            person = self._person_of(measure_profile(keypoints, self.hand))
+            person = person_arrays(measure_profile(keypoints, self.hand), self.hand)
         # Of slow trackers, not every sample is a loss.
         lost_s = max(self.options.reacquire_after_s, 1.5 * float(np.median(elapsed_s)))
         tuning = replace(self.options, reacquire_after_s=lost_s).tuning()
@@ -200,11 +198,6 @@ class HandRetargeter:
             InvalidInputError: wrong unit, or a finger that is complete in no sample.
         """
         return measure_profile(keypoints_m, self.hand)
-
-    def _person_of(self, profile: HandProfile | None) -> np.ndarray:
-        if profile is None:
-            return unknown_person(self._arrays, robot_bone_m(self.hand))
-        return person_arrays(profile, self.hand)
 
     def _blank(self) -> Memory:
         rest = np.clip(0.0, self._arrays["lower_rad"][0], self._arrays["upper_rad"][0])

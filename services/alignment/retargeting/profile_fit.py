@@ -56,43 +56,38 @@ KNUCKLE_TOLERANCE_M = (0.012, 0.015)
 EVERY_SAMPLE_ALONE = RetargetOptions(pinch_far_m=0.0051, temporal_weight_m2=0.0)
 
 
-def unknown_person(hand: np.ndarray, robot_bone_m: np.ndarray) -> np.ndarray:
-    """Record `PERSON` without a profile: bones and knuckles of each sample are used."""
-    record = np.zeros(1, dtype=PERSON)
-    num = len(robot_bone_m)
-    record["bone_m"][0, :num] = robot_bone_m
-    record["bone_scale"] = 1.0
-    record["knuckle_m"] = hand["knuckle_m"]
-    record["travel"] = 1.0
-    record["freedom"] = UNKNOWN_FREEDOM
-    return record
+def person_arrays(profile: HandProfile | None, hand: HandModel) -> np.ndarray:
+    """Record `PERSON` for the fingers that the robot hand has.
 
-
-def person_arrays(profile: HandProfile, hand: HandModel) -> np.ndarray:
-    """Record `PERSON` of a profile, for the fingers that the robot hand has."""
-    sigma_m = max(profile.point_sigma_m, LEAST_SIGMA_M)
+    Without a profile, bones and knuckles of each sample are used.
+    """
     record = np.zeros(1, dtype=PERSON)
-    rows, num = _chains_of(hand), len(hand.fingers)
-    record["is_known"] = True
-    record["is_rigid"] = profile.is_rigid
-    own_m, bone_m = robot_bone_m(hand), profile.bone_m[rows].copy()
+    person, num, own_m = record[0], len(hand.fingers), robot_bone_m(hand)
+    if profile is None:
+        person["bone_m"][:num], person["bone_scale"][:] = own_m, 1.0
+        person["knuckle_m"][:num], person["travel"][:] = zero_points_m(hand)[:, 0], 1.0
+        person["freedom"][:] = UNKNOWN_FREEDOM
+        return record
+    rows = _chains_of(hand)
+    bone_m, knuckle_sigma_m = profile.bone_m[rows].copy(), profile.knuckle_sigma_m[rows]
     for finger, bone in zip(*np.nonzero(own_m[:, :2] < LEAST_BONE_M), strict=True):
         # Two bones of the person in a row are one of the robot's.
         bone_m[finger, bone + 1] += bone_m[finger, bone]
         bone_m[finger, bone] = 0.0
-    record["bone_m"][0, :num] = bone_m
-    record["bone_scale"][0, :num] = bone_m / np.maximum(own_m, LEAST_BONE_M)
-    record["knuckle_m"][0, :num] = profile.knuckle_m[rows]
-    record["travel"][0, :num] = profile.travel[rows]
-    record["freedom"][0, :num] = (
-        (profile.knuckle_sigma_m[rows] / sigma_m) ** 2 if profile.is_rigid else UNKNOWN_FREEDOM
-    )
+    person["is_known"], person["is_rigid"] = True, profile.is_rigid
+    person["bone_m"][:num] = bone_m
+    person["bone_scale"][:num] = bone_m / np.maximum(own_m, LEAST_BONE_M)
+    person["knuckle_m"][:num] = profile.knuckle_m[rows]
+    person["travel"][:num] = profile.travel[rows]
+    person["freedom"][:num] = UNKNOWN_FREEDOM
+    if profile.is_rigid:
+        sigma_m = max(profile.point_sigma_m, LEAST_SIGMA_M)
+        person["freedom"][:num] = (knuckle_sigma_m / sigma_m) ** 2
     noise_m = BONE_SIGMAS * np.sqrt(2) * profile.point_sigma_m
-    record["bone_tolerance_m"][0, :num] = np.maximum(
-        BONE_TOLERANCE * bone_m, max(BONE_TOLERANCE_M, noise_m)
-    )
-    spread_m = KNUCKLE_SIGMAS * np.hypot(profile.knuckle_sigma_m[rows], profile.point_sigma_m)
-    record["knuckle_tolerance_m"][0, :num] = np.clip(spread_m, *KNUCKLE_TOLERANCE_M)
+    least_m = max(BONE_TOLERANCE_M, noise_m)
+    person["bone_tolerance_m"][:num] = np.maximum(BONE_TOLERANCE * bone_m, least_m)
+    spread_m = KNUCKLE_SIGMAS * np.hypot(knuckle_sigma_m, profile.point_sigma_m)
+    person["knuckle_tolerance_m"][:num] = np.clip(spread_m, *KNUCKLE_TOLERANCE_M)
     return record
 
 
@@ -163,7 +158,7 @@ def _knuckle_motion(points_m: np.ndarray, hand: HandModel) -> Float64[np.ndarray
     own, rows, num = hand_arrays(hand), _chains_of(hand), len(points_m)
     keypoints = np.full((num, NUM_KEYPOINTS, 3), np.nan)
     keypoints[:, _NODES] = points_m
-    output, person = Output.of(num, len(rows)), unknown_person(own, robot_bone_m(hand))
+    output, person = Output.of(num, len(rows)), person_arrays(None, hand)
     retarget_samples(
         (own, person, EVERY_SAMPLE_ALONE.tuning(), np.zeros(1, dtype=SCRATCH)),
         (keypoints, np.full(num, np.inf)),

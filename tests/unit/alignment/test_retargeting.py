@@ -9,7 +9,7 @@ from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import HandModel, RobotHand
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
-from services.alignment.retargeting.profile_fit import robot_bone_m, unknown_person
+from services.alignment.retargeting.profile_fit import person_arrays
 from services.alignment.retargeting.solver.arrays import SCRATCH, hand_arrays
 from services.alignment.retargeting.solver.minimize import linearize
 
@@ -34,7 +34,7 @@ MIDDLE_NODES = ("proximal", "intermediate", "distal", "tip")
 
 def test_slopes_are_the_derivative():
     hand = hand_arrays(HAND)
-    person = unknown_person(hand, robot_bone_m(HAND))
+    person = person_arrays(None, HAND)
     person["travel"], person["knuckle_m"] = np.linspace(0, 1, 5), 0.01
     work = np.zeros(1, dtype=SCRATCH)
     work["scale"] = [0.7, 0.9, 1.1]
@@ -74,7 +74,7 @@ def slanted(hand):
 @pytest.mark.parametrize("model", [HAND, slanted(HAND)], ids=["Wuji", "slanted"])
 def test_points_of_the_solver_are_those_of_the_hand(model):
     hand = hand_arrays(model)
-    person = unknown_person(hand, robot_bone_m(model))
+    person = person_arrays(None, model)
     work = np.zeros(1, dtype=SCRATCH)
     work["scale"] = 1.0
     joints = np.random.default_rng(1).uniform(hand["lower_rad"][0], hand["upper_rad"][0])
