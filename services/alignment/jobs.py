@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import structlog
@@ -63,9 +64,18 @@ def align_recording(
     """
     recording = store.recording(recording_id)
     episode_id = episode_id_of(recording, options)
-    created = not store.exists(episode_id) and _write(
-        store, recording, episode_id, options, on_progress
-    )
+    created = False
+    if not store.exists(episode_id):
+        episode = build_episode(
+            recording, episode_id=episode_id, options=options, on_progress=on_progress
+        )
+        # Another process may write the same episode meanwhile.
+        with suppress(ConflictError):
+            with store.writer(kind="episode", attributes=episode.attributes) as writer:
+                _write_streams(writer, episode, on_progress)
+                writer.set_attributes(episode.complete_attributes())
+            created = True
+            logger.info("recording_aligned", recording_id=recording_id, episode_id=episode_id)
     return report_of(store.open(episode_id), recording_id=recording_id, created=created)
 
 
@@ -181,29 +191,6 @@ class AlignmentWorker:
             child.kill()
             with self._in_use:
                 child.close()
-
-
-def _write(
-    store: EpisodeStore,
-    recording: RecordingReader,
-    episode_id: str,
-    options: AlignmentOptions,
-    on_progress: OnProgress,
-) -> bool:
-    episode = build_episode(
-        recording, episode_id=episode_id, options=options, on_progress=on_progress
-    )
-    try:
-        with store.writer(kind="episode", attributes=episode.attributes) as writer:
-            _write_streams(writer, episode, on_progress)
-            writer.set_attributes(episode.complete_attributes())
-    except ConflictError:
-        # Another process has written the same episode meanwhile.
-        return False
-    logger.info(
-        "recording_aligned", recording_id=recording.attributes.recording_id, episode_id=episode_id
-    )
-    return True
 
 
 def _write_streams(writer: EpisodeWriter, episode: BuiltEpisode, on_progress: OnProgress) -> None:
