@@ -11,7 +11,6 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int64
 from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
@@ -20,14 +19,13 @@ from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, disk_errors
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.hands.hand_files import load_hand
-from dextouch.hands.robot_hand import HandModel
 from dextouch.schemas import json_ready
 from dextouch.serving import load_settings
 from services.alignment.jobs import AlignmentWorker, check_recording, episode_id_of
 from services.alignment.options import AlignmentOptions
 from services.alignment.report import AlignmentReport, report_of
 from services.alignment.report_page import report_line, report_page
-from services.alignment.retargeting import HandRetargeter, RetargetResult, RetargetStatus
+from services.alignment.retargeting import HandRetargeter, RetargetStatus
 from services.alignment.retargeting.hand_profile import calibrated_profile
 from services.alignment.settings import AlignmentSettings, usable_cores
 from services.alignment.synchronization.progress import Progress
@@ -196,12 +194,21 @@ def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
 def _retarget(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     hand = load_hand(parsed.model, parsed.mapping)
     episode = _find_episode(EpisodeStore(parsed.store), parsed.id, settings.options)
-    t_ref_ns, motion = _retarget_other_hand(episode, hand)
+    name = f"keypoints_{hand.side}"
+    if name not in episode.streams:
+        raise NotFoundError(
+            f"episode {episode.attributes.episode_id!r}: has no {name!r}, only "
+            f"{', '.join(sorted(episode.streams))}; expected an episode of a person"
+        )
+    stream = episode.read(name)
+    retargeter = HandRetargeter(hand, calibrated_profile(episode.attributes.calibration, hand.side))
+    t_s = (stream.t_ref_ns - stream.t_ref_ns[0]).astype(np.float64) / NS_PER_S
+    motion = retargeter.retarget(stream.values, t_s=t_s)
     with disk_errors(f"write {parsed.to}"), parsed.to.open("wb") as file:
         np.savez(
             file,
             joint_names=np.array(hand.joint_names),
-            t_ref_ns=t_ref_ns,
+            t_ref_ns=stream.t_ref_ns,
             joints_rad=motion.joints_rad,
             status=motion.status,
             tip_error_m=motion.tip_error_m,
@@ -280,22 +287,6 @@ def _find_episode(store: EpisodeStore, item_id: str, options: AlignmentOptions) 
     if store.exists(item_id):
         return store.open(item_id)
     return store.open(episode_id_of(store.recording(item_id), options))
-
-
-def _retarget_other_hand(
-    episode: EpisodeReader, hand: HandModel
-) -> tuple[Int64[np.ndarray, " time"], RetargetResult]:
-    """Times on the episode's clock, at the rate of the tracker, and the motion of a robot hand."""
-    name = f"keypoints_{hand.side}"
-    if name not in episode.streams:
-        raise NotFoundError(
-            f"episode {episode.attributes.episode_id!r}: has no {name!r}, only "
-            f"{', '.join(sorted(episode.streams))}; expected an episode of a person"
-        )
-    stream = episode.read(name)
-    retargeter = HandRetargeter(hand, calibrated_profile(episode.attributes.calibration, hand.side))
-    t_s = (stream.t_ref_ns - stream.t_ref_ns[0]).astype(np.float64) / NS_PER_S
-    return stream.t_ref_ns, retargeter.retarget(stream.values, t_s=t_s)
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, AlignmentSettings], int]] = {

@@ -190,35 +190,27 @@ def estimate_sigmas(
     declared = np.log(np.square([component.sigma for component in components]))
     log_theta = declared.copy()
     for _ in range(MAX_NOISE_ROUNDS):
-        step = _scoring_step(left_over, J, M, (log_theta, declared))
+        scaled = M * np.exp(log_theta)[:, None, None, None]
+        inverse = np.linalg.inv(scaled.sum(axis=0))
+        weighted_J = inverse @ J
+        fitted = np.linalg.inv((np.swapaxes(J, 1, 2) @ weighted_J).sum(axis=0))
+        unknowns = fitted @ (np.swapaxes(weighted_J, 1, 2) @ left_over[..., None]).sum(axis=0)
+        residual = inverse @ (left_over[..., None] - J @ unknowns)
+        squares = (np.swapaxes(residual, 1, 2) @ scaled @ residual).sum(axis=(1, 2, 3))
+        shares = inverse @ scaled
+        expected = np.trace(shares, axis1=2, axis2=3).sum(axis=1)
+        used_up = (np.swapaxes(weighted_J, 1, 2) @ scaled @ weighted_J).sum(axis=1)
+        expected -= (used_up * fitted.T).sum(axis=(1, 2))
+        gradient = 0.5 * (squares - expected) - (log_theta - declared) / PRIOR_LOG_SIGMA**2
+        flat = shares.reshape(len(M), -1)
+        turned = np.swapaxes(shares, 2, 3).reshape(len(M), -1)
+        fisher = 0.5 * flat @ turned.T + np.eye(len(M)) / PRIOR_LOG_SIGMA**2
+        step = np.linalg.solve(fisher, gradient)
         log_theta = log_theta + np.clip(step, -MAX_NOISE_STEP, MAX_NOISE_STEP)
         log_theta = np.maximum(log_theta, declared + 2 * np.log(MIN_SHARE))
         if np.abs(step).max() < SMALLEST_NOISE_STEP:
             break
     return np.exp(0.5 * log_theta)
-
-
-def _scoring_step(
-    left_over: np.ndarray, J: np.ndarray, M: np.ndarray, logs: tuple[np.ndarray, np.ndarray]
-) -> np.ndarray:
-    """One step of the logarithms of the variances; `logs` are where they are and were declared."""
-    log_theta, declared = logs
-    scaled = M * np.exp(log_theta)[:, None, None, None]
-    inverse = np.linalg.inv(scaled.sum(axis=0))
-    weighted_J = inverse @ J
-    fitted = np.linalg.inv((np.swapaxes(J, 1, 2) @ weighted_J).sum(axis=0))
-    unknowns = fitted @ (np.swapaxes(weighted_J, 1, 2) @ left_over[..., None]).sum(axis=0)
-    residual = inverse @ (left_over[..., None] - J @ unknowns)
-    squares = (np.swapaxes(residual, 1, 2) @ scaled @ residual).sum(axis=(1, 2, 3))
-    shares = inverse @ scaled
-    expected = np.trace(shares, axis1=2, axis2=3).sum(axis=1)
-    used_up = (np.swapaxes(weighted_J, 1, 2) @ scaled @ weighted_J).sum(axis=1)
-    expected -= (used_up * fitted.T).sum(axis=(1, 2))
-    gradient = 0.5 * (squares - expected) - (log_theta - declared) / PRIOR_LOG_SIGMA**2
-    flat = shares.reshape(len(M), -1)
-    turned = np.swapaxes(shares, 2, 3).reshape(len(M), -1)
-    fisher = 0.5 * flat @ turned.T + np.eye(len(M)) / PRIOR_LOG_SIGMA**2
-    return np.linalg.solve(fisher, gradient)
 
 
 def pose_measurement(Ts_measured: np.ndarray, information: np.ndarray) -> Measurement:

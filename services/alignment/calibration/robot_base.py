@@ -19,6 +19,7 @@ from services.alignment.calibration.bundle import (
 )
 from services.alignment.calibration.motion import (
     AXIS_NAMES,
+    MIN_VIEWS,
     DegenerateMotionError,
     Series,
     adjoint,
@@ -88,7 +89,9 @@ def solve_robot_base(
     noise, mount = noise or RobotBaseNoise(), None
     if T_effector_tracker is not None:
         _check_places(effector)
-        mount = invert(_checked_mount(T_effector_tracker))
+        repeated = np.broadcast_to(T_effector_tracker, (MIN_VIEWS, *np.shape(T_effector_tracker)))
+        (given,) = checked_poses(f"{TASK}, T_effector_tracker", T_effector_tracker=repeated)
+        mount = invert(given[0])
     agreed = agreeing_views(series, mount)
     # The robot errs in the effector's axes.
     own = sensor_components(
@@ -116,12 +119,6 @@ def solve_robot_base(
             missing_axes=list(AXIS_NAMES),
         )
     return result
-
-
-def _checked_mount(T_effector_tracker: np.ndarray) -> Float64[np.ndarray, "4 4"]:
-    mount = np.asarray(T_effector_tracker, dtype=np.float64)
-    repeated = np.broadcast_to(mount, (4, *mount.shape))
-    return checked_poses(f"{TASK}, T_effector_tracker", T_effector_tracker=repeated)[0][0]
 
 
 def _check_places(Ts_base_effector: np.ndarray) -> None:

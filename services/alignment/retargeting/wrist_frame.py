@@ -111,7 +111,12 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
             "pose as the stream wrist_left or wrist_right",
             fault="moving_axes",
         )
-    covariance = _covariance(left_over, size * mean[is_used])
+    # Residuals are all that rotation, offset and size, seven numbers, leave.
+    variance = np.square(left_over).sum() / (left_over.size - 7)
+    centred = size * mean[is_used]
+    centred = centred - centred.mean(axis=0)
+    inertia = np.square(centred).sum() * np.eye(3) - centred.T @ centred
+    covariance = np.asarray(variance * np.linalg.inv(inertia))
     sigma_rad = float(np.sqrt(np.trace(covariance)))
     if sigma_rad > MAX_SIGMA_RAD:
         raise InvalidInputError(
@@ -325,15 +330,6 @@ def _turn_of_samples(
         whole = seen.sum(axis=1) == seen.sum(axis=1).max()
     Rs, _, _ = _laid_over(mean, palms[whole], seen[whole])
     return float(np.sqrt(np.square(rotation_angle(R.T @ Rs)).mean()))
-
-
-def _covariance(left_over: np.ndarray, points: np.ndarray) -> Float64[np.ndarray, "3 3"]:
-    """Covariance of the rotation about the wrist's own axes, from the residuals of the fit."""
-    # Rotation, offset and size are seven numbers.
-    variance = np.square(left_over).sum() / (left_over.size - 7)
-    centred = points - points.mean(axis=0)
-    inertia = np.square(centred).sum() * np.eye(3) - centred.T @ centred
-    return np.asarray(variance * np.linalg.inv(inertia))
 
 
 def _bends_rad(samples: np.ndarray) -> Float64[np.ndarray, "time 4"]:

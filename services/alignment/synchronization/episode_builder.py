@@ -124,7 +124,11 @@ def _find_stretch(
         raise InvalidInputError(f"{where}: streams {empty} hold fewer than two usable samples")
     first_ns = {name: int(stream.t_ns[0]) for name, stream in parts.items()}
     last_ns = {name: int(stream.t_ns[-1]) for name, stream in parts.items()}
-    origin_ns, stop_ns = max(first_ns.values()), min(map(_end_ns, parts.values()))
+    origin_ns = max(first_ns.values())
+    stop_ns = min(
+        last_ns[name] + round(EDGE_PERIODS * stream.descriptor.period_ns())
+        for name, stream in parts.items()
+    )
     num_steps = int(max(stop_ns - origin_ns, 0) * 1e-9 * options.model_rate_hz) + 1
     # Relative to the origin from here on: int64 stays exact, floats stay small.
     moved = {name: replace(stream, t_ns=stream.t_ns - origin_ns) for name, stream in parts.items()}
@@ -151,11 +155,6 @@ def _find_stretch(
         num_steps - (stop - first),
         refused_matrices(refused),
     )
-
-
-def _end_ns(stream: LoadedStream) -> int:
-    """How far a stream may be continued."""
-    return int(stream.t_ns[-1]) + round(EDGE_PERIODS * stream.descriptor.period_ns())
 
 
 def _episode_attributes(
