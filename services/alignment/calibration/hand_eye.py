@@ -176,8 +176,20 @@ def solve_hand_eye(
         left_out_views=agreed.left_out,
         T_tracker_camera=bundle.X,
     )
-    _check_budget(result)
-    return result
+    if not result.doubt:
+        return result
+    # In the tracker's axes, as the operator turns the tracker.
+    turned = adjoint(result.T_tracker_camera)
+    covariance = turned @ result.covariance @ turned.T
+    worst = np.linalg.eigh(covariance[:3, :3])[1][:, -1]
+    axis = AXIS_NAMES[int(np.argmax(np.abs(worst)))]
+    others = [name for name in AXIS_NAMES if name != axis]
+    raise DegenerateMotionError(
+        f"{TASK}: the uncertainty of the mount is {result.doubt}; the "
+        f"rotation about the tracker's {axis} axis is least certain: rotate it more about "
+        f"{' and '.join(others)}, take more views, and move the board closer",
+        missing_axes=others,
+    )
 
 
 def board_components(Ts_camera_board: np.ndarray, noise: HandEyeNoise) -> dict[str, Component]:
@@ -197,24 +209,6 @@ def board_components(Ts_camera_board: np.ndarray, noise: HandEyeNoise) -> dict[s
         shapes[:, place, place] = block
         components[name] = Component(sigma, shapes)
     return components
-
-
-def _check_budget(result: HandEyeResult) -> None:
-    """Refuse a mount whose standard deviation is too large."""
-    if not result.doubt:
-        return
-    # In the tracker's axes, as the operator turns the tracker.
-    turned = adjoint(result.T_tracker_camera)
-    covariance = turned @ result.covariance @ turned.T
-    worst = np.linalg.eigh(covariance[:3, :3])[1][:, -1]
-    axis = AXIS_NAMES[int(np.argmax(np.abs(worst)))]
-    others = " and ".join(name for name in AXIS_NAMES if name != axis)
-    raise DegenerateMotionError(
-        f"{TASK}: the uncertainty of the mount is {result.doubt}; the "
-        f"rotation about the tracker's {axis} axis is least certain: rotate it more about "
-        f"{others}, take more views, and move the board closer",
-        missing_axes=[name for name in AXIS_NAMES if name != axis],
-    )
 
 
 def project(

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float64, Int64, Shaped
+from jaxtyping import Int64, Shaped
 
 from dextouch.episodes import GOP_IMAGES, RecordingReader
 from dextouch.errors import InvalidInputError
@@ -153,7 +153,14 @@ def date_stream(recording: RecordingReader, name: str) -> DatedStream:
         T_tracker_body = calibrated_transform(calibration, MOUNTS.get(name, ""))
         T_world_base = None
         if descriptor.frame == BASE_FRAME:
-            T_world_base = _base_of(calibration, name)
+            T_world_base = calibrated_transform(calibration, BASE_NAME)
+            if T_world_base is None:
+                raise InvalidInputError(
+                    f"stream {name!r}: poses are in the robot's base, and calibration "
+                    f"{BASE_NAME!r} (4 by 4) is missing; run dextouch station calibrate "
+                    "robot-base, or send poses in the world",
+                    missing=[BASE_NAME],
+                )
             descriptor = descriptor.model_copy(update={"frame": "world"})
         convert = partial(_moved_poses, T_world_base=T_world_base, T_tracker_body=T_tracker_body)
     return DatedStream(recording, descriptor, timing, convert)
@@ -214,18 +221,6 @@ def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:
         quality=quality,
         calibration={f"{name}_refused_taxels": matrix_rows(refused[None].astype(np.float64))},
     )
-
-
-def _base_of(calibration: dict[str, Matrix], stream: str) -> Float64[np.ndarray, "4 4"]:
-    T_world_base = calibrated_transform(calibration, BASE_NAME)
-    if T_world_base is None:
-        raise InvalidInputError(
-            f"stream {stream!r}: poses are in the robot's base, and calibration {BASE_NAME!r} "
-            "(4 by 4) is missing; run dextouch station calibrate robot-base, or send poses "
-            "in the world",
-            missing=[BASE_NAME],
-        )
-    return T_world_base
 
 
 def _moved_poses(
