@@ -64,17 +64,13 @@ class StationCameraSettings(DeviceSettings):
         return nanoseconds(self.exposure_ms)
 
     @model_validator(mode="after")
-    def _exposure_within_period(self) -> "StationCameraSettings":
+    def _timing_is_possible(self) -> "StationCameraSettings":
         exposure_ns = self.exposure_ns
         if exposure_ns is not None and not 0 < exposure_ns <= 1e9 / self.rate_hz:
             raise ValueError(
                 f"camera {self.stream}: got an exposure of {exposure_ns} ns, expected more than 0 "
                 f"and at most the period of {self.rate_hz:g} Hz"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _latency_with_sigma(self) -> "StationCameraSettings":
         if (self.latency_ms is None) != (self.latency_sigma_ms is None):
             raise ValueError(
                 f"camera {self.stream}: got latency {self.latency_ms} ms with sigma "
