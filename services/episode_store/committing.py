@@ -46,7 +46,9 @@ def commit_spool(
         for name, descriptor in reader.streams.items():
             fitting = max(1, min(COPY_SAMPLES, COPY_BYTES // descriptor.sample_bytes()))
             num_samples = COPY_IMAGES if descriptor.unit in ENCODED_UNITS else fitting
-            for batch in reader.batches(name, num_samples=num_samples):
+            total = reader.num_samples(name)
+            for start in range(0, total, num_samples):
+                batch = reader.read(name, start, min(start + num_samples, total))
                 writer.append(name, **vars(batch))
     return {name: reader.num_samples(name) for name in reader.streams}
 

@@ -1,9 +1,8 @@
 """Context of a store command: the store, its arguments, and output."""
 
 import argparse
-import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +16,14 @@ _SIZES = ("bytes", "kB", "MB", "GB", "TB")
 Outcome = tuple[dict[str, Any], int]
 
 
-def _ask(question: str) -> str:
-    sys.stderr.write(question)
-    sys.stderr.flush()
-    return sys.stdin.readline().strip()
-
-
 @dataclass(frozen=True)
 class Context:
-    """Store, parsed arguments, and functions for output and confirmation."""
+    """Store, parsed arguments, and the function for output."""
 
     store: EpisodeStore
     url: str
     options: argparse.Namespace
     say: Callable[[str], None]
-    ask: Callable[[str], str] = field(default=_ask)
 
     def kind_of(self, item_id: str) -> Kind:
         """Kind of an id: given by --kind, otherwise the one under which it exists.

@@ -1,6 +1,7 @@
 """Commands `delete`, `restore` and `purge`."""
 
 import json
+import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -45,10 +46,7 @@ def _delete_all_of(context: Context) -> Outcome:
     asked = options.operator or options.recording
     for victim in plan_deletion(root, request):
         context.say(f"{victim.place}/{victim.folder}  {victim.reason}")
-    if (
-        not options.yes
-        and context.ask(f"Type {asked} to delete all of this permanently: ") != asked
-    ):
+    if not options.yes and _answer(f"Type {asked} to delete all of this permanently: ") != asked:
         raise InvalidInputError("delete: not confirmed; nothing was removed")
     path = Path(options.receipt or f"deletion-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json")
     checkpoints = Path(options.checkpoints) if options.checkpoints else None
@@ -63,6 +61,12 @@ def _delete_all_of(context: Context) -> Outcome:
         f"receipt {path}"
     )
     return json.loads(json.dumps(asdict(receipt))), 0 if receipt.complete else EXIT_DAMAGED
+
+
+def _answer(question: str) -> str:
+    sys.stderr.write(question)
+    sys.stderr.flush()
+    return sys.stdin.readline().strip()
 
 
 def restore(context: Context) -> Outcome:

@@ -6,7 +6,6 @@ Images of `jpeg` and `h264` streams are object arrays of bytes.
 
 import os
 import shutil
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -46,7 +45,6 @@ __all__ = ["LOG_FILE", "SpoolReader", "SpoolWriter", "read_attributes"]
 
 RECORDING_FILE = "recording.json"
 CLOSED_FILE = "closed"
-DEFAULT_BATCH_SAMPLES = 60
 
 
 class SpoolReader:
@@ -112,20 +110,6 @@ class SpoolReader:
             )
         (body,) = read_bodies(self.path, self.streams[stream_name], rows[number : number + 1])
         return body
-
-    def batches(
-        self, stream_name: str, *, num_samples: int = DEFAULT_BATCH_SAMPLES
-    ) -> Iterator[SampleBatch]:
-        """Iterate over batches of fixed size; batch n is always the same.
-
-        A spool that is still written yields only full batches; a closed one also the last, partial
-        batch.
-        """
-        total = self.num_samples(stream_name)
-        for start in range(0, total, num_samples):
-            stop = start + num_samples
-            if stop <= total or self.closed:
-                yield self.read(stream_name, start, min(stop, total))
 
     def _span(self, stream_name: str, start: int, stop: int) -> tuple[np.ndarray, int]:
         """The records with samples start … stop-1, and the number of samples in them before."""

@@ -301,7 +301,8 @@ def upload(client, spool):
     for name, descriptor in spool.streams.items():
         number = status.next_batch.get(name, 0)
         if status.state == "open":
-            for batch in list(spool.batches(name))[number:]:
+            for start in range(60 * number, spool.num_samples(name), 60):
+                batch = spool.read(name, start, min(start + 60, spool.num_samples(name)))
                 client.send_batch("take-1", descriptor, batch, number=number)
                 number += 1
         num_batches[name] = number
