@@ -232,6 +232,11 @@ class EpisodeStoreClient:
         content: bytes | str | None = None,
         accept: str = "*/*",
     ) -> httpx.Response:
+        given = {
+            key: value.isoformat() if isinstance(value, datetime) else value
+            for key, value in (query or {}).items()
+            if value is not None
+        }
         headers = {"accept": accept}
         if content is not None:
             binary = isinstance(content, bytes)
@@ -240,7 +245,7 @@ class EpisodeStoreClient:
             response = self._http.request(
                 method,
                 path,
-                params=httpx.QueryParams(_params(query or {})),
+                params=httpx.QueryParams(given),
                 content=content,
                 headers=headers,
             )
@@ -265,14 +270,6 @@ def _refusal(response: httpx.Response) -> DexTouchError:
             f"{response.status_code} without a reason",
             **({"retry_after_s": int(seconds)} if seconds.isdecimal() else {}),
         )
-
-
-def _params(query: Query) -> dict[str, str | int | float | bool | Sequence[str]]:
-    return {
-        key: value.isoformat() if isinstance(value, datetime) else value
-        for key, value in query.items()
-        if value is not None
-    }
 
 
 def _part(text: str) -> str:

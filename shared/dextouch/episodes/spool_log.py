@@ -124,16 +124,11 @@ def open_log(folder: Path) -> Iterator[LogBytes]:
     Raises:
         CorruptDataError: the log is missing.
     """
-    path = folder / LOG_FILE
     with disk_errors(f"read log of spool {folder.name!r}"):
-        if not path.is_file():
+        if not (folder / LOG_FILE).is_file():
             raise CorruptDataError(f"spool {folder.name!r}: {LOG_FILE} is missing")
-        descriptor = os.open(path, os.O_RDONLY)
-    try:
-        with disk_errors(f"read log of spool {folder.name!r}"):
-            yield LogBytes(descriptor)
-    finally:
-        os.close(descriptor)
+        with (folder / LOG_FILE).open("rb") as file:
+            yield LogBytes(file.fileno())
 
 
 def find_records(data: LogBytes) -> LogRecords:

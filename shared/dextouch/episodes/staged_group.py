@@ -176,23 +176,16 @@ def publish_stage(stage: Path, target: Path, record: CommitRecord) -> None:
             (stage / name).unlink(missing_ok=True)
         sync_folder(stage)
         target.parent.mkdir(parents=True, exist_ok=True)
+        # Renaming a folder onto one that is not empty fails, so a race cannot overwrite.
         try:
-            _move_into_place(stage, target)
-        except ConflictError:
+            stage.rename(target)
+        except OSError as error:
+            if error.errno not in {errno.ENOTEMPTY, errno.EEXIST}:
+                raise
             if known is not None:
                 write_stage(stage, known)
-            raise
+            raise _taken(target) from error
         sync_folder(target.parent)
-
-
-def _move_into_place(stage: Path, target: Path) -> None:
-    # Renaming a folder onto one that is not empty fails, so a race cannot overwrite.
-    try:
-        stage.rename(target)
-    except OSError as error:
-        if error.errno not in {errno.ENOTEMPTY, errno.EEXIST}:
-            raise
-        raise _taken(target) from error
 
 
 def _taken(target: Path) -> ConflictError:
