@@ -19,7 +19,7 @@ from dextouch.episodes.format import (
     with_counts,
 )
 from dextouch.episodes.staged_group import commit_stage, write_stage
-from dextouch.episodes.staging_recovery import recover_stage
+from dextouch.episodes.staging_recovery import RecoveredGroup, recover_stage
 from dextouch.episodes.stream_writer import StreamWriter, WriteOptions
 from dextouch.errors import (
     ConflictError,
@@ -227,7 +227,7 @@ class EpisodeWriter:
         try:
             with suppress(StorageError):
                 write_stage(self._stage, self._with_losses())
-            group = recover_stage(self._stage, self._target.parent.parent)
+            group = self._complete()
         except DexTouchError as failure:
             where = f" in {self._stage}" if self._stage.exists() else ""
             told = (
@@ -245,6 +245,10 @@ class EpisodeWriter:
         if error is not None:
             error.add_note(told)
         return self._stage.exists()
+
+    def _complete(self) -> RecoveredGroup | None:
+        """Commit the stage, as a writer to a bucket overrides; None if there is nothing to keep."""
+        return recover_stage(self._stage, self._target.parent.parent)
 
     def _commit(self) -> None:
         if not self._streams:
