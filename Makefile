@@ -4,13 +4,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 LEROBOT := tests/benchmarks/lerobot
 LEROBOT_VENV ?= .venv-lerobot
+OPENPI_VENV ?= .venv-openpi
 STAGE ?= store loader acquisition clocks calibration retargeting alignment closure twin world-model evaluator agreement
 MADE := runs/reproduce
 DOCS_VENV ?= .venv-docs
 SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow vm fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export wheel-test \
+.PHONY: demo test check slow vm fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-openpi wheel-test \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -100,6 +101,14 @@ bench-lerobot: $(LEROBOT_VENV)/.complete   ## opt-in: our store beside LeRobotDa
 
 check-lerobot-export: $(LEROBOT_VENV)/.complete   ## opt-in: our exports open in lerobot itself
 	$(LEROBOT_VENV)/bin/python $(LEROBOT)/check_export.py
+
+$(OPENPI_VENV)/.complete:
+	$(PYTHON) -m venv $(OPENPI_VENV)
+	$(OPENPI_VENV)/bin/pip install --quiet --disable-pip-version-check openpi-client==0.1.2 'websockets>=13' typing_extensions
+	touch $@
+
+check-openpi: $(VENV)/.dev $(OPENPI_VENV)/.complete   ## opt-in: openpi's own client and packing, both ways
+	$(BIN)/python tests/system/openpi/check.py $(OPENPI_VENV)/bin/python
 
 # The site reads the docstrings of dextouch and needs neither torch nor mujoco, so it has an environment of its own.
 $(DOCS_VENV)/.complete: pyproject.toml constraints.txt

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from dextouch.clients.episode_store import EpisodeStoreClient as EpisodeStoreClient
     from dextouch.clients.http_link import HttpLink as HttpLink
     from dextouch.clients.http_link import Reply as Reply
+    from dextouch.clients.openpi import OpenPiPolicy as OpenPiPolicy
     from dextouch.clients.policy import Policy as Policy
     from dextouch.clients.policy import PolicyStart as PolicyStart
     from dextouch.clients.rollouts import Rollout as Rollout

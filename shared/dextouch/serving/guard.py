@@ -217,7 +217,8 @@ def _digest(text: str) -> bytes:
 
 def _token(authorization: str | None) -> str | None:
     kind, _, token = (authorization or "").partition(" ")
-    return token.strip() or None if kind.lower() == "bearer" else None
+    # Api-Key is what clients of openpi send.
+    return token.strip() or None if kind.lower() in {"bearer", "api-key"} else None
 
 
 @dataclass(frozen=True)

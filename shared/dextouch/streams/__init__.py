@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from dextouch.streams.batch import frame_body as frame_body
     from dextouch.streams.batch import read_batch as read_batch
     from dextouch.streams.batch import sample_ends as sample_ends
+    from dextouch.streams.openpi import pack_openpi as pack_openpi
+    from dextouch.streams.openpi import unpack_openpi as unpack_openpi
     from dextouch.streams.packing import pack as pack
     from dextouch.streams.packing import unpack as unpack
     from dextouch.streams.samples import ENCODED_UNITS as ENCODED_UNITS

@@ -43,6 +43,7 @@ from dextouch.serving import (
     timed,
 )
 from dextouch.streams import unpack
+from dextouch.worlds.openpi import openpi_router
 from dextouch.worlds.rollouts import Answer, RolloutLimits, RolloutService
 from dextouch.worlds.world import World
 
@@ -93,7 +94,7 @@ def create_world_app(
     return create_service_app(
         name=name,
         settings=settings,
-        routers=[rollout_router(service)],
+        routers=[rollout_router(service), openpi_router(service)],
         lifespan=lifespan,
         readiness=readiness,
     )

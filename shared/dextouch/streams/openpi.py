@@ -1,0 +1,140 @@
+"""Messages of openpi's WebSocket protocol: msgpack with numpy arrays as maps.
+
+An array is {b"__ndarray__": true, b"data": bytes, b"dtype": str, b"shape": [...]}, a numpy scalar
+{b"__npgeneric__": true, b"data": value, b"dtype": str}. Source: msgpack_numpy.py of openpi-client
+0.1.2 (github.com/Physical-Intelligence/openpi, Apache 2.0).
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Final
+
+import msgpack
+import numpy as np
+
+from dextouch.errors import InvalidInputError, LimitExceededError
+from dextouch.streams.packing import MAX_DIMENSIONS, MAX_ITEMS, MAX_ITEMS_A_CONTAINER, MAX_NUMBERS
+
+# Kinds of dtypes that are read: bool, signed, unsigned, floating.
+_KINDS: Final = "biuf"
+
+
+def pack_openpi(message: Mapping[str, Any]) -> bytes:
+    """Serialize nested maps and lists of plain values and arrays.
+
+    Raises:
+        InvalidInputError: a value that msgpack does not hold.
+    """
+    try:
+        return msgpack.packb(dict(message), default=_encoded)
+    except (TypeError, OverflowError) as error:
+        raise InvalidInputError(f"openpi message: {error}") from error
+
+
+def unpack_openpi(data: bytes, *, max_bytes: int) -> dict[str, Any]:
+    """Deserialize a message; arrays are read-only views into `data`.
+
+    Args:
+        data: from an untrusted source.
+        max_bytes: size limit.
+
+    Raises:
+        LimitExceededError: more bytes or items than allowed.
+        InvalidInputError: not msgpack, not a map with text keys, or an invalid array.
+    """
+    if len(data) > max_bytes:
+        raise LimitExceededError(
+            f"openpi message: got {len(data)} bytes, expected at most {max_bytes}"
+        )
+    num_items = 0
+
+    def count(container: list[Any] | dict[Any, Any]) -> None:
+        nonlocal num_items
+        num_items += 1 + len(container)
+        if num_items > MAX_ITEMS:
+            raise LimitExceededError(f"openpi message: holds more than {MAX_ITEMS} items")
+
+    def of_map(found: dict[Any, Any]) -> Any:  # noqa: ANN401 - a map, an array or a number
+        count(found)
+        if b"__ndarray__" in found:
+            return _array(found)
+        if b"__npgeneric__" in found:
+            return _array(found | {b"shape": [], b"data": _scalar_bytes(found)})[()]
+        return found
+
+    def of_list(found: list[Any]) -> list[Any]:
+        count(found)
+        return found
+
+    try:
+        message = msgpack.unpackb(
+            data,
+            object_hook=of_map,
+            list_hook=of_list,
+            max_array_len=MAX_ITEMS_A_CONTAINER,
+            max_map_len=MAX_ITEMS_A_CONTAINER,
+        )
+    except (ValueError, msgpack.UnpackException) as error:
+        raise InvalidInputError(
+            f"openpi message: not msgpack ({type(error).__name__}: {error})"
+        ) from error
+    if not isinstance(message, dict) or not all(isinstance(name, str) for name in message):
+        raise InvalidInputError("openpi message: expected a map whose keys are text")
+    return message
+
+
+def _encoded(value: object) -> dict[bytes, Any]:
+    if not isinstance(value, np.ndarray | np.generic) or value.dtype.kind not in _KINDS:
+        raise TypeError(f"got {type(value).__name__}, expected plain values and numeric arrays")
+    if isinstance(value, np.generic):
+        return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
+    return {
+        b"__ndarray__": True,
+        b"data": np.ascontiguousarray(value).tobytes(),
+        b"dtype": value.dtype.str,
+        b"shape": value.shape,
+    }
+
+
+def _dtype(found: Mapping[Any, Any]) -> "np.dtype[Any]":
+    name = found.get(b"dtype")
+    try:
+        dtype = np.dtype(name if isinstance(name, str) else "V")
+    except TypeError:
+        dtype = np.dtype("V")
+    if dtype.kind not in _KINDS:
+        raise InvalidInputError(
+            f"openpi message: got an array of dtype {name!r}, expected one of numbers"
+        )
+    return dtype
+
+
+def _scalar_bytes(found: Mapping[Any, Any]) -> bytes:
+    value = found.get(b"data")
+    if not isinstance(value, bool | int | float):
+        raise InvalidInputError(f"openpi message: got the scalar {value!r}, expected a number")
+    try:
+        return np.asarray(value, dtype=_dtype(found)).tobytes()
+    except OverflowError as error:
+        raise InvalidInputError(f"openpi message: scalar {value}: {error}") from error
+
+
+def _array(found: Mapping[Any, Any]) -> np.ndarray:
+    dtype, shape, data = _dtype(found), found.get(b"shape"), found.get(b"data")
+    if (
+        not isinstance(shape, list)
+        or len(shape) > MAX_DIMENSIONS
+        or not all(isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in shape)
+        or math.prod(max(n, 1) for n in shape) > MAX_NUMBERS
+    ):
+        raise InvalidInputError(
+            f"openpi message: got an array of shape {shape!r}, expected at most {MAX_DIMENSIONS} "
+            f"counts whose product is at most {MAX_NUMBERS}"
+        )
+    expected = math.prod(shape) * dtype.itemsize
+    if not isinstance(data, bytes) or len(data) != expected:
+        got = f"{len(data)} bytes" if isinstance(data, bytes) else type(data).__name__
+        raise InvalidInputError(
+            f"openpi message: array {shape}: got {got}, expected {expected} bytes"
+        )
+    return np.frombuffer(data, dtype=dtype).reshape(shape)

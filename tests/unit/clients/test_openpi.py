@@ -1,0 +1,114 @@
+"""Policies behind openpi's protocol, served by hand with websockets and msgpack alone."""
+
+import threading
+import time
+from contextlib import contextmanager
+
+import msgpack
+import numpy as np
+import pytest
+from websockets.sync.server import serve
+
+from dextouch.clients import OpenPiPolicy, PolicyStart
+from dextouch.errors import InvalidInputError, ShapeError, UnavailableError
+from dextouch.schemas import Observation
+from services.evaluation.policies.outside import PolicySource
+from tests.unit.worlds import fakes
+from tests.unit.worlds.test_openpi import decoded, encoded
+
+START = PolicyStart("stand_bottle", "stand it up", 0, fakes.anchor(), np.eye(3))
+
+
+@contextmanager
+def policy_server(answer):
+    """A server that answers each request by `answer(request)`: a map, text or bytes."""
+
+    def handle(connection):
+        connection.send(msgpack.packb({"policy": "by hand"}))
+        for data in connection:
+            reply = answer(msgpack.unpackb(data, object_hook=decoded))
+            if isinstance(reply, dict):
+                reply = msgpack.packb(reply, default=encoded)
+            connection.send(reply)
+
+    with serve(handle, "127.0.0.1", 0, compression=None) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        server.shutdown()
+        thread.join(10)
+
+
+def observation() -> Observation:
+    return fakes.observation(4, seed=1)
+
+
+def test_a_request_holds_the_newest_step_and_the_instruction():
+    asked = []
+
+    def answer(request):
+        asked.append(request)
+        return {
+            "actions": np.arange(20 * 67, dtype=np.float32).reshape(20, 67),
+            "server_timing": {},
+        }
+
+    with policy_server(answer) as url:
+        policy = OpenPiPolicy(url, images={"observation/exterior_image_1_left": "camera_head"})
+        assert policy.metadata == {"policy": "by hand"}
+        policy.reset(START)
+        seen = observation()
+        actions = policy.act(seen)
+        policy.close()
+    (request,) = asked
+    assert set(request) == {
+        "observation/exterior_image_1_left", "observation/state", "observation/tactile", "prompt",
+    }  # fmt: skip
+    assert request["prompt"] == "stand it up"
+    image = request["observation/exterior_image_1_left"]
+    assert image.dtype == np.uint8
+    np.testing.assert_array_equal(image, seen.images["camera_head"][-1])
+    np.testing.assert_array_equal(request["observation/state"], seen.action_reached[-1])
+    np.testing.assert_array_equal(request["observation/tactile"], seen.tactile_kpa[-1])
+    np.testing.assert_array_equal(actions, np.arange(16 * 67).reshape(16, 67))
+
+
+@pytest.mark.parametrize(
+    ("reply", "error", "message"),
+    [
+        ("Traceback: CUDA out of memory", InvalidInputError, "CUDA out of memory"),
+        ({"action": 1}, InvalidInputError, "no array `actions`"),
+        ({"actions": [[0.0]]}, InvalidInputError, "got list"),
+        ({"actions": np.zeros((16, 7))}, ShapeError, r"\[16, 7\], expected \[K, 67\]"),
+        ({"actions": np.zeros(67)}, ShapeError, r"\[67\]"),
+        (b"\xc1", InvalidInputError, "not msgpack"),
+    ],
+)
+def test_answers_that_are_no_actions_name_the_server(reply, error, message):
+    with policy_server(lambda _: reply) as url:
+        policy = OpenPiPolicy(url)
+        with pytest.raises(error, match=message):
+            policy.act(observation())
+        policy.close()
+
+
+def test_a_server_that_is_gone_or_slow_is_unavailable():
+    with pytest.raises(UnavailableError, match="does not answer"):
+        OpenPiPolicy("ws://127.0.0.1:9")
+    with policy_server(lambda _: time.sleep(1) or {}) as url:
+        policy = OpenPiPolicy(url, timeout_s=0.1)
+        with pytest.raises(UnavailableError, match=r"within 0.1 s"):
+            policy.act(observation())
+        policy.close()
+        with pytest.raises(UnavailableError, match="connection lost"):
+            policy.act(observation())
+
+
+def test_it_is_a_policy_by_name():
+    with policy_server(lambda _: {"actions": np.zeros((16, 67))}) as url:
+        policy = PolicySource.parse("pi=dextouch.clients:OpenPiPolicy").load({"url": url})
+        policy.reset(START)
+        assert policy.act(observation()).shape == (16, 67)
+        policy.close()
+    with pytest.raises(InvalidInputError, match="expected at least 1"):
+        OpenPiPolicy("ws://127.0.0.1:9", chunk_steps=0)

@@ -1,0 +1,168 @@
+"""Rollouts over the WebSocket, by a client that knows openpi's protocol and nothing of ours."""
+
+from contextlib import contextmanager
+
+import msgpack
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from dextouch.clients import RolloutClient
+from dextouch.worlds import WorldServiceSettings, create_world_app
+from tests.unit.worlds import fakes
+from tests.unit.worlds.running import served
+
+KEY = "a-key-of-sixteen-letters"
+START = {"world": "sum", "task": "stand_bottle", "seed": 3, "instruction": "stand it up"}
+
+
+def encoded(value):
+    """An array as openpi's clients write it."""
+    shape, data = value.shape, value.tobytes()
+    return {b"__ndarray__": True, b"data": data, b"dtype": value.dtype.str, b"shape": shape}
+
+
+def decoded(found):
+    if b"__ndarray__" not in found:
+        return found
+    return np.frombuffer(found[b"data"], found[b"dtype"]).reshape(found[b"shape"])
+
+
+class Client:
+    """Sends one message at a time; text is an error."""
+
+    def __init__(self, connection):
+        self.connection = connection
+        self.metadata = self.receive()
+
+    def receive(self):
+        answer = self.connection.recv(timeout=20)
+        if isinstance(answer, str):
+            raise RuntimeError(answer)  # noqa: TRY004 - as openpi's client does
+        return msgpack.unpackb(answer, object_hook=decoded)
+
+    def infer(self, message):
+        self.connection.send(msgpack.packb(message, default=encoded))
+        return self.receive()
+
+
+@contextmanager
+def opened(url, key=None):
+    headers = {"Authorization": f"Api-Key {key}"} if key else None
+    address = url.replace("http", "ws") + "/v1/openpi"
+    with connect(address, compression=None, additional_headers=headers, proxy=None) as connection:
+        yield Client(connection)
+
+
+@pytest.fixture(scope="module")
+def url():
+    app = create_world_app({"sum": fakes.SumWorld()}, WorldServiceSettings())
+    with served(app) as address:
+        yield address
+
+
+def over_http(url, num_chunks):
+    with RolloutClient(url) as client:
+        rollout = client.start(**START)
+        seen = [rollout.observation]
+        return seen + [rollout.step(fakes.actions(8, value=n)) for n in range(num_chunks)]
+
+
+def test_a_rollout_is_that_of_the_http_routes(url):
+    expected = over_http(url, 2)
+    with opened(url) as client:
+        assert [world["name"] for world in client.metadata["worlds"]] == ["sum"]
+        answers = [client.infer({"start": START})]
+        answers += [client.infer({"actions": fakes.actions(8, value=n)}) for n in range(2)]
+        assert answers[2]["rollout"]["next_chunk"] == 2
+        rollout_id = answers[2]["rollout"]["id"]
+        assert client.infer({"end": True}) == {"ended": rollout_id}
+        with pytest.raises(RuntimeError, match="there is no rollout"):
+            client.infer({"actions": fakes.actions(8)})
+    for answer, truth in zip(answers, expected, strict=True):
+        np.testing.assert_array_equal(answer["tactile_kpa"], truth.tactile_kpa)
+        np.testing.assert_array_equal(answer["action_reached"], truth.action_reached)
+        for camera, images in truth.images.items():
+            np.testing.assert_array_equal(answer[f"image/{camera}"], images)
+        assert answer["observation"]["first_step"] == truth.first_step
+
+
+def test_a_lost_connection_resumes_and_a_chunk_is_applied_once(url):
+    with opened(url) as client:
+        rollout_id = client.infer({"start": START})["rollout"]["id"]
+        first = client.infer({"actions": fakes.actions(8), "chunk": 0})
+    with opened(url) as client:
+        assert client.infer({"resume": rollout_id})["rollout"]["next_chunk"] == 1
+        again = client.infer({"actions": fakes.actions(8), "chunk": 0})
+        assert (again["replayed"], first["replayed"]) == (True, False)
+        np.testing.assert_array_equal(again["tactile_kpa"], first["tactile_kpa"])
+        with pytest.raises(RuntimeError, match="expected chunk 1"):
+            client.infer({"actions": fakes.actions(8), "chunk": 5})
+        assert client.infer({"actions": fakes.actions(8)})["rollout"]["next_chunk"] == 2
+
+
+def test_answers_hold_what_was_asked_for(url):
+    with opened(url) as client:
+        client.infer({"start": START, "return": {"cameras": [], "steps": "last"}})
+        answer = client.infer({"actions": fakes.actions(8)})
+        assert not [name for name in answer if name.startswith("image/")]
+        assert answer["tactile_kpa"].shape == (1, 2, 320)
+
+
+@pytest.mark.parametrize(
+    ("message", "error"),
+    [
+        ({}, "got the keys none"),
+        ({"start": START, "end": True}, "expected one of start, resume, actions, end"),
+        ({"start": START, "more": 1}, "got the keys more, start"),
+        ({"start": START | {"world": "none"}}, "'none'"),
+        ({"start": {"world": "sum"}}, "task"),
+        ({"start": "now"}, "start"),
+        ({"start": START, "return": {"steps": "some"}}, "return"),
+        ({"resume": "0" * 32}, "0000"),
+        ({"actions": [[1.0]]}, "got list, expected an array"),
+        ({"actions": np.zeros((8, 66))}, "67"),
+        ({"actions": np.full((8, 67), np.nan)}, "NaN"),
+        ({"actions": np.zeros((8, 67)), "chunk": "0"}, "expected a whole number"),
+    ],
+)
+def test_a_refused_message_changes_nothing(url, message, error):
+    with opened(url) as client:
+        if "start" not in message:
+            client.infer({"start": START})
+        with pytest.raises(RuntimeError, match=error):
+            client.infer(message)
+        if "start" not in message:
+            answer = client.infer({"actions": fakes.actions(8)})
+            assert answer["rollout"]["next_chunk"] == 1
+
+
+@pytest.mark.parametrize(
+    ("message", "error"),
+    [
+        ("hello", "got text"),
+        (b"\xc1", "not msgpack"),
+        (b"\0" * 100_000, "got 100000 bytes, expected at most 65536"),
+    ],
+)
+def test_what_is_no_message_is_answered(url, message, error):
+    with opened(url) as client:
+        client.connection.send(message)
+        with pytest.raises(RuntimeError, match=error):
+            client.receive()
+        assert client.infer({"start": START})["rollout"]["next_chunk"] == 0
+
+
+def test_a_key_with_the_scope_is_needed_where_keys_are_set():
+    keys = (
+        {"name": "policy", "key": KEY, "scopes": ["rollout"]},
+        {"name": "reader", "key": KEY[::-1], "scopes": ["read"]},
+    )
+    settings = WorldServiceSettings.model_validate({"api_keys": keys})
+    with served(create_world_app({"sum": fakes.SumWorld()}, settings)) as url:
+        with opened(url, KEY) as client:
+            assert client.infer({"start": START})["rollout"]["next_chunk"] == 0
+        for key in (None, "another-key-of-letters", KEY[::-1]):
+            with pytest.raises((InvalidStatus, ConnectionClosed)), opened(url, key):
+                pass
