@@ -3,7 +3,12 @@ from typing import Any
 
 class UnpackException(Exception): ...
 
-def packb(o: object, *, use_bin_type: bool = True) -> bytes: ...
+def packb(
+    o: object,
+    *,
+    default: Callable[[Any], Any] | None = None,
+    use_bin_type: bool = True,
+) -> bytes: ...
 def unpackb(
     packed: bytes,
     *,
