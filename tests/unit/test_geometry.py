@@ -152,3 +152,18 @@ def test_gaps_and_outside_are_marked_not_filled():
     assert valid.tolist() == [False, True, True, False, True, True, False]
     with pytest.raises(InvalidInputError):
         interpolation.bracket(np.array([0, 0]), np.array([0]), max_gap_ns=1)
+
+
+def test_the_error_of_transforms_that_are_not_rigid():
+    T = transforms.transform(Rotation.from_rotvec([0.3, -2.0, 0.7]).as_matrix(), [1.0, 2.0, 3.0])
+    assert transforms.rigid_error(np.stack([T, np.eye(4)])) < 1e-12
+    # By hand: stretched by 1 %, RᵀR is 1.0201 I; the last row is half a metre off.
+    stretched, moved = np.eye(4), np.eye(4)
+    stretched[:3, :3] *= 1.01
+    moved[3, 0] = 0.5
+    assert transforms.rigid_error(stretched) == pytest.approx(0.0201)
+    assert transforms.rigid_error(np.stack([T, moved])) == 0.5
+    for entry, value in (((0, 0), np.nan), ((0, 3), np.inf), ((2, 2), -1.0)):
+        wrong = np.eye(4)
+        wrong[entry] = value
+        assert transforms.rigid_error(wrong) == np.inf

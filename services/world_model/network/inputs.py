@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
-from dextouch.geometry import invert
+from dextouch.geometry import invert, rigid_error
 from dextouch.hands.actions import (
     IDENTITY_POSE_9D,
     JOINTS_LEFT,
@@ -182,9 +182,7 @@ def _checked_anchor(anchor: AnchorPoses) -> np.ndarray:
         raise ShapeError(f"anchor: got shape {Ts.shape}, expected three 4x4 transforms")
     if not np.isfinite(Ts).all():
         raise NonFiniteError("anchor: holds NaN or infinity, expected rigid transforms")
-    R = Ts[:, :3, :3]
-    error = float(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max())
-    if error > 1e-3 or (np.linalg.det(R) < 0).any():
+    if (error := rigid_error(Ts)) > 1e-3:
         raise InvalidInputError(
             f"anchor: no rigid transform (RᵀR differs from the identity by {error:.2g}), "
             "expected T_world_wrist_left, T_world_wrist_right, T_world_camera_head"

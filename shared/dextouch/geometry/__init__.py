@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from dextouch.geometry.transforms import pinhole_matrix as pinhole_matrix
     from dextouch.geometry.transforms import pose_from_transform as pose_from_transform
     from dextouch.geometry.transforms import project as project
+    from dextouch.geometry.transforms import rigid_error as rigid_error
     from dextouch.geometry.transforms import transform as transform
     from dextouch.geometry.transforms import transform_from_pose as transform_from_pose
 else:

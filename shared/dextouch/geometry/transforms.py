@@ -3,6 +3,8 @@
 Projected points are in the optical frame (x right, y down, z forward).
 """
 
+import math
+
 import numpy as np
 from jaxtyping import Bool, Float64
 
@@ -31,6 +33,20 @@ def invert(T_a_b: np.ndarray) -> Float64[np.ndarray, "*batch 4 4"]:
     T = np.asarray(T_a_b, dtype=np.float64)
     R_b_a = np.swapaxes(T[..., :3, :3], -1, -2)
     return transform(R_b_a, -(R_b_a @ T[..., :3, 3:])[..., 0])
+
+
+def rigid_error(T: np.ndarray) -> float:
+    """How far transforms [..., 4, 4] are from rigid ones: 0 for rotations with the row 0 0 0 1.
+
+    The largest difference of RᵀR from the identity and of the last row; infinite for reflections
+    and where a value is not finite.
+    """
+    T = np.asarray(T, dtype=np.float64)
+    R = T[..., :3, :3]
+    if not np.isfinite(T).all() or (np.linalg.det(R) < 0).any():
+        return math.inf
+    off = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max()
+    return float(max(off, np.abs(T[..., 3, :] - [0.0, 0.0, 0.0, 1.0]).max()))
 
 
 def apply(T_a_b: np.ndarray, points_b: np.ndarray) -> Float64[np.ndarray, "*batch 3"]:

@@ -14,6 +14,7 @@ from pydantic import (
 )
 
 from dextouch.frozen_model import FrozenModel
+from dextouch.geometry import rigid_error
 from dextouch.hands.actions import AnchorPoses
 from dextouch.streams import StreamDescriptor
 
@@ -30,6 +31,7 @@ ClockWarning = Literal["skew", "residual", "stop"]
 StoreId = Annotated[str, Field(pattern=ID_PATTERN)]
 Domain = Literal["human", "robot"]
 Origin = Literal["recorded", "twin", "imagined"]
+RIGID_TOLERANCE: Final = 1e-6
 Matrix = tuple[tuple[FiniteFloat, ...], ...]
 NonNegativeFinite = Annotated[FiniteFloat, Field(ge=0)]
 # Centre x y z and half sizes x y z of a bounding box.
@@ -58,9 +60,7 @@ class StoredAnchor(FrozenModel):
     @field_validator("*")
     @classmethod
     def _is_rigid(cls, rows: Matrix) -> Matrix:
-        T = np.array(_check_matrix(rows, (4, 4)))
-        orthonormal = np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
-        if not orthonormal or np.linalg.det(T[:3, :3]) < 0 or T[3].tolist() != [0, 0, 0, 1]:
+        if rigid_error(np.array(_check_matrix(rows, (4, 4)))) > RIGID_TOLERANCE:
             raise ValueError("expected a rigid transform: a rotation and the last row 0 0 0 1")
         return rows
 

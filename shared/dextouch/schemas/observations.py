@@ -10,6 +10,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
 from dextouch.frozen_model import FrozenModel
+from dextouch.geometry import rigid_error
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
 from dextouch.schemas.problems import first_problems
 from dextouch.schemas.rollouts import ActionKind, Doubt, RolloutInfo, StartRequest
@@ -335,9 +336,7 @@ def _observation_from(
 def _origin_from(arrays: Mapping[str, np.ndarray], *, where: str) -> RolloutOrigin:
     poses = [_matrix(arrays, name, 4, where) for name in ANCHOR_NAMES]
     for name, T in zip(ANCHOR_NAMES, poses, strict=True):
-        R = T[:3, :3]
-        off = max(np.abs(R.T @ R - np.eye(3)).max(), np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max())
-        if off > RIGID_TOLERANCE or np.linalg.det(R) < 0:
+        if (off := rigid_error(T)) > RIGID_TOLERANCE:
             raise DegenerateRotationError(
                 f"{where}: {name} is not a rigid transform (off by {off:.1e}, expected at most "
                 f"{RIGID_TOLERANCE:.0e})"
