@@ -155,7 +155,8 @@ def test_gaps_and_outside_are_marked_not_filled():
 
 
 def test_the_error_of_transforms_that_are_not_rigid():
-    T = transforms.transform(Rotation.from_rotvec([0.3, -2.0, 0.7]).as_matrix(), [1.0, 2.0, 3.0])
+    R = Rotation.from_rotvec([0.3, -2.0, 0.7]).as_matrix()
+    T = transforms.transform(R, np.array([1.0, 2.0, 3.0]))
     assert transforms.rigid_error(np.stack([T, np.eye(4)])) < 1e-12
     # By hand: stretched by 1 %, RᵀR is 1.0201 I; the last row is half a metre off.
     stretched, moved = np.eye(4), np.eye(4)
