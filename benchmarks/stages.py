@@ -83,6 +83,14 @@ STAGES = {
         "is kept in --keep when it is computed, so a run that was broken off goes on where it "
         "stood.",
     ),
+    "rollouts": StageEntry(
+        "benchmarks.rollouts.benchmark",
+        "time a chunk of a rollout beside an echo of the same bytes",
+        "Serves rollouts of a world that computes nothing and two echoes in a process of their "
+        "own, and times chunks of 16 steps over HTTP and over the WebSocket, with the last image "
+        "or all of them, in turns with echoes of the same bytes. Close other programs first: "
+        "timings on a busy machine say little.",
+    ),
     "agreement": StageEntry(
         "benchmarks.agreement",
         "check how often the intervals of an evaluation hold the truth",

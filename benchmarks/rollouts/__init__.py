@@ -1,0 +1,1 @@
+"""Cost of a chunk: our server beside echoes of the same bytes."""

@@ -1,0 +1,29 @@
+"""The benchmark of chunks beside echoes, in its shortest form."""
+
+import json
+
+import pytest
+
+from benchmarks.command import main
+from dextouch.errors import InvalidInputError
+
+
+def test_ours_and_the_echo_move_the_same_bytes(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("benchmarks.command.refuse_shape_checks", lambda: None)
+    path = tmp_path / "report.json"
+    assert main(["rollouts", "--quick", "--rounds", "1", "--chunks", "5", "--json", str(path)]) == 0
+    report = json.loads(path.read_text())
+    sizes = report["bytes"]
+    # 16 images of 64 x 64 px, 16 x 640 taxels in float32 and 16 x 67 numbers in float64.
+    everything = 16 * (64 * 64 * 3 + 640 * 4 + 67 * 8)
+    for way in ("HTTP", "WebSocket"):
+        assert 0 < sizes[f"{way}, 16 raw images"] - everything < 1500
+        assert 0 < sizes[f"{way}, last image"] - everything / 16 < 1500
+    assert len(report["seconds"]) == 8
+    assert "WebSocket, last image" in capsys.readouterr().out
+
+
+def test_more_chunks_than_a_rollout_has_are_refused(monkeypatch):
+    monkeypatch.setattr("benchmarks.command.refuse_shape_checks", lambda: None)
+    with pytest.raises(InvalidInputError, match="901 chunks"):
+        main(["rollouts", "--chunks", "901"])
