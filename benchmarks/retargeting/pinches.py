@@ -17,7 +17,7 @@ from dextouch.hands import CHAINS, NODE_INDEX
 from dextouch.hands.robot_hand import NUM_FINGERS
 from dextouch.tactile.layout import Side
 from services.twin.hands import HumanHand
-from services.twin.human_hand import METACARPAL_BASES_M
+from services.twin.human_hand import METACARPAL_BASES_M, human_fingers
 
 # Sizes of the people against the average; each of their bones differs by up to 8 % more.
 SIZES: Final = (0.85, 0.92, 1.0, 1.08, 1.15)
@@ -69,12 +69,11 @@ class Person(HumanHand):
     """
 
     def __init__(self, side: Side, size: float, seed: int) -> None:
-        super().__init__(side)
         if not size > 0:
             raise InvalidInputError(f"size of a hand: got {size}, expected above zero")
         self.size = size
         rng = np.random.default_rng([seed, int(side == "right")])
-        self.fingers = tuple(
+        fingers = tuple(
             finger._replace(
                 joints=tuple(
                     row._replace(position_m=_longer(row.position_m, size, rng))
@@ -82,8 +81,9 @@ class Person(HumanHand):
                 ),
                 tip_m=_longer(finger.tip_m, size, rng),
             )
-            for finger in self.fingers
+            for finger in human_fingers(side)
         )
+        super().__init__(side, fingers)
 
     def keypoints_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
         """The 25 tracked nodes in wrist coordinates, metres, for joint angles [T, 20]."""

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
@@ -71,18 +72,17 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         }
         sizes: dict[tuple[str, str], int] = {}
 
-        def once(subject: tuple[str, str, str]) -> float:
-            way, answer, server = subject
+        def once(way: str, answer: str, server: str, _: int = 0) -> float:
             opened = _ours if server == "ours" else _echo
             with opened(urls, way, answer, sizes) as chunk:
                 return _median_s(chunk, plan["chunks"])
 
         for way in WAYS:
             for answer in ANSWERS:
-                once((way, answer, "ours"))
+                once(way, answer, "ours")
         with bar("rounds", plan["rounds"] * len(subjects)) as step:
             found = interleaved(
-                {name: lambda _, s=subject: once(s) for name, subject in subjects.items()},
+                {name: partial(once, *subject) for name, subject in subjects.items()},
                 plan["rounds"],
                 on_step=step,
             )

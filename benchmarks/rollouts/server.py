@@ -3,7 +3,6 @@
 Answers once with the three URLs, and ends when its parent does.
 """
 
-import sys
 import threading
 
 import numpy as np
@@ -119,7 +118,8 @@ async def echo(scope: Scope, receive: Receive, send: Send) -> None:
 def echo_messages(connection: ServerConnection) -> None:
     """Answer every message with as many bytes as its first eight say."""
     for message in connection:
-        connection.send(bytes(int.from_bytes(message[:8], "little")))
+        head = message[:8] if isinstance(message, bytes) else b""
+        connection.send(bytes(int.from_bytes(head, "little")))
 
 
 def main() -> None:
@@ -140,4 +140,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -4,6 +4,7 @@ Both are five fingers × four hinges in the wrist frame of `dextouch.hands.robot
 along -z, thumb side +x, right palm towards +y, left palm towards -y).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, Literal, NamedTuple
@@ -13,7 +14,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import UnknownNameError
 from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
-from dextouch.hands.robot_hand import HandModel, RobotHand
+from dextouch.hands.robot_hand import FingerTable, HandModel, RobotHand
 from dextouch.tactile.layout import PALM_PITCH_M, PALM_SHAPE, Side
 from services.twin.human_hand import METACARPAL_BASES_M, human_fingers
 
@@ -55,10 +56,19 @@ _HUMAN_SHAPE: Final = HandShape(
 
 
 class HumanHand(HandModel):
-    """A human hand with the robot's kinematic tree and joint order, but human bones and limits."""
+    """A human hand with the robot's kinematic tree and joint order, but human bones and limits.
 
-    def __init__(self, side: str) -> None:
-        super().__init__(side, human_fingers(side), name=f"human {side} hand")
+    Args:
+        side: "left" or "right".
+        fingers: of a person, thumb first; default: of average size.
+
+    Raises:
+        UnknownNameError: any other side.
+    """
+
+    def __init__(self, side: str, fingers: Sequence[FingerTable] | None = None) -> None:
+        found = human_fingers(side) if fingers is None else fingers
+        super().__init__(side, found, name=f"human {side} hand")
 
     def keypoints_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
         """The 25 tracked nodes in wrist coordinates, metres, for joint angles [T, 20]."""

@@ -170,7 +170,7 @@ def test_a_hand_that_cannot_pinch_is_refused():
     # A thumb that points away and hardly moves.
     thumb = person.fingers[0]
     stiff = tuple(row._replace(limits_rad=(-0.6, -0.5)) for row in thumb.joints)
-    person.fingers = (thumb._replace(joints=stiff), *person.fingers[1:])
+    HumanHand.__init__(person, "right", (thumb._replace(joints=stiff), *person.fingers[1:]))
     with pytest.raises(LimitExceededError, match="thumb and index"):
         pinch_motion(person, "right")
 

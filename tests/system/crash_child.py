@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dextouch.episodes import EpisodeStore, video
+from dextouch.episodes import EpisodeStore, GopEncoder
 from dextouch.episodes.spool import SpoolWriter
 from tests.system import take_source
 
@@ -118,7 +118,7 @@ def recover(order, _images, _jpegs):
 
 def count_encoded(counters):
     """Count the images that leave the encoders, whose threads are named after their streams."""
-    encode = video.GopEncoder.encode
+    encode = GopEncoder.encode
 
     def counted(self, image):
         access_unit = encode(self, image)
@@ -126,7 +126,7 @@ def count_encoded(counters):
         counters.add(ENCODED, name)
         return access_unit
 
-    video.GopEncoder.encode = counted
+    GopEncoder.encode = counted
 
 
 def kill_at_file_event(number, counters):

@@ -85,7 +85,7 @@ class HandModel:
         _check_fingers(fingers, name)
         self.side = side
         self.name = name
-        self.fingers = tuple(fingers)
+        self._fingers = tuple(fingers)
         rows = [row for finger in fingers for row in finger.joints]
         self.joint_names = tuple(row.name for row in rows)
         self.lower_rad, self.upper_rad = np.array([row.limits_rad for row in rows]).T.copy()
@@ -98,6 +98,11 @@ class HandModel:
         self._offsets[self._is_joint] = transform(R, np.array([row.position_m for row in rows]))
         self._axes = np.zeros((*self._is_joint.shape, 3))
         self._axes[self._is_joint] = [row.axis for row in rows]
+
+    @property
+    def fingers(self) -> tuple[FingerTable, ...]:
+        """The tables, which do not change: others are another hand."""
+        return self._fingers
 
     def joint_frames(
         self, joints_rad: np.ndarray
