@@ -43,8 +43,9 @@ wheel-test: $(VENV)/.dev   ## build the wheel, install it outside the checkout, 
 vm: $(VENV)/.dev         ## real drivers on a Debian kernel's devices; apt-get install qemu-system-x86 busybox-static cpio kmod
 	$(BIN)/python -m pytest -q -s -m vm tests/vm
 
-fuzz: $(VENV)/.dev       ## mutate packets of all gloves, guided by coverage; ARGS="--seconds 600"
+fuzz: $(VENV)/.dev       ## mutate packets of all gloves, guided by coverage, then requests to all services; ARGS="--seconds 600"
 	PYTHONPATH=.:shared $(BIN)/python -m tests.fuzz.mutate $(ARGS)
+	$(BIN)/python -m pytest -q -m slow tests/integration/test_openapi_conformance.py
 
 mutants: $(VENV)/.dev    ## plant known bugs one by one and count those that a test notices; ARGS="--area geometry"
 	PYTHONPATH=.:shared $(BIN)/python -m tests.mutants.run $(ARGS)

@@ -16,7 +16,7 @@ from dextouch.schemas import (
     TakePrompt,
     UploadStatus,
 )
-from dextouch.serving import RequireScope
+from dextouch.serving import MSGPACK, RequireScope
 from dextouch.streams import pack
 from services.acquisition.health import DiskJudge, judge_uploads
 from services.acquisition.station import Station
@@ -92,18 +92,24 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
         """When something was raised and when it ended, on the station's clock."""
         return station.health.events(since_ns)
 
-    @router.get("/live/taxels")
+    @router.get(
+        "/live/taxels", response_class=Response, responses={200: {"content": {MSGPACK: {}}}}
+    )
     async def taxels() -> Response:
         """Newest pressures (kPa, float32 [320]) of the gloves that are heard, packed."""
         pressures = station.live.pressures_kpa(station.clock.now_ns())
-        return Response(pack({}, pressures), media_type="application/msgpack")
+        return Response(pack({}, pressures), media_type=MSGPACK)
 
     @router.get("/live/cameras")
     async def cameras() -> CameraList:
         """Cameras that have sent an image."""
         return CameraList(cameras=tuple(station.live.cameras(station.clock.now_ns())))
 
-    @router.get("/live/cameras/{name}")
+    @router.get(
+        "/live/cameras/{name}",
+        response_class=Response,
+        responses={200: {"content": {"image/jpeg": {}}}},
+    )
     async def camera(name: str) -> Response:
         """Newest image as JPEG."""
         image = station.live.jpeg(name, station.clock.now_ns())

@@ -50,7 +50,7 @@ def alignments_router(jobs: JobRunner) -> APIRouter:
             raise error_from_problem(asked[0].problem)
         return asked[0]
 
-    @router.get("")
+    @router.get("", responses={404: {}})
     async def listing(
         state: JobState | None = None,
         after: str | None = None,

@@ -1,7 +1,7 @@
 """Request and response bodies of the alignment service, and the states of an alignment job."""
 
 from datetime import UTC, datetime
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import AwareDatetime, Field, FiniteFloat, model_validator
 
@@ -23,7 +23,7 @@ class AlignmentRequest(FrozenModel):
     """Align one or up to a thousand recordings; missing options default to the service's."""
 
     recording_id: StoreId | None = None
-    recording_ids: tuple[StoreId, ...] | None = Field(
+    recording_ids: Annotated[tuple[StoreId, ...], Field(fail_fast=True)] | None = Field(
         default=None, min_length=1, max_length=MAX_BATCH
     )
     options: AlignmentOptions | None = None

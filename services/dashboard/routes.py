@@ -17,6 +17,7 @@ from fastapi import (
     WebSocketDisconnect,
 )
 from fastapi.responses import JSONResponse
+from fastapi.security import APIKeyCookie
 from pydantic import Field, ValidationError
 from pydantic_core import to_jsonable_python
 from starlette.requests import HTTPConnection
@@ -26,7 +27,7 @@ from dextouch.errors import AccessDeniedError
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import not_signed_in
 from services.dashboard.feeds import Feeds
-from services.dashboard.sessions import Sessions
+from services.dashboard.sessions import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView
 from services.dashboard.topics import Topic
@@ -35,6 +36,8 @@ from services.dashboard.touch import heatmap_layout
 WEBSOCKET_REFUSED = 1008
 # Interval at which a WebSocket checks that its session is still valid.
 SESSION_CHECK_S = 1.0
+# Documents the cookie; `guard` checks it.
+SESSION = APIKeyCookie(name=COOKIE, scheme_name="session", auto_error=False)
 # Same pattern as stream names (dextouch.streams.StreamDescriptor).
 CameraName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 
@@ -54,7 +57,9 @@ def guard(connection: HTTPConnection) -> None:
 
 def api_router(settings: DashboardSettings) -> APIRouter:
     """Router of the page's data and actions."""
-    router = APIRouter(prefix="/v1", dependencies=[Depends(guard)], tags=["dashboard"])
+    router = APIRouter(
+        prefix="/v1", dependencies=[Depends(guard), Depends(SESSION)], tags=["dashboard"]
+    )
     layout = heatmap_layout()
 
     @router.get("/heatmap")
@@ -88,7 +93,11 @@ def api_router(settings: DashboardSettings) -> APIRouter:
         path = f"/v1/uploads/{quote(recording_id, safe='')}/retry"
         await feeds.upstream("acquisition").send("POST", path)
 
-    @router.get("/cameras/{name}.jpg")
+    @router.get(
+        "/cameras/{name}.jpg",
+        response_class=Response,
+        responses={200: {"content": {"image/jpeg": {}}}},
+    )
     async def camera(name: CameraName, request: Request) -> Response:
         """The newest image of one camera."""
         feeds: Feeds = request.app.state.feeds

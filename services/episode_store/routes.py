@@ -1,6 +1,6 @@
 """HTTP routes of the store: uploads by stations, and reading of recordings and episodes."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, HTTPException, Path, Query, Request, Response
 
@@ -21,6 +21,7 @@ from services.episode_store.catalog import Catalog, EpisodeFilter, EpisodeQuery,
 from services.episode_store.intake import Intake
 from services.episode_store.reading import Answer, SpanQuery, StoreReader, WindowQuery
 
+Responses = dict[int | str, dict[str, Any]]
 MAY_READ = Depends(RequireScope("store_read"))
 MAY_WRITE = Depends(RequireScope("store_write"))
 # Room for the calibration and descriptors of a station, or the ledger of a take.
@@ -28,6 +29,9 @@ MAX_ATTRIBUTES_BYTES = 2**20
 WINDOW_MSGPACK = "application/vnd.dextouch.window+msgpack"
 # Committed content is immutable but may be deleted: clients must revalidate.
 CACHE_CONTROL = "private, no-cache"
+# Responses of these routes besides the problems that all routes can give.
+SAMPLES: Responses = {200: {"content": {MSGPACK: {}}}, 304: {}}
+WINDOW: Responses = {200: {"content": {WINDOW_MSGPACK: {}, MSGPACK: {}}}, 304: {}, 406: {}}
 IfNoneMatch = Annotated[str | None, Header(alias="if-none-match")]
 
 
@@ -45,7 +49,6 @@ def uploads_router(intake: Intake) -> APIRouter:
         "/recordings/{recording_id}/streams/{stream}/batches/{number}",
         tags=["recordings"],
         dependencies=[MAY_WRITE],
-        openapi_extra={"requestBody": {"content": {OCTETS: {}}}},
     )
     @takes({OCTETS: AS_SET})
     async def put_batch(
@@ -96,7 +99,12 @@ def reading_router(catalog: Catalog, reader: StoreReader, *, max_page: int) -> A
         """Attributes of a finished recording."""
         return reader.recording_attributes(recording_id)
 
-    @router.get("/recordings/{recording_id}/streams/{stream}", tags=["recordings"])
+    @router.get(
+        "/recordings/{recording_id}/streams/{stream}",
+        tags=["recordings"],
+        response_class=Response,
+        responses=SAMPLES,
+    )
     def recording_samples(
         recording_id: str,
         stream: str,
@@ -118,7 +126,12 @@ def reading_router(catalog: Catalog, reader: StoreReader, *, max_page: int) -> A
         """Attributes of an episode."""
         return reader.episode(episode_id)
 
-    @router.get("/episodes/{episode_id}/windows", tags=["episodes"])
+    @router.get(
+        "/episodes/{episode_id}/windows",
+        tags=["episodes"],
+        response_class=Response,
+        responses=WINDOW,
+    )
     def window(
         episode_id: str,
         query: Annotated[WindowQuery, Query()],
@@ -129,7 +142,12 @@ def reading_router(catalog: Catalog, reader: StoreReader, *, max_page: int) -> A
         media_type = _chosen_type(accept, (WINDOW_MSGPACK, MSGPACK))
         return _response(reader.window(episode_id, query, known=if_none_match), media_type)
 
-    @router.get("/episodes/{episode_id}/streams/{stream}", tags=["episodes"])
+    @router.get(
+        "/episodes/{episode_id}/streams/{stream}",
+        tags=["episodes"],
+        response_class=Response,
+        responses=SAMPLES,
+    )
     def episode_samples(
         episode_id: str,
         stream: str,

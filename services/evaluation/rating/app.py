@@ -111,7 +111,9 @@ def rating_router(
     needs_rater = RequireScope("rate")
     router = APIRouter(prefix="/v1/rating", tags=["rating"], dependencies=[Depends(needs_rater)])
 
-    @router.get("/next", response_model=None, responses={200: {"model": ShownRollout}, 204: {}})
+    @router.get(
+        "/next", response_model=None, responses={200: {"model": ShownRollout}, 204: {}, 409: {}}
+    )
     def next_rollout(
         request: Request, rater: RaterName, key: Annotated[str, Depends(needs_rater)]
     ) -> ShownRollout | Response:
@@ -136,7 +138,11 @@ def rating_router(
             num_open=assigned.num_open,
         )
 
-    @router.get("/rollouts/{token}/steps/{step}.jpg", response_class=Response)
+    @router.get(
+        "/rollouts/{token}/steps/{step}.jpg",
+        response_class=Response,
+        responses={200: {"content": {"image/jpeg": {}}}},
+    )
     def picture(token: Token, step: Annotated[int, Path(ge=0, le=100_000)]) -> Response:
         """Head image and taxel maps of one step."""
         jpeg = pictures.step(queue.rollout(token).episode_id, step)

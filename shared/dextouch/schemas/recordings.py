@@ -1,6 +1,6 @@
 """Schemas of recordings: attributes, and the bodies of uploads to the store."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import AwareDatetime, Field, FiniteFloat
 
@@ -48,10 +48,10 @@ class RecordingAttributes(FrozenModel):
     success: bool | None = None
     recovered: bool = False
     calibration: dict[str, Matrix] = Field(default={})
-    lineage: tuple[LineageEntry, ...] = ()
-    ledger: tuple[LedgerEntry, ...] = ()
+    lineage: Annotated[tuple[LineageEntry, ...], Field(fail_fast=True)] = ()
+    ledger: Annotated[tuple[LedgerEntry, ...], Field(fail_fast=True)] = ()
     quality: dict[str, FiniteFloat] = Field(default={})
-    streams: tuple[StreamDescriptor, ...] = ()
+    streams: Annotated[tuple[StreamDescriptor, ...], Field(fail_fast=True)] = ()
 
     def as_interrupted(self) -> "RecordingAttributes":
         """Mark the take as interrupted: set `recovered`, and note it in every stream's ledger."""
@@ -82,7 +82,7 @@ class FinishRecording(FrozenModel):
 
     num_batches: dict[str, int]
     success: bool | None = None
-    ledger: tuple[LedgerEntry, ...] = ()
+    ledger: Annotated[tuple[LedgerEntry, ...], Field(fail_fast=True)] = ()
 
 
 class RecordingSummary(FrozenModel):

@@ -13,6 +13,7 @@ from contextlib import (
     contextmanager,
     nullcontext,
 )
+from functools import partial
 from http import HTTPStatus
 
 import structlog
@@ -40,6 +41,7 @@ from dextouch.schemas import (
     Readiness,
     problem_from_error,
 )
+from dextouch.serving.documentation import document_service
 from dextouch.serving.guard import AccessControl, Admits, BodyRules, GuardMiddleware, SitePolicy
 from dextouch.serving.settings import ServiceSettings
 
@@ -47,6 +49,8 @@ logger = structlog.get_logger(__name__)
 
 REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 KNOWN_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+# A body of 1 MiB can hold 500,000 mistakes.
+MAX_MISTAKES = 10
 SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
@@ -98,6 +102,9 @@ def create_service_app(
     app.include_router(_health_router(name, readiness))
     for router in routers:
         app.include_router(router)
+    app.openapi = partial(  # type: ignore[method-assign]
+        document_service, app, routers, needs_key=app.state.access.has_keys
+    )
     return app
 
 
@@ -147,12 +154,15 @@ def _add_error_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def validation(request: Request, error: RequestValidationError) -> Response:
+        found = error.errors()
         items = [
             {"where": ".".join(str(part) for part in item["loc"]), "what": str(item["msg"])}
-            for item in error.errors()
+            for item in found[:MAX_MISTAKES]
         ]
-        malformed = any(item["type"] == "json_invalid" for item in error.errors())
+        malformed = any(item["type"] == "json_invalid" for item in found[:MAX_MISTAKES])
         text = "; ".join(f"{item['where']}: {item['what']}" for item in items)
+        if len(found) > len(items):
+            text += f"; and {len(found) - len(items)} more"
         ours = InvalidInputError(text or "invalid request", errors=items)
         return _problem_response(request, ours, 400 if malformed else 422)
 

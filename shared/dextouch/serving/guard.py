@@ -255,6 +255,11 @@ def takes(
     return mark
 
 
+def body_rule(endpoint: Callable[..., object]) -> BodyRule | None:
+    """What `takes` declared of a route; None without it."""
+    return getattr(endpoint, RULE_ATTRIBUTE, None)
+
+
 def media_type(content_type: str | None) -> tuple[str, dict[str, str]]:
     """A Content-Type's media type and parameters in lower case; "none" where there is none.
 
@@ -278,7 +283,7 @@ class BodyRules:
             (
                 route.path_regex,
                 frozenset(route.methods or ()),
-                getattr(route.endpoint, RULE_ATTRIBUTE, DEFAULT_RULE),
+                body_rule(route.endpoint) or DEFAULT_RULE,
             )
             for router in routers
             for route in router.routes

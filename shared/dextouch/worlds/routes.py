@@ -52,13 +52,18 @@ REPLAYED_HEADER = "dextouch-replayed"
 MAX_BODY_BYTES = 2**28
 # Room for 1000 rows of float64, or some hundred rows as JSON.
 MAX_CHUNK_BYTES = 2**20
+# Bodies above it are decoded in a thread, so that others need not wait.
+MAX_INLINE_BYTES = 64 * KIB
 
 
 class ActionsBody(FrozenModel):
     """A chunk as JSON: rows of 67 numbers."""
 
-    actions: list[list[float]]
+    actions: Annotated[list[Annotated[list[float], Field(fail_fast=True)]], Field(fail_fast=True)]
 
+
+# Both routes that simulate answer with a packed observation, or as JSON if that is asked for.
+ANSWER: dict[str, Any] = {"content": {MSGPACK: {}, JSON: {}}}
 
 # From the query: ?steps=last&cameras=camera_head&tactile=false; unknown parameters are refused.
 Selector = Annotated[ReturnSelector, Query()]
@@ -117,7 +122,13 @@ def rollout_router(service: RolloutService) -> APIRouter:
         """List the available worlds."""
         return WorldList(worlds=tuple(service.worlds()))
 
-    @router.post("/rollouts", status_code=201)
+    @router.post(
+        "/rollouts",
+        status_code=201,
+        response_class=Response,
+        responses={201: ANSWER},
+        openapi_extra=_json_body(StartRequest),
+    )
     @takes({JSON: 16 * KIB, MSGPACK: AS_SET})
     async def start(request: Request, selector: Selector) -> Response:
         """Start a rollout from a task and seed, or from an observation."""
@@ -137,7 +148,12 @@ def rollout_router(service: RolloutService) -> APIRouter:
         """End a rollout."""
         await service.delete(rollout_id)
 
-    @router.post("/rollouts/{rollout_id}/chunks/{chunk}")
+    @router.post(
+        "/rollouts/{rollout_id}/chunks/{chunk}",
+        response_class=Response,
+        responses={200: ANSWER},
+        openapi_extra=_json_body(ActionsBody),
+    )
     @takes({OCTETS: MAX_CHUNK_BYTES, JSON: MAX_CHUNK_BYTES})
     async def step(rollout_id: str, chunk: int, request: Request, selector: Selector) -> Response:
         """Advance by the numbered action chunk."""
@@ -156,6 +172,12 @@ def rollout_router(service: RolloutService) -> APIRouter:
     return router
 
 
+def _json_body(model: type[FrozenModel]) -> dict[str, Any]:
+    """OpenAPI fields of a body that the route reads by itself."""
+    content = {JSON: {"schema": model.model_json_schema()}}
+    return {"requestBody": {"required": True, "content": content}}
+
+
 async def _start_of(request: Request) -> tuple[StartRequest, RolloutStart]:
     kind, _ = media_type(request.headers.get("content-type"))
     body = await request.body()
@@ -170,11 +192,9 @@ async def _actions_of(request: Request) -> Shaped[np.ndarray, "..."]:
     kind, parameters = media_type(request.headers.get("content-type"))
     body = await request.body()
     if kind == JSON:
-        rows = validate_fields(ActionsBody, body, where="body").actions
-        if any(len(row) != ACTION_DIM for row in rows) or not rows:
-            lengths = sorted({len(row) for row in rows})
-            raise ShapeError(f"chunk: got rows of {lengths} numbers, expected {ACTION_DIM}")
-        return np.array(rows, dtype=np.float64)
+        if len(body) > MAX_INLINE_BYTES:
+            return await run_in_threadpool(_actions_from_json, body)
+        return _actions_from_json(body)
     dtype = parameters.get("dtype", "")
     if dtype not in {"float32", "float64"}:
         raise InvalidInputError(
@@ -188,6 +208,14 @@ async def _actions_of(request: Request) -> Shaped[np.ndarray, "..."]:
             f"([K, {ACTION_DIM}] {dtype}, little endian)"
         )
     return np.frombuffer(body, np.dtype(dtype).newbyteorder("<")).reshape(-1, ACTION_DIM)
+
+
+def _actions_from_json(body: bytes) -> Shaped[np.ndarray, "..."]:
+    rows = validate_fields(ActionsBody, body, where="body").actions
+    if any(len(row) != ACTION_DIM for row in rows) or not rows:
+        lengths = sorted({len(row) for row in rows})
+        raise ShapeError(f"chunk: got rows of {lengths} numbers, expected {ACTION_DIM}")
+    return np.array(rows, dtype=np.float64)
 
 
 def _response(request: Request, answer: Answer, *, status: int = 200) -> Response:

@@ -12,6 +12,7 @@ from httpx import ASGITransport, AsyncClient
 from pydantic import BaseModel, SecretStr
 
 from dextouch import __version__, errors
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Problem, error_from_problem
 from dextouch.serving import (
     AS_SET,
@@ -43,11 +44,16 @@ CASES = [
 ]
 
 
+PROBLEM = "application/problem+json"
 JSON_HEADER = {"content-type": JSON}
 OCTETS_HEADER = {"content-type": OCTETS}
 
 
 class Body(BaseModel):
+    number: int
+
+
+class StrictBody(FrozenModel):
     number: int
 
 
@@ -64,6 +70,10 @@ def make_app(**kwargs) -> FastAPI:
 
     @router.post("/json")
     async def take_json(body: Body) -> int:
+        return body.number
+
+    @router.post("/strict")
+    async def take_strict(body: StrictBody) -> int:
         return body.number
 
     @router.post("/raw")
@@ -128,6 +138,53 @@ async def test_unknown_routes_methods_and_bodies_are_problems():
         missing = problem_of(await client.post("/json", json={"number": "many"}))
         assert missing.status == 422
         assert "body.number" in missing.detail
+
+
+async def test_the_answer_to_many_mistakes_is_short():
+    many = {f"field{index}": 0 for index in range(100)}
+    async with client_of(make_app()) as client:
+        problem = problem_of(await client.post("/strict", json=many))
+    assert problem.status == 422
+    assert len(problem.details["errors"]) == 10
+    # The missing number is the first of them.
+    assert problem.detail.startswith("body.number: Field required; ")
+    assert problem.detail.endswith("; and 91 more")
+
+
+def operation_of(app: FastAPI, path: str, method: str) -> tuple[dict, dict[str, str]]:
+    """An operation of the OpenAPI document, and the media types of its responses by status."""
+    operation = app.openapi()["paths"][path][method]
+    answers = operation["responses"].items()
+    return operation, {status: "".join(answer.get("content", "")) for status, answer in answers}
+
+
+def test_the_document_has_what_routes_declare():
+    _, plain = operation_of(make_app(), "/fail/{index}", "get")
+    problems = {status: kind for status, kind in plain.items() if int(status) >= 400}
+    assert problems == dict.fromkeys(("404", "413", "415", "421", "422", "500", "503"), PROBLEM)
+    raw, answers = operation_of(make_app(), "/raw", "post")
+    assert set(raw["requestBody"]["content"]) == {JSON, OCTETS}
+    assert {"400", "403", "409", "429", "507"} <= set(answers)
+    assert "security" not in raw
+    components = make_app().openapi()["components"]
+    assert set(components["schemas"]["Problem"]["required"]) == {
+        "type",
+        "title",
+        "status",
+        "detail",
+    }
+    assert "HTTPValidationError" not in components["schemas"]
+
+
+@pytest.mark.parametrize("has_keys", [True, False])
+def test_the_document_names_the_key_that_a_route_needs(has_keys):
+    key = ApiKey(name="policy", key=SecretStr("g" * 20), scopes=("rollout",))
+    app = make_app(settings=ServiceSettings(api_keys=(key,) if has_keys else ()))
+    scheme = app.openapi()["components"]["securitySchemes"]["api_key"]
+    assert (scheme["type"], scheme["scheme"]) == ("http", "bearer")
+    operation, answers = operation_of(app, "/guarded", "get")
+    assert operation["security"] == [{"api_key": ["rollout"]}, *([] if has_keys else [{}])]
+    assert answers["401"] == answers["403"] == PROBLEM
 
 
 @pytest.mark.parametrize("path", ["/raw", "/json"])

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import threading
 
 import anyio.to_thread
 import hypothesis.strategies as st
@@ -21,7 +22,7 @@ from dextouch.schemas import (
     encode_start,
 )
 from dextouch.serving.guard import ApiKey
-from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
+from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app, routes
 from tests.unit.worlds.fakes import CAMERAS, K_HEAD, SumWorld, actions, anchor, observation
 
 MSGPACK = {"content-type": "application/msgpack"}
@@ -136,6 +137,31 @@ async def test_a_chunk_waits_for_no_thread_but_its_worlds(client, monkeypatch):
     response = await client.post(path, content=actions(4).tobytes(), headers=FLOAT64)
     assert response.status_code == 200
     assert not taken
+
+
+async def test_large_json_chunks_are_decoded_beside_the_event_loop(client, monkeypatch):
+    path = f"/v1/rollouts/{await begin(client)}/chunks/0"
+    decoded_in = []
+    validate = routes.validate_fields
+
+    def noted(*args, **options):
+        decoded_in.append(threading.current_thread())
+        return validate(*args, **options)
+
+    monkeypatch.setattr(routes, "validate_fields", noted)
+    for num_steps in (4, 1000):
+        body = {"actions": actions(num_steps).tolist()}
+        await client.post(path, json=body)
+    assert decoded_in[0] is threading.current_thread()
+    assert decoded_in[1] is not threading.current_thread()
+
+
+@pytest.mark.parametrize("rows", [["x"] * 1000, [["x"] * 1000]])
+async def test_only_the_first_mistake_of_a_chunk_is_told(client, rows):
+    path = f"/v1/rollouts/{await begin(client)}/chunks/0"
+    problem = problem_of(await client.post(path, json={"actions": rows}))
+    assert problem.status == 422
+    assert problem.detail.count("actions.") == 1
 
 
 async def test_json_answers_hold_the_same(client):
