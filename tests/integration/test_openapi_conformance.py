@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from collections import defaultdict
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from urllib.parse import quote
@@ -33,7 +34,13 @@ pytestmark = pytest.mark.filterwarnings("ignore:Do not use the `random` module")
 URL = "http://localhost"
 KEY = "a-key-of-some-length"
 SCOPES = ("station", "store_read", "store_write", "align", "rollout", "rate", "operate")
-KEYED = {"api_keys": (ApiKey(name="all", key=KEY, scopes=SCOPES),)}
+OTHER_KEY = "another-key-of-length"
+KEYED = {
+    "api_keys": (
+        ApiKey(name="all", key=KEY, scopes=SCOPES),
+        ApiKey(name="other", key=OTHER_KEY, scopes=("other",)),
+    )
+}
 AUTHORIZED = {"authorization": f"Bearer {KEY}"}
 PROMPT = {"task": "stack_bowls", "instruction": "stack the bowls"}
 START = {"world": "sum", "task": "stand_bottle", "seed": 1, "instruction": "stand it up"}
@@ -282,6 +289,36 @@ def fields_of(document, operation):
         name = one.get("$ref", "").rpartition("/")[2]
         found = document["components"]["schemas"][name] if name else one
         yield from found.get("properties", {})
+
+
+# Requests that the guard or the key refuses, and the statuses that it may give.
+REFUSED = [
+    ({}, b"", {401}),
+    ({"authorization": "Bearer nonsense"}, b"", {401}),
+    ({"authorization": f"Bearer {OTHER_KEY}"}, b"", {403, 401}),
+    (AUTHORIZED | {"content-type": "text/plain"}, b"{}", {415}),
+    (AUTHORIZED | {"content-type": JSON}, b" " * 2**25, {413, 415}),
+]
+
+
+@pytest.mark.parametrize("service", SERVICES)
+async def test_refusals_are_in_the_document(service, tmp_path):
+    async with SERVICES[service](tmp_path) as served:
+        transport = httpx.ASGITransport(served.app, raise_app_exceptions=False)
+        async with httpx.AsyncClient(transport=transport, base_url=URL) as client:
+            for path, operations in served.app.openapi()["paths"].items():
+                for method, operation in operations.items():
+                    if "security" not in operation:
+                        continue
+                    url = path.format_map(defaultdict(lambda: "0", served.known))
+                    for headers, content, statuses in REFUSED:
+                        response = await client.request(
+                            method, url, headers=headers, content=content
+                        )
+                        status = response.status_code
+                        assert status in statuses, f"{method} {url}: {response.text}"
+                        kind = response.headers["content-type"]
+                        assert kind in operation["responses"][str(status)]["content"]
 
 
 @pytest.mark.parametrize(

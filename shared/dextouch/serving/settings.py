@@ -1,6 +1,7 @@
 """Service settings from flags and environment, and running a service from them."""
 
 import argparse
+import gc
 import inspect
 import re
 from collections.abc import Callable, Sequence
@@ -162,6 +163,10 @@ def run(app: FastAPI, settings: ServiceSettings) -> None:
     """Serve until SIGINT or SIGTERM; requests in flight get `shutdown_grace_s` to end."""
     import uvicorn
 
+    # Without it each full garbage collection visits all modules: a body of 1 MiB with 300,000 lists
+    # causes so many that decoding takes 0.36 instead of 0.05 s.
+    gc.collect()
+    gc.freeze()
     grace_s = settings.shutdown_grace_s
     uvicorn.run(app, host=settings.host, port=settings.port, **server_options(grace_s))
 

@@ -1,5 +1,6 @@
 """Settings: one class gives environment and flags, refuses what it does not know, and is frozen."""
 
+import gc
 import json
 import re
 
@@ -7,7 +8,13 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 from dextouch.errors import InvalidInputError
-from dextouch.serving import ServiceSettings, load_settings, service_config
+from dextouch.serving import (
+    ServiceSettings,
+    create_service_app,
+    load_settings,
+    run,
+    service_config,
+)
 from dextouch.serving.guard import is_loopback
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - that keys are demanded there is what is tested
@@ -134,3 +141,12 @@ def test_help_names_the_command_and_shows_an_example(capsys):
     assert "--names NAME,…" in text
     assert "--is-mock, --no-is-mock" in text
     assert not re.search(r"--\S*_|tuple\[|null|factory", text)
+
+
+def test_the_garbage_collector_leaves_out_what_a_service_starts_with(monkeypatch):
+    frozen = []
+    monkeypatch.setattr("uvicorn.run", lambda *_, **__: frozen.append(gc.get_freeze_count()))
+    before = gc.get_freeze_count()
+    app = create_service_app(name="x", settings=ServiceSettings(), routers=[])
+    run(app, ServiceSettings())
+    assert frozen[0] > before
