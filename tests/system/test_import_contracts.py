@@ -22,7 +22,7 @@ OFFENCES = [
     ("torch only where networks are", "services/twin/scene.py", "import torch"),
     ("zarr only in dextouch.episodes", "services/cli/exports.py", "import zarr"),
     (
-        "Drivers never import mocks",
+        "Drivers and packets never import mocks",
         "services/acquisition/drivers/base.py",
         "import services.acquisition.mocks.replay",
     ),
