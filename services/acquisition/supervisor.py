@@ -158,7 +158,9 @@ class DeviceSupervisor:
         self.connected.set()
         self._release_waiter()
         while not self._stopping.is_set():
-            if readings := self.driver.read():
+            # A decoder may name a stream without a sample.
+            readings = {name: samples for name, samples in self.driver.read().items() if samples}
+            if readings:
                 # A loss of a device that gave something is new, whatever it says.
                 self._logged = NOTHING_LOGGED
                 self.count(readings)

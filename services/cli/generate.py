@@ -41,6 +41,8 @@ def main(arguments: Sequence[str]) -> int:
     options = _parser().parse_args(list(arguments))
     source = EpisodeStore(options.episodes)
     wanted = chosen_sources(source, options)
+    # What a killed run left unfinished.
+    EpisodeStore(options.store).sweep()
     refuse_trained_sources(source, wanted, options.checkpoint)
     imagine = partial(
         imagine_all,

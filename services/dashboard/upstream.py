@@ -45,7 +45,8 @@ class Upstream:
         """
         response = await self.send(method, path, body)
         try:
-            return TypeAdapter(form).validate_json(response.content)
+            # A service of a later release may say more.
+            return TypeAdapter(form).validate_json(response.content, extra="ignore")
         except ValidationError as error:
             raise UnavailableError(
                 f"{self.name}: unexpected response to {method} {path} ({first_problems(error)})",

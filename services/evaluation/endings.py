@@ -10,7 +10,7 @@ from jaxtyping import Float32, UInt8
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import Observation
+from dextouch.schemas import Observation, is_rollout
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
@@ -149,7 +149,7 @@ def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:
         {},
         _event_times(
             about.event_times_s,
-            unknown_if_empty=about.success or about.origin == "imagined",
+            unknown_if_empty=about.success or about.origin == "imagined" or is_rollout(about),
         ),
         1 / about.model_rate_hz,
     )

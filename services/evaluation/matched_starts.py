@@ -85,7 +85,12 @@ def rollout_failure(
         task=start.task,
         seed=start.seed,
         error=type(error).__name__,
-        message=error.message,
-        traceback=trace if isinstance(trace, str) else None,
+        message=_printable(error.message),
+        traceback=_printable(trace) if isinstance(trace, str) else None,
         repeat=repeat,
     )
+
+
+def _printable(text: str) -> str:
+    """Text of a policy's error without lone surrogates, which JSON readers refuse."""
+    return text.encode("utf-8", "replace").decode()

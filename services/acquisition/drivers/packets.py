@@ -14,6 +14,8 @@ Found = TypeVar("Found")
 
 # Packets that overtake each other do so within a few; a restarted device jumps further.
 LATE_PACKETS = 64
+# Where few packets have come, those this much earlier may still be late ones.
+MIN_LATE_NS = 1_000_000_000
 # magic, version, source, payload length, sequence, device time in ns (docs/device_packets.md)
 HEADER = struct.Struct("<4sBBIIQ")
 CRC = struct.Struct("<I")
@@ -49,9 +51,10 @@ class DecoderStatistics:
 class SequenceCounter:
     """Counts lost, late and repeated packets and restarts by a sequence number of so many bits.
 
-    A decreasing number is a late packet if it is missing among the last 64, a repeated one if it
-    came among these at the same time of the device, otherwise a restart of the device. The frames
-    of a `FrameSearch` that are late or repeated are left out, which leaves a gap.
+    A decreasing number is a late packet if it is missing among the last 64 and its time of the
+    device is not before theirs, a repeated one if it came among these at the same time, otherwise
+    a restart of the device. The frames of a `FrameSearch` that are late or repeated are left out,
+    which leaves a gap.
     """
 
     def __init__(self, statistics: DecoderStatistics, *, bits: int) -> None:
@@ -86,7 +89,7 @@ class SequenceCounter:
             self._came.append(came)
             return
         step = (sequence - self._last) % self._modulus
-        if sequence in self._missing:
+        if sequence in self._missing and self._is_of_this_run(t_device_ns):
             # Its clock steps back, too, which alone would look like a restart.
             statistics.late += 1
             statistics.lost -= self._missing.pop(sequence)
@@ -102,6 +105,16 @@ class SequenceCounter:
             statistics.restarts += 1
             self._begin(sequence)
         self._came.append(came)
+
+    def _is_of_this_run(self, t_device_ns: int | None) -> bool:
+        """Whether a time can be that of a late packet, and not that of a restarted device."""
+        times_ns = [time_ns for _, time_ns in self._came if time_ns is not None]
+        if t_device_ns is None or not times_ns:
+            return True
+        newest_ns = max(times_ns)
+        # As long before the oldest of the newest packets as that is before the newest one.
+        reach_ns = max(2 * (newest_ns - min(times_ns)), MIN_LATE_NS)
+        return newest_ns - reach_ns <= t_device_ns <= newest_ns
 
     def _is_repeated(self, came: tuple[int, int | None]) -> bool:
         if self._last is None or (self._last - came[0]) % self._modulus >= LATE_PACKETS:
@@ -172,18 +185,25 @@ class PortionedSearch(ABC, Generic[Found]):
 
 
 class FrameSearch(PortionedSearch[Found]):
-    """Looks for frames that begin with a mark.
+    """Looks for frames that begin with a mark and are counted by a sequence number.
 
     After an invalid frame the search continues one byte further, not after its claimed end, so that
     only the damaged frame is lost.
 
     Args:
         mark: the bytes that every frame begins with.
+        sequence_bits: of the sequence number; `_take` gives each to `self.sequence.count`.
     """
 
-    def __init__(self, mark: bytes) -> None:
+    def __init__(self, mark: bytes, *, sequence_bits: int) -> None:
         super().__init__()
         self._mark = mark
+        self.sequence = SequenceCounter(self.statistics, bits=sequence_bits)
+
+    def reset(self) -> None:
+        """Forget half a frame (the link was lost); the next number may be any."""
+        super().reset()
+        self.sequence.reset()
 
     def _search(self, data: bytes) -> tuple[list[Found], int]:
         found: list[Found] = []
@@ -272,14 +292,8 @@ class PacketDecoder(FrameSearch[Packet]):
             raise InvalidInputError(
                 f"magics {list(self._sizes)}: got no common start, expected one byte or more"
             )
-        super().__init__(start)
+        super().__init__(start, sequence_bits=SEQUENCE_BITS)
         self._magic = magic
-        self._sequence = SequenceCounter(self.statistics, bits=SEQUENCE_BITS)
-
-    def reset(self) -> None:
-        """Forget half a packet (the link was lost); the next number may be any."""
-        super().reset()
-        self._sequence.reset()
 
     def _take(self, data: bytes, position: int) -> tuple[Packet, int] | None:
         start = position + HEADER.size
@@ -302,6 +316,6 @@ class PacketDecoder(FrameSearch[Packet]):
             self.statistics.crc_errors += 1
             return None
         if magic == self._magic:
-            self._sequence.count(sequence, t_device_ns=t_device_ns)
+            self.sequence.count(sequence, t_device_ns=t_device_ns)
         packet = Packet(version, source, sequence, t_device_ns, data[start:end], magic)
         return packet, OVERHEAD + length

@@ -1,7 +1,6 @@
 """The commands `dextouch study run` and `dextouch study report`."""
 
 import argparse
-import hashlib
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -24,7 +23,7 @@ from services.evaluation.command_line import (
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.studies.definition import read_definition
 from services.evaluation.studies.engine import StudyParts, cells_of, run_study
-from services.evaluation.studies.policies import PolicyFactory
+from services.evaluation.studies.policies import PolicyFactory, file_digest
 from services.evaluation.studies.reports import REPORT_FILE, write_reports
 from services.evaluation.studies.results import StudyHeader, StudyResults
 from services.evaluation.success_probe import SuccessProbe
@@ -111,12 +110,17 @@ def _run(options: argparse.Namespace) -> int:
     policies = PolicyFactory(definition, partial(demonstrator, definition))
     policies.load()
     with served_worlds(definition) as addresses:
-        digests = {"definition": definition.digest, "probe": _file_digest(probe_path)}
+        digests = {"definition": definition.digest, "probe": file_digest(probe_path)}
+        digests |= policies.digests()
         with ExitStack() as connections:
             digests |= connect(addresses, connections).digests
         header = StudyHeader(definition.name, definition.model_dump(mode="json"), digests)
         results = StudyResults.create_or_resume(folder, header)
         num_cells = sum(1 for _ in cells_of(definition))
+        store = EpisodeStore(folder / "rollouts") if definition.keep_rollouts else None
+        if store is not None:
+            # What a killed run left unfinished.
+            store.sweep()
         print(f"{definition.name}: {len(results.outcomes)} of {num_cells} rollouts have a result")
         run_study(
             definition,
@@ -127,7 +131,7 @@ def _run(options: argparse.Namespace) -> int:
                 probe,
                 instructions,
                 policies.training_starts(),
-                EpisodeStore(folder / "rollouts") if definition.keep_rollouts else None,
+                store,
             ),
             retry_failed=options.retry_failed,
         )
@@ -144,7 +148,3 @@ def _finish(results: StudyResults, json_path: Path | None) -> int:
     print_failures(figures, results.path)
     print(f"\nreport: {results.path.with_name(REPORT_FILE)}")
     return EXIT_FAILED if figures["failures"] else 0
-
-
-def _file_digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

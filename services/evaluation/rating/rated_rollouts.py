@@ -11,6 +11,7 @@ from PIL import Image
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.images import encode_jpeg
+from dextouch.schemas import is_rollout
 from services.evaluation.rating.rating_queue import RatedRollout, token_of
 from services.evaluation.rating.rubrics import Rubric
 from services.evaluation.reporting.pictures import touch_image
@@ -64,7 +65,7 @@ def state_scores(
     found = {}
     for rollout in rollouts:
         about, rubric = store.open(rollout.episode_id).attributes, rubrics[rollout.task]
-        was_noted = about.event_times_s or about.success is False
+        was_noted = about.event_times_s or (about.success is False and not is_rollout(about))
         if about.origin == "twin" and was_noted and rubric.is_seen_by_twin:
             holds = rubric.holds_in_twin(about.event_times_s)
             found[rollout.episode_id] = rubric.score(holds)

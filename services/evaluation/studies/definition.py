@@ -124,7 +124,8 @@ class StudyDefinition(FrozenModel):
     @property
     def digest(self) -> str:
         """SHA-256 of everything that can change a result, if only by rounding."""
-        text = self.model_dump_json(exclude={"name", "keep_rollouts"})
+        # Policies that do not look get their last chunk in two parts unless rollouts are kept.
+        text = self.model_dump_json(exclude={"name"})
         return hashlib.sha256(text.encode()).hexdigest()
 
 

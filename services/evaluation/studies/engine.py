@@ -74,9 +74,17 @@ def run_study(
         retry_failed: whether failed rollouts are run again.
 
     Raises:
-        ConflictError: a start was trained on.
+        ConflictError: a start was trained on, or the study is being run already.
         UnavailableError: a world stopped answering; the other results are kept.
     """
+    with results.locked():
+        _run_missing(definition, results, parts, retry_failed=retry_failed)
+    return study_report(definition, results)
+
+
+def _run_missing(
+    definition: StudyDefinition, results: StudyResults, parts: StudyParts, *, retry_failed: bool
+) -> None:
     missing = [
         cell
         for cell in cells_of(definition)
@@ -95,9 +103,11 @@ def run_study(
                 trained_on=parts.trained_on,
             )
             starts = begin_matched(worlds.addresses[REAL], plan, parts.probe)
+            for one in starts:
+                if isinstance(one, FailedStart) and isinstance(one.error, UnavailableError):
+                    raise one.error
         by_key: dict[tuple[str, int], Start] = {(one.task, one.seed): one for one in starts}
         _Workers(definition, results, parts, by_key).run(missing)
-    return study_report(definition, results)
 
 
 def study_report(definition: StudyDefinition, results: StudyResults) -> ClosedLoopReport:

@@ -1,7 +1,9 @@
 """Policies of a study."""
 
+import hashlib
 from collections.abc import Callable
 from copy import copy
+from pathlib import Path
 
 from dextouch.clients import Policy
 from dextouch.episodes import EpisodeStore
@@ -12,6 +14,11 @@ from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.settings import DEFAULT_POLICY
 from services.evaluation.studies.definition import PolicyChoice, StudyDefinition
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 class PolicyFactory:
@@ -53,6 +60,23 @@ class PolicyFactory:
             for name, choice in self._definition.policies.items()
             if choice.builtin == "behaviour-cloning"
         }
+
+    def digests(self) -> dict[str, str]:
+        """Digests of checkpoints and of replayed episodes, which do not cover factories' code."""
+        return {
+            f"policy {name}": digest
+            for name, choice in self._definition.policies.items()
+            if (digest := self._digest(choice)) is not None
+        }
+
+    def _digest(self, choice: PolicyChoice) -> str | None:
+        if choice.builtin == "behaviour-cloning":
+            return file_digest(choice.checkpoint or DEFAULT_POLICY)
+        if choice.replay is None:
+            return None
+        store = EpisodeStore(choice.replay)
+        content = [f"{one} {store.open(one).content_sha256}" for one in sorted(store.list())]
+        return hashlib.sha256("\n".join(content).encode()).hexdigest()
 
     def _load(self, name: str, choice: PolicyChoice) -> Policy:
         if choice.factory is not None:

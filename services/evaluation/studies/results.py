@@ -1,8 +1,10 @@
 """Results of a study: a file that only grows, one JSON line per rollout, and can be resumed."""
 
+import fcntl
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -60,13 +62,18 @@ class StudyResults:
         """Open the results of a study; an incomplete last line of a killed study is removed.
 
         Raises:
-            ConflictError: the folder holds results of another study, or of other worlds.
+            ConflictError: the folder holds results of another study, or of other worlds or
+                policies, or another process is running the study.
             CorruptDataError: a damaged line.
             StorageError: the file cannot be read or written.
         """
         path = folder / FILE
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            if path.exists():
+                # Whether another process is writing to it.
+                with _locked(path):
+                    pass
             if not path.exists() or b"\n" not in path.read_bytes():
                 path.write_bytes(_line(asdict(header)))
                 return cls(path, header, {})
@@ -107,6 +114,10 @@ class StudyResults:
             ) from error
         return cls(path, header, outcomes)
 
+    def locked(self) -> AbstractContextManager[None]:
+        """Context in which no other process may add results; raises ConflictError."""
+        return _locked(self.path)
+
     def keep(self, outcome: Outcome) -> None:
         """Append an outcome; it is on the disk when this returns.
 
@@ -121,6 +132,19 @@ class StudyResults:
         except OSError as error:
             raise StorageError(f"results {self.path}: cannot be written ({error})") from error
         self.outcomes[cell_of(outcome)] = outcome
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ConflictError(
+                f"results {path}: another process is running this study; wait for it, or choose "
+                "another --folder"
+            ) from error
+        yield
 
 
 def cell_of(outcome: Outcome) -> Cell:

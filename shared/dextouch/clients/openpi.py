@@ -53,22 +53,11 @@ class OpenPiPolicy:
         self._url, self._images = url, dict(images)
         self._chunk_steps, self._timeout_s = chunk_steps, timeout_s
         self._prompt = ""
-        headers = None if api_key is None else {"Authorization": f"Api-Key {api_key}"}
+        self._headers = None if api_key is None else {"Authorization": f"Api-Key {api_key}"}
         self._open = ExitStack()
-        try:
-            self._connection: ClientConnection = self._open.enter_context(
-                connect(
-                    url,
-                    compression=None,
-                    max_size=MAX_ANSWER_BYTES,
-                    additional_headers=headers,
-                    open_timeout=timeout_s,
-                    proxy=None,
-                )
-            )
-        except (OSError, WebSocketException) as error:
-            raise UnavailableError(f"policy server {url}: does not answer ({error})") from error
-        self.metadata = self._receive()
+        self._connection: ClientConnection | None = None
+        self.metadata: dict[str, Any] = {}
+        self._connected()
 
     def reset(self, start: PolicyStart) -> None:
         """Remember the instruction; the server gets no message, as in openpi's own client."""
@@ -88,11 +77,12 @@ class OpenPiPolicy:
         request["observation/state"] = observation.action_reached[-1]
         request["observation/tactile"] = observation.tactile_kpa[-1]
         request["prompt"] = self._prompt
+        connection = self._connected()
         try:
-            self._connection.send(pack_openpi(request))
+            connection.send(pack_openpi(request))
         except (OSError, WebSocketException) as error:
             raise self._gone(error) from error
-        actions = self._receive().get("actions")
+        actions = self._receive(connection).get("actions")
         if not isinstance(actions, np.ndarray):
             raise InvalidInputError(
                 f"policy server {self._url}: its answer has no array `actions`; got "
@@ -106,20 +96,47 @@ class OpenPiPolicy:
         return actions[: self._chunk_steps]
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection; the next `act` opens another."""
+        self._connection = None
         self._open.close()
 
-    def _receive(self) -> dict[str, Any]:
+    def _connected(self) -> ClientConnection:
+        """The connection; a new one where the last was lost or did not answer in time."""
+        if self._connection is None:
+            try:
+                self._connection = self._open.enter_context(
+                    connect(
+                        self._url,
+                        compression=None,
+                        max_size=MAX_ANSWER_BYTES,
+                        additional_headers=self._headers,
+                        open_timeout=self._timeout_s,
+                        # A server may compute, or compile, for longer than a ping would wait.
+                        ping_interval=None,
+                        proxy=None,
+                    )
+                )
+            except (OSError, WebSocketException) as error:
+                raise UnavailableError(
+                    f"policy server {self._url}: does not answer ({error})"
+                ) from error
+            self.metadata = self._receive(self._connection)
+        return self._connection
+
+    def _receive(self, connection: ClientConnection) -> dict[str, Any]:
         try:
-            answer = self._connection.recv(self._timeout_s)
+            answer = connection.recv(self._timeout_s)
         except (OSError, WebSocketException) as error:
             raise self._gone(error) from error
         if isinstance(answer, str):
-            # openpi sends errors, tracebacks included, as text.
+            # openpi sends errors, tracebacks included, as text, and closes the connection.
+            self.close()
             raise InvalidInputError(f"policy server {self._url}: reported {answer[-2000:]}")
         return unpack_openpi(answer, max_bytes=MAX_ANSWER_BYTES)
 
     def _gone(self, error: Exception) -> UnavailableError:
+        # An answer that comes late must not be taken for that to the next request.
+        self.close()
         return UnavailableError(
             f"policy server {self._url}: no answer within {self._timeout_s:g} s or connection lost "
             f"({type(error).__name__}: {error})"

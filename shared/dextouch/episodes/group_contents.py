@@ -72,10 +72,10 @@ class GroupContents(Generic[A]):
 
     def inspect_array(
         self, name: str, *, progress: Callable[[int], None] = lambda _: None
-    ) -> Iterator[tuple[int | None, str]]:
+    ) -> Iterator[tuple[int | None, StorageError]]:
         """Read an array of a committed group and iterate over its damage.
 
-        Damage is the number of a storage chunk, None for the whole array, and a message. `progress`
+        Damage is the number of a storage chunk, None for the whole array, and its error. `progress`
         gets the size of every intact storage chunk, encoded, in bytes.
         """
         entry, what = self.entries[name], f"{self.what}: array {name!r}"
@@ -84,11 +84,11 @@ class GroupContents(Generic[A]):
             metadata = get_metadata(self.files, f"{name}/{METADATA_FILE}", self.what)
             if metadata != array_metadata(entry):
                 is_whole = False
-                yield None, f"{what}: {METADATA_FILE} is damaged"
+                yield None, CorruptDataError(f"{what}: {METADATA_FILE} is damaged")
             shard = self.shard(name)
             num_chunks = len(shard.check_index())
         except StorageError as error:
-            yield None, error.message
+            yield None, error
             return
         for number in range(num_chunks):
             try:
@@ -96,12 +96,12 @@ class GroupContents(Generic[A]):
                 digest.update(hashed_bytes(payload, entry, number, what))
             except StorageError as error:
                 is_whole = False
-                yield number, error.message
+                yield number, error
             else:
                 progress(len(payload))
         # Also detects damage for which a forger has adapted the checksums.
         if is_whole and digest.hexdigest() != entry.sha256:
-            yield None, f"{what}: sha256 does not match"
+            yield None, CorruptDataError(f"{what}: sha256 does not match")
 
 
 def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> bytes | memoryview:

@@ -155,6 +155,7 @@ class GroupReader(Generic[A]):
 
         Raises:
             CorruptDataError: the first damaged array, by name.
+            StorageError: the storage cannot be read.
             InvalidInputError: a group that is still being written.
         """
         contents = self._contents
@@ -162,8 +163,8 @@ class GroupReader(Generic[A]):
             raise InvalidInputError(f"{self._what}: is still being written")
         sizes: list[int] = []
         for name in contents.entries:
-            for _, message in contents.inspect_array(name, progress=sizes.append):
-                raise CorruptDataError(message)
+            for _, error in contents.inspect_array(name, progress=sizes.append):
+                raise error
         return Verification(
             num_arrays=len(contents.entries),
             num_bytes=sum(sizes),

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.episodes import StoredAnchor as StoredAnchor
     from dextouch.schemas.episodes import StoreId as StoreId
     from dextouch.schemas.episodes import Verification as Verification
+    from dextouch.schemas.episodes import is_rollout as is_rollout
     from dextouch.schemas.episodes import json_ready as json_ready
     from dextouch.schemas.episodes import matrix_rows as matrix_rows
     from dextouch.schemas.observations import EVERYTHING as EVERYTHING

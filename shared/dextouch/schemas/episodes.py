@@ -153,6 +153,11 @@ class EpisodeAttributes(FrozenModel):
         return np.array(self.K_head)
 
 
+def is_rollout(attributes: EpisodeAttributes) -> bool:
+    """Whether an episode is a rollout over the API, which notes no milestones."""
+    return any(entry.kind == "rollout" for entry in attributes.lineage)
+
+
 class EpisodeSummary(FrozenModel):
     """One row of the catalog; `duration_s` is that of the model grid, or of the longest stream."""
 

@@ -6,6 +6,7 @@ An array is {b"__ndarray__": true, b"data": bytes, b"dtype": str, b"shape": [...
 """
 
 import math
+import re
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -15,8 +16,9 @@ import numpy as np
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.streams.packing import MAX_DIMENSIONS, MAX_ITEMS, MAX_ITEMS_A_CONTAINER, MAX_NUMBERS
 
-# Kinds of dtypes that are read: bool, signed, unsigned, floating.
+# Kinds of dtypes that are read, bool, signed, unsigned and floating, and their names.
 _KINDS: Final = "biuf"
+_DTYPE: Final = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")
 
 
 def pack_openpi(message: Mapping[str, Any]) -> bytes:
@@ -98,15 +100,11 @@ def _encoded(value: object) -> dict[bytes, Any]:
 
 def _dtype(found: Mapping[Any, Any]) -> "np.dtype[Any]":
     name = found.get(b"dtype")
-    try:
-        dtype = np.dtype(name if isinstance(name, str) else "V")
-    except TypeError:
-        dtype = np.dtype("V")
-    if dtype.kind not in _KINDS:
+    if not isinstance(name, str) or not _DTYPE.fullmatch(name):
         raise InvalidInputError(
-            f"openpi message: got an array of dtype {name!r}, expected one of numbers"
+            f"openpi message: got an array of dtype {name!r}, expected one of numbers, such as <f4"
         )
-    return dtype
+    return np.dtype(name)
 
 
 def _scalar_bytes(found: Mapping[Any, Any]) -> bytes:
@@ -114,8 +112,9 @@ def _scalar_bytes(found: Mapping[Any, Any]) -> bytes:
     if not isinstance(value, bool | int | float):
         raise InvalidInputError(f"openpi message: got the scalar {value!r}, expected a number")
     try:
-        return np.asarray(value, dtype=_dtype(found)).tobytes()
-    except OverflowError as error:
+        with np.errstate(over="ignore"):
+            return np.asarray(value, dtype=_dtype(found)).tobytes()
+    except (OverflowError, ValueError) as error:
         raise InvalidInputError(f"openpi message: scalar {value}: {error}") from error
 
 

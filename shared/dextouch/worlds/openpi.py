@@ -85,9 +85,14 @@ class _Session:
                 f"message: got the keys {', '.join(sorted(message)) or 'none'}, expected one of "
                 f"{', '.join(_FORMS)}, and optionally chunk and return"
             )
+        before = self._selector
         if "return" in message:
             self._selector = _validated(ReturnSelector, message["return"], "return")
-        return await getattr(self, f"_{given[0]}")(message)
+        try:
+            return await getattr(self, f"_{given[0]}")(message)
+        except DexTouchError:
+            self._selector = before
+            raise
 
     async def _start(self, message: dict[str, Any]) -> bytes:
         request = _validated(StartRequest, message["start"], "start")
@@ -114,8 +119,9 @@ class _Session:
 
     async def _end(self, message: dict[str, Any]) -> bytes:
         del message
-        rollout_id, self._rollout_id = self._current(), None
+        rollout_id = self._current()
         await self._service.delete(rollout_id)
+        self._rollout_id = None
         return pack_openpi({"ended": rollout_id})
 
     def _current(self) -> str:

@@ -157,6 +157,26 @@ def test_the_devices_time_tells_a_repeated_packet_from_a_restart(packets, expect
     assert statistics == DecoderStatistics(packets=len(packets), **expected)
 
 
+@pytest.mark.parametrize("first_run", [range(40, 60), range(30, 35), range(60, 63), range(5, 6)])
+@pytest.mark.parametrize("is_link_lost", [False, True])
+def test_a_restarted_device_loses_none_of_its_packets(first_run, is_link_lost):
+    """Its numbers are among those before the first run, its clock is not."""
+    decoder = PacketDecoder(b"TEST", min_payload=1, max_payload=1)
+    period_ns, run_ns = 10_000_000, 10**12
+
+    def packet(number, t_device_ns):
+        return encode_packet(b"TEST", Packet(1, 0, number, t_device_ns, b"x"))
+
+    for number in first_run:
+        assert decoder.feed(packet(number, run_ns + number * period_ns))
+    if is_link_lost:
+        decoder.reset()
+    kept = [decoder.feed(packet(number, number * period_ns)) for number in range(100)]
+    assert [len(found) for found in kept] == [1] * 100
+    statistics = decoder.statistics
+    assert (statistics.restarts, statistics.late, statistics.lost) == (1, 0, 0)
+
+
 @settings(max_examples=100, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),

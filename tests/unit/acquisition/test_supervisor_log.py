@@ -80,3 +80,31 @@ def test_another_reason_is_logged_at_once():
         ("no permission", 1),
         ("no permission", 301),
     ]
+
+
+class Quiet(Driver):
+    """A device whose decoder names its stream in every second read without a sample of it."""
+
+    num_reads = 0
+
+    def open(self):
+        pass
+
+    def read(self):
+        self.num_reads += 1
+        if self.num_reads == 6:
+            self.stop.set()
+        return {"head": [object()]} if self.num_reads % 2 else {"head": []}
+
+
+def test_a_stream_without_a_sample_is_no_reading():
+    seen = []
+    decoder = PoseTrackerDecoder("head")
+    driver = Quiet("head", transport=HidPort("head").transport, decoder=decoder, clock=Waits(9))
+    supervisor = DeviceSupervisor(driver, sink=seen.append, clock=Waits(9))
+    driver.stop = supervisor._stopping
+    supervisor.count = seen.append
+    supervisor._run()
+    assert len(seen) == 2 * 3
+    assert all(samples for readings in seen for samples in readings.values())
+    assert supervisor.last_error is None

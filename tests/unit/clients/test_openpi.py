@@ -100,8 +100,33 @@ def test_a_server_that_is_gone_or_slow_is_unavailable():
         with pytest.raises(UnavailableError, match=r"within 0.1 s"):
             policy.act(observation())
         policy.close()
-        with pytest.raises(UnavailableError, match="connection lost"):
+    with pytest.raises(UnavailableError, match="does not answer"):
+        policy.act(observation())
+
+
+def test_a_late_answer_is_not_taken_for_the_next_one():
+    """After a timeout or an error the policy connects anew: answers stay with their requests."""
+    asked = []
+
+    def answer(request):
+        asked.append(request)
+        if len(asked) == 1:
+            time.sleep(0.5)
+        if len(asked) == 3:
+            return "Traceback: once"
+        return {"actions": np.full((16, 67), float(len(asked)))}
+
+    with policy_server(answer) as url:
+        policy = OpenPiPolicy(url, timeout_s=0.3)
+        with pytest.raises(UnavailableError):
             policy.act(observation())
+        assert policy.act(observation())[0, 0] == 2.0
+        with pytest.raises(InvalidInputError, match="once"):
+            policy.act(observation())
+        assert policy.act(observation())[0, 0] == 4.0
+        policy.close()
+        assert policy.act(observation())[0, 0] == 5.0
+        policy.close()
 
 
 def test_it_is_a_policy_by_name():

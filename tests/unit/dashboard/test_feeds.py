@@ -4,14 +4,17 @@ import json
 import re
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 from dashboard_fakes import PRESSURES, broken_upstream
 
-from dextouch.errors import ConflictError, NotFoundError, UnknownNameError
+from dextouch.errors import ConflictError, NotFoundError, UnavailableError, UnknownNameError
+from dextouch.schemas.station import HealthEvents
 from services.dashboard import app
 from services.dashboard.feeds import Feeds
 from services.dashboard.settings import DashboardSettings
+from services.dashboard.upstream import Upstream
 
 
 @pytest.fixture
@@ -227,3 +230,18 @@ def test_the_page_draws_every_topic(feeds):
     handlers = page.split("const topics = {")[1].split("\n};")[0]
     # Taxels are bytes, with a handler of their own.
     assert set(feeds.topics) - {"taxels"} <= set(re.findall(r"^  (\w+):", handlers, re.MULTILINE))
+
+
+async def test_a_station_of_a_later_release_may_say_more():
+    """Unknown fields, nested ones too, are left out; missing ones are an answer of another form."""
+    event = {"t_host_ns": 1, "stream": "head", "code": "silent", "level": "WARN"}
+
+    def answer(request):
+        events = [event | {"colour": "red"}] if request.url.path == "/more" else [{"code": "x"}]
+        return httpx.Response(200, json={"events": events, "now_ns": 2, "page": 2})
+
+    transport = httpx.MockTransport(answer)
+    station = Upstream("station", httpx.AsyncClient(transport=transport, base_url="http://fake"))
+    assert (await station.read(HealthEvents, "/more")).events[0].stream == "head"
+    with pytest.raises(UnavailableError, match="station"):
+        await station.read(HealthEvents, "/less")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numcodecs.zstd import Zstd
 
-from dextouch.episodes.shards import with_crc
+from dextouch.episodes.shards import ShardReader, with_crc
 from dextouch.episodes.zstd import frame_bytes
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError
 from tests.unit.episodes.hostile_group import (
@@ -66,6 +66,19 @@ def everything(store):
 def read_all(store):
     for read in everything(store).values():
         read()
+
+
+def test_storage_that_refuses_is_no_damage(store, monkeypatch):
+    """What repairs on `CorruptDataError` must not act on a permission problem."""
+
+    def refuse(*_):
+        raise StorageError("the bucket refused (403 AccessDenied)")
+
+    reader = store.open(ID)
+    monkeypatch.setattr(ShardReader, "payload", refuse)
+    with pytest.raises(StorageError, match="403") as caught:
+        reader.verify()
+    assert type(caught.value) is StorageError
 
 
 def test_all_of_it_is_whole(store):

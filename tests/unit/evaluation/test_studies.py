@@ -10,12 +10,17 @@ from dextouch.clients import RolloutClient, http_link
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, UnavailableError
 from dextouch.worlds import WorldServiceSettings, create_world_app
+from services.evaluation.checkpoints import save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
+from services.evaluation.endings import read_ending_episode
 from services.evaluation.policies.hold import HoldPolicy
+from services.evaluation.rating.rated_rollouts import rated_rollouts, state_scores
+from services.evaluation.rating.rubrics import Rubric
 from services.evaluation.scores import ClosedLoopReport, RolloutFailure, RolloutScore
 from services.evaluation.studies.definition import StudyDefinition, read_definition
 from services.evaluation.studies.engine import StudyParts, cells_of, run_study, study_report
 from services.evaluation.studies.kept_rollouts import rollout_episode_id
+from services.evaluation.studies.policies import PolicyFactory
 from services.evaluation.studies.results import Cell, StudyHeader, StudyResults
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_probe import SuccessProbe
@@ -58,7 +63,7 @@ def test_a_study_counts_its_rollouts(tmp_path):
     assert study.num_rollouts == 12 * 3 == len(set(cells_of(study)))
     assert next(cells_of(study)) == Cell("real", "reach", 2000, "hold", 0)
     assert study.digest != definition_of(STUDY, tmp_path).digest
-    assert study.digest == study.model_copy(update={"keep_rollouts": False}).digest
+    assert study.digest == study.model_copy(update={"name": "another"}).digest
     again = StudyDefinition.model_validate_json(study.model_dump_json())
     assert again == study
 
@@ -264,6 +269,78 @@ def test_a_world_that_goes_away_stops_the_study_and_costs_no_rows(
     with pytest.raises(UnavailableError):
         run_study(one_by_one, results, failing)
     assert not [o for o in results.outcomes.values() if isinstance(o, RolloutFailure)]
+
+
+def test_a_real_world_that_goes_away_before_the_starts_costs_no_rows(
+    tmp_path, study, parts, monkeypatch
+):
+    monkeypatch.setattr(http_link, "RETRY_PAUSES_S", ())
+    results = StudyResults.create_or_resume(tmp_path, header_of(study))
+
+    def connect(connections):
+        worlds = parts.connect(connections)
+        gone = connections.enter_context(RolloutClient("http://127.0.0.1:9"))
+        addresses = worlds.addresses | {"real": WorldAddress(gone, "judge")}
+        return replace(worlds, addresses=addresses)
+
+    with pytest.raises(UnavailableError, match=r"127\.0\.0\.1:9"):
+        run_study(study, results, replace(parts, connect=connect))
+    assert results.outcomes == {}
+
+
+def test_a_study_is_run_by_one_process_at_a_time(tmp_path, study, parts):
+    results = StudyResults.create_or_resume(tmp_path, header_of(study))
+    with results.locked():
+        for start in (
+            lambda: StudyResults.create_or_resume(tmp_path, header_of(study)),
+            lambda: run_study(study, results, parts),
+        ):
+            with pytest.raises(ConflictError, match="another process is running this study"):
+                start()
+        assert StudyResults.read(tmp_path).outcomes == {}
+    assert run_study(study, results, parts).scores
+
+
+class Surrogate(HoldPolicy):
+    """Names a file that is not UTF-8 in its error."""
+
+    def act(self, observation):
+        raise OSError("no file caf\udce9.pt")
+
+
+def test_errors_that_are_no_text_can_be_read_again(tmp_path, study, parts):
+    results = StudyResults.create_or_resume(tmp_path, header_of(study))
+    odd = replace(parts, load_policies=lambda: {"hold": Surrogate(), "script": script()})
+    report = run_study(study, results, odd)
+    assert "caf?.pt" in report.failures[0].message
+    assert StudyResults.read(tmp_path).outcomes == results.outcomes
+
+
+def test_changed_policies_are_another_study(tmp_path, policy_checkpoint):
+    path = tmp_path / "cloned.safetensors"
+    text = STUDY.replace(
+        'builtin = "hold"', f'builtin = "behaviour-cloning"\ncheckpoint = "{path}"'
+    )
+    factory = PolicyFactory(definition_of(text, tmp_path), lambda _: pytest.fail("a script"))
+    save_checkpoint(path, policy_checkpoint)
+    before = factory.digests()
+    assert set(before) == {"policy hold"}
+    path.write_bytes(path.read_bytes() + b"\0")
+    assert factory.digests() != before
+
+
+def test_milestones_of_a_rollout_are_unknown_not_missed(tmp_path, study, parts):
+    store = EpisodeStore(tmp_path / "rollouts")
+    results = StudyResults.create_or_resume(tmp_path, header_of(study))
+    run_study(study, results, replace(parts, store=store))
+    failed = store.open(rollout_episode_id(results.header, Cell("real", "reach", 2000, "hold", 0)))
+    assert failed.attributes.success is False
+    assert read_ending_episode(failed).event_times_s is None
+    rubric = Rubric.model_validate(
+        {"criteria": [{"name": "reached", "points": 1, "description": "r", "milestone": "r"}]}
+    )
+    rated = rated_rollouts(store, ("reach",))
+    assert state_scores(store, rated, {"reach": rubric}) == {}
 
 
 def test_repeats_differ_by_their_noise_and_count_as_one_start(tmp_path, study, parts):

@@ -110,6 +110,14 @@ def test_answers_hold_what_was_asked_for(url):
         assert answer["tactile_kpa"].shape == (1, 2, 320)
 
 
+def test_a_refused_message_selects_nothing(url):
+    with opened(url) as client:
+        client.infer({"start": START})
+        with pytest.raises(RuntimeError, match="expected an array"):
+            client.infer({"actions": 1, "return": {"steps": "last"}})
+        assert client.infer({"actions": fakes.actions(8)})["tactile_kpa"].shape == (8, 2, 320)
+
+
 @pytest.mark.parametrize(
     ("message", "error"),
     [

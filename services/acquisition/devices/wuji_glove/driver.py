@@ -16,7 +16,6 @@ from services.acquisition.devices.kind import DeviceKind, GloveSettings, serial_
 from services.acquisition.drivers.base import CellLayout, Driver, StreamDecoder, hand_name
 from services.acquisition.drivers.packets import (
     FrameSearch,
-    SequenceCounter,
 )
 
 MARK = b"\xaa\x55"
@@ -54,8 +53,7 @@ class WujiFrames(FrameSearch[WujiPacket]):
     """
 
     def __init__(self) -> None:
-        super().__init__(MARK)
-        self._sequence = SequenceCounter(self.statistics, bits=SEQUENCE_BITS)
+        super().__init__(MARK, sequence_bits=SEQUENCE_BITS)
         self._last_ms: int | None = None
 
     def _take(self, data: bytes, position: int) -> tuple[WujiPacket, int] | None:
@@ -80,7 +78,7 @@ class WujiFrames(FrameSearch[WujiPacket]):
             self.statistics.suspects += 1
             return None
         sequence, time_ms = STAMPS.unpack_from(packet, CRC_OFFSET - STAMPS.size)
-        self._sequence.count(
+        self.sequence.count(
             sequence, t_device_ns=time_ms * TICK_NS, is_restarted=self._went_back(time_ms)
         )
         return WujiPacket(hand, sequence, time_ms, cells), PACKET_BYTES

@@ -87,9 +87,9 @@ def inspect_group(
         progress(size)
 
     findings = [
-        Finding(message, name, number)
+        Finding(error.message, name, number)
         for name in contents.entries
-        for number, message in contents.inspect_array(name, progress=count)
+        for number, error in contents.inspect_array(name, progress=count)
     ]
     if not findings:
         findings += _stamp_findings(contents)
