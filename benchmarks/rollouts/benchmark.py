@@ -63,32 +63,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         )
     child = ChildProcess("benchmarks.rollouts.server")
     try:
-        urls = child.receive()
-        subjects = {
-            f"{way}, {answer}, {server}": (way, answer, server)
-            for way in WAYS
-            for answer in ANSWERS
-            for server in ("ours", "echo")
-        }
-        sizes: dict[tuple[str, str], int] = {}
-
-        def once(way: str, answer: str, server: str, _: int = 0) -> float:
-            opened = _ours if server == "ours" else _echo
-            with opened(urls, way, answer, sizes) as chunk:
-                return _median_s(chunk, plan["chunks"])
-
-        for way in WAYS:
-            for answer in ANSWERS:
-                once(way, answer, "ours")
-        with bar("rounds", plan["rounds"] * len(subjects)) as step:
-            found = interleaved(
-                {name: partial(once, *subject) for name, subject in subjects.items()},
-                plan["rounds"],
-                on_step=step,
-            )
+        times_s, sizes = timed(child.receive(), plan, bar)
     finally:
         child.close()
-    times_s = {name: Figure.of(values) for name, values in found.items()}
     over = {
         (way, answer): times_s[f"{way}, {answer}, ours"].over(times_s[f"{way}, {answer}, echo"])
         for way in WAYS
@@ -118,6 +95,35 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "the chunks of a round, medians over the rounds, ratios round by round"
         ],
     )
+
+
+def timed(
+    urls: Mapping[str, str], plan: Mapping[str, int], bar: Bar
+) -> tuple[dict[str, Figure], dict[tuple[str, str], int]]:
+    """Seconds of a chunk and of its echo, and bytes of the answers by way and kind."""
+    subjects = {
+        f"{way}, {answer}, {server}": (way, answer, server)
+        for way in WAYS
+        for answer in ANSWERS
+        for server in ("ours", "echo")
+    }
+    sizes: dict[tuple[str, str], int] = {}
+
+    def once(way: str, answer: str, server: str, _: int = 0) -> float:
+        opened = _ours if server == "ours" else _echo
+        with opened(urls, way, answer, sizes) as chunk:
+            return _median_s(chunk, plan["chunks"])
+
+    for way in WAYS:
+        for answer in ANSWERS:
+            once(way, answer, "ours")
+    with bar("rounds", plan["rounds"] * len(subjects)) as step:
+        found = interleaved(
+            {name: partial(once, *subject) for name, subject in subjects.items()},
+            plan["rounds"],
+            on_step=step,
+        )
+    return {name: Figure.of(values) for name, values in found.items()}, sizes
 
 
 def _median_s(chunk: Chunk, count: int) -> float:

@@ -14,7 +14,7 @@ from services.episode_store.catalog import Catalog
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Intake, StorageLimits
 from services.episode_store.reading import StoreReader
-from services.episode_store.routes import reading_router, uploads_router
+from services.episode_store.routes import catalog_router, content_router, uploads_router
 from services.episode_store.settings import EpisodeStoreSettings
 
 logger = structlog.get_logger(__name__)
@@ -43,7 +43,8 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         settings=settings,
         routers=[
             uploads_router(intake),
-            reading_router(catalog, reader, max_page=settings.max_page),
+            catalog_router(catalog, max_page=settings.max_page),
+            content_router(reader),
         ],
         lifespan=lifespan,
     )

@@ -84,8 +84,8 @@ def uploads_router(intake: Intake) -> APIRouter:
     return router
 
 
-def reading_router(catalog: Catalog, reader: StoreReader, *, max_page: int) -> APIRouter:
-    """Create the routes of recordings, episodes and the catalog."""
+def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
+    """Create the routes that list recordings and episodes, and sum up their hours."""
     router = APIRouter(prefix="/v1", dependencies=[MAY_READ])
 
     @router.get("/recordings", tags=["recordings"])
@@ -93,6 +93,24 @@ def reading_router(catalog: Catalog, reader: StoreReader, *, max_page: int) -> A
         """List finished recordings that match all filters."""
         limit = wanted.num_rows(max_page)
         return catalog.recordings(wanted, limit=limit, offset=wanted.offset, after=wanted.after)
+
+    @router.get("/episodes", tags=["episodes"])
+    def episodes(wanted: Annotated[EpisodeQuery, Query()]) -> EpisodeList:
+        """List episodes that match all filters."""
+        limit = wanted.num_rows(max_page)
+        return catalog.episodes(wanted, limit=limit, offset=wanted.offset, after=wanted.after)
+
+    @router.get("/catalog/hours", tags=["catalog"])
+    def hours(wanted: Annotated[EpisodeFilter, Query()]) -> CatalogHours:
+        """Hours and counts of the matching episodes by task, domain and origin."""
+        return catalog.hours(wanted)
+
+    return router
+
+
+def content_router(reader: StoreReader) -> APIRouter:
+    """Create the routes of single recordings and episodes."""
+    router = APIRouter(prefix="/v1", dependencies=[MAY_READ])
 
     @router.get("/recordings/{recording_id}/attributes", tags=["recordings"])
     def attributes(recording_id: str) -> RecordingAttributes:
@@ -114,12 +132,6 @@ def reading_router(catalog: Catalog, reader: StoreReader, *, max_page: int) -> A
         """Samples of a finished recording with start_ns ≤ t_host_ns < stop_ns, as msgpack."""
         answer = reader.samples("recording", recording_id, stream, span, known=if_none_match)
         return _response(answer, MSGPACK)
-
-    @router.get("/episodes", tags=["episodes"])
-    def episodes(wanted: Annotated[EpisodeQuery, Query()]) -> EpisodeList:
-        """List episodes that match all filters."""
-        limit = wanted.num_rows(max_page)
-        return catalog.episodes(wanted, limit=limit, offset=wanted.offset, after=wanted.after)
 
     @router.get("/episodes/{episode_id}", tags=["episodes"])
     def episode(episode_id: str) -> EpisodeDetail:
@@ -157,11 +169,6 @@ def reading_router(catalog: Catalog, reader: StoreReader, *, max_page: int) -> A
         """Samples with start_ns ≤ t_ref_ns < stop_ns as msgpack."""
         answer = reader.samples("episode", episode_id, stream, span, known=if_none_match)
         return _response(answer, MSGPACK)
-
-    @router.get("/catalog/hours", tags=["catalog"])
-    def hours(wanted: Annotated[EpisodeFilter, Query()]) -> CatalogHours:
-        """Hours and counts of the matching episodes by task, domain and origin."""
-        return catalog.hours(wanted)
 
     return router
 

@@ -5,7 +5,6 @@ An array is {b"__ndarray__": true, b"data": bytes, b"dtype": str, b"shape": [...
 0.1.2 (github.com/Physical-Intelligence/openpi, Apache 2.0).
 """
 
-import math
 import re
 from collections.abc import Mapping
 from typing import Any, Final
@@ -14,7 +13,7 @@ import msgpack
 import numpy as np
 
 from dextouch.errors import InvalidInputError, LimitExceededError
-from dextouch.streams.packing import MAX_DIMENSIONS, MAX_ITEMS, MAX_ITEMS_A_CONTAINER, MAX_NUMBERS
+from dextouch.streams.packing import MAX_ITEMS, MAX_ITEMS_A_CONTAINER, array_of
 
 # Kinds of dtypes that are read, bool, signed, unsigned and floating, and their names.
 _KINDS: Final = "biuf"
@@ -119,21 +118,6 @@ def _scalar_bytes(found: Mapping[Any, Any]) -> bytes:
 
 
 def _array(found: Mapping[Any, Any]) -> np.ndarray:
-    dtype, shape, data = _dtype(found), found.get(b"shape"), found.get(b"data")
-    if (
-        not isinstance(shape, list)
-        or len(shape) > MAX_DIMENSIONS
-        or not all(isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in shape)
-        or math.prod(max(n, 1) for n in shape) > MAX_NUMBERS
-    ):
-        raise InvalidInputError(
-            f"openpi message: got an array of shape {shape!r}, expected at most {MAX_DIMENSIONS} "
-            f"counts whose product is at most {MAX_NUMBERS}"
-        )
-    expected = math.prod(shape) * dtype.itemsize
-    if not isinstance(data, bytes) or len(data) != expected:
-        got = f"{len(data)} bytes" if isinstance(data, bytes) else type(data).__name__
-        raise InvalidInputError(
-            f"openpi message: array {shape}: got {got}, expected {expected} bytes"
-        )
-    return np.frombuffer(data, dtype=dtype).reshape(shape)
+    return array_of(
+        found.get(b"data"), _dtype(found), found.get(b"shape"), what="openpi message: array"
+    )

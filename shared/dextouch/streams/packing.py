@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import msgpack
 import numpy as np
+from jaxtyping import Shaped
 
 from dextouch.errors import InvalidInputError, LimitExceededError
 
@@ -96,9 +97,27 @@ def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np
 def _array(name: str, entry: object) -> np.ndarray:
     if not isinstance(entry, dict) or set(entry) != {"dtype", "shape", "data"}:
         raise InvalidInputError(f"array {name!r}: expected a map of dtype, shape and data")
-    dtype, shape, data = entry["dtype"], entry["shape"], entry["data"]
+    dtype = entry["dtype"]
     if dtype not in DTYPES:
         raise InvalidInputError(f"array {name!r}: dtype {dtype!r}, expected one of {DTYPES}")
+    little_endian = np.dtype(dtype).newbyteorder("<")
+    return array_of(entry["data"], little_endian, entry["shape"], what=f"array {name!r}")
+
+
+def array_of(
+    data: object, dtype: "np.dtype[Any]", shape: object, *, what: str
+) -> Shaped[np.ndarray, "..."]:
+    """A read-only array view into bytes of an untrusted message.
+
+    Args:
+        data: the elements in C order.
+        dtype: of the elements, a trusted one.
+        shape: list of counts.
+        what: names the array in errors.
+
+    Raises:
+        InvalidInputError: not a shape, too many elements, or another number of bytes.
+    """
     if (
         not isinstance(shape, list)
         or len(shape) > MAX_DIMENSIONS
@@ -106,11 +125,11 @@ def _array(name: str, entry: object) -> np.ndarray:
         or math.prod(max(n, 1) for n in shape) > MAX_NUMBERS
     ):
         raise InvalidInputError(
-            f"array {name!r}: shape {shape!r}, expected at most {MAX_DIMENSIONS} counts whose "
-            f"product is at most {MAX_NUMBERS}"
+            f"{what}: shape {shape!r}, expected at most {MAX_DIMENSIONS} counts whose product is "
+            f"at most {MAX_NUMBERS}"
         )
-    expected = math.prod(shape) * np.dtype(dtype).itemsize
+    expected = math.prod(shape) * dtype.itemsize
     if not isinstance(data, bytes) or len(data) != expected:
         got = len(data) if isinstance(data, bytes) else type(data).__name__
-        raise InvalidInputError(f"array {name!r}: got {got} bytes, expected {expected} for {shape}")
-    return np.frombuffer(data, dtype=np.dtype(dtype).newbyteorder("<")).reshape(shape)
+        raise InvalidInputError(f"{what}: got {got} bytes, expected {expected} for {shape}")
+    return np.frombuffer(data, dtype=dtype).reshape(shape)

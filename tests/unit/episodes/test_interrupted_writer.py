@@ -1,8 +1,6 @@
 """Takes that an exception, a Ctrl-C or a full disk breaks off: what was appended is kept."""
 
-import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -20,71 +18,16 @@ from dextouch.errors import (
     StorageError,
     StorageFullError,
 )
-from dextouch.schemas import RecordingAttributes
-from dextouch.streams import StreamDescriptor
-
-FORCE = StreamDescriptor(
-    name="force", kind="scalar", shape=(2,), dtype="float32", unit="N", nominal_rate_hz=10
+from tests.unit.episodes.broken_takes import (
+    CAMERA,
+    FORCE,
+    break_off,
+    kept_numbers,
+    record,
+    record_17,
+    stages,
+    take,
 )
-CAMERA = StreamDescriptor(
-    name="camera", kind="image", shape=(48, 64, 3), dtype="uint8", unit="h264", nominal_rate_hz=30
-)
-# 3600 bytes a sample and 30 samples a storage chunk: noise fills a small disk quickly.
-NOISE = StreamDescriptor(
-    name="noise", kind="tactile", shape=(900,), dtype="float32", unit="kPa", nominal_rate_hz=60
-)
-
-
-def take(*streams, **changes):
-    fields = {"recording_id": "take-1", "task": "t", "instruction": "", "domain": "human"}
-    return RecordingAttributes.model_validate(
-        fields | {"station": "bench", "streams": streams} | changes
-    )
-
-
-def record(writer, first, count=1):
-    """Samples whose value and stamp are their number."""
-    numbers = np.arange(first, first + count)
-    values = np.repeat(numbers[:, None], 2, axis=1).astype("f4")
-    writer.append("force", values=values, t_host_ns=numbers)
-
-
-def kept_numbers(store, recording_id="take-1", *, broken_off=True):
-    """The numbers of the samples of `force`; stamps and values agree, and nothing is damaged."""
-    reader = store.recording(recording_id)
-    reader.verify()
-    assert reader.attributes.recovered
-    ledger = [(entry.stream, entry.event) for entry in reader.attributes.ledger]
-    marked = [stream.name for stream in reader.attributes.streams] if broken_off else []
-    assert ledger == [(name, "interrupted") for name in marked]
-    batch = reader.read("force")
-    assert batch.values[:, 0].tolist() == batch.t_host_ns.tolist()
-    return batch.t_host_ns.tolist()
-
-
-def stages(store):
-    return list((store.root / ".staging").iterdir())
-
-
-def break_off(store, fill, *streams, error=RuntimeError, options=None):
-    """A take of some samples that an exception ends; what its user is told about it."""
-    with (
-        pytest.raises(error) as caught,
-        store.writer(kind="recording", attributes=take(*streams), options=options) as writer,
-    ):
-        _fill_and_fail(writer, fill, error)
-    return " ".join(getattr(caught.value, "__notes__", []))
-
-
-def _fill_and_fail(writer, fill, error):
-    fill(writer)
-    raise error("the glove came off")
-
-
-def record_17(writer):
-    """Three storage chunks of five samples, and two samples that wait in memory."""
-    for number in range(17):
-        record(writer, number)
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
@@ -220,84 +163,6 @@ def _fail_at_the_stamps(self, rows):
     if rows.dtype == np.int64:
         raise RuntimeError("stamps")
     real_append(self, rows)
-
-
-def fill_disk(writer):
-    rng = np.random.default_rng(1)
-    for number in range(10_000):
-        values = rng.normal(size=(1, 900)).astype("f4")
-        writer.append("noise", values=values, t_host_ns=np.array([number]))
-
-
-def test_a_full_disk_keeps_the_take(store, file_size_limit):
-    writer = store.writer(kind="recording", attributes=take(NOISE))
-    with file_size_limit(1_000_000), pytest.raises(StorageFullError) as caught, writer:
-        fill_disk(writer)
-    assert "no space left" in caught.value.message
-    # Nothing can follow a block that was broken off.
-    assert "try again" not in caught.value.message
-    # Cutting off the storage chunk that did not fit left room for the index.
-    assert "marked as recovered" in " ".join(caught.value.__notes__)
-    reader = store.recording("take-1")
-    reader.verify()
-    assert reader.num_samples("noise") >= 240
-    expected = np.random.default_rng(1).normal(size=(reader.num_samples("noise"), 900))
-    np.testing.assert_array_equal(reader.read("noise").values, expected.astype("f4"))
-
-
-FULL_DISK = """
-import json
-import sys
-from pathlib import Path
-import numpy as np
-from dextouch.episodes import EpisodeStore
-from dextouch.errors import StorageFullError
-from dextouch.schemas.recordings import RecordingAttributes
-
-disk = Path(sys.argv[1])
-ballast = disk / "ballast"
-ballast.write_bytes(bytes(1 << 20))
-store = EpisodeStore(disk / "store")
-rng, num_appended, notes = np.random.default_rng(1), 0, []
-try:
-    attributes = RecordingAttributes.model_validate_json(sys.argv[2])
-    with store.writer(kind="recording", attributes=attributes) as writer:
-        while True:
-            values = rng.normal(size=(1, 900)).astype("f4")
-            writer.append("noise", values=values, t_host_ns=np.array([num_appended]))
-            num_appended += 1
-except StorageFullError as error:
-    notes = getattr(error, "__notes__", [])
-before = store.list(kind="recording")
-ballast.unlink()
-(group,) = store.recover()
-store.recording("take-1").verify()
-answer = {"appended": num_appended, "notes": notes, "before": before, "kept": group.num_samples}
-print(json.dumps(answer))
-"""
-
-
-@pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare to mount a small disk with")
-def test_a_disk_that_is_really_full(tmp_path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = 'mount -t tmpfs -o size=4m none "$1" || exit 77; shift; exec "$@"'
-    small_disk = ["unshare", "-rm", "sh", "-c", mounted, "sh", str(disk)]
-    script = [sys.executable, "-c", FULL_DISK, str(disk), take(NOISE).model_dump_json()]
-    child = subprocess.run(
-        [*small_disk, *script],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if child.returncode == 77 or child.stderr.startswith("unshare"):
-        pytest.skip(f"no small disk can be mounted here: {child.stderr.strip()}")
-    assert child.returncode == 0, child.stderr
-    got = json.loads(child.stdout)
-    assert got["before"] == []
-    assert "EpisodeStore.recover completes it" in " ".join(got["notes"])
-    assert got["appended"] > 600
-    assert got["appended"] - got["kept"]["noise"] <= 30
 
 
 def test_a_take_whose_id_was_taken_meanwhile_is_kept_under_another(store):

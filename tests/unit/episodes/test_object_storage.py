@@ -14,7 +14,7 @@ from obstore.store import S3Store
 from zarr.storage import ObjectStore
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.object_bucket import Bucket, ObjectOptions, parse_address
+from dextouch.episodes.object_bucket import Bucket
 from dextouch.episodes.object_storage import BLOCK_BYTES
 from dextouch.episodes.uploads import ORPHAN_AGE, sweep_orphans
 from dextouch.errors import (
@@ -23,7 +23,6 @@ from dextouch.errors import (
     NotFoundError,
     StorageError,
     UnavailableError,
-    UnknownNameError,
 )
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import StreamDescriptor
@@ -55,44 +54,6 @@ def store(url, tmp_path):
 @pytest.fixture
 def bucket(store):
     return store._storage._bucket
-
-
-def test_addresses():
-    address = parse_address(
-        "s3://takes/a/b%20c/?endpoint=http://h:9000&allow_http=true&work_folder=/w", {}, None
-    )
-    assert (address.bucket, address.prefix, str(address)) == ("takes", "a/b c", "s3://takes/a/b c")
-    assert address.options.endpoint == "http://h:9000"
-    assert str(address.work_folder) == "/w"
-    bare = parse_address("s3://takes", {"secret_access_key": "hush"}, None)
-    assert (bare.prefix, str(bare)) == ("", "s3://takes")
-    assert "hush" not in repr(bare)
-    # Two places never share a work folder that nobody chose.
-    one, other = (parse_address(f"s3://takes/{p}", {}, None).work_folder for p in ("a-b", "a/b"))
-    assert one != other
-
-
-@pytest.mark.parametrize(
-    "url",
-    ["s3://", "s3:///prefix", "s3://b:80/x", "s3://key:hush@b/x", "s3://b/a//c", "s3://b/../c"],
-)
-def test_addresses_that_are_none(url):
-    with pytest.raises(InvalidInputError, match=r"episode store|prefix") as caught:
-        EpisodeStore(url)
-    assert "hush" not in str(caught.value)
-
-
-def test_options_that_do_not_fit():
-    with pytest.raises(InvalidInputError, match="ends up in logs") as caught:
-        EpisodeStore("s3://b/p?secret_access_key=hush")
-    assert "hush" not in str(caught.value)
-    with pytest.raises(UnknownNameError, match=r"valid: .*endpoint"):
-        EpisodeStore("s3://b/p?endpiont=x")
-    with pytest.raises(InvalidInputError, match=r"invalid options \['max_retries'\]"):
-        EpisodeStore("s3://b/p", {"max_retries": "many"})
-    with pytest.raises(InvalidInputError, match="with s3://bucket/prefix only"):
-        EpisodeStore("data/store", {"endpoint": "x"})
-    assert "hush" not in repr(ObjectOptions.model_validate({"session_token": "hush"}))
 
 
 def test_a_work_folder_belongs_to_one_address(made, store, s3_server):
@@ -434,12 +395,3 @@ def test_a_forked_process_is_told_how_to_start(store):
     with os.fdopen(receiver, "rb") as answer:
         assert b"start workers with 'spawn'" in answer.read()
     os.waitpid(child, 0)
-
-
-def test_without_the_library_the_message_says_what_to_install(monkeypatch):
-    for name in list(sys.modules):
-        if name.startswith(("obstore", "dextouch.episodes.object_", "dextouch.episodes.uploads")):
-            monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "obstore", None)
-    with pytest.raises(UnavailableError, match=r"pip install 'dextouch-wm\[s3\]'"):
-        EpisodeStore("s3://bucket/prefix")

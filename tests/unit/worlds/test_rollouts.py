@@ -1,7 +1,6 @@
 """The rollout service: numbering, replay, branches, expiry, and going on in another process."""
 
 import asyncio
-import threading
 
 import numpy as np
 import pytest
@@ -11,16 +10,14 @@ from dextouch.errors import (
     DexTouchError,
     EndedError,
     InvalidInputError,
-    LimitExceededError,
     NonFiniteError,
     NotFoundError,
-    StorageError,
-    UnavailableError,
     UnknownNameError,
 )
-from dextouch.schemas import MAX_SEED, ReturnSelector, RolloutStart, decode_answer
-from dextouch.serving.state import MemoryState, RedisState
-from dextouch.worlds.rollouts import RolloutLimits, RolloutService, chunk_seed
+from dextouch.schemas import MAX_SEED, ReturnSelector, RolloutStart
+from dextouch.serving.state import MemoryState
+from dextouch.worlds.rollouts import chunk_seed
+from tests.unit.worlds.begun import ALL, START, begin, decoded, service
 from tests.unit.worlds.fakes import (
     K_HEAD,
     BatchSumWorld,
@@ -29,22 +26,6 @@ from tests.unit.worlds.fakes import (
     anchor,
     observation,
 )
-
-ALL = ReturnSelector()
-START = RolloutStart("stand_bottle", 3, "stand the bottle")
-
-
-def service(store=None, world=None, **limits) -> RolloutService:
-    served = world or SumWorld()
-    return RolloutService({"sum": served}, store or MemoryState(), RolloutLimits(**limits))
-
-
-def decoded(answer):
-    return decode_answer(answer.payload, max_bytes=10**7)
-
-
-async def begin(made, start=START) -> str:
-    return decoded(await made.start("sum", start, ALL)).rollout.id
 
 
 async def test_chunks_count_up_and_steps_follow():
@@ -254,133 +235,6 @@ async def test_rollouts_expire_without_chunks():
     now_s[0] = 28.0
     with pytest.raises(NotFoundError, match="expired"):
         await made.step(rollout_id, 2, actions(4), ALL)
-    made.close()
-
-
-async def test_limits_on_number_and_length():
-    now_s = [0.0]
-    made = service(MemoryState(clock_s=lambda: now_s[0]), max_rollouts=2, max_chunks=2, ttl_s=10.0)
-    first = await begin(made)
-    await made.fork(first)
-    for refused in (begin(made), made.fork(first)):
-        with pytest.raises(LimitExceededError, match=r"limit of 2 rollouts is reached; delete one"):
-            await refused
-    for chunk in range(2):
-        await made.step(first, chunk, actions(4), ALL)
-    with pytest.raises(LimitExceededError, match="has 2 chunks"):
-        await made.step(first, 2, actions(4), ALL)
-    now_s[0] = 11.0
-    await begin(made)
-    made.close()
-
-
-@pytest.mark.parametrize("num_processes", [1, 2])
-async def test_of_many_starts_at_once_only_as_many_as_allowed_begin(state, num_processes):
-    if isinstance(state, RedisState):
-        await state._client.flushdb()
-    made = [service(state, max_rollouts=4) for _ in range(num_processes)]
-    results = await asyncio.gather(
-        *(begin(made[i % num_processes]) for i in range(24)), return_exceptions=True
-    )
-    begun = [result for result in results if isinstance(result, str)]
-    assert len(begun) == 4
-    refused = [result for result in results if not isinstance(result, str)]
-    assert {type(error) for error in refused} == {LimitExceededError}
-    assert refused[0].details == {"retry_after_s": 1}
-    # A place is free again once a rollout has ended; branches take one, too.
-    await made[0].delete(begun[0])
-    results = await asyncio.gather(
-        *(made[i % num_processes].fork(begun[1]) for i in range(24)), return_exceptions=True
-    )
-    assert sum(not isinstance(result, Exception) for result in results) == 1
-    for each in made:
-        each.close()
-
-
-class Waiting(SumWorld):
-    """Begins when it is let; an instruction of none cannot begin at all."""
-
-    def __init__(self):
-        super().__init__()
-        self.may_begin = threading.Event()
-        self.has_place = threading.Event()
-
-    def reset(self, start):
-        if not start.instruction:
-            raise InvalidInputError("no instruction")
-        self.has_place.set()
-        self.may_begin.wait(30)
-        return super().reset(start)
-
-
-async def test_starts_that_fail_or_are_cancelled_leave_their_place(state):
-    if isinstance(state, RedisState):
-        await state._client.flushdb()
-    world = Waiting()
-    made = service(state, world=world, max_rollouts=1)
-    for _ in range(2):
-        with pytest.raises(InvalidInputError, match="no instruction"):
-            await begin(made, RolloutStart("stand_bottle", 3, ""))
-    starting = asyncio.create_task(begin(made))
-    await asyncio.to_thread(world.has_place.wait, 30)
-    with pytest.raises(LimitExceededError):
-        await begin(made)
-    starting.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await starting
-    world.may_begin.set()
-    await begin(made)
-    made.close()
-
-
-def fail_after(store, command, error):
-    """Let a command of a store do its work, if any, and then fail."""
-    asked = getattr(store, command)
-
-    async def failing(*args, **kwargs):
-        await asked(*args, **kwargs)
-        raise error
-
-    setattr(store, command, failing)
-
-
-async def test_a_store_whose_answer_is_lost_holds_no_place(state):
-    if isinstance(state, RedisState):
-        await state._client.flushdb()
-    made = service(state, max_rollouts=2)
-    first = await begin(made)
-    fail_after(state, "add", UnavailableError("answer lost"))
-    for asked in (begin(made), made.fork(first)):
-        with pytest.raises(UnavailableError, match="answer lost"):
-            await asked
-    del state.add
-    await begin(made)
-    with pytest.raises(LimitExceededError):
-        await begin(made)
-    made.close()
-
-
-@pytest.mark.parametrize("error", [StorageError("read-only replica"), UnavailableError("gone")])
-async def test_the_error_of_a_start_stays_when_its_place_cannot_be_freed(error):
-    store = MemoryState()
-    fail_after(store, "delete", error)
-    made = service(store, Waiting())
-    with pytest.raises(InvalidInputError, match="no instruction"):
-        await begin(made, RolloutStart("stand_bottle", 3, ""))
-    made.close()
-
-
-async def test_memory_stays_flat_over_abandoned_rollouts():
-    now_s = [0.0]
-    store = MemoryState(clock_s=lambda: now_s[0])
-    made = service(store, max_rollouts=4, ttl_s=1.0)
-    for _ in range(300):
-        await begin(made)
-        now_s[0] += 0.5
-    assert len(made._live) <= 4
-    store._expire()
-    assert len(store._entries) <= 3
-    assert len(made._locks) == 0
     made.close()
 
 
