@@ -138,8 +138,25 @@ def find_boards(images: Sequence[np.ndarray], board: Chessboard | CharucoBoard) 
     )
 
 
-def calibrate_found(found: FoundBoards) -> CameraCalibration:
+def calibrate_camera(
+    images: Sequence[np.ndarray], board: Chessboard | CharucoBoard
+) -> CameraCalibration:
     """Intrinsics from photos of one board in different tilts and places.
+
+    Args:
+        images: uint8 [h, w] or [h, w, 3], all of one size; photos without the board are left out.
+        board: what is on the photos.
+
+    Raises:
+        ShapeError: no images, or of different sizes.
+        InvalidInputError: the board is found in too few photos, or is no board.
+        DegenerateMotionError: the views do not show the focal length; tilt the board.
+    """
+    return calibrate_found(find_boards(images, board))
+
+
+def calibrate_found(found: FoundBoards) -> CameraCalibration:
+    """`calibrate_camera` for corners that were detected before.
 
     Raises:
         InvalidInputError: the board is found in too few photos.

@@ -155,11 +155,19 @@ class HandRetargeter:
         tables = (self._arrays, self._person, tuning, self._scratch)
         return self._follow(tables, (keypoints[None], self._elapsed_s), self._memory)
 
-    def retarget(self, keypoints_m: np.ndarray, t_s: np.ndarray | None = None) -> RetargetResult:
+    def retarget(
+        self,
+        keypoints_m: np.ndarray,
+        valid: np.ndarray | None = None,
+        *,
+        t_s: np.ndarray | None = None,
+    ) -> RetargetResult:
         """Joint angles of a whole recording; untracked stretches are interpolated in time.
 
         Args:
             keypoints_m: [T, 25, 3], metres, wrist axes; NaN marks a missing node.
+            valid: bool [T, 25], False for nodes that are not to be used; None uses all that are
+                not NaN.
             t_s: [T] rising times, relative to any moment; None takes 60 Hz.
 
         Raises:
@@ -168,6 +176,10 @@ class HandRetargeter:
                 in any sample.
         """
         keypoints = checked_keypoints(keypoints_m)
+        if valid is not None:
+            keypoints = np.where(
+                _checked_valid(valid, len(keypoints))[..., None], keypoints, np.nan
+            )
         elapsed_s = _elapsed_s(len(keypoints), t_s)
         person = self._person
         if self.profile is None:
@@ -234,6 +246,16 @@ def warm_up() -> None:
     """Compile the solver, or load it from numba's cache: seconds once a machine, then a moment."""
     keypoints = np.full((1, NUM_KEYPOINTS, 3), np.nan)
     HandRetargeter("right").step(keypoints[0])
+
+
+def _checked_valid(valid: np.ndarray, num_samples: int) -> Bool[np.ndarray, "time 25"]:
+    mask = np.asarray(valid)
+    if mask.dtype != np.bool_ or mask.shape != (num_samples, NUM_KEYPOINTS):
+        raise ShapeError(
+            f"valid: got {mask.dtype} {list(mask.shape)}, expected bool "
+            f"[{num_samples}, {NUM_KEYPOINTS}], one value for each node"
+        )
+    return mask
 
 
 def _elapsed_s(num_samples: int, t_s: np.ndarray | None) -> Float64[np.ndarray, " time"]:

@@ -1,0 +1,8 @@
+"""Decoder of our tactile glove, under the name that code outside this repository imports.
+
+The driver itself is `services.acquisition.devices.tactile_glove`.
+"""
+
+from services.acquisition.devices.tactile_glove.driver import TactileGloveDecoder
+
+__all__ = ["TactileGloveDecoder"]
