@@ -87,7 +87,9 @@ async def serve_all(
         UnavailableError: a service terminated unexpectedly; the others were shut down.
     """
     servers = {
-        place.name: Server(uvicorn.Config(app, backlog=BACKLOG, **server_options(grace_s)))
+        place.name: Server(
+            uvicorn.Config(app, backlog=BACKLOG, **server_options(app, grace_s=grace_s))
+        )
         for place, app in placed
     }
     tasks = {

@@ -84,6 +84,7 @@ def create_service_app(
     app = FastAPI(
         title=name, version=__version__, docs_url=None, redoc_url=None, lifespan=_started(lifespan)
     )
+    app.state.settings = settings
     app.state.access = AccessControl(settings.api_keys)
     app.state.registry = CollectorRegistry()
     app.state.running = False

@@ -21,9 +21,9 @@ BEARER = {"type": "http", "scheme": "bearer", "description": "A key of the servi
 BINARY = {"type": "string", "format": "binary"}
 PROBLEM_CONTENT = {PROBLEM_MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
 
-# The guard and the error handlers can give these on any route (413 and 415 also where a GET has a
-# body), and on those that change something.
-OF_ANY = frozenset({413, 415, 421, 500, 503})
+# The server, the guard and the error handlers can give these on any route (413 and 415 also where a
+# GET has a body), and on those that change something.
+OF_ANY = frozenset({408, 413, 415, 421, 431, 500, 503})
 OF_CHANGES = frozenset({403, 404, 409, 422, 429, 507})
 
 

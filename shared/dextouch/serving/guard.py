@@ -302,6 +302,7 @@ class BodyRules:
         """Wrap `receive` to enforce the limit, with or without Content-Length."""
         limit = self._limit(headers, rule)
         received = 0
+        is_complete = False
 
         def check(num_bytes: int) -> None:
             if num_bytes > limit:
@@ -309,8 +310,12 @@ class BodyRules:
                 raise HTTPException(413, f"body: got {num_bytes} bytes, expected at most {limit}")
 
         async def limited() -> AsgiMessage:
-            nonlocal received
+            nonlocal received, is_complete
             message = await receive()
+            if message["type"] == "http.disconnect" and not is_complete:
+                # Nobody reads this response; a ClientDisconnect would be logged as our mistake.
+                raise HTTPException(400, "body: the connection ended before the body")
+            is_complete = not message.get("more_body", False)
             received += len(message.get("body", b""))
             check(received)
             return message

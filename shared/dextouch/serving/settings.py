@@ -71,6 +71,15 @@ class ServiceSettings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="least level of log events"
     )
+    max_connections: int = Field(
+        default=512, ge=1, description="open at the same time; further clients get status 503"
+    )
+    client_timeout_s: float = Field(
+        default=20.0,
+        gt=0,
+        description="seconds that a client below 16 KiB/s may take to send a request or read a "
+        "response",
+    )
     shutdown_grace_s: int = Field(
         default=10, ge=0, le=600, description="seconds that requests in flight get to end"
     )
@@ -167,17 +176,23 @@ def run(app: FastAPI, settings: ServiceSettings) -> None:
     # causes so many that decoding takes 0.36 instead of 0.05 s.
     gc.collect()
     gc.freeze()
-    grace_s = settings.shutdown_grace_s
-    uvicorn.run(app, host=settings.host, port=settings.port, **server_options(grace_s))
+    options = server_options(app, grace_s=settings.shutdown_grace_s)
+    uvicorn.run(app, host=settings.host, port=settings.port, **options)
 
 
-def server_options(grace_s: int) -> dict[str, Any]:
+def server_options(app: FastAPI, *, grace_s: int) -> dict[str, Any]:
     """Options of uvicorn for every service, alone or beside others.
 
     Args:
+        app: the service; its settings limit its connections.
         grace_s: time that requests in flight get to end.
     """
-    return {
+    from dextouch.serving.connections import limited_protocols
+
+    settings: ServiceSettings = getattr(app.state, "settings", None) or ServiceSettings()
+    return limited_protocols(
+        max_connections=settings.max_connections, client_timeout_s=settings.client_timeout_s
+    ) | {
         "log_config": None,
         "access_log": False,
         "server_header": False,

@@ -161,7 +161,9 @@ def operation_of(app: FastAPI, path: str, method: str) -> tuple[dict, dict[str, 
 def test_the_document_has_what_routes_declare():
     _, plain = operation_of(make_app(), "/fail/{index}", "get")
     problems = {status: kind for status, kind in plain.items() if int(status) >= 400}
-    assert problems == dict.fromkeys(("404", "413", "415", "421", "422", "500", "503"), PROBLEM)
+    assert problems == dict.fromkeys(
+        ("404", "408", "413", "415", "421", "422", "431", "500", "503"), PROBLEM
+    )
     raw, answers = operation_of(make_app(), "/raw", "post")
     assert set(raw["requestBody"]["content"]) == {JSON, OCTETS}
     assert {"400", "403", "409", "429", "507"} <= set(answers)

@@ -1,0 +1,231 @@
+"""Connections of a service: how many there are, and how long a client may keep it waiting.
+
+uvicorn by itself waits for ever for a request that has begun, and for clients that do not read.
+"""
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from http import HTTPStatus
+from typing import Any
+
+import structlog
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
+from dextouch.schemas import PROBLEM_MEDIA_TYPE, problem_from_error
+
+logger = structlog.get_logger(__name__)
+
+# Clients that are at least as fast never run out of time.
+MIN_BYTES_PER_S = 16 * 2**10
+# Of a request, beside its body.
+MAX_HEADER_BYTES = 2**16
+# Clients that are told at the same time that there is no place; further ones are just closed.
+MAX_REFUSED = 64
+MAX_CHECK_PERIOD_S = 1.0
+
+
+def limited_protocols(*, max_connections: int, client_timeout_s: float) -> dict[str, Any]:
+    """Options of uvicorn for a limited number of connections with clients that are not too slow.
+
+    A connection without a request makes room for a new one, the oldest first; if there is none, new
+    ones get status 503. A client may take `client_timeout_s` in all to send a request and to read
+    the response; only time at less than 16 KiB/s counts.
+    """
+    limits = _Limits(max_connections, client_timeout_s)
+    return {
+        "http": partial(_LimitedHttp, limits=limits),
+        "ws": partial(_LimitedWebSocket, limits=limits),
+    }
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of one server, and its connections without a request, the oldest first."""
+
+    max_connections: int
+    client_timeout_s: float
+    idle: dict["_LimitedHttp", None] = field(default_factory=dict)
+
+    @property
+    def check_period_s(self) -> float:
+        """Time between two looks at a connection."""
+        return min(self.client_timeout_s / 8, MAX_CHECK_PERIOD_S)
+
+
+class _Watched(asyncio.Protocol):
+    """Ends a connection whose client keeps the service waiting for too long in all.
+
+    Time counts only while the service waits for the client, and each 16 KiB give a second back.
+    """
+
+    loop: asyncio.AbstractEventLoop
+    transport: asyncio.Transport
+    connections: set[Any]
+
+    def __init__(self, *, limits: _Limits, **given: Any) -> None:  # noqa: ANN401 - uvicorn's
+        super().__init__(**given)
+        self._limits = limits
+        self._left_s = limits.client_timeout_s
+        self._moved_bytes = 0
+        self._unsent_bytes = 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self._check_later()
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._left_s = self._limits.client_timeout_s
+
+    def _waits_for_request(self) -> bool:
+        return False
+
+    def _time_out(self) -> None:
+        self.transport.abort()
+
+    def _check_later(self) -> None:
+        self.loop.call_later(self._limits.check_period_s, self._check)
+
+    def _check(self) -> None:
+        # A lost connection, or one that has become a WebSocket.
+        if self not in self.connections:
+            return
+        unsent = self.transport.get_write_buffer_size()
+        if unsent or self._waits_for_request():
+            moved = self._moved_bytes + max(0, self._unsent_bytes - unsent)
+            left_s = self._left_s - self._limits.check_period_s + moved / MIN_BYTES_PER_S
+            self._left_s = min(left_s, self._limits.client_timeout_s)
+        else:
+            self._left_s = self._limits.client_timeout_s
+        self._moved_bytes, self._unsent_bytes = 0, unsent
+        if self._left_s <= 0:
+            logger.info("client_too_slow", client=self.transport.get_extra_info("peername"))
+            self._time_out()
+        self._check_later()
+
+
+class _LimitedWebSocket(_Watched, WebSocketsSansIOProtocol):
+    """WebSocket whose client must read; uvicorn's pings find those that are gone."""
+
+
+class _LimitedHttp(_Watched, HttpToolsProtocol):
+    """HTTP connection with a time limit for requests, and a place among a limited number."""
+
+    def __init__(self, *, limits: _Limits, **given: Any) -> None:  # noqa: ANN401 - uvicorn's
+        super().__init__(limits=limits, **given)
+        self._is_receiving = True
+        self._has_begun = False
+        self._is_refused = False
+        self._header_bytes = 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        idle, limit = self._limits.idle, self._limits.max_connections
+        num_open = len(self.connections)
+        if num_open > limit:
+            oldest = next(iter(idle), None)
+            if oldest is not None:
+                del idle[oldest]
+                oldest.transport.close()
+            elif num_open > limit + MAX_REFUSED:
+                self.transport.abort()
+                return
+            else:
+                text = f"the service has {limit} connections, expected fewer; try again later"
+                self._refuse(503, UnavailableError(text, retry_after_s=1))
+                return
+        idle[self] = None
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._limits.idle.pop(self, None)
+
+    def data_received(self, data: bytes) -> None:
+        if self._is_refused:
+            return
+        if self.timeout_keep_alive_task is not None:
+            # Even if it is no request, such as an empty line.
+            self._is_receiving, self._has_begun, self._header_bytes = True, False, 0
+        self._header_bytes += len(data)
+        self._moved_bytes += len(data)
+        super().data_received(data)
+        if self._is_receiving and self._header_bytes > MAX_HEADER_BYTES:
+            text = f"got {self._header_bytes} bytes of headers, expected at most {MAX_HEADER_BYTES}"
+            self._refuse(431, InvalidInputError(text))
+
+    def on_message_begin(self) -> None:
+        super().on_message_begin()
+        self._is_receiving, self._has_begun, self._header_bytes = True, True, 0
+
+    def on_headers_complete(self) -> None:
+        self._limits.idle.pop(self, None)
+        super().on_headers_complete()
+
+    def on_body(self, body: bytes) -> None:
+        super().on_body(body)
+        # The bytes around the pieces of a body may be as many as the body.
+        self._header_bytes = max(0, self._header_bytes - 2 * len(body))
+
+    def on_message_complete(self) -> None:
+        super().on_message_complete()
+        self._is_receiving = False
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        if self.timeout_keep_alive_task is not None:
+            self._limits.idle[self] = None
+
+    def _has_headers(self) -> bool:
+        """Whether the request that is being received has its headers."""
+        return self.cycle is not None and self.cycle.scope is self.scope
+
+    def _waits_for_request(self) -> bool:
+        if self._has_headers() and self.cycle.response_complete:
+            # The rest of a request that was refused.
+            self._moved_bytes = 0
+        return self._is_receiving and not self.flow.read_paused
+
+    def _time_out(self) -> None:
+        is_answered = self._has_headers() and self.cycle.response_started
+        if self._is_refused or is_answered or not self._is_receiving or not self._has_begun:
+            self.transport.abort()
+            return
+        limit_s = self._limits.client_timeout_s
+        text = f"got a part, expected the request within {limit_s:g} s or at 16 KiB/s"
+        self._refuse(408, UnavailableError(text))
+
+    def _refuse(self, status: int, error: DexTouchError) -> None:
+        """Answer and end the connection.
+
+        It is read for a moment more: closing at once could make the client lose the answer.
+        """
+        is_working = self.cycle is not None and not self.cycle.response_complete
+        if self.pipeline or (is_working and not self._has_headers()):
+            # The client would take this for the answer to its earlier request.
+            self.transport.abort()
+            return
+        if is_working:
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+        self._limits.idle.pop(self, None)
+        self._is_refused = self._is_receiving = True
+        self._left_s = 1.5 * self._limits.check_period_s
+        self.transport.write(_answer(status, error))
+        self.transport.write_eof()
+
+
+def _answer(status: int, error: DexTouchError) -> bytes:
+    problem = problem_from_error(error, instance="", request_id="")
+    body = problem.model_copy(update={"status": status}).model_dump_json().encode()
+    headers: Mapping[str, object] = {
+        "content-type": PROBLEM_MEDIA_TYPE,
+        "content-length": len(body),
+        "connection": "close",
+        **({"retry-after": 1} if status == HTTPStatus.SERVICE_UNAVAILABLE else {}),
+    }
+    lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
+    return f"HTTP/1.1 {status} {HTTPStatus(status).phrase}\r\n{lines}\r\n".encode() + body
