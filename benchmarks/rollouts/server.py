@@ -43,6 +43,8 @@ def resting_actions(num_steps: int) -> Float64[np.ndarray, "steps 67"]:
 class StillWorld:
     """Returns the same prepared observation for every chunk."""
 
+    is_quick = True
+
     def __init__(self) -> None:
         self.description = WorldDescription(
             name="still",

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
@@ -161,13 +162,19 @@ def _check_object_poses(poses: np.ndarray, num_steps: int, where: str) -> None:
 def _check_array(
     name: str, array: np.ndarray, expected: tuple[str, tuple[int, ...]], where: str
 ) -> None:
-    if (array.dtype.name, array.shape) != expected:
+    if (_name_of(array.dtype), array.shape) != expected:
         raise ShapeError(
             f"{where}: {name} got {array.dtype.name} {list(array.shape)}, "
             f"expected {expected[0]} {list(expected[1])}"
         )
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise NonFiniteError(f"{where}: {name} holds NaN or infinity, expected finite numbers")
+
+
+# numpy puts the name together anew each time, which takes longer than the rest of the check.
+@lru_cache(maxsize=32)
+def _name_of(dtype: "np.dtype[Any]") -> str:
+    return dtype.name
 
 
 class ObservationFields(FrozenModel):

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from email.message import Message
+from functools import cached_property, lru_cache
 from typing import TypeVar
 
 import structlog
@@ -35,6 +36,8 @@ HOST_NAME = re.compile(r"[a-z0-9_.-]+")
 HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9_.-]+))(?::\d{1,5})?")
 ORIGIN = re.compile(r"(https?)://(?:([a-z0-9_.-]+)|\[([0-9a-f:.]+)\])(?::([0-9]{1,5}))?")
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
+# By which a page of another site is recognised.
+SENDER_HEADERS = (b"host", b"origin", b"sec-fetch-site")
 # Health checks and Prometheus have no key, and use container names as host.
 PROBES = frozenset({"/healthz", "/readyz", "/metrics"})
 POLICY_VIOLATION = 1008
@@ -98,18 +101,39 @@ class SitePolicy:
 
     def check(self, connection: HTTPConnection, *, is_unsafe: bool) -> None:
         """Refuse pages of other sites; unsafe is what may change state, or opens a WebSocket."""
-        host = ", ".join(connection.headers.getlist("host")).lower()
+        sent: dict[bytes, list[str]] = {}
+        for name, value in connection.scope["headers"]:
+            if name in SENDER_HEADERS:
+                sent.setdefault(name, []).append(value.decode("latin-1").lower())
+        hosts, origins, sites = (tuple(sent.get(name, ())) for name in SENDER_HEADERS)
+        self._check_once(connection.scope["scheme"], hosts, origins, sites[:1], is_unsafe=is_unsafe)
+
+    @cached_property
+    def _check_once(self) -> Callable[..., None]:
+        """As `_check`, for senders that it has just admitted without another look."""
+        return lru_cache(maxsize=64)(self._check)
+
+    def _check(
+        self,
+        scheme: str,
+        hosts: Sequence[str],
+        origins: Sequence[str],
+        sites: Sequence[str],
+        *,
+        is_unsafe: bool,
+    ) -> None:
+        host = ", ".join(hosts)
         self._check_host(host)
         if not is_unsafe:
             return
         # Of a WebSocket the scheme is ws or wss, of its page http or https.
-        own = _canonical(f"{connection.scope['scheme'].replace('ws', 'http')}://{host}")
-        if "origin" in connection.headers:
-            origin = ", ".join(connection.headers.getlist("origin")).lower()
+        own = _canonical(f"{scheme.replace('ws', 'http')}://{host}")
+        if origins:
+            origin = ", ".join(origins)
             if _canonical(origin) not in {own, *self.origins}:
                 raise _foreign_origin(f"origin {origin!r}", own)
             return
-        site = connection.headers.get("sec-fetch-site", "none").lower()
+        site = sites[0] if sites else "none"
         if site in {"cross-site", "same-site"}:
             raise _foreign_origin(f"a page of another origin (Sec-Fetch-Site: {site})", own)
 
@@ -260,6 +284,7 @@ def body_rule(endpoint: Callable[..., object]) -> BodyRule | None:
     return getattr(endpoint, RULE_ATTRIBUTE, None)
 
 
+@lru_cache(maxsize=64)
 def media_type(content_type: str | None) -> tuple[str, dict[str, str]]:
     """A Content-Type's media type and parameters in lower case; "none" where there is none.
 

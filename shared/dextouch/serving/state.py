@@ -1,6 +1,7 @@
 """Versioned key-value state shared by processes (rollouts, leases), in memory or in Redis."""
 
 import asyncio
+import math
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
@@ -23,10 +24,11 @@ Argument = str | bytes | int | float
 
 @dataclass(frozen=True)
 class Versioned:
-    """A value and its version, which starts at 1 and counts writes."""
+    """A value in two parts, and its version, which starts at 1 and counts writes."""
 
     value: bytes
     version: int
+    tail: bytes = b""
 
 
 class MemoryState:
@@ -35,6 +37,8 @@ class MemoryState:
     def __init__(self, *, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
         self._entries: dict[str, tuple[Versioned, float]] = {}
+        # No entry expires earlier.
+        self._expires_s = math.inf
 
     async def get(self, key: str) -> Versioned | None:
         """The value, or None when absent or expired."""
@@ -42,8 +46,22 @@ class MemoryState:
         entry = self._entries.get(key)
         return None if entry is None else entry[0]
 
-    async def set(self, key: str, value: bytes, *, expected_version: int, ttl_s: float) -> int:
+    async def version(self, key: str) -> int:
+        """The version that `get` would return, without the value; 0 when absent or expired."""
+        stored = await self.get(key)
+        return 0 if stored is None else stored.version
+
+    async def set(
+        self, key: str, value: bytes, *, tail: bytes = b"", expected_version: int, ttl_s: float
+    ) -> int:
         """Write if the version is the expected one (0: absent), and renew the time to live.
+
+        Args:
+            key: of the entry.
+            value: its first part.
+            tail: its second part, such as megabytes that are not to be copied behind the first.
+            expected_version: that the new value was computed from.
+            ttl_s: seconds until it expires.
 
         Returns:
             The new version.
@@ -56,8 +74,10 @@ class MemoryState:
         version = 0 if stored is None else stored[0].version
         if version != expected_version:
             raise _version_conflict(key, expected=expected_version, got=version)
-        written = Versioned(bytes(value), version + 1)
-        self._entries[key] = (written, self._clock_s() + _checked_ttl(ttl_s))
+        written = Versioned(bytes(value), version + 1, tail)
+        until_s = self._clock_s() + _checked_ttl(ttl_s)
+        self._expires_s = min(self._expires_s, until_s)
+        self._entries[key] = (written, until_s)
         return written.version
 
     async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
@@ -90,17 +110,20 @@ class MemoryState:
 
     def _expire(self) -> None:
         now_s = self._clock_s()
+        if now_s < self._expires_s:
+            return
         gone = [key for key, (_, until_s) in self._entries.items() if until_s <= now_s]
         for key in gone:
             del self._entries[key]
+        self._expires_s = min((until_s for _, until_s in self._entries.values()), default=math.inf)
 
 
-# KEYS[1] key · ARGV: expected version, value, time to live in ms → {1, new} or {0, stored}
+# KEYS[1] key · ARGV: expected version, value, tail, time to live in ms → {1, new} or {0, stored}
 COMPARE_AND_SET = """
 local version = tonumber(redis.call('HGET', KEYS[1], 'version') or '0')
 if version ~= tonumber(ARGV[1]) then return {0, version} end
-redis.call('HSET', KEYS[1], 'version', version + 1, 'value', ARGV[2])
-redis.call('PEXPIRE', KEYS[1], ARGV[3])
+redis.call('HSET', KEYS[1], 'version', version + 1, 'value', ARGV[2], 'tail', ARGV[3])
+redis.call('PEXPIRE', KEYS[1], ARGV[4])
 return {1, version + 1}
 """
 
@@ -142,13 +165,21 @@ class RedisState:
 
     async def get(self, key: str) -> Versioned | None:
         """See MemoryState."""
-        version, value = await self._call("HMGET", REDIS_PREFIX + key, "version", "value")
-        return None if version is None else Versioned(value, int(version))
+        version, value, tail = await self._call(
+            "HMGET", REDIS_PREFIX + key, "version", "value", "tail"
+        )
+        return None if version is None else Versioned(value, int(version), tail or b"")
 
-    async def set(self, key: str, value: bytes, *, expected_version: int, ttl_s: float) -> int:
+    async def version(self, key: str) -> int:
+        """See MemoryState."""
+        return int(await self._call("HGET", REDIS_PREFIX + key, "version") or 0)
+
+    async def set(
+        self, key: str, value: bytes, *, tail: bytes = b"", expected_version: int, ttl_s: float
+    ) -> int:
         """See MemoryState."""
         written, version = await self._run(
-            self._compare_and_set, key, expected_version, value, _milliseconds(ttl_s)
+            self._compare_and_set, key, expected_version, value, tail, _milliseconds(ttl_s)
         )
         if not written:
             raise _version_conflict(key, expected=expected_version, got=int(version))

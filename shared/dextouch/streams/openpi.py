@@ -91,7 +91,7 @@ def _encoded(value: object) -> dict[bytes, Any]:
         return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
     return {
         b"__ndarray__": True,
-        b"data": np.ascontiguousarray(value).tobytes(),
+        b"data": np.ascontiguousarray(value).data,
         b"dtype": value.dtype.str,
         b"shape": value.shape,
     }

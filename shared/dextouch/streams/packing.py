@@ -20,6 +20,7 @@ MAX_ITEMS = 16_384
 # even of empty arrays.
 MAX_NUMBERS = 1 << 31
 DTYPES = ("uint8", "uint16", "int32", "int64", "float32", "float64", "bool")
+_NAMES = {np.dtype(name).newbyteorder("<"): name for name in DTYPES}
 
 
 C = TypeVar("C", bound=Sized)
@@ -33,11 +34,14 @@ def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
     """
     packed = {}
     for name, array in arrays.items():
-        dtype = np.asarray(array).dtype.name
-        if dtype not in DTYPES:
-            raise InvalidInputError(f"array {name!r}: dtype {dtype}, expected one of {DTYPES}")
-        ordered = np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<"))
-        packed[name] = {"dtype": dtype, "shape": list(ordered.shape), "data": ordered.tobytes()}
+        ordered = np.ascontiguousarray(array)
+        dtype = _NAMES.get(ordered.dtype)
+        if dtype is None:
+            dtype = ordered.dtype.name
+            if dtype not in DTYPES:
+                raise InvalidInputError(f"array {name!r}: dtype {dtype}, expected one of {DTYPES}")
+            ordered = ordered.astype(np.dtype(dtype).newbyteorder("<"))
+        packed[name] = {"dtype": dtype, "shape": list(ordered.shape), "data": ordered.data}
     try:
         return msgpack.packb({"fields": dict(fields), "arrays": packed})
     except OverflowError as error:

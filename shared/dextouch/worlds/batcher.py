@@ -4,7 +4,7 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
@@ -13,9 +13,11 @@ from jaxtyping import Float64
 
 from dextouch.errors import LimitExceededError, UnavailableError
 from dextouch.schemas import EVERYTHING, ReturnSelector
-from dextouch.worlds.world import BatchWorld, State, SteppedRollout, World
+from dextouch.worlds.world import BatchWorld, QuickWorld, State, SteppedRollout, World
 
 ResultT = TypeVar("ResultT")
+# Start time and duration of a batch, and of each entry the step and its snapshot.
+SteppedBatch = tuple[float, float, list[tuple[SteppedRollout[State], bytes]]]
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class StepJob(Generic[State]):
 
 
 class WorldWorker(Generic[State]):
-    """One world, one thread, one queue.
+    """One world, one thread, one queue; a `QuickWorld` needs neither thread nor queue.
 
     A world with `step_batch` gets all pending chunks of one length at once, without waiting for
     more; other worlds get them one by one. Bound to the event loop that first uses it.
@@ -54,18 +56,26 @@ class WorldWorker(Generic[State]):
         self._max_waiting = max_waiting
         self._max_batch = max_batch if isinstance(world, BatchWorld) else 1
         self._waiting: deque[StepJob[State]] = deque()
-        self._drain: asyncio.Task[None] | None = None
+        # Of a failed batch; they run one by one, so that only the faulty rollout fails.
+        self._apart: deque[StepJob[State]] = deque()
+        self._is_stepping = False
+        self._is_quick = isinstance(world, QuickWorld) and world.is_quick
         self._executor = ThreadPoolExecutor(
             max_workers=1, thread_name_prefix=f"world-{world.description.name}"
         )
 
     async def call(self, function: Callable[..., ResultT], *arguments: Any) -> ResultT:  # noqa: ANN401
-        """Run a function in the world's thread."""
+        """Run a function in the world's thread, or here if the world is quick."""
+        if self._is_quick:
+            return function(*arguments)
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._executor, function, *arguments)
 
     async def step(self, job: StepJob[State]) -> StepOutcome[State]:
         """Advance one rollout; raises LimitExceededError where the queue is full."""
+        if self._is_quick:
+            began_s, device_s, ((stepped, snapshot),) = self._step_all([job])
+            return StepOutcome(stepped, snapshot, began_s - job.since_s, device_s)
         if len(self._waiting) >= self._max_waiting:
             raise LimitExceededError(
                 f"world {self.world.description.name}: {len(self._waiting)} chunks are pending, "
@@ -73,21 +83,24 @@ class WorldWorker(Generic[State]):
                 retry_after_s=1,
             )
         self._waiting.append(job)
-        if self._drain is None or self._drain.done():
-            self._drain = asyncio.create_task(self._run_waiting())
+        if not self._is_stepping:
+            self._step_next()
         return await job.outcome
 
     def close(self) -> None:
         """Finish the running step and reject pending ones."""
-        if self._drain is not None:
-            self._drain.cancel()
-        while self._waiting:
-            _fail(self._waiting.popleft(), UnavailableError("the service is shutting down"))
+        for jobs in (self._apart, self._waiting):
+            while jobs:
+                _fail(jobs.popleft(), _shutting_down())
         self._executor.shutdown(wait=True, cancel_futures=True)
 
-    async def _run_waiting(self) -> None:
-        while self._waiting:
-            await self._run(self._take_batch())
+    def _step_next(self) -> None:
+        """Hand the next batch to the world's thread."""
+        batch = [self._apart.popleft()] if self._apart else self._take_batch()
+        self._is_stepping = True
+        loop = asyncio.get_running_loop()
+        running = self._executor.submit(self._step_all, batch)
+        running.add_done_callback(lambda ran: loop.call_soon_threadsafe(self._stepped, batch, ran))
 
     def _take_batch(self) -> list[StepJob[State]]:
         """The oldest pending chunk and, up to the limit, others of its length."""
@@ -97,24 +110,24 @@ class WorldWorker(Generic[State]):
         self._waiting = deque(job for job in self._waiting if job not in batch)
         return batch
 
-    async def _run(self, batch: Sequence[StepJob[State]]) -> None:
-        (result,) = await asyncio.gather(self.call(self._step_all, batch), return_exceptions=True)
-        if not isinstance(result, BaseException):
-            began_s, device_s, steps = result
+    def _stepped(self, batch: Sequence[StepJob[State]], ran: "Future[SteppedBatch[State]]") -> None:
+        """Answer those of a batch, in the event loop."""
+        self._is_stepping = False
+        error = _shutting_down() if ran.cancelled() else ran.exception()
+        if error is None:
+            began_s, device_s, steps = ran.result()
             for job, (stepped, snapshot) in zip(batch, steps, strict=True):
                 if not job.outcome.done():
                     queued_s = began_s - job.since_s
                     job.outcome.set_result(StepOutcome(stepped, snapshot, queued_s, device_s))
         elif len(batch) == 1:
-            _fail(batch[0], result)
+            _fail(batch[0], error)
         else:
-            # One by one, so that only the faulty rollout fails.
-            for job in batch:
-                await self._run([job])
+            self._apart.extend(batch)
+        if self._apart or self._waiting:
+            self._step_next()
 
-    def _step_all(
-        self, jobs: Sequence[StepJob[State]]
-    ) -> tuple[float, float, list[tuple[SteppedRollout[State], bytes]]]:
+    def _step_all(self, jobs: Sequence[StepJob[State]]) -> SteppedBatch[State]:
         """Runs in the world's thread; returns start time, duration, steps and snapshots."""
         began_s = time.perf_counter()
         if isinstance(self.world, BatchWorld) and len(jobs) > 1:
@@ -136,3 +149,7 @@ class WorldWorker(Generic[State]):
 def _fail(job: StepJob[Any], error: BaseException) -> None:
     if not job.outcome.done():
         job.outcome.set_exception(error)
+
+
+def _shutting_down() -> UnavailableError:
+    return UnavailableError("the service is shutting down")

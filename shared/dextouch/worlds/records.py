@@ -8,7 +8,7 @@ import numpy as np
 
 from dextouch.errors import LimitExceededError, NotFoundError, StorageError, UnavailableError
 from dextouch.schemas import RolloutInfo
-from dextouch.serving import StateStore
+from dextouch.serving import StateStore, Versioned
 from dextouch.streams import pack, unpack
 
 KEY_PREFIX = "rollout:"
@@ -23,7 +23,7 @@ class RolloutRecord:
 
     `request_sha256` and `payload` are request and response of the newest chunk, for a client that
     missed the response; None and empty before the first chunk. `version` is that of the store from
-    which the record was read or computed; it is not part of the bytes.
+    which the record was read or computed. Neither version nor payload are part of the bytes.
     """
 
     info: RolloutInfo
@@ -33,24 +33,30 @@ class RolloutRecord:
     version: int = 0
 
     def to_bytes(self) -> bytes:
-        """Serialize the record."""
-        arrays = {"snapshot": np.frombuffer(self.snapshot, np.uint8)}
-        if self.request_sha256 is not None:
-            arrays["payload"] = np.frombuffer(self.payload, np.uint8)
-        info = self.info.model_dump(mode="json")
-        return pack({"info": info, "request_sha256": self.request_sha256}, arrays)
+        """Serialize the record, except the payload, which is stored as it is."""
+        fields = {
+            "info": self.info.model_dump(mode="json"),
+            "request_sha256": self.request_sha256,
+            "payload_bytes": len(self.payload),
+        }
+        return pack(fields, {"snapshot": np.frombuffer(self.snapshot, np.uint8)})
 
     @staticmethod
-    def from_bytes(data: bytes, *, version: int = 0) -> "RolloutRecord":
-        """Deserialize a record."""
-        fields, arrays = unpack(data, max_bytes=MAX_RECORD_BYTES)
-        return RolloutRecord(
-            RolloutInfo.model_validate(fields["info"]),
-            arrays["snapshot"].tobytes(),
-            fields["request_sha256"],
-            arrays["payload"].tobytes() if "payload" in arrays else b"",
-            version,
-        )
+    def from_stored(stored: Versioned) -> "RolloutRecord":
+        """The record that a store holds.
+
+        Raises:
+            StorageError: not the whole payload, as one written by another version of DexTouch.
+        """
+        fields, arrays = unpack(stored.value, max_bytes=MAX_RECORD_BYTES)
+        info = RolloutInfo.model_validate(fields["info"])
+        if fields.get("payload_bytes") != len(stored.tail):
+            raise StorageError(
+                f"rollout {info.id}: got {len(stored.tail)} bytes of its newest response, expected "
+                f"{fields.get('payload_bytes')}; start a new one"
+            )
+        snapshot = arrays["snapshot"].tobytes()
+        return RolloutRecord(info, snapshot, fields["request_sha256"], stored.tail, stored.version)
 
 
 class RecordStore:
@@ -65,7 +71,11 @@ class RecordStore:
         stored = await self._store.get(KEY_PREFIX + rollout_id)
         if stored is None:
             raise _unknown(rollout_id)
-        return RolloutRecord.from_bytes(stored.value, version=stored.version)
+        return RolloutRecord.from_stored(stored)
+
+    async def is_newest(self, record: RolloutRecord) -> bool:
+        """Whether nobody has written since, without reading what is stored."""
+        return await self._store.version(KEY_PREFIX + record.info.id) == record.version
 
     @asynccontextmanager
     async def place(self, rollout_id: str, *, limit: int) -> AsyncIterator[int]:
@@ -94,6 +104,7 @@ class RecordStore:
         return await self._store.set(
             KEY_PREFIX + record.info.id,
             record.to_bytes(),
+            tail=record.payload,
             expected_version=record.version,
             ttl_s=self._ttl_s,
         )

@@ -86,9 +86,9 @@ class RolloutService:
         self.limits = limits or RolloutLimits()
         self._workers = {name: WorldWorker(world) for name, world in worlds.items()}
         self._records = RecordStore(store, ttl_s=self.limits.ttl_s)
-        # The newest states of this process's rollouts, least recently used first, with the versions
-        # of their records.
-        self._live: OrderedDict[str, tuple[int, Any]] = OrderedDict()
+        # The newest states of this process's rollouts, least recently used first, with their
+        # records, of which snapshot and payload are left out.
+        self._live: OrderedDict[str, tuple[RolloutRecord, Any]] = OrderedDict()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
 
     def worlds(self) -> list[WorldDescription]:
@@ -126,7 +126,7 @@ class RolloutService:
                 ttl_s=self.limits.ttl_s,
             )
             version = await self._records.write(RolloutRecord(info, snapshot, version=placed))
-        self._keep(info.id, version, started.state)
+        self._keep(RolloutRecord(info, b"", version=version), started.state)
         logger.info("rollout_started", rollout_id=info.id, world=world, task=info.task)
         origin = RolloutOrigin(started.anchor, started.K_head)
         shown = started.observation.selected(selector)
@@ -150,13 +150,14 @@ class RolloutService:
         """
         lock = self._locks.setdefault(rollout_id, asyncio.Lock())
         async with lock:
-            record = await self._records.read(rollout_id)
+            record = await self._newest(rollout_id, chunk)
             worker = self._worker_of(record.info)
             description = worker.world.description
             check_selector(selector, description)
             checked = check_chunk(actions, description)
-            asked = selector.model_dump_json().encode() + checked.astype("<f8").tobytes()
-            sha256 = hashlib.sha256(asked).hexdigest()
+            asked = hashlib.sha256(selector.model_dump_json().encode())
+            asked.update(np.ascontiguousarray(checked, dtype="<f8").data)
+            sha256 = asked.hexdigest()
             replayed = _replay(record, chunk, sha256)
             if replayed is not None:
                 logger.info("chunk_replayed", rollout_id=rollout_id, chunk=chunk)
@@ -207,6 +208,15 @@ class RolloutService:
         for worker in self._workers.values():
             worker.close()
 
+    async def _newest(self, rollout_id: str, chunk: int) -> RolloutRecord:
+        """The record; without its large parts if the live state is to be advanced."""
+        held, _ = self._live.get(rollout_id, (None, None))
+        # Any other chunk is a repetition, which needs the stored response, or a conflict.
+        is_next = held is not None and chunk == held.info.next_chunk
+        if held is not None and is_next and await self._records.is_newest(held):
+            return held
+        return await self._records.read(rollout_id)
+
     async def _advance(
         self,
         stored: RolloutRecord,
@@ -217,8 +227,8 @@ class RolloutService:
     ) -> Answer:
         """Compute a chunk and commit its record."""
         before = stored.info
-        held, state = self._live.get(before.id, (0, None))
-        if held != stored.version:
+        held, state = self._live.get(before.id, (None, None))
+        if held is None or held.version != stored.version:
             state = await worker.call(worker.world.restore, stored.snapshot)
         seed = chunk_seed(before.seed, before.next_chunk, before.world_digest)
         outcome = await worker.step(StepJob(state, actions, seed, selector))
@@ -240,20 +250,21 @@ class RolloutService:
         payload = encode_answer(info, seen, tactile=selector.tactile, info=told)
         record = RolloutRecord(info, outcome.snapshot, request_sha256, payload, stored.version)
         version = await self._records.write(record)
-        self._keep(info.id, version, outcome.stepped.state)
+        self._keep(RolloutRecord(info, b"", version=version), outcome.stepped.state)
         return Answer(payload, queued_s=outcome.queued_s, device_s=outcome.device_s)
 
     async def _end(self, record: RolloutRecord, error: EndedError) -> EndedError:
         """Mark a rollout as ended; returns the error that later chunks get."""
         info = record.info.model_copy(update={"ended": error.reason})
-        await self._records.write(replace(record, info=info))
+        stored = await self._records.read(info.id)
+        await self._records.write(replace(stored, info=info, version=record.version))
         self._live.pop(info.id, None)
         logger.info("rollout_ended", rollout_id=info.id, reason=error.reason)
         return _over(info)
 
-    def _keep(self, rollout_id: str, version: int, state: object) -> None:
-        self._live[rollout_id] = (version, state)
-        self._live.move_to_end(rollout_id)
+    def _keep(self, record: RolloutRecord, state: object) -> None:
+        self._live[record.info.id] = (record, state)
+        self._live.move_to_end(record.info.id)
         if len(self._live) > self.limits.max_rollouts:
             self._live.popitem(last=False)
 

@@ -12,7 +12,7 @@ from jaxtyping import Shaped
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.errors import ShapeError
 from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import ACTION_DIM
 from dextouch.schemas import (
@@ -43,12 +43,18 @@ from dextouch.serving import (
     timed,
 )
 from dextouch.streams import unpack
+from dextouch.worlds.chunk_shortcut import (
+    REPLAYED_HEADER,
+    SCOPE,
+    ChunkShortcut,
+    actions_from,
+    timings_s,
+    wants_json,
+)
 from dextouch.worlds.openpi import openpi_router
 from dextouch.worlds.rollouts import Answer, RolloutLimits, RolloutService
 from dextouch.worlds.world import World
 
-SCOPE = "rollout"
-REPLAYED_HEADER = "dextouch-replayed"
 MAX_BODY_BYTES = 2**28
 # Room for 1000 rows of float64, or some hundred rows as JSON.
 MAX_CHUNK_BYTES = 2**20
@@ -85,6 +91,7 @@ def create_world_app(
     """Create the application; its shutdown ends the worlds' threads."""
     store = open_state(settings.state_url)
     service = RolloutService(worlds, store, settings.limits)
+    shortcut = ChunkShortcut(service)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -96,13 +103,15 @@ def create_world_app(
         await store.ping()
         return []
 
-    return create_service_app(
+    app = create_service_app(
         name=name,
         settings=settings,
-        routers=[rollout_router(service), openpi_router(service)],
+        routers=[rollout_router(service, shortcut), openpi_router(service)],
         lifespan=lifespan,
         readiness=readiness,
     )
+    app.state.shortcut = shortcut
+    return app
 
 
 def serve_worlds(
@@ -113,8 +122,8 @@ def serve_worlds(
     run(create_world_app(worlds, settings, name=name), settings)
 
 
-def rollout_router(service: RolloutService) -> APIRouter:
-    """Router of one rollout service."""
+def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRouter:
+    """Router of one rollout service; its route of chunks teaches the shortcut."""
     router = APIRouter(prefix="/v1", tags=["rollouts"], dependencies=[Depends(RequireScope(SCOPE))])
 
     @router.get("/worlds")
@@ -160,7 +169,8 @@ def rollout_router(service: RolloutService) -> APIRouter:
         with timed(request, "decode"):
             actions = await _actions_of(request)
         answer = await service.step(rollout_id, chunk, actions, selector)
-        request.state.timings_s |= {"queue": answer.queued_s, "device": answer.device_s}
+        request.state.timings_s |= timings_s(answer)
+        shortcut.learn(request, selector)
         return _response(request, answer)
 
     @router.post("/rollouts/{rollout_id}/fork", status_code=201)
@@ -195,19 +205,7 @@ async def _actions_of(request: Request) -> Shaped[np.ndarray, "..."]:
         if len(body) > MAX_INLINE_BYTES:
             return await run_in_threadpool(_actions_from_json, body)
         return _actions_from_json(body)
-    dtype = parameters.get("dtype", "")
-    if dtype not in {"float32", "float64"}:
-        raise InvalidInputError(
-            f"chunk: got dtype {dtype!r}, expected the header "
-            f"'Content-Type: {OCTETS}; dtype=float32' or float64"
-        )
-    row_bytes = ACTION_DIM * np.dtype(dtype).itemsize
-    if not body or len(body) % row_bytes:
-        raise ShapeError(
-            f"chunk: got {len(body)} bytes, expected a multiple of {row_bytes} "
-            f"([K, {ACTION_DIM}] {dtype}, little endian)"
-        )
-    return np.frombuffer(body, np.dtype(dtype).newbyteorder("<")).reshape(-1, ACTION_DIM)
+    return actions_from(body, parameters.get("dtype", ""))
 
 
 def _actions_from_json(body: bytes) -> Shaped[np.ndarray, "..."]:
@@ -220,8 +218,7 @@ def _actions_from_json(body: bytes) -> Shaped[np.ndarray, "..."]:
 
 def _response(request: Request, answer: Answer, *, status: int = 200) -> Response:
     headers = {REPLAYED_HEADER: "true" if answer.replayed else "false"}
-    accepted = request.headers.get("accept", MSGPACK)
-    if JSON in accepted and MSGPACK not in accepted:
+    if wants_json(request.headers.get("accept", "")):
         with timed(request, "encode"):
             content, media_type = _as_json(answer.payload), JSON
         return Response(content, status, headers, media_type)

@@ -136,6 +136,20 @@ class BatchWorld(World[State], Protocol[State]):
         ...
 
 
+@runtime_checkable
+class QuickWorld(World[State], Protocol[State]):
+    """A world that may say that each of its calls takes well below a millisecond.
+
+    Its calls are then made in the event loop itself: changing to another thread and back takes
+    longer, and nobody else is kept waiting for long.
+    """
+
+    @property
+    def is_quick(self) -> bool:
+        """Whether calls take well below a millisecond."""
+        ...
+
+
 def check_start(start: RolloutStart, description: WorldDescription) -> RolloutStart:
     """Validate a start and keep only images of this world's cameras."""
     if start.task not in description.tasks:
