@@ -8,7 +8,7 @@ from benchmarks.simulated.hand_motions import Motion, motion_of, robot_motion
 from benchmarks.simulated.tracking_faults import fuzzed
 from benchmarks.stress.cells import Check, StageCells
 from dextouch.hands.robot_hand import RobotHand
-from services.alignment.retargeting.hand_retargeter import HandRetargeter, RetargetStatus
+from services.alignment.retargeting import HandRetargeter, RetargetStatus
 from services.twin.hands import twin_hand
 
 STAGE = StageCells("retargeting")

@@ -4,12 +4,10 @@ Every step of a job is committed to disk before anyone hears of it; only progres
 """
 
 import asyncio
-import fcntl
-import re
 import sqlite3
 import threading
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import google_crc32c
@@ -32,11 +30,6 @@ from services.alignment.synchronization.progress import Progress
 logger = structlog.get_logger(__name__)
 
 DATABASE_FILE = "jobs.sqlite3"
-LOCK_FILE = "lock"
-# Where earlier versions kept jobs, and its name once they have been imported.
-JSON_LINES_FILE = "jobs.jsonl"
-IMPORTED_FILE = "jobs.jsonl.imported"
-JSON_LINE = re.compile(rb'\{"crc32c":(\d{1,10}),"job":(.*)\}')
 SCHEMA_VERSION = 1
 SCHEMA = """
 CREATE TABLE jobs (
@@ -194,29 +187,19 @@ class JobDatabase:
 
     Raises:
         ConflictError: another process has it open.
-        CorruptDataError: the database, or the file of an earlier version, is damaged.
+        CorruptDataError: the database is damaged.
         StorageError: it cannot be read or written.
     """
 
     def __init__(self, folder: Path) -> None:
         self._path, self._guard = folder / DATABASE_FILE, threading.Lock()
-        with ExitStack() as opened:
-            with disk_errors(f"open the jobs in {folder}"):
-                folder.mkdir(parents=True, exist_ok=True)
-                lock = opened.enter_context((folder / LOCK_FILE).open("a"))
-            try:
-                # Held by earlier versions as well, so that two versions never share jobs.
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise ConflictError(
-                    f"alignment jobs in {folder}: another alignment service uses them; stop it, or "
-                    "give this one a --jobs-folder of its own"
-                ) from error
-            with self._errors("open"):
-                connection = sqlite3.connect(self._path, check_same_thread=False, timeout=0)
-                self._connection = opened.enter_context(closing(connection))
-                self._prepare(connection)
-            self._opened = opened.pop_all()
+        with disk_errors(f"open the jobs in {folder}"):
+            folder.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as opened, self._errors("open"):
+            self._connection = sqlite3.connect(self._path, check_same_thread=False, timeout=0)
+            opened.callback(self._connection.close)
+            self._prepare(self._connection.execute)
+            opened.pop_all()
 
     def load(self) -> dict[str, AlignmentJob]:
         """Jobs by id, in the order in which they were submitted.
@@ -227,8 +210,20 @@ class JobDatabase:
         select = "SELECT position, crc32c, CAST(job AS BLOB) FROM jobs ORDER BY position"
         with self._errors("read"), self._guard:
             rows = self._connection.execute(select).fetchall()
-        jobs = [_checked(body, crc, f"{self._path}, job {place}") for place, crc, body in rows]
-        return {job.alignment_id: job for job in jobs}
+        jobs = {}
+        for place, crc32c, body in rows:
+            where = f"{self._path}, job {place}"
+            if google_crc32c.value(body) != crc32c:
+                raise CorruptDataError(f"{where}: does not match its checksum; {MOVE_AWAY}")
+            try:
+                job = AlignmentJob.model_validate_json(body)
+            except ValidationError as error:
+                raise CorruptDataError(
+                    f"{where}: not a job of this version ({error.error_count()} fields do not "
+                    f"fit); {MOVE_AWAY}"
+                ) from error
+            jobs[job.alignment_id] = job
+        return jobs
 
     def commit(self, removed: Iterable[str], saved: Iterable[AlignmentJob]) -> None:
         """Remove jobs, then insert or update others, in one transaction.
@@ -242,49 +237,45 @@ class JobDatabase:
             connection.executemany(UPSERT, [_row(job) for job in saved])
 
     def close(self) -> None:
-        """Close the database and release the lock."""
+        """Close the database, so that another process may open it."""
         with self._guard:
-            self._opened.close()
+            self._connection.close()
 
-    def _prepare(self, connection: sqlite3.Connection) -> None:
-        """Create the table, or check it; import the jobs of an earlier version once."""
+    def _prepare(self, execute: Callable[[str], sqlite3.Cursor]) -> None:
         # One process has the database, so the log's index need not be in shared memory, which
         # network file systems lack.
-        connection.execute("PRAGMA locking_mode = EXCLUSIVE")
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")
-        (version,) = connection.execute("PRAGMA user_version").fetchone()
-        earlier = self._path.with_name(JSON_LINES_FILE)
+        execute("PRAGMA locking_mode = EXCLUSIVE")
+        execute("PRAGMA journal_mode = WAL")
+        execute("PRAGMA synchronous = FULL")
+        (version,) = execute("PRAGMA user_version").fetchone()
         if version == 0:
-            jobs = _read_json_lines(earlier)
-            with connection:
-                connection.execute("BEGIN")
-                connection.execute(SCHEMA)
-                connection.executemany(UPSERT, [_row(job) for job in jobs])
-                connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-            logger.info("job_database_created", path=str(self._path), num_imported=len(jobs))
+            execute("BEGIN")
+            execute(SCHEMA)
+            execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            execute("COMMIT")
         elif version != SCHEMA_VERSION:
             raise CorruptDataError(
                 f"{self._path}: got schema version {version}, expected {SCHEMA_VERSION}; use the "
                 "version of DexTouch that wrote it, or move the file away"
             )
-        else:
-            (found,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-            if found != "ok":
-                raise CorruptDataError(f"{self._path}: damaged ({found}); {MOVE_AWAY}")
-        if earlier.is_file():
-            earlier.replace(earlier.with_name(IMPORTED_FILE))
+        (found,) = execute("PRAGMA quick_check(1)").fetchone()
+        if found != "ok":
+            raise CorruptDataError(f"{self._path}: damaged ({found}); {MOVE_AWAY}")
 
     @contextmanager
     def _errors(self, verb: str) -> Iterator[None]:
-        """Turn errors of SQLite and of the disk into ours."""
+        """Turn errors of SQLite into ours."""
         what = f"{verb} {self._path}"
         try:
-            with disk_errors(what):
-                yield
+            yield
         except sqlite3.Error as error:
             # Extended codes carry the primary one in their lowest byte.
             code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+            if code == sqlite3.SQLITE_BUSY:
+                raise ConflictError(
+                    f"alignment jobs in {self._path.parent}: another alignment service uses them; "
+                    "stop it, or give this one a --jobs-folder of its own"
+                ) from error
             if code == sqlite3.SQLITE_FULL:
                 told = f"{what}: no space left; free space and try again"
                 raise StorageFullError(told) from error
@@ -296,36 +287,3 @@ class JobDatabase:
 def _row(job: AlignmentJob) -> tuple[str, int, str]:
     body = job.model_dump_json(exclude_none=True)
     return job.alignment_id, google_crc32c.value(body.encode()), body
-
-
-def _checked(body: bytes, crc32c: int, where: str) -> AlignmentJob:
-    if google_crc32c.value(body) != crc32c:
-        raise CorruptDataError(f"{where}: does not match its checksum; {MOVE_AWAY}")
-    try:
-        return AlignmentJob.model_validate_json(body)
-    except ValidationError as error:
-        raise CorruptDataError(
-            f"{where}: not a job of this version ({error.error_count()} fields do not fit); "
-            f"{MOVE_AWAY}"
-        ) from error
-
-
-def _read_json_lines(path: Path) -> list[AlignmentJob]:
-    """The jobs of an earlier version, which appended each state to a file; a torn end is ignored.
-
-    Raises:
-        CorruptDataError: a line before the end is damaged.
-    """
-    *lines, _torn = path.read_bytes().split(b"\n") if path.is_file() else [b""]
-    jobs: dict[str, AlignmentJob] = {}
-    for number, line in enumerate(lines, start=1):
-        where = f"{path}, line {number} of {len(lines)}"
-        match = JSON_LINE.fullmatch(line)
-        if match is None:
-            raise CorruptDataError(f"{where}: not a line of jobs; {MOVE_AWAY}")
-        job = _checked(match[2], int(match[1]), where)
-        if job.alignment_id in jobs and jobs[job.alignment_id].state in ENDED:
-            # Submitted again: it goes to the end of the queue.
-            del jobs[job.alignment_id]
-        jobs[job.alignment_id] = job
-    return list(jobs.values())

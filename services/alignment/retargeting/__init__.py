@@ -4,10 +4,9 @@ from services.alignment.retargeting.hand_profile import HandProfile
 from services.alignment.retargeting.hand_retargeter import (
     HandRetargeter,
     RetargetResult,
-    RetargetStatus,
     warm_up,
 )
-from services.alignment.retargeting.solver.arrays import RetargetOptions
+from services.alignment.retargeting.solver.arrays import RetargetOptions, RetargetStatus
 
 __all__ = [
     "HandProfile",

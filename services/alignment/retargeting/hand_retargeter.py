@@ -1,7 +1,6 @@
 """`HandRetargeter`: joint angles of a robot hand that follow a tracked human hand."""
 
 from dataclasses import dataclass, replace
-from enum import IntEnum
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
@@ -15,8 +14,9 @@ from services.alignment.retargeting.profile_fit import (
     measure_profile,
     person_arrays,
 )
-from services.alignment.retargeting.solver import arrays
 from services.alignment.retargeting.solver.arrays import (
+    IMPLAUSIBLE,
+    NOMINAL_PERIOD_S,
     SCRATCH,
     Memory,
     Output,
@@ -25,27 +25,6 @@ from services.alignment.retargeting.solver.arrays import (
     joint_places,
 )
 from services.alignment.retargeting.solver.solve import retarget_samples
-
-NOMINAL_PERIOD_S = arrays.NOMINAL_PERIOD_S
-
-
-class RetargetStatus(IntEnum):
-    """How a finger was solved; for a sample, the worst status of its fingers.
-
-    PARTIAL: some of its points were missing. REACQUIRED: it was lost and searched again; live, its
-    joints are approaching the tracked pose at the velocity limit. UNCONVERGED: the solver did not
-    converge. IMPLAUSIBLE: bones or knuckle do not match this hand. MISSING: fewer than two points.
-    With the last two, the finger keeps its previous angles; a sample is IMPLAUSIBLE or MISSING if
-    all fingers are, PARTIAL if some are.
-    """
-
-    SOLVED = arrays.SOLVED
-    PARTIAL = arrays.PARTIAL
-    REACQUIRED = arrays.REACQUIRED
-    UNCONVERGED = arrays.UNCONVERGED
-    IMPLAUSIBLE = arrays.IMPLAUSIBLE
-    MISSING = arrays.MISSING
-
 
 @dataclass(frozen=True)
 class RetargetResult:
@@ -225,7 +204,7 @@ class HandRetargeter:
             status=output.status,
             finger_status=output.finger_status,
             tip_error_m=output.tip_error_m,
-            solved=output.finger_status < arrays.IMPLAUSIBLE,
+            solved=output.finger_status < IMPLAUSIBLE,
         )
 
     def _filled(self, result: RetargetResult, t_s: np.ndarray) -> np.ndarray:

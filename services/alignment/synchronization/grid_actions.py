@@ -10,12 +10,8 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 from dextouch.hands.actions import AnchorPoses, HandTrajectory, actions_from_poses
 from dextouch.schemas import Domain, Matrix
 from dextouch.tactile.layout import SIDES, Side
+from services.alignment.retargeting import HandRetargeter, RetargetResult, RetargetStatus
 from services.alignment.retargeting.hand_profile import calibrated_profile
-from services.alignment.retargeting.hand_retargeter import (
-    HandRetargeter,
-    RetargetResult,
-    RetargetStatus,
-)
 from services.alignment.retargeting.wrist_frame import hand_axes_check
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import (

@@ -1,7 +1,8 @@
-"""Where compiled code is kept, what of it is brought along, and that another user may run it."""
+"""Where compiled code is kept, and that the image's user runs what the image holds."""
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -13,23 +14,21 @@ import pytest
 from services.alignment.retargeting.solver.compiled import folder_of_code
 
 CHECKOUT = Path(__file__).parents[3]
-# Of deploy/Dockerfile.
+DOCKERFILE = CHECKOUT / "deploy" / "Dockerfile"
 IMAGE_UID = 10001
 # Another user may not reach the interpreter's own modules: they are all loaded before. What is ours
 # is then imported again, as that user.
 AS_USER = """
-import json, os, sys, tempfile
+import json, os, sys
 import numba
 import services.alignment.retargeting
 
 numba.njit(lambda a: a + 1.0)(1.0)
-uid, place = int(sys.argv[1]), sys.argv[2]
+uid = int(sys.argv[1])
 os.setgroups([])
 os.setgid(uid)
 os.setuid(uid)
-numba.config.CACHE_DIR = sys.argv[3]
-if place == "nowhere":
-    tempfile.tempdir = "/proc/nowhere"
+numba.config.CACHE_DIR = sys.argv[2]
 for name in [name for name in sys.modules if name.startswith("services.")]:
     del sys.modules[name]
 """
@@ -55,104 +54,63 @@ print(json.dumps({"is_loaded": bool(retarget_samples.stats.cache_hits)}))
 """
 
 
-def test_the_first_folder_by_the_content_of_the_code(tmp_path):
-    before = os.umask(0o022)
-    folder = folder_of_code(tmp_path / "wanted", tmp_path / "spare")
-    os.umask(before)
-    assert folder.parent == tmp_path / "wanted"
-    assert len(folder.name) == 16
-    assert folder_of_code(tmp_path / "wanted", tmp_path / "spare") == folder
-    # What it holds is run: others may read, not write.
-    assert folder.stat().st_mode & 0o777 == 0o755
-
-
-def test_read_only_code_is_copied(tmp_path, monkeypatch):
-    name = folder_of_code(tmp_path / "wanted", tmp_path / "spare").name
-    (tmp_path / "wanted" / name / "deep").mkdir()
-    (tmp_path / "wanted" / name / "deep" / "solver.nbi").write_bytes(b"code")
-    (tmp_path / "wanted" / name / "deep").chmod(0o555)
-    monkeypatch.setattr(os, "access", lambda path, _: tmp_path / "wanted" not in path.parents)
-    folder = folder_of_code(tmp_path / "wanted", tmp_path / "spare")
-    assert folder == tmp_path / "spare" / name
-    assert (folder / "deep" / "solver.nbi").read_bytes() == b"code"
-    assert folder.stat().st_mode & 0o700 == 0o700
-    assert (folder / "deep").stat().st_mode & 0o700 == 0o700
-
-
-def test_code_that_others_may_write_is_not_taken(tmp_path, monkeypatch):
-    name = folder_of_code(tmp_path / "wanted", tmp_path / "spare").name
-    (tmp_path / "wanted" / name / "solver.nbi").write_bytes(b"code")
-    (tmp_path / "wanted" / name).chmod(0o777)
-    monkeypatch.setattr(os, "access", lambda path, _: tmp_path / "wanted" not in path.parents)
-    folder = folder_of_code(tmp_path / "wanted", tmp_path / "spare")
-    assert list(folder.iterdir()) == []
-
-
 @pytest.mark.parametrize("umask", [0o002, 0o022, 0o077])
-def test_folders_of_every_umask_are_used_again(tmp_path, umask):
+def test_folder_by_the_content_of_the_code_is_of_this_user_alone(tmp_path, umask):
     before = os.umask(umask)
     try:
-        found = [folder_of_code(tmp_path / "new" / "wanted", tmp_path / "spare") for _ in range(2)]
+        folder, again = [folder_of_code(tmp_path / "new" / "base") for _ in range(2)]
     finally:
         os.umask(before)
-    assert [folder.parent for folder in found] == [tmp_path / "new" / "wanted"] * 2
-    for made in (found[0], found[0].parent):
-        assert made.stat().st_mode & 0o022 == 0
+    assert folder == again
+    assert folder.parent == tmp_path / "new" / "base"
+    assert len(folder.name) == 16
     # What numba makes inside has the modes of the umask: others must not get there.
-    is_open = umask & 0o022 != 0o022
-    assert found[0].stat().st_mode & 0o077 == 0 or not is_open
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert folder.parent.stat().st_mode & 0o022 == 0
+
+
+@pytest.mark.parametrize("mode", [0o770, 0o755, 0o707])
+def test_no_folder_that_others_may_enter_is_used(tmp_path, mode):
+    folder = folder_of_code(tmp_path / "base")
+    folder.chmod(mode)
+    assert folder_of_code(tmp_path / "base") is None
 
 
 @pytest.mark.parametrize("mode", [0o775, 0o757])
-def test_no_folder_that_others_may_write_is_used(tmp_path, mode):
-    wanted, spare = tmp_path / "wanted", tmp_path / "spare"
-    wanted.mkdir()
-    wanted.chmod(mode)
-    assert folder_of_code(wanted, spare).parent == spare
-    wanted.chmod(0o755)
-    folder = folder_of_code(wanted, spare)
-    assert folder.parent == wanted
-    folder.chmod(mode)
-    assert folder_of_code(wanted, spare).parent == spare
+def test_no_folder_that_others_may_replace_is_used(tmp_path, mode):
+    folder_of_code(tmp_path / "base").parent.chmod(mode)
+    assert folder_of_code(tmp_path / "base") is None
 
 
 def test_a_link_that_is_turned_later_changes_nothing(tmp_path):
     (tmp_path / "real").mkdir(mode=0o755)
     (tmp_path / "link").symlink_to(tmp_path / "real")
-    folder = folder_of_code(tmp_path / "link", tmp_path / "spare")
+    folder = folder_of_code(tmp_path / "link")
     assert folder.parent == tmp_path / "real"
     # In a folder for temporary files anybody may make a link of this name.
     folder.rename(tmp_path / "elsewhere")
     folder.symlink_to(tmp_path / "elsewhere")
-    assert folder_of_code(tmp_path / "link", tmp_path / "spare").parent == tmp_path / "spare"
-
-
-def test_code_below_a_folder_that_others_may_write_is_not_copied(tmp_path, monkeypatch):
-    name = folder_of_code(tmp_path / "wanted", tmp_path / "spare").name
-    (tmp_path / "wanted" / name / "solver.nbi").write_bytes(b"code")
-    (tmp_path / "wanted").chmod(0o777)
-    monkeypatch.setattr(os, "access", lambda path, _: tmp_path / "wanted" not in path.parents)
-    folder = folder_of_code(tmp_path / "wanted", tmp_path / "spare")
-    assert list(folder.iterdir()) == []
+    assert folder_of_code(tmp_path / "link") is None
 
 
 def test_a_folder_for_temporary_files_may_be_named(tmp_path):
-    (tmp_path / "wanted").mkdir()
-    (tmp_path / "wanted").chmod(0o1777)
-    assert folder_of_code(tmp_path / "wanted", tmp_path / "spare").parent == tmp_path / "wanted"
-    # Where others could put a folder of their own in its place.
-    (tmp_path / "wanted").chmod(0o777)
-    assert folder_of_code(tmp_path / "wanted", tmp_path / "spare").parent == tmp_path / "spare"
+    (tmp_path / "base").mkdir()
+    (tmp_path / "base").chmod(0o1777)
+    assert folder_of_code(tmp_path / "base").parent == tmp_path / "base"
 
 
-def test_nowhere_to_write(tmp_path):
+def test_nowhere_to_write(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    assert folder_of_code(tmp_path / "file" / "a", tmp_path / "file" / "b") is None
+    assert folder_of_code(tmp_path / "file" / "a") is None
+    assert folder_of_code(tmp_path / "base") is not None
+    # On a disk that is mounted read-only.
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert folder_of_code(tmp_path / "base") is None
 
 
 def test_the_folder_of_somebody_else_is_not_run(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "getuid", lambda: tmp_path.stat().st_uid + 1)
-    assert folder_of_code(tmp_path / "wanted", tmp_path / "spare") is None
+    assert folder_of_code(tmp_path / "base") is None
 
 
 @pytest.fixture(scope="module")
@@ -166,18 +124,12 @@ def image():
     shutil.rmtree(base)
 
 
-def run_as(uid, script, image, place="temporary"):
+def run_as(uid, script, image, base):
     """What a script prints as that user, without a home; and what is logged."""
     path = image / "script.py"
     path.write_text(AS_USER + script)
-    # numba keeps the time of the file with its code.
-    os.utime(path, (1, 1))
-    temporary = image / f"tmp-{uid}"
-    if not temporary.is_dir():
-        temporary.mkdir(mode=0o700)
-        os.chown(temporary, uid, uid)
     done = subprocess.run(
-        [sys.executable, str(path), str(uid), place, str(image / "compiled")],
+        [sys.executable, str(path), str(uid), str(base)],
         cwd="/",
         env={
             "PYTHONPATH": f"{CHECKOUT}{os.pathsep}{CHECKOUT / 'shared'}",
@@ -185,7 +137,6 @@ def run_as(uid, script, image, place="temporary"):
             # Of what is imported as root.
             "NUMBA_CACHE_DIR": str(image / "root"),
             "HOME": "/nonexistent",
-            "TMPDIR": str(temporary),
         },
         capture_output=True,
         text=True,
@@ -198,35 +149,62 @@ def run_as(uid, script, image, place="temporary"):
     return json.loads(answer), "\n".join(logged) + done.stderr
 
 
-@pytest.fixture(scope="module")
-def built(image):
-    """The folder of the code that root compiled."""
-    found, _ = run_as(0, SMALL, image)
-    assert not found["is_loaded"]
-    return Path(found["folder"])
+def start_container(image):
+    """Run the entry command of the image as its user; returns the folder that it copies code to."""
+    (line,) = re.findall(r"^ENTRYPOINT (.*)$", DOCKERFILE.read_text(), re.MULTILINE)
+    temporary = image / "tmp"
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(mode=0o700)
+    os.chown(temporary, IMAGE_UID, IMAGE_UID)
+    entry = [word.replace("/opt/dextouch", str(image)) for word in json.loads(line)]
+    # Twice, as where a container is started again.
+    for _ in range(2):
+        done = subprocess.run(
+            [*entry, "sh", "-c", "umask; echo $1", "a", "two words"],
+            user=IMAGE_UID,
+            group=IMAGE_UID,
+            extra_groups=[],
+            umask=0o022,
+            env={"PATH": os.environ["PATH"], "NUMBA_CACHE_DIR": str(temporary / "compiled")},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert done.stdout == "0022\ntwo words\n"
+    return temporary / "compiled", done.stderr
 
 
-def test_code_that_root_compiled_is_run_by_the_images_user(image, built):
-    found, logged = run_as(IMAGE_UID, SMALL, image)
+def build(image, script):
+    """Compile as root, and make the code readable, as the image does."""
+    shutil.rmtree(image / "compiled", ignore_errors=True)
+    built, _ = run_as(0, script, image, image / "compiled")
+    assert not built["is_loaded"]
+    for path in [image / "compiled", *(image / "compiled").rglob("*")]:
+        path.chmod(path.stat().st_mode | (0o055 if path.is_dir() else 0o044))
+
+
+def test_code_that_root_compiled_is_run_by_the_images_user(image):
+    build(image, SMALL)
+    base, told = start_container(image)
+    assert told == ""
+    found, logged = run_as(IMAGE_UID, SMALL, image, base)
     assert found["total"] == 3.5
-    assert found["folder"] == str(image / f"tmp-{IMAGE_UID}" / f"dextouch-{IMAGE_UID}" / built.name)
+    assert Path(found["folder"]).parent == base
     assert found["is_loaded"]
     assert "compiled_code" not in logged
 
 
-def test_code_that_may_not_be_read_is_compiled_again(image, built):
-    built.chmod(0o700)
-    shutil.rmtree(image / f"tmp-{IMAGE_UID}", ignore_errors=True)
-    found, logged = run_as(IMAGE_UID, SMALL, image)
-    built.chmod(0o755)
+def test_an_image_without_code_starts_and_compiles(image):
+    shutil.rmtree(image / "compiled", ignore_errors=True)
+    base, told = start_container(image)
+    assert "compiled" in told
+    found, _ = run_as(IMAGE_UID, SMALL, image, base)
     assert found["total"] == 3.5
     assert not found["is_loaded"]
-    assert "compiled_code_not_copied" in logged
 
 
-def test_without_any_folder_code_is_compiled_in_memory(image, built):
-    assert built.is_dir()
-    found, logged = run_as(IMAGE_UID, SMALL, image, "nowhere")
+def test_without_any_folder_code_is_compiled_in_memory(image):
+    found, logged = run_as(IMAGE_UID, SMALL, image, "/proc/nowhere")
     assert found == {"total": 3.5, "folder": None, "is_loaded": False}
     assert "compiled_code_not_kept" in logged
     assert "NUMBA_CACHE_DIR" in logged
@@ -234,9 +212,7 @@ def test_without_any_folder_code_is_compiled_in_memory(image, built):
 
 @pytest.mark.slow
 def test_the_solver_that_root_compiled_is_run_by_the_images_user(image):
-    shutil.rmtree(image / "compiled", ignore_errors=True)
-    shutil.rmtree(image / f"tmp-{IMAGE_UID}", ignore_errors=True)
-    built, _ = run_as(0, SOLVER, image)
-    assert built == {"is_loaded": False}
-    found, _ = run_as(IMAGE_UID, SOLVER, image)
+    build(image, SOLVER)
+    base, _ = start_container(image)
+    found, _ = run_as(IMAGE_UID, SOLVER, image, base)
     assert found == {"is_loaded": True}

@@ -4,6 +4,7 @@ Tables of fixed size are records: compiled functions hand on one pointer, and st
 """
 
 from dataclasses import astuple, dataclass, fields
+from enum import IntEnum
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -27,8 +28,6 @@ PINCH_WEIGHT_FAR: Final = 1e-3
 MAX_WEIGHT = 1e6
 LEAST = 1e-6
 NO_TURN = (1.0, 0.0, 0.0, 0.0)
-# Phalanges of the robot's fingers as capsules.
-PHALANX_RADIUS_M = 0.0085
 # Where cold searches begin, as fractions from lower to upper limit, knuckle to tip. The first two
 # find nearly all postures; the others are for the rest.
 STARTS = (
@@ -42,8 +41,27 @@ STARTS = (
     (0.90, 0.75, 0.10, 0.50),
 )
 
-# What became of a finger in a sample; see `RetargetStatus`.
-SOLVED, PARTIAL, REACQUIRED, UNCONVERGED, IMPLAUSIBLE, MISSING = range(6)
+
+class RetargetStatus(IntEnum):
+    """How a finger was solved; for a sample, the worst status of its fingers.
+
+    PARTIAL: some of its points were missing. REACQUIRED: it was lost and searched again; live, its
+    joints are approaching the tracked pose at the velocity limit. UNCONVERGED: the solver did not
+    converge. IMPLAUSIBLE: bones or knuckle do not match this hand. MISSING: fewer than two points.
+    With the last two, the finger keeps its previous angles; a sample is IMPLAUSIBLE or MISSING if
+    all fingers are, PARTIAL if some are.
+    """
+
+    SOLVED = 0
+    PARTIAL = 1
+    REACQUIRED = 2
+    UNCONVERGED = 3
+    IMPLAUSIBLE = 4
+    MISSING = 5
+
+
+# As the compiled solver knows them.
+SOLVED, PARTIAL, REACQUIRED, UNCONVERGED, IMPLAUSIBLE, MISSING = map(int, RetargetStatus)
 
 _F, _J, _P = MAX_FINGERS, MAX_JOINTS, NUM_POINTS
 
@@ -72,8 +90,6 @@ HAND: Final = np.dtype(
         ("knuckle_m", np.float64, (_F, 3)),
         # Where cold searches begin.
         ("starts_rad", np.float64, (MAX_STARTS, _F, _J)),
-        # Phalanges as capsules, from knuckle to tip.
-        ("radius_m", np.float64, (_F, 3)),
         # Which keypoints are knuckle, PIP, DIP and tip; -1 where the finger has no such joint.
         ("nodes", np.int64, (_F, _P)),
     ]
@@ -169,8 +185,6 @@ class RetargetOptions:
         posture_weight_m2: pull of joints in a pinch towards what their own points ask for, m²/rad².
         reacquire_after_s: a finger that was lost for so long is searched from several starts.
         num_starts: of such a search, 1 … 8.
-        keeps_fingers_apart: push neighbouring fingers apart where their capsules overlap; costs
-            microseconds where they do not.
     """
 
     temporal_weight_m2: float = 1e-4
@@ -182,7 +196,6 @@ class RetargetOptions:
     posture_weight_m2: float = 3e-3
     reacquire_after_s: float = 0.1
     num_starts: int = len(STARTS)
-    keeps_fingers_apart: bool = False
 
     def __post_init__(self) -> None:
         ranges = {
@@ -268,7 +281,6 @@ def hand_arrays(hand: HandModel) -> np.ndarray:
         row["num_joints"][index] = len(finger.joints)
         row["point_joints"][index] = finger.points
         row["tip_m"][index] = finger.tip_m
-        row["radius_m"][index] = PHALANX_RADIUS_M
         row["nodes"][index] = solver_indices(finger.chain)
         for point in (1, 2):
             # A finger with fewer joints: one bone follows two of the person's.

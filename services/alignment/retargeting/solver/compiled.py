@@ -6,10 +6,7 @@ Compiled code is therefore kept in a folder that is named after the content of t
 
 import hashlib
 import os
-import shutil
 import stat
-import tempfile
-from contextlib import suppress
 from pathlib import Path
 
 import structlog
@@ -17,106 +14,45 @@ from numba import config, njit
 
 PACKAGE = Path(__file__).parent
 ROOT_UID = 0
-_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
-def folder_of_code(*bases: Path) -> Path | None:
-    """Where compiled code is kept: in the first of these folders that this user may write.
+def folder_of_code(base: Path) -> Path | None:
+    """Folder for the compiled code of this version; no other user may enter or replace it.
 
-    Code of this version that an earlier, read-only one holds (of an image that another user built)
-    is copied. Code is run: it is used only from folders of this user or root that no other user can
-    write to. Where the umask lets a group write new files, other users cannot enter the folder.
+    Code in it is run without a question, so a folder that somebody else made is not used.
 
     Args:
-        bases: for the code of all versions, best first; other users may read the code in it.
+        base: for the code of all versions; made if needed.
 
     Returns:
-        None where none may be written.
+        None where there is no such folder that this user may write to.
     """
     code = b"".join(path.read_bytes() for path in sorted(PACKAGE.glob("*.py")))
-    name = hashlib.sha256(code).hexdigest()[:16]
-    tried: list[Path] = []
-    for base in bases:
-        try:
-            # What a link leads to is checked and used, wherever the link leads later.
-            folder = base.resolve() / name
-            tried.append(folder)
-            is_new = not folder.is_dir()
-            if is_new:
-                _make(folder)
-            is_own = os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid()
-            if not (is_own and _is_safe(folder)):
-                continue
-        except (OSError, RuntimeError):  # the latter for links in a circle
-            continue
-        if is_new:
-            _copy_first(tried[:-1], folder)
-        return folder
-    return None
-
-
-def _make(folder: Path) -> None:
-    """Make a folder and the one above, for this user alone to write."""
-    folder.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
-    umask = os.umask(_OTHERS_WRITE)
-    os.umask(umask)
-    # numba leaves the modes of its files to the umask.
-    is_strict = umask & _OTHERS_WRITE == _OTHERS_WRITE
-    folder.mkdir(exist_ok=True, mode=0o755 if is_strict else 0o700)
-
-
-def _is_safe(folder: Path) -> bool:
-    """Whether only this user and root can change or replace the folder."""
-    found, above = folder.lstat(), folder.parent.stat()
-    return (
-        stat.S_ISDIR(found.st_mode)
-        and not found.st_mode & _OTHERS_WRITE
-        and not (above.st_mode & _OTHERS_WRITE and not above.st_mode & stat.S_ISVTX)
-        and {found.st_uid, above.st_uid} <= {ROOT_UID, os.getuid()}
+    try:
+        # What a link leads to is checked and used, wherever the link leads later.
+        base = base.expanduser().resolve()
+        base.mkdir(mode=0o755, parents=True, exist_ok=True)
+        folder = base / hashlib.sha256(code).hexdigest()[:16]
+        folder.mkdir(mode=0o700, exist_ok=True)
+        above, found = base.stat(), folder.lstat()
+    except (OSError, RuntimeError):  # the latter without a home, and for links in a circle
+        return None
+    others_write = above.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    is_safe = (
+        found.st_mode & ~stat.S_ISGID == stat.S_IFDIR | stat.S_IRWXU
+        and found.st_uid == os.getuid()
+        and above.st_uid in {ROOT_UID, os.getuid()}
+        and (not others_write or above.st_mode & stat.S_ISVTX)
     )
+    return folder if is_safe and os.access(folder, os.W_OK) else None
 
 
-def _copy_first(sources: list[Path], folder: Path) -> None:
-    """Copy the first of these folders that may be read; without any, code is compiled again."""
-    for source in sources:
-        try:
-            if not (source.is_dir() and _is_safe(source)):
-                continue
-            # `rglob` passes over what may not be read without a word.
-            next(source.iterdir(), None)
-            for path in sorted(source.rglob("*")):
-                if path.is_file():
-                    target = folder / path.relative_to(source)
-                    target.parent.mkdir(parents=True, exist_ok=True)
-                    # Another process may read it already: whole or not at all.
-                    part = target.with_name(f"{target.name}.{os.getpid()}")
-                    shutil.copyfile(path, part)
-                    part.replace(target)
-        except OSError as error:
-            structlog.get_logger().warning(
-                "compiled_code_not_copied", source=str(source), error=str(error)
-            )
-            continue
-        return
-
-
-def _usual_bases() -> list[Path]:
-    """`NUMBA_CACHE_DIR` or the user's own cache, then a folder for temporary files."""
-    bases = []
-    # Without a home.
-    with suppress(RuntimeError):
-        bases.append(Path(config.CACHE_DIR or "~/.cache/dextouch").expanduser())
-    # With nothing writable.
-    with suppress(FileNotFoundError):
-        bases.append(Path(tempfile.gettempdir()) / f"dextouch-{os.getuid()}")
-    return bases
-
-
-_FOLDER = folder_of_code(*_usual_bases())
+_BASE = Path(config.CACHE_DIR or "~/.cache/dextouch")
+_FOLDER = folder_of_code(_BASE)
 if _FOLDER is None:
     structlog.get_logger().warning(
         "compiled_code_not_kept",
-        tried=[str(base) for base in _usual_bases()],
+        tried=str(_BASE),
         advice="every start compiles for about half a minute; set NUMBA_CACHE_DIR to a folder that "
         "this user alone may write",
     )

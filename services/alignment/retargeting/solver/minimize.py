@@ -235,9 +235,8 @@ def hold_and_damp(work, finger, num_joints, joints, damping):
         )
         if held:
             gradient[joint] = 0.0
-            for other in range(num_joints):
-                hessian[joint, other] = 0.0
-                hessian[other, joint] = 0.0
+            hessian[joint, :] = 0.0
+            hessian[:, joint] = 0.0
             hessian[joint, joint] = 1.0
             # What ties this joint to the thumb (columns), or the thumb to a finger (rows).
             work.coupling[finger, :, joint] = 0.0
@@ -288,18 +287,15 @@ def damped_step(hand, work, group, joints, damping):
             if work.step[hub, joint] == 1.0:
                 work.coupling[finger, joint, :] = 0.0
     reduced, right = work.reduced, work.step[hub]
+    reduced[:] = work.hessian[hub]
     for a in range(size):
         right[a] = -work.gradient[hub, a]
-        for b in range(size):
-            reduced[a, b] = work.hessian[hub, a, b]
     for finger in group[1:]:
         own = hand.num_joints[finger]
         solved = work.solved[finger]
         factor(work.hessian[finger], own)
-        for b in range(own):
-            solved[MAX_JOINTS, b] = work.gradient[finger, b]
-            for a in range(size):
-                solved[a, b] = work.coupling[finger, a, b]
+        solved[:MAX_JOINTS] = work.coupling[finger]
+        solved[MAX_JOINTS] = work.gradient[finger]
         substitute(work.hessian[finger], own, solved[MAX_JOINTS])
         for a in range(size):
             substitute(work.hessian[finger], own, solved[a])
@@ -346,8 +342,7 @@ def minimize(hand, person, work, group, joints, tolerance_rad):
         if new_cost <= cost:
             cost = new_cost
             for finger in group:
-                for joint in range(hand.num_joints[finger]):
-                    joints[finger, joint] = work.trial[finger, joint]
+                joints[finger] = work.trial[finger]
             damping = max(0.2 * damping, DAMPING_RANGE[0])
         else:
             damping = min(8.0 * damping, DAMPING_RANGE[1])
@@ -375,9 +370,7 @@ def solve_cold(hand, person, work, finger, joints, num_starts):
         # A hair of difference is rounding, not another minimum: keep the first.
         if cost < best * (1.0 - 1e-6):
             best = cost
-            for joint in range(MAX_JOINTS):
-                kept[joint] = joints[finger, joint]
+            kept[:] = joints[finger]
         if best < EXACT_COST_M2:
             break
-    for joint in range(MAX_JOINTS):
-        joints[finger, joint] = kept[joint]
+    joints[finger] = kept

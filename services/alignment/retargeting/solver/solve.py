@@ -1,5 +1,7 @@
 """Entry point of the compiled solver: joint angles for every sample of a tracked hand.
 
+Samples are checked for plausibility first, finger by finger.
+
 Every finger is a small least-squares problem in a box: points of a *virtual hand* (the robot's
 axes, the person's bones) against measured points, plus a pull towards the sample before. Thumb and
 fingers that come near one another are solved together: vectors between the robot's own fingertips
@@ -16,7 +18,9 @@ from services.alignment.retargeting.solver.arrays import (
     NOMINAL_PERIOD_S,
     NUM_POINTS,
     PARTIAL,
+    PINCH_WEIGHT_FAR,
     REACQUIRED,
+    SOLVED,
     UNCONVERGED,
 )
 from services.alignment.retargeting.solver.compiled import compiled, compiled_once
@@ -25,17 +29,134 @@ from services.alignment.retargeting.solver.minimize import (
     STEP_TOLERANCE_RAD,
     linearize,
     minimize,
+    place_joints,
     solve_cold,
 )
-from services.alignment.retargeting.solver.plausibility import (
-    check_finger,
-    find_pinches,
-    read_sample,
-)
 
-# How often fingers are pushed apart in one sample; those that overlap by less are left.
-MAX_PUSHES = 4
-TOUCH_M = 2e-4
+# Two bones bent by more than 140° are an error of the tracker: hands and robot stop at 120°.
+MAX_BEND_COSINE = -0.766
+
+
+@compiled
+@no_type_check
+def read_sample(hand, work, keypoints):
+    """The points of every finger into the scratch; a missing one is zero."""
+    for finger in range(hand.num_fingers):
+        for index in range(NUM_POINTS):
+            node = hand.nodes[finger, index]
+            x, y, z = keypoints[node, 0], keypoints[node, 1], keypoints[node, 2]
+            seen = node >= 0 and np.isfinite(x) and np.isfinite(y) and np.isfinite(z)
+            work.usable[finger, index] = seen
+            point = work.measured[finger, index]
+            point[0] = x if seen else 0.0
+            point[1] = y if seen else 0.0
+            point[2] = z if seen else 0.0
+
+
+@compiled
+@no_type_check
+def check_finger(hand, person, tuning, work, finger, memory):
+    """Which points of a finger to use; SOLVED, PARTIAL, IMPLAUSIBLE or MISSING. Bones get a scale.
+
+    Bones of a length or a bend that no finger has, and knuckles far from where they belong, are
+    errors of the tracker; the whole finger is rejected, because the wrong point cannot be
+    identified.
+    """
+    measured, usable = work.measured[finger], work.usable[finger]
+    count, expected = 0, 0
+    for index in range(1, NUM_POINTS):
+        count += 1 if usable[index] else 0
+        expected += 1 if hand.nodes[finger, index] >= 0 else 0
+    is_whole = count == expected and usable[0]
+    if count < 2 or (not person.is_known and not is_whole):
+        return MISSING
+    work.scale[finger] = person.bone_scale[finger]
+    work.freedom[finger] = person.freedom[finger]
+    bones = work.bones
+    bones[:] = 0.0
+    for bone in range(3):
+        if not (usable[bone] and usable[bone + 1]):
+            continue
+        squared = 0.0
+        for k in range(3):
+            bones[bone, k] = measured[bone + 1, k] - measured[bone, k]
+            squared += bones[bone, k] ** 2
+        length = np.sqrt(squared)
+        known = person.bone_m[finger, bone]
+        if person.is_known:
+            if abs(length - known) > person.bone_tolerance_m[finger, bone]:
+                return IMPLAUSIBLE
+        elif not 0.003 <= length <= 0.150:
+            return IMPLAUSIBLE
+        if not person.is_rigid:
+            work.scale[finger, bone] *= length / known
+        if length > 0.0:
+            for k in range(3):
+                bones[bone, k] /= length
+    for bone in range(2):
+        cosine = 0.0
+        for k in range(3):
+            cosine += bones[bone, k] * bones[bone + 1, k]
+        if cosine < MAX_BEND_COSINE:
+            return IMPLAUSIBLE
+    if person.is_known and usable[0]:
+        error_m = knuckle_error_m(hand, person, tuning, work, finger, memory)
+        if error_m > person.knuckle_tolerance_m[finger]:
+            return IMPLAUSIBLE
+    return SOLVED if is_whole else PARTIAL
+
+
+@compiled
+@no_type_check
+def knuckle_error_m(hand, person, tuning, work, finger, memory):
+    """Distance of a measured knuckle from its previous position, less possible travel since."""
+    travel = person.travel[finger]
+    base = hand.point_joints[finger, 0]
+    origin = work.origin[finger]
+    if travel > 0.0:
+        place_joints(hand, finger, memory.alone_rad[finger], origin, work.axis[finger], work.turn)
+    squared, arm = 0.0, 0.0
+    for k in range(3):
+        expected = person.knuckle_m[finger, k]
+        if travel > 0.0:
+            expected += travel * (origin[base, k] - hand.knuckle_m[finger, k])
+            arm += (origin[base, k] - origin[0, k]) ** 2
+        squared += (work.measured[finger, 0, k] - expected) ** 2
+    turned = min(tuning.velocity_limit_rad_s * memory.unsolved_s[finger], 2.0)
+    return np.sqrt(squared) - travel * np.sqrt(arm) * turned
+
+
+@compiled
+@no_type_check
+def find_pinches(hand, tuning, work, status):
+    """The thumb and all fingers near it into `members` and `is_near`; vectors and weights.
+
+    The weight goes from that of near to that of far evenly in its logarithm.
+    """
+    thumb, measured, usable = hand.thumb, work.measured, work.usable
+    work.is_near[:] = 0
+    if thumb < 0 or status[thumb] >= IMPLAUSIBLE or not usable[thumb, 3]:
+        return 0
+    count = 1
+    work.members[0] = thumb
+    for finger in range(hand.num_fingers):
+        if finger == thumb or status[finger] >= IMPLAUSIBLE or not usable[finger, 3]:
+            continue
+        squared = 0.0
+        for k in range(3):
+            work.pinch_m[finger, k] = measured[thumb, 3, k] - measured[finger, 3, k]
+            squared += work.pinch_m[finger, k] ** 2
+        gap = np.sqrt(squared)
+        if gap >= tuning.pinch_far_m:
+            continue
+        apart = max(gap - tuning.pinch_near_m, 0.0) / (tuning.pinch_far_m - tuning.pinch_near_m)
+        work.pinch_weight[finger] = (
+            tuning.pinch_weight * (PINCH_WEIGHT_FAR / tuning.pinch_weight) ** apart
+        )
+        work.members[count] = finger
+        work.is_near[finger] = work.is_near[thumb] = 1
+        count += 1
+    return count if count > 1 else 0
 
 
 @compiled
@@ -135,8 +256,7 @@ def solve_pinches(hand, person, tuning, work, memory, num_near, output):
             reach = allowed
         set_box(hand, work, finger, work.sent, reach)
         work.posture_weight_m2[finger] = tuning.posture_weight_m2
-        for joint in range(hand.num_joints[finger]):
-            work.posture[finger, joint] = alone[finger, joint]
+        work.posture[finger] = alone[finger]
     group = work.members[:num_near]
     for finger in range(hand.num_fingers):
         if status[finger] >= IMPLAUSIBLE:
@@ -183,95 +303,6 @@ def mark_reacquired(hand, person, work, memory, output):
         errors_m[finger] = tip_error(work, finger, hand.num_joints[finger])
 
 
-@compiled
-@no_type_check
-def segment_gap(a0, a1, b0, b1):
-    """Closest points of two segments: their parameters, the vector from a to b and its length.
-
-    Ericson, Real-Time Collision Detection, 5.1.9, for segments of some length.
-    """
-    aa = ab = bb = ac = bc = 0.0
-    for k in range(3):
-        da, db, c = a1[k] - a0[k], b1[k] - b0[k], a0[k] - b0[k]
-        aa += da * da
-        bb += db * db
-        ab += da * db
-        ac += da * c
-        bc += db * c
-    denominator = aa * bb - ab * ab
-    s = min(max((ab * bc - ac * bb) / denominator, 0.0), 1.0) if denominator > 1e-15 else 0.5
-    t = (ab * s + bc) / bb
-    if not 0.0 <= t <= 1.0:
-        t = min(max(t, 0.0), 1.0)
-        s = min(max((ab * t - ac) / aa, 0.0), 1.0)
-    x = b0[0] + t * (b1[0] - b0[0]) - a0[0] - s * (a1[0] - a0[0])
-    y = b0[1] + t * (b1[1] - b0[1]) - a0[1] - s * (a1[1] - a0[1])
-    z = b0[2] + t * (b1[2] - b0[2]) - a0[2] - s * (a1[2] - a0[2])
-    return s, t, x, y, z, np.sqrt(x * x + y * y + z * z)
-
-
-@compiled
-@no_type_check
-def robot_point(hand, work, finger, index):
-    """Knuckle, PIP, DIP or tip of the robot's finger, as last linearized."""
-    at = hand.point_joints[finger, index] if index < 3 else hand.num_joints[finger]
-    return work.origin[finger, at]
-
-
-@compiled
-@no_type_check
-def push(hand, work, finger, phalanx, along, distance_m):
-    """Move a finger's measured points along `push_m`, more the further from the knuckle."""
-    knuckle = robot_point(hand, work, finger, 0)
-    before, after = (
-        robot_point(hand, work, finger, phalanx),
-        robot_point(hand, work, finger, phalanx + 1),
-    )
-    squared = 0.0
-    for k in range(3):
-        squared += (before[k] + along * (after[k] - before[k]) - knuckle[k]) ** 2
-    arm = max(np.sqrt(squared), 0.02)
-    for index in range(1, NUM_POINTS):
-        point = robot_point(hand, work, finger, index)
-        squared = 0.0
-        for k in range(3):
-            squared += (point[k] - knuckle[k]) ** 2
-        lever = min(np.sqrt(squared) / arm, 3.0) * work.scale[finger, 0]
-        for k in range(3):
-            work.measured[finger, index, k] += lever * distance_m * work.push_m[k]
-
-
-@compiled
-@no_type_check
-def push_apart(hand, work, status):
-    """Move the targets of neighbouring fingers that overlap apart; whether any."""
-    touched = False
-    push_m = work.push_m
-    for a in range(hand.num_fingers - 1):
-        b = a + 1
-        if hand.thumb in (a, b) or status[a] >= IMPLAUSIBLE or status[b] >= IMPLAUSIBLE:
-            continue
-        depth, at_a, at_b, along_a, along_b = 0.0, -1, -1, 0.0, 0.0
-        for i in range(3):
-            for j in range(3):
-                s, t, x, y, z, gap = segment_gap(
-                    robot_point(hand, work, a, i),
-                    robot_point(hand, work, a, i + 1),
-                    robot_point(hand, work, b, j),
-                    robot_point(hand, work, b, j + 1),
-                )
-                missing = hand.radius_m[a, i] + hand.radius_m[b, j] - gap
-                # Axes that cross have no direction to part in.
-                if missing > depth and gap > 1e-6:
-                    depth, at_a, at_b, along_a, along_b = missing, i, j, s, t
-                    push_m[0], push_m[1], push_m[2] = x / gap, y / gap, z / gap
-        if depth > TOUCH_M:
-            touched = True
-            push(hand, work, b, at_b, along_b, 0.5 * depth)
-            push(hand, work, a, at_a, along_a, -0.5 * depth)
-    return touched
-
-
 @compiled_once
 @no_type_check
 def retarget_samples(tables, samples, memory, output):
@@ -293,24 +324,16 @@ def retarget_samples(tables, samples, memory, output):
         found = (status, output.tip_error_m[t])
         read_sample(hand, work, keypoints[t])
         work.elapsed_s = elapsed_s[t]
+        work.sent[:num_fingers] = joints
         for finger in range(num_fingers):
-            for joint in range(hand.num_joints[finger]):
-                work.sent[finger, joint] = joints[finger, joint]
             memory.unsolved_s[finger] += elapsed_s[t]
             status[finger] = check_finger(hand, person, tuning, work, finger, memory)
         num_near = find_pinches(hand, tuning, work, status)
         solve_alone(hand, person, tuning, work, memory, found)
         solve_pinches(hand, person, tuning, work, memory, num_near, found)
-        if tuning.keeps_fingers_apart:
-            for _ in range(MAX_PUSHES):
-                if not push_apart(hand, work, status):
-                    break
-                solve_alone(hand, person, tuning, work, memory, found)
-                solve_pinches(hand, person, tuning, work, memory, num_near, found)
         mark_reacquired(hand, person, work, memory, found)
         for finger in range(num_fingers):
             if status[finger] < IMPLAUSIBLE:
                 memory.unsolved_s[finger] = 0.0
-            for joint in range(hand.num_joints[finger]):
-                output.joints_rad[t, finger, joint] = joints[finger, joint]
+        output.joints_rad[t] = joints
         output.status[t] = worst_of(status)
