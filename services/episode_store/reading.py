@@ -31,14 +31,6 @@ class WindowQuery(FrozenModel):
     half_size: bool = False
     gray: bool = False
 
-    def camera_names(self) -> tuple[str, ...]:
-        """Names of the cameras."""
-        return tuple(name for name in self.cameras.split(",") if name)
-
-    def image_form(self) -> ImageForm:
-        """Requested form of images."""
-        return ImageForm(half_size=self.half_size, gray=self.gray)
-
 
 class SpanQuery(FrozenModel):
     """Query of samples: start_ns ≤ t < stop_ns, by default all."""
@@ -91,7 +83,8 @@ class StoreReader:
         etag = etag_of(reader, "window", query)
         if is_known(etag, known):
             return Answer(etag, None)
-        cameras, form = query.camera_names(), query.image_form()
+        cameras = tuple(name for name in query.cameras.split(",") if name)
+        form = ImageForm(half_size=query.half_size, gray=query.gray)
         # An unknown camera is refused by the reader.
         known_cameras = [reader.streams[name] for name in cameras if name in reader.streams]
         step_bytes = sum(
@@ -134,15 +127,8 @@ class StoreReader:
         etag = etag_of(reader, stream, span)
         if is_known(etag, known):
             return Answer(etag, None)
-        self._check_size(reader, stream, span)
-        return Answer(etag, _packed(reader, stream, span))
-
-    def _check_size(
-        self, reader: EpisodeReader | RecordingReader, stream: str, span: SpanQuery
-    ) -> None:
         count = reader.count(stream, span.start_ns, span.stop_ns)
-        descriptor = reader.streams[stream]
-        sample_bytes = descriptor.sample_bytes() + 24
+        sample_bytes = reader.streams[stream].sample_bytes() + 24
         if count * sample_bytes > self._max_bytes:
             allowed = self._max_bytes // sample_bytes
             raise LimitExceededError(
@@ -151,6 +137,7 @@ class StoreReader:
                 got=count,
                 expected=allowed,
             )
+        return Answer(etag, _packed(reader, stream, span))
 
 
 def _packed(reader: EpisodeReader | RecordingReader, stream: str, span: SpanQuery) -> bytes:

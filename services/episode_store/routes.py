@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Header, HTTPException, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 
 from dextouch.schemas import (
     BatchReceipt,
@@ -31,7 +31,7 @@ WINDOW_MSGPACK = "application/vnd.dextouch.window+msgpack"
 CACHE_CONTROL = "private, no-cache"
 # Responses of these routes besides the problems that all routes can give.
 SAMPLES: Responses = {200: {"content": {MSGPACK: {}}}, 304: {}}
-WINDOW: Responses = {200: {"content": {WINDOW_MSGPACK: {}, MSGPACK: {}}}, 304: {}, 406: {}}
+WINDOW: Responses = {200: {"content": {WINDOW_MSGPACK: {}}}, 304: {}}
 IfNoneMatch = Annotated[str | None, Header(alias="if-none-match")]
 
 
@@ -147,12 +147,10 @@ def content_router(reader: StoreReader) -> APIRouter:
     def window(
         episode_id: str,
         query: Annotated[WindowQuery, Query()],
-        accept: Annotated[str | None, Header()] = None,
         if_none_match: IfNoneMatch = None,
     ) -> Response:
         """Window of the model grid as msgpack (`dextouch.episodes.decode_window`)."""
-        media_type = _chosen_type(accept, (WINDOW_MSGPACK, MSGPACK))
-        return _response(reader.window(episode_id, query, known=if_none_match), media_type)
+        return _response(reader.window(episode_id, query, known=if_none_match), WINDOW_MSGPACK)
 
     @router.get(
         "/episodes/{episode_id}/streams/{stream}",
@@ -173,33 +171,9 @@ def content_router(reader: StoreReader) -> APIRouter:
     return router
 
 
-def _chosen_type(accept: str | None, offered: tuple[str, ...]) -> str:
-    """The offered media type with the highest weight; the first one in a tie."""
-    weights = [(_weight(kind, accept or "*/*"), -place) for place, kind in enumerate(offered)]
-    weight, place = max(weights)
-    if weight <= 0:
-        # Starlette's exception, since no DexTouch error maps to 406.
-        raise HTTPException(406, f"got Accept {accept!r}, expected one of {', '.join(offered)}")
-    return offered[-place]
-
-
-def _weight(kind: str, accept: str) -> float:
-    """Quality value of the most specific range that matches a media type."""
-    weights: dict[str, str] = {}
-    for part in accept.split(","):
-        name, *parameters = (word.strip().lower() for word in part.split(";"))
-        pairs = (parameter.partition("=") for parameter in parameters)
-        weights.setdefault(name, next((q for key, _, q in pairs if key.strip() == "q"), "1"))
-    ranges = (kind, kind.partition("/")[0] + "/*", "*/*")
-    try:
-        return float(next((weights[name] for name in ranges if name in weights), "0"))
-    except ValueError:
-        return 0.0
-
-
 def _response(answer: Answer, media_type: str) -> Response:
     """Response with ETag; 304 without a body if the client has it already."""
-    headers = {"etag": answer.etag, "cache-control": CACHE_CONTROL, "vary": "accept"}
+    headers = {"etag": answer.etag, "cache-control": CACHE_CONTROL}
     if answer.data is None:
         return Response(status_code=304, headers=headers)
     return Response(answer.data, media_type=media_type, headers=headers)
