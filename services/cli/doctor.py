@@ -1,4 +1,4 @@
-"""Command `dextouch doctor`: checks what DexTouch can do on this machine."""
+"""Command `dextouch doctor`: checks this machine, and names the extra of a missing package."""
 
 import ctypes.util
 import importlib.util
@@ -10,7 +10,23 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from dextouch.command_line import CommandParser, add_json, write_result
-from services.cli.extras import install_hint
+from dextouch.errors import DexTouchError, UnavailableError
+
+# Import names; if several extras provide a package, the most relevant one has it.
+_PACKAGES = {
+    "store": "zarr zstandard google_crc32c av",
+    "station": "serial fastcrc hid usb cv2",
+    "serve": "fastapi uvicorn httptools rich redis httpx pydantic_settings structlog "
+    "prometheus_client jinja2 websockets",
+    "align": "scipy numba",
+    "model": "torch safetensors PIL",
+    "twin": "mujoco",
+    "gym": "gymnasium",
+    "export": "pyarrow mcap foxglove_schemas_protobuf numcodecs",
+    "rerun": "rerun",
+    "s3": "obstore",
+}
+EXTRA_OF = {package: extra for extra, names in _PACKAGES.items() for package in names.split()}
 
 
 @dataclass(frozen=True)
@@ -23,7 +39,7 @@ class Finding:
     do: str = ""
 
 
-_PACKAGES = {
+_PURPOSES = {
     "zstandard": "episodes",
     "serial": "gloves over serial",
     "hid": "trackers over HID",
@@ -38,6 +54,22 @@ _PACKAGES = {
 }
 
 
+def install_hint(package: str) -> str:
+    """The command that installs a package through its extra."""
+    return f"pip install 'dextouch-wm[{EXTRA_OF[package]}]'"
+
+
+def missing_package(error: ModuleNotFoundError, otherwise: str = "") -> DexTouchError | None:
+    """Error for a missing package, with an alternative; None if no extra provides it."""
+    package = (error.name or "").partition(".")[0]
+    if package not in EXTRA_OF:
+        return None
+    return UnavailableError(
+        f"the package {package!r} is not installed; {install_hint(package)}, or "
+        f"'dextouch-wm[all]' for everything{otherwise}. `dextouch doctor` lists what is missing"
+    )
+
+
 def examine() -> list[Finding]:
     """Check Python, packages, disk, devices and optional programs, without changing anything."""
     version = platform.python_version()
@@ -45,7 +77,7 @@ def examine() -> list[Finding]:
         Finding("Python", version, ok=version.startswith("3.11"), do="install Python 3.11"),
         Finding("processor cores", str(os.cpu_count())),
     ]
-    for package, purpose in _PACKAGES.items():
+    for package, purpose in _PURPOSES.items():
         there = importlib.util.find_spec(package) is not None
         hint, answer = ("", "yes") if there else (install_hint(package), "no")
         findings.append(Finding(f"{package} ({purpose})", answer, ok=there, do=hint))

@@ -8,21 +8,18 @@ can be repeated.
 """
 
 import argparse
-import os
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.command_line import write_result
 from dextouch.episodes import SPLITS, EpisodeReader, EpisodeStore, is_in
 from dextouch.errors import ConflictError, NotFoundError
-from services.cli.imagined_data import imagine_all, positive, seed_range
-from services.cli.training_data import comma_separated, in_processes
+from services.cli.imagined_data import chosen_episodes, imagination_parser, imagine, positive
 from services.evaluation.reporting import PredictionPicture, ReportPictures, write_report
 from services.generation.demonstrations import CAMERA
-from services.world_model.checkpoints import default_checkpoint, read_checkpoint
+from services.world_model.checkpoints import read_checkpoint
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.training.dataset import fingerprint
 from services.world_model.training.episodes import read_episode
@@ -44,15 +41,7 @@ def main(arguments: Sequence[str]) -> int:
     # What a killed run left unfinished.
     EpisodeStore(options.store).sweep()
     refuse_trained_sources(source, wanted, options.checkpoint)
-    imagine = partial(
-        imagine_all,
-        episodes=options.episodes,
-        output=options.store,
-        checkpoint=options.checkpoint,
-        only_judged=False,
-    )
-    parts = [wanted[part :: options.jobs] for part in range(min(options.jobs, len(wanted)))]
-    made = [one for part in in_processes(imagine, parts, options.jobs) for one in part]
+    made = imagine(options, wanted, only_judged=False)
     target = EpisodeStore(options.store)
     num_bytes = sum(target.open(one).verify().num_bytes for one in made)
     print(
@@ -77,15 +66,12 @@ def chosen_sources(store: EpisodeStore, options: argparse.Namespace) -> list[str
         NotFoundError: there is none.
     """
     by_task: dict[str, list[str]] = {}
-    tasks = options.tasks or None
-    for episode_id in sorted(store.list()):
+    for episode_id in sorted(chosen_episodes(store, options.tasks or None, options.seeds)):
         about = store.open(episode_id).attributes
         if (
             about.domain == "robot"
             and about.origin != "imagined"
             and (about.success or options.with_failures)
-            and (tasks is None or about.task in tasks)
-            and (options.seeds is None or about.seed in options.seeds)
             and is_in(about, (options.split,) if options.split else ())
         ):
             by_task.setdefault(about.task, []).append(episode_id)
@@ -142,36 +128,12 @@ def _picture(source: EpisodeStore, imagined: EpisodeReader) -> PredictionPicture
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = CommandParser(prog="dextouch generate", description=__doc__, epilog=_EPILOG)
+    parser = imagination_parser(prog="dextouch generate", description=__doc__, epilog=_EPILOG)
     add = parser.add_argument
-    add("--episodes", required=True, metavar="URL", help="store of the robot episodes to imagine")
-    add("--store", required=True, metavar="URL", help="store for the imagined episodes")
-    add(
-        "--checkpoint",
-        type=Path,
-        default=default_checkpoint(),
-        metavar="PATH",
-        help="world model (default: the package's)",
-    )
     add("--split", choices=SPLITS, help="only scenes of this split (default: all)")
-    add("--tasks", type=comma_separated, metavar="TASK,…", help="default: all")
-    add("--seeds", type=seed_range, metavar="FIRST:LAST+1", help="default: all")
     add("--count", type=positive, metavar="N", help="at most so many, evenly over tasks")
     add("--with-failures", action="store_true", help="also imagine episodes that failed")
     add("--strips", type=Path, metavar="PATH", help="HTML page of truth above imagination")
-    add(
-        "--num-strips",
-        type=positive,
-        default=12,
-        metavar="N",
-        help="episodes on that page (%(default)s)",
-    )
-    add(
-        "--jobs",
-        type=positive,
-        default=os.cpu_count() or 1,
-        metavar="N",
-        help="processes (default: one per core)",
-    )
-    add_json(parser)
+    shown = "episodes on that page (%(default)s)"
+    add("--num-strips", type=positive, default=12, metavar="N", help=shown)
     return parser

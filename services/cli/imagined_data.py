@@ -96,35 +96,45 @@ def positive(text: str) -> int:
     return int(text)
 
 
+def imagination_parser(**about: str) -> CommandParser:
+    """Parser of a command that imagines episodes; `imagine` takes what it parses."""
+    parser = CommandParser(**about)
+    add = parser.add_argument
+    add("--episodes", required=True, metavar="URL", help="store of the episodes to imagine")
+    add("--store", required=True, metavar="URL", help="store for the imagined episodes")
+    model = "world model (default: the package's)"
+    add("--checkpoint", type=Path, default=default_checkpoint(), metavar="PATH", help=model)
+    add("--tasks", type=comma_separated, metavar="TASK,…", help="default: all")
+    add("--seeds", type=seed_range, metavar="FIRST:LAST+1", help="default: all")
+    jobs = "processes (default: one per core)"
+    add("--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help=jobs)
+    add_json(parser)
+    return parser
+
+
+def imagine(options: argparse.Namespace, wanted: Sequence[str], *, only_judged: bool) -> list[str]:
+    """Imagine these episodes with the options of `imagination_parser`; returns the new ids."""
+    part = partial(
+        imagine_all,
+        episodes=options.episodes,
+        output=options.store,
+        checkpoint=options.checkpoint,
+        only_judged=only_judged,
+    )
+    parts = [wanted[first :: options.jobs] for first in range(min(options.jobs, len(wanted)))]
+    return [one for made in in_processes(part, parts, options.jobs) for one in made]
+
+
 def main(argv: Sequence[str]) -> int:
     """Run `dextouch train imagined`."""
-    parser = CommandParser(
+    parser = imagination_parser(
         prog="dextouch train imagined",
         description=__doc__,
         epilog="example:\n  dextouch train imagined --episodes runs/episodes --store runs/imagined",
     )
-    add = parser.add_argument
-    add("--episodes", required=True, help="store of the episodes to imagine")
-    add("--store", required=True, help="store for the imagined episodes")
-    model = "world model (default: the package's)"
-    add("--checkpoint", type=Path, default=default_checkpoint(), help=model)
-    tasks = "comma-separated tasks (default: all)"
-    add("--tasks", type=comma_separated, help=tasks)
-    add("--seeds", type=seed_range, help="FIRST:LAST+1 (default: all)")
-    jobs = "processes (default: one per core)"
-    add("--jobs", type=positive, default=os.cpu_count() or 1, help=jobs)
-    add_json(parser)
-    arguments = parser.parse_args(list(argv))
-    source = EpisodeStore(arguments.episodes)
-    wanted = chosen_episodes(source, arguments.tasks or None, arguments.seeds)
-    imagine = partial(
-        imagine_all,
-        episodes=arguments.episodes,
-        output=arguments.store,
-        checkpoint=arguments.checkpoint,
-    )
-    parts = [wanted[part :: arguments.jobs] for part in range(min(arguments.jobs, len(wanted)))]
-    count = sum(map(len, in_processes(imagine, parts, arguments.jobs)))
+    options = parser.parse_args(list(argv))
+    wanted = chosen_episodes(EpisodeStore(options.episodes), options.tasks or None, options.seeds)
+    count = len(imagine(options, wanted, only_judged=True))
     print(f"{count} imagined")
-    write_result(arguments.json, {"imagined": count})
+    write_result(options.json, {"imagined": count})
     return 0

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from dextouch import __version__
 from dextouch.command_line import messages_aside
 from dextouch.errors import DexTouchError, UnknownNameError
-from services.cli.extras import missing_package
+from services.cli.doctor import missing_package
 
 
 class Command(NamedTuple):
@@ -19,7 +19,7 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "demo": Command("record, align, imagine and score on this machine", "cli.demo:main"),
+    "demo": Command("record, align, imagine and score on this machine", "cli.demo.command:main"),
     "up": Command("run every service in one process, with a dashboard", "cli.up:main"),
     "doctor": Command("check what this machine can do and what is missing", "cli.doctor:main"),
     "twin": Command(
@@ -81,7 +81,7 @@ COMMANDS = {
     ),
     "study": Command(
         "score policies in several worlds, defined in a file and resumable",
-        "cli.study:main",
+        "cli.study.command:main",
     ),
     "rate": Command("score rollouts by people: a page for raters, and their agreement"),
     "rate serve": Command(
@@ -94,8 +94,6 @@ COMMANDS = {
     "dashboard": Command("serve the operators' page", "dashboard.app:main"),
 }
 
-# Groups that serve when no command is named, as earlier versions did.
-SERVING_GROUPS = ("station", "store", "align")
 EXIT_USAGE = 2
 EXIT_REFUSED = 3
 
@@ -138,9 +136,6 @@ def find_command(words: Sequence[str]) -> tuple[str, list[str]]:
         raise UnknownNameError("command", first, [name for name in COMMANDS if " " not in name])
     if f"{first} {second}" in COMMANDS:
         return f"{first} {second}", list(words[2:])
-    is_bare = not second or (second.startswith("--") and second != "--help")
-    if first in SERVING_GROUPS and is_bare:
-        return f"{first} serve", list(words[1:])
     if not COMMANDS[first].target and second not in {"", "-h", "--help"}:
         raise UnknownNameError(f"dextouch {first} command", second, list(commands_of(first)))
     return first, list(words[1:])

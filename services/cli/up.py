@@ -17,7 +17,7 @@ from dextouch.data_folder import data_folder
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.schemas import first_problems
 from dextouch.serving import configure_logging, load_settings
-from services.cli.extras import missing_package
+from services.cli.doctor import missing_package
 from services.cli.servers import Place, bind, serve_all, stop_on_signals
 
 if TYPE_CHECKING:

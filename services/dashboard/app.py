@@ -2,6 +2,7 @@
 
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -50,14 +51,16 @@ def create_app(
     app = create_service_app(
         name="dashboard",
         settings=settings,
-        routers=[page_router(), api_router(settings), live_router()],
+        routers=[
+            page_router(settings, sessions),
+            api_router(settings, feeds, sessions),
+            live_router(feeds, sessions),
+        ],
         lifespan=lifespan,
         admits=sessions.allows,
     )
-    app.state.settings = settings
-    app.state.feeds = feeds
     app.state.sessions = sessions
-    app.state.refusal_page = refusal_page
+    app.state.refusal_page = partial(refusal_page, settings.station)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     return app
 

@@ -1,5 +1,6 @@
 """HTML pages: the station, signing in and out, and refusals."""
 
+from functools import partial
 from pathlib import Path
 from urllib.parse import parse_qs
 
@@ -30,27 +31,25 @@ TEMPLATES = Environment(
 )
 
 
-def page_router() -> APIRouter:
+def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
     """Router of the HTML pages."""
     router = APIRouter(include_in_schema=False)
+    page = partial(_page, settings.station)
 
     @router.get("/")
     async def index(request: Request) -> Response:
-        sessions: Sessions = request.app.state.sessions
         if not sessions.allows(request):
-            return _page(request, "sign_in.html", reason="")
-        tasks = request.app.state.settings.tasks
-        return _page(request, "index.html", tasks=tasks, signed_in=sessions.needs_key)
+            return page("sign_in.html", reason="")
+        return page("index.html", tasks=settings.tasks, signed_in=sessions.needs_key)
 
     @router.post("/sign_in")
     @takes({FORM: 4 * KIB}, needs_key=False)
     async def sign_in(request: Request) -> Response:
         fields = parse_qs((await request.body()).decode("utf-8", "replace"))
-        sessions: Sessions = request.app.state.sessions
         try:
             token = sessions.sign_in(fields.get("key", [""])[0])
         except AccessDeniedError as error:
-            return _page(request, "sign_in.html", 401, reason=error.message)
+            return page("sign_in.html", 401, reason=error.message)
         answer = RedirectResponse("/", 303)
         answer.set_cookie(
             COOKIE,
@@ -65,7 +64,6 @@ def page_router() -> APIRouter:
     @router.post("/sign_out")
     @takes({FORM: KIB}, needs_key=False)
     async def sign_out(request: Request) -> Response:
-        sessions: Sessions = request.app.state.sessions
         sessions.sign_out(request)
         answer = RedirectResponse("/", 303)
         answer.delete_cookie(COOKIE)
@@ -74,12 +72,11 @@ def page_router() -> APIRouter:
     return router
 
 
-def refusal_page(request: Request, error: DexTouchError) -> Response:
+def refusal_page(station: str, _: Request, error: DexTouchError) -> Response:
     """HTML page of a refusal, in place of problem+json."""
-    return _page(request, "refused.html", status_of(error), reason=error.message)
+    return _page(station, "refused.html", status_of(error), reason=error.message)
 
 
-def _page(request: Request, name: str, status: int = 200, **values: object) -> HTMLResponse:
-    settings: DashboardSettings = request.app.state.settings
-    text = TEMPLATES.get_template(name).render(station=settings.station, **values)
+def _page(station: str, name: str, status: int = 200, **values: object) -> HTMLResponse:
+    text = TEMPLATES.get_template(name).render(station=station, **values)
     return HTMLResponse(text, status, headers=PAGE_HEADERS)

@@ -1,31 +1,19 @@
 """HTTP and WebSocket routes of the page: data, live updates and recorder actions."""
 
 import asyncio
-from collections.abc import Mapping
 from contextlib import suppress
 from typing import Annotated, Any
 from urllib.parse import quote
 
-from fastapi import (
-    APIRouter,
-    Body,
-    Depends,
-    Path,
-    Request,
-    Response,
-    WebSocket,
-    WebSocketDisconnect,
-)
+from fastapi import APIRouter, Body, Depends, Path, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import JSONResponse
 from fastapi.security import APIKeyCookie
 from pydantic import Field, ValidationError
 from pydantic_core import to_jsonable_python
-from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketState
 
 from dextouch.errors import AccessDeniedError
 from dextouch.frozen_model import FrozenModel
-from dextouch.serving import not_signed_in
 from services.dashboard.feeds import Feeds
 from services.dashboard.sessions import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
@@ -36,7 +24,7 @@ from services.dashboard.touch import heatmap_layout
 WEBSOCKET_REFUSED = 1008
 # Interval at which a WebSocket checks that its session is still valid.
 SESSION_CHECK_S = 1.0
-# Documents the cookie; `guard` checks it.
+# Documents the cookie; `Sessions.guard` checks it.
 SESSION = APIKeyCookie(name=COOKIE, scheme_name="session", auto_error=False)
 # Same pattern as stream names (dextouch.streams.StreamDescriptor).
 CameraName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
@@ -48,18 +36,10 @@ class Subscription(FrozenModel):
     view: tuple[Annotated[str, Field(max_length=64)], ...] = Field(max_length=16)
 
 
-def guard(connection: HTTPConnection) -> None:
-    """Refuse browsers that are not signed in."""
-    sessions: Sessions = connection.app.state.sessions
-    if not sessions.allows(connection):
-        raise not_signed_in()
-
-
-def api_router(settings: DashboardSettings) -> APIRouter:
+def api_router(settings: DashboardSettings, feeds: Feeds, sessions: Sessions) -> APIRouter:
     """Router of the page's data and actions."""
-    router = APIRouter(
-        prefix="/v1", dependencies=[Depends(guard), Depends(SESSION)], tags=["dashboard"]
-    )
+    guards = [Depends(sessions.guard), Depends(SESSION)]
+    router = APIRouter(prefix="/v1", dependencies=guards, tags=["dashboard"])
     layout = heatmap_layout()
 
     @router.get("/heatmap")
@@ -68,9 +48,8 @@ def api_router(settings: DashboardSettings) -> APIRouter:
         return JSONResponse(layout)
 
     @router.get("/overview")
-    async def overview(request: Request) -> JSONResponse:
+    async def overview() -> JSONResponse:
         """Everything that the page shows, as JSON."""
-        feeds: Feeds = request.app.state.feeds
         station, services, takes = await asyncio.gather(
             feeds.station(), feeds.services(), feeds.takes()
         )
@@ -79,17 +58,13 @@ def api_router(settings: DashboardSettings) -> APIRouter:
         return JSONResponse(to_jsonable_python(shown))
 
     @router.post("/recorder/{action}")
-    async def operate(
-        action: str, request: Request, body: Annotated[dict[str, Any], Body()]
-    ) -> RecorderView:
+    async def operate(action: str, body: Annotated[dict[str, Any], Body()]) -> RecorderView:
         """Arm, record, stop, save (`success` required) or discard; the recorder's new state."""
-        feeds: Feeds = request.app.state.feeds
         return await feeds.operate(action, body)
 
     @router.post("/uploads/{recording_id}/retry", status_code=204)
-    async def retry(recording_id: str, request: Request) -> None:
+    async def retry(recording_id: str) -> None:
         """Upload a refused take again."""
-        feeds: Feeds = request.app.state.feeds
         path = f"/v1/uploads/{quote(recording_id, safe='')}/retry"
         await feeds.upstream("acquisition").send("POST", path)
 
@@ -98,9 +73,8 @@ def api_router(settings: DashboardSettings) -> APIRouter:
         response_class=Response,
         responses={200: {"content": {"image/jpeg": {}}}},
     )
-    async def camera(name: CameraName, request: Request) -> Response:
+    async def camera(name: CameraName) -> Response:
         """The newest image of one camera."""
-        feeds: Feeds = request.app.state.feeds
         image = await feeds.upstream("acquisition").send("GET", f"/v1/live/cameras/{name}")
         media_type = image.headers.get("content-type", "image/jpeg")
         return Response(image.content, media_type=media_type, headers={"cache-control": "no-store"})
@@ -108,29 +82,29 @@ def api_router(settings: DashboardSettings) -> APIRouter:
     return router
 
 
-def live_router() -> APIRouter:
+def live_router(feeds: Feeds, sessions: Sessions) -> APIRouter:
     """WebSocket router: the page subscribes to the topics in view and receives their updates."""
     router = APIRouter()
 
     @router.websocket("/v1/live")
     async def live(websocket: WebSocket) -> None:
         try:
-            guard(websocket)
+            sessions.guard(websocket)
         except AccessDeniedError as error:
             await websocket.close(WEBSOCKET_REFUSED, error.message[:120])
             return
         await websocket.accept()
-        topics: Mapping[str, Topic] = websocket.app.state.feeds.topics
-        session = asyncio.create_task(_close_with_session(websocket))
+        session = asyncio.create_task(_close_with_session(websocket, sessions))
         senders: dict[str, asyncio.Task[None]] = {}
         try:
             with suppress(WebSocketDisconnect):
                 while websocket.application_state is WebSocketState.CONNECTED:
-                    wanted = topics.keys() & _view(await websocket.receive_text())
+                    wanted = feeds.topics.keys() & _view(await websocket.receive_text())
                     for name in senders.keys() - wanted:
                         senders.pop(name).cancel()
                     for name in wanted - senders.keys():
-                        senders[name] = asyncio.create_task(_send(websocket, topics[name]))
+                        sending = _send(websocket, feeds.topics[name], sessions)
+                        senders[name] = asyncio.create_task(sending)
         finally:
             tasks = (session, *senders.values())
             for task in tasks:
@@ -140,23 +114,23 @@ def live_router() -> APIRouter:
     return router
 
 
-async def _send(websocket: WebSocket, topic: Topic) -> None:
+async def _send(websocket: WebSocket, topic: Topic, sessions: Sessions) -> None:
     """Send the updates of a topic until the session or the connection ends."""
     with suppress(AccessDeniedError, WebSocketDisconnect, RuntimeError):
         async for messages in topic.updates():
             for message in messages:
-                guard(websocket)
+                sessions.guard(websocket)
                 if isinstance(message, bytes):
                     await websocket.send_bytes(message)
                 else:
                     await websocket.send_text(message)
 
 
-async def _close_with_session(websocket: WebSocket) -> None:
+async def _close_with_session(websocket: WebSocket, sessions: Sessions) -> None:
     """Close the connection when its session ends."""
     try:
         while True:
-            guard(websocket)
+            sessions.guard(websocket)
             await asyncio.sleep(SESSION_CHECK_S)
     except AccessDeniedError as error:
         await websocket.close(WEBSOCKET_REFUSED, error.message)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from starlette.requests import HTTPConnection
 
-from dextouch.serving import AccessControl
+from dextouch.serving import AccessControl, not_signed_in
 
 COOKIE = "dextouch_session"
 SCOPE = "operate"
@@ -54,3 +54,8 @@ class Sessions:
         if not self.needs_key:
             return True
         return self._ends_s.get(connection.cookies.get(COOKIE, ""), 0.0) > self._clock_s()
+
+    def guard(self, connection: HTTPConnection) -> None:
+        """Refuse browsers that are not signed in."""
+        if not self.allows(connection):
+            raise not_signed_in()

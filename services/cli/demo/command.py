@@ -1,9 +1,9 @@
-"""Command line `dextouch demo`: runs all stages and writes report.json and report.html."""
+"""Command line `dextouch demo`: runs all stages, prints the result and writes the reports."""
 
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 from fastapi import FastAPI
+from rich.console import Console
+from rich.table import Table
 
 from dextouch import __version__
 from dextouch.command_line import write_result
@@ -23,10 +25,10 @@ from services.alignment.app import create_app as create_alignment
 from services.alignment.settings import AlignmentSettings
 from services.cli.demo import recording, scoring
 from services.cli.demo.settings import DemoPlan, parse
-from services.cli.demo.table import show
 from services.cli.servers import served
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
+from services.evaluation.command_line import print_scores
 from services.evaluation.prediction import measure_prediction, read_scene
 from services.evaluation.reporting import (
     ActionPicture,
@@ -35,6 +37,7 @@ from services.evaluation.reporting import (
     ReportPictures,
     write_report,
 )
+from services.evaluation.reporting.sections import comparison_bars, error_rows, figure
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 
@@ -221,3 +224,46 @@ def _strip(episode: EpisodeReader, name: str) -> EpisodePicture:
         images=window.images[CAMERA][steps],
         tactile_kpa=window.tactile_kpa[steps],
     )
+
+
+def show(report: Mapping[str, Any]) -> None:
+    """Print stages, errors, predictions and scores."""
+    console = Console()
+    stages = [(row["name"], f"{row['seconds']:.1f}") for row in report["stages"]]
+    console.print(_table("Stages", ("stage", "seconds"), stages))
+    # Of the clocks only the worst one.
+    clocks = report["errors"]["clock_rms_ms"]
+    worst = max(clocks, key=lambda name: clocks[name])
+    errors = error_rows({**report["errors"], "clock_rms_ms": {f"{worst} (worst)": clocks[worst]}})
+    rows = [(row.name, f"{figure(row.value)} {row.unit}".strip(), row.bound) for row in errors]
+    title = "Recording path against the twin's truth"
+    console.print(_table(title, ("error", "value", "bound"), rows))
+    console.print(_world_model(report["world_model"]))
+    print_scores(report)
+    accuracy = report["success_probe"]["held_out_accuracy"]
+    console.print(
+        f"\nImagined success is classified by a probe that is correct on {accuracy:.0%} of true "
+        "held-out endings; endings that the model predicts wrongly mislead it. Endings that the "
+        "probe or the model flags as uncertain count with the more likely outcome. Intervals, and "
+        "how many are uncertain, are in the report."
+    )
+
+
+def _table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]] = ()) -> Table:
+    table = Table(title=title, title_justify="left", header_style="bold")
+    for index, column in enumerate(columns):
+        table.add_column(column, justify="left" if index == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _world_model(figures: Mapping[str, Any]) -> Table:
+    table = _table("World model, whole rollouts of held-out scenes", ("", "", ""))
+    table.show_header = False
+    for group in comparison_bars(figures):
+        for index, bar in enumerate(group.bars):
+            name = f"{group.title}, {group.note}" if index == 0 else ""
+            table.add_row(name, bar.name, f"{figure(bar.value)} {group.unit}".strip())
+        table.add_section()
+    return table

@@ -10,15 +10,13 @@ from dextouch.errors import ConflictError, DexTouchError
 from dextouch.worlds import BatchWorld
 from services.cli.demo.settings import TASKS, DemoPlan
 from services.cli.main import run_command
+from services.cli.study.parts import demonstrator
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
 from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_probe import SuccessProbe
-from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name, scripted_actions
-from services.twin.settings import TwinSettings
-from services.twin.stage import Stage
+from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name
 from services.twin.tasks import get_task
 from services.world_model.checkpoints import default_checkpoint
 from services.world_model.state_checkpoints import read_state_checkpoint
@@ -123,18 +121,8 @@ def ladder(plan: DemoPlan) -> dict[str, Policy]:
     and the actions of another scene. The twin only plans the demonstrator's commands, without
     simulation.
     """
-    stages = {task: Stage(task, "robot", TwinSettings()) for task in TASKS}
     names = (*(script_name(level) for level in plan.levels_mm), HOLD, RETREAT, ELSEWHERE)
-    return {
-        name: ReplayPolicy(
-            {
-                (task, seed): scripted_actions(stage, seed, name)
-                for task, stage in stages.items()
-                for seed in plan.seeds
-            }
-        )
-        for name in names
-    }
+    return {name: demonstrator(TASKS, plan.seeds, name) for name in names}
 
 
 def judge(

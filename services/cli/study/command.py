@@ -107,7 +107,7 @@ def _run(options: argparse.Namespace) -> int:
     probe_path = definition.probe or DEFAULT_PROBE
     probe = SuccessProbe.load(probe_path)
     instructions = instructions_for(definition.tasks, probe.metadata.settings["instructions"])
-    policies = PolicyFactory(definition, partial(demonstrator, definition))
+    policies = PolicyFactory(definition, partial(demonstrator, definition.tasks, definition.seeds))
     policies.load()
     with served_worlds(definition) as addresses:
         digests = {"definition": definition.digest, "probe": file_digest(probe_path)}

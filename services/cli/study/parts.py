@@ -1,9 +1,10 @@
 """Worlds and policies of a study: connections, processes that serve worlds, and training data."""
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 
 from dextouch.clients import RolloutClient
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
@@ -114,17 +115,22 @@ def refuse_training_seeds(definition: StudyDefinition) -> None:
                 )
 
 
-def demonstrator(definition: StudyDefinition, script: str) -> ReplayPolicy:
+def demonstrator(tasks: Sequence[str], seeds: Sequence[int], script: str) -> ReplayPolicy:
     """The twin's demonstrator, planned for all starts without simulation.
 
     Raises:
         UnknownNameError: no such script or task.
     """
-    stages = {task: Stage(task, "robot", TwinSettings()) for task in definition.tasks}
+    stages = {task: _robot_stage(task) for task in tasks}
     return ReplayPolicy(
         {
             (task, seed): scripted_actions(stage, seed, script)
             for task, stage in stages.items()
-            for seed in definition.seeds
+            for seed in seeds
         }
     )
+
+
+@lru_cache(maxsize=4)
+def _robot_stage(task: str) -> Stage:
+    return Stage(task, "robot", TwinSettings())

@@ -13,11 +13,10 @@ from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas import LineageEntry
-from services.cli.demo.command import Stages, worst_errors
+from services.cli.demo.command import Stages, show, worst_errors
 from services.cli.demo.recording import align, forget_take
 from services.cli.demo.scoring import ladder, refuse_trained
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, parse
-from services.cli.demo.table import rate, show
 from services.cli.servers import bind, served
 from tests.unit.bridges.takes import write_episode, write_recording
 from tests.unit.worlds.fakes import anchor, observation
@@ -161,6 +160,8 @@ def test_the_table_shows_undefined_agreement(capsys):
                 }
             },
             "comments": {"t": ["It flatters."]},
+            "imagined_world": "world_model",
+            "real_differences": {},
         }
     )
     shown = capsys.readouterr().out
@@ -186,12 +187,6 @@ def test_policies_that_do_not_look_are_good_and_bad_ones():
     assert not np.array_equal(chunks["script 0 mm"], chunks["another scene's actions"])
     np.testing.assert_array_equal(chunks["hold"], np.repeat(chunks["hold"][:1], 16, axis=0))
     assert chunks["retreat"][-1, 11] != chunks["retreat"][0, 11]
-
-
-def test_the_table_shows_intervals():
-    row = {"real": 0.0, "real_interval": [0.0, 0.39], "imagined": 0.5}
-    assert rate(row, "real") == "0.00 (0.00 … 0.39)"
-    assert rate(row, "imagined") == "0.50"
 
 
 def test_seeds_of_training_are_refused():

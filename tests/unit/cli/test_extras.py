@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from services.cli.extras import EXTRA_OF, missing_package
+from services.cli.doctor import EXTRA_OF, missing_package
 
 ROOT = Path(__file__).parents[3]
 # Runs every line of standard input as a command, in an environment without some packages.
@@ -47,7 +47,7 @@ COMMANDS = (
     "up",
     "twin record --task stand_bottle --seeds 0",
     "twin serve --help",
-    "station --mock_store x",
+    "station serve --mock_store x",
     "station calibrate show nothing",
     "store list",
     "export --format mcap nothing --to x.mcap",
