@@ -23,8 +23,7 @@ from dextouch.schemas import json_ready
 from dextouch.serving import load_settings
 from services.alignment.jobs import AlignmentWorker, check_recording, episode_id_of
 from services.alignment.options import AlignmentOptions
-from services.alignment.report import AlignmentReport, report_of
-from services.alignment.report_page import report_line, report_page
+from services.alignment.report import AlignmentReport, report_line, report_of, report_page
 from services.alignment.retargeting import HandRetargeter, RetargetStatus
 from services.alignment.retargeting.hand_profile import calibrated_profile
 from services.alignment.settings import AlignmentSettings, usable_cores

@@ -9,8 +9,8 @@ from benchmarks.simulated.board_scenes import mount_difference
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector
+from services.alignment.calibration.hand_eye import RobotBaseNoise, solve_robot_base
 from services.alignment.calibration.motion import DegenerateMotionError, move, twist
-from services.alignment.calibration.robot_base import RobotBaseNoise, solve_robot_base
 
 
 def pairs(seed, *, num=20, turn_rad=0.6, axes=(1, 1, 1), span_m=0.25, has_mount=True):

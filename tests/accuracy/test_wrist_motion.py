@@ -22,9 +22,8 @@ from dextouch.hands.actions import (
     reanchor,
     relative_pose_9d,
 )
-from services.alignment.calibration.hand_eye import solve_hand_eye
+from services.alignment.calibration.hand_eye import solve_hand_eye, solve_robot_base
 from services.alignment.calibration.motion import move
-from services.alignment.calibration.robot_base import solve_robot_base
 from services.alignment.recording_error import pose_difference
 from tests.accuracy.test_robot_base import pairs
 

@@ -12,7 +12,22 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.hands import CHAINS
+from dextouch.hands import CHAINS, NUM_KEYPOINTS, solver_indices
+from dextouch.hands.robot_hand import HandModel
+from services.alignment.retargeting.hand_checks import checked_keypoints, thinned
+from services.alignment.retargeting.solver.arrays import (
+    IMPLAUSIBLE,
+    MAX_JOINTS,
+    PERSON,
+    SCRATCH,
+    Memory,
+    Output,
+    RetargetOptions,
+    hand_arrays,
+    joint_places,
+    zero_points_m,
+)
+from services.alignment.retargeting.solver.solve import retarget_samples
 
 NUM_FINGERS = 5
 # Proximal phalanx of an index finger, children to large adults and robots: outside, the unit is
@@ -23,6 +38,34 @@ _INDEX_FINGER = CHAINS.index("index")
 NUM_COLUMNS = 9
 # A person's knuckles turn in place (0), the robot's travel with its flexion axes (1).
 RIGID_TRAVEL = 0.5
+
+_NODES = np.array([solver_indices(chain) for chain in CHAINS])
+# Samples that are looked at, spread over the recording: 240 know a bone to a tenth of the noise.
+NUM_SAMPLES = 240
+# Below this a tracker's noise makes no difference, and ratios of zeros would come up (metres).
+LEAST_SIGMA_M = 1e-4
+# A knuckle's spread is the difference of two variances, each known to some 8 % from 240 samples:
+# less than this share of the tracker's noise is indistinguishable from none.
+LEAST_SIGMA_SHARE = 0.3
+# Standard deviations within which 95 of 100 points of a normal distribution in space lie.
+CHI_95 = 2.7955
+LEAST_KNUCKLE_SIGMA_M = 1e-5
+# A robot's knuckle that moved less than this (RMS, metres) does not determine its travel.
+LEAST_TRAVEL_M = 1e-3
+UNKNOWN_FREEDOM = 1e6
+# Of a robot's finger; shorter is none.
+LEAST_BONE_M = 1e-6
+# A bone that differs from the person's by more than all of these is an error of the tracker: a part
+# of its length, a distance, and so many standard deviations of the tracker's noise.
+BONE_TOLERANCE = 0.3
+BONE_TOLERANCE_M = 0.008
+BONE_SIGMAS = 5.0
+# So is a knuckle that lies so many standard deviations from its place in the wrist frame, but no
+# nearer and no further than this; neighbours are 16 mm or more apart.
+KNUCKLE_SIGMAS = 3.5
+KNUCKLE_TOLERANCE_M = (0.012, 0.015)
+# Samples that lie seconds apart: no pinches, no pull.
+EVERY_SAMPLE_ALONE = RetargetOptions(pinch_far_m=0.0051, temporal_weight_m2=0.0)
 
 
 @dataclass(frozen=True)
@@ -121,3 +164,140 @@ def check_bone_unit(index_proximal_m: float, *, where: str) -> None:
             f"{low} … {high} m ({hint}); send metres in the order of dextouch.hands.NODES",
             got=index_proximal_m,
         )
+
+
+def person_arrays(profile: HandProfile | None, hand: HandModel) -> np.ndarray:
+    """Record `PERSON` for the fingers that the robot hand has.
+
+    Without a profile, bones and knuckles of each sample are used.
+    """
+    record = np.zeros(1, dtype=PERSON)
+    person, num, own_m = record[0], len(hand.fingers), robot_bone_m(hand)
+    if profile is None:
+        person["bone_m"][:num], person["bone_scale"][:] = own_m, 1.0
+        person["knuckle_m"][:num], person["travel"][:] = zero_points_m(hand)[:, 0], 1.0
+        person["freedom"][:] = UNKNOWN_FREEDOM
+        return record
+    rows = _chains_of(hand)
+    bone_m, knuckle_sigma_m = profile.bone_m[rows].copy(), profile.knuckle_sigma_m[rows]
+    for finger, bone in zip(*np.nonzero(own_m[:, :2] < LEAST_BONE_M), strict=True):
+        # Two bones of the person in a row are one of the robot's.
+        bone_m[finger, bone + 1] += bone_m[finger, bone]
+        bone_m[finger, bone] = 0.0
+    person["is_known"], person["is_rigid"] = True, profile.is_rigid
+    person["bone_m"][:num] = bone_m
+    person["bone_scale"][:num] = bone_m / np.maximum(own_m, LEAST_BONE_M)
+    person["knuckle_m"][:num] = profile.knuckle_m[rows]
+    person["travel"][:num] = profile.travel[rows]
+    person["freedom"][:num] = UNKNOWN_FREEDOM
+    if profile.is_rigid:
+        sigma_m = max(profile.point_sigma_m, LEAST_SIGMA_M)
+        person["freedom"][:num] = (knuckle_sigma_m / sigma_m) ** 2
+    noise_m = BONE_SIGMAS * np.sqrt(2) * profile.point_sigma_m
+    least_m = max(BONE_TOLERANCE_M, noise_m)
+    person["bone_tolerance_m"][:num] = np.maximum(BONE_TOLERANCE * bone_m, least_m)
+    spread_m = KNUCKLE_SIGMAS * np.hypot(knuckle_sigma_m, profile.point_sigma_m)
+    person["knuckle_tolerance_m"][:num] = np.clip(spread_m, *KNUCKLE_TOLERANCE_M)
+    return record
+
+
+def _chains_of(hand: HandModel) -> list[int]:
+    """Which chain of the tracked skeleton (thumb … little) each of the hand's fingers follows."""
+    return [CHAINS.index(finger.chain) for finger in hand.fingers]
+
+
+def robot_bone_m(hand: HandModel) -> Float64[np.ndarray, "fingers 3"]:
+    """Lengths from knuckle to PIP, DIP and tip of a robot hand at zero angles."""
+    return np.asarray(np.linalg.norm(np.diff(zero_points_m(hand), axis=1), axis=-1))
+
+
+def measure_profile(keypoints_m: np.ndarray, hand: HandModel) -> HandProfile:
+    """Medians of bones and knuckles, and how the knuckles travel when fingers bend.
+
+    Args:
+        keypoints_m: [T, 25, 3] any samples of the hand; those with whole fingers count.
+        hand: the robot hand of the same side, whose axes define how far fingers are bent.
+
+    Raises:
+        ShapeError: wrong shape.
+        InvalidInputError: a finger is complete in no sample, or its bone lengths are invalid (unit,
+            order).
+    """
+    # Knuckle, PIP, DIP and tip of thumb … little (of the thumb: CMC, MCP, IP, tip).
+    points_m = checked_keypoints(keypoints_m)[:, _NODES]
+    whole = np.isfinite(points_m).all(axis=(-1, -2))
+    _check_seen(whole, hand.side)
+    points_m[~whole] = np.nan
+    lengths = np.linalg.norm(np.diff(points_m, axis=2), axis=-1)
+    check_bone_unit(float(np.nanmedian(lengths[:, _INDEX_FINGER, 0])), where="keypoints")
+    low, high = BONE_RANGE_M
+    lengths[~((lengths >= low) & (lengths <= high)).all(axis=-1)] = np.nan
+    _check_seen(np.isfinite(lengths).all(axis=-1), hand.side)
+    bone_m = np.nanmedian(lengths, axis=0)
+    spread_m = 1.4826 * np.nanmedian(np.abs(lengths - bone_m), axis=0)
+    # The length of a bone has the noise of two points along it.
+    point_sigma_m = float(np.median(spread_m) / np.sqrt(2))
+    rows = thinned(np.flatnonzero(whole.any(axis=1)), NUM_SAMPLES)
+    moved_m = _knuckle_motion(points_m[rows], hand)
+    usable = whole[rows] & np.isfinite(moved_m).all(axis=-1)
+    knuckle_m, travel, sigma_m = np.zeros((NUM_FINGERS, 3)), np.zeros(5), np.zeros(5)
+    for finger in range(NUM_FINGERS):
+        kept = usable[:, finger]
+        if not kept.any():
+            kept = whole[rows, finger]
+        knuckle_m[finger], travel[finger], left_m = _fit_knuckle(
+            points_m[rows][kept, finger, 0], moved_m[kept, finger]
+        )
+        least_m = max(LEAST_KNUCKLE_SIGMA_M, LEAST_SIGMA_SHARE * point_sigma_m)
+        sigma_m[finger] = max(np.sqrt(max(left_m**2 - point_sigma_m**2, 0.0)), least_m)
+    return HandProfile(bone_m, knuckle_m, travel, sigma_m, point_sigma_m)
+
+
+def _check_seen(whole: np.ndarray, side: str) -> None:
+    never = [name for name, seen in zip(CHAINS, whole.T, strict=True) if not seen.any()]
+    if never:
+        raise InvalidInputError(
+            f"keypoints of the {side} hand: no step shows all nodes of {', '.join(never)} with "
+            f"bones of {BONE_RANGE_M[0]} … {BONE_RANGE_M[1]} m; expected every finger at least once"
+        )
+
+
+def _knuckle_motion(points_m: np.ndarray, hand: HandModel) -> Float64[np.ndarray, "n 5 3"]:
+    """Knuckles of the robot when its fingers point like the tracked ones; NaN if unknown."""
+    own, rows, num = hand_arrays(hand), _chains_of(hand), len(points_m)
+    keypoints = np.full((num, NUM_KEYPOINTS, 3), np.nan)
+    keypoints[:, _NODES] = points_m
+    output, person = Output.of(num, len(rows)), person_arrays(None, hand)
+    retarget_samples(
+        (own, person, EVERY_SAMPLE_ALONE.tuning(), np.zeros(1, dtype=SCRATCH)),
+        (keypoints, np.full(num, np.inf)),
+        Memory.starting_at(np.zeros((len(rows), MAX_JOINTS))),
+        output,
+    )
+    is_joint = joint_places(hand)
+    knuckles = hand.chain_points_m(output.joints_rad[:, is_joint])[:, :, 0]
+    moved_own_m = knuckles - own["knuckle_m"][0, : len(rows)]
+    moved_own_m[output.finger_status >= IMPLAUSIBLE] = np.nan
+    moved_m = np.full((num, NUM_FINGERS, 3), np.nan)
+    moved_m[:, rows] = moved_own_m
+    return moved_m
+
+
+def _fit_knuckle(
+    seen_m: np.ndarray, moved_m: np.ndarray
+) -> tuple[Float64[np.ndarray, "3"], float, float]:
+    """Position, travel and residual (standard deviation per axis) of one knuckle."""
+    if not np.isfinite(moved_m).all():
+        moved_m = np.zeros_like(seen_m)
+    centred = moved_m - moved_m.mean(axis=0)
+    energy = float((centred**2).sum())
+    travel = 0.0
+    if energy > len(seen_m) * LEAST_TRAVEL_M**2:
+        travel = float((centred * (seen_m - np.median(seen_m, axis=0))).sum() / energy)
+        travel = min(max(travel, 0.0), 1.0)
+    places = seen_m - travel * moved_m
+    place = np.median(places, axis=0)
+    # By the worst twentieth, not the middle: people's knuckles are off most in a fist.
+    off_m = np.linalg.norm(places - place, axis=1)
+    left_m = float(np.percentile(off_m, 95)) / CHI_95
+    return place, travel, left_m

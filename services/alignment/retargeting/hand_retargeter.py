@@ -9,8 +9,8 @@ from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.hands.robot_hand import HandModel, RobotHand
 from services.alignment.retargeting.hand_checks import checked_keypoints
-from services.alignment.retargeting.hand_profile import HandProfile
-from services.alignment.retargeting.profile_fit import (
+from services.alignment.retargeting.hand_profile import (
+    HandProfile,
     measure_profile,
     person_arrays,
 )
@@ -25,6 +25,7 @@ from services.alignment.retargeting.solver.arrays import (
     joint_places,
 )
 from services.alignment.retargeting.solver.solve import retarget_samples
+
 
 @dataclass(frozen=True)
 class RetargetResult:

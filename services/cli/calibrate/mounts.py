@@ -8,8 +8,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import invert
-from services.alignment.calibration.hand_eye import BoardViews, solve_hand_eye
-from services.alignment.calibration.robot_base import solve_robot_base
+from services.alignment.calibration.hand_eye import BoardViews, solve_hand_eye, solve_robot_base
 from services.cli.calibrate.advice import turn_coverage
 from services.cli.calibrate.boards import board_pose, is_ambiguous, parse_board, read_photos
 from services.cli.calibrate.camera import read_lens

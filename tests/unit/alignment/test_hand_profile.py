@@ -7,8 +7,7 @@ from benchmarks.retargeting.pinches import people, pinch_motion
 from benchmarks.simulated.hand_motions import robot_motion
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import CHAINS, NODE_INDEX
-from dextouch.hands.robot_hand import RobotHand
-from services.alignment.retargeting import HandProfile, HandRetargeter, RetargetOptions
+from services.alignment.retargeting import HandProfile, HandRetargeter
 from services.alignment.retargeting.hand_profile import calibrated_profile, profile_name
 
 NOISE_M = 1e-3
