@@ -27,7 +27,6 @@ PINCH_WEIGHT_FAR: Final = 1e-3
 # Beyond, products of weights and distances drown what the points say.
 MAX_WEIGHT = 1e6
 LEAST = 1e-6
-NO_TURN = (1.0, 0.0, 0.0, 0.0)
 # Where cold searches begin, as fractions from lower to upper limit, knuckle to tip. The first two
 # find nearly all postures; the others are for the rest.
 STARTS = (
@@ -72,15 +71,11 @@ HAND: Final = np.dtype(
         # -1 without a thumb.
         ("thumb", np.int64),
         ("num_joints", np.int64, (_F,)),
-        # A joint's frame in its parent, and its axis in its own frame.
+        # A joint's frame in its parent; it turns about its own z.
         ("rotation", np.float64, (_F, _J, 3, 3)),
         ("position_m", np.float64, (_F, _J, 3)),
-        ("axis", np.float64, (_F, _J, 3)),
-        # Short cuts: whether (1) that frame is turned at all; which axis (0, 1, 2) it is or the
-        # opposite of, with its sign, or 3.
+        # Short cut: whether (1) that frame is turned at all.
         ("is_turned", np.uint8, (_F, _J)),
-        ("axis_kind", np.int64, (_F, _J)),
-        ("axis_sign", np.float64, (_F, _J)),
         # The joints whose origins are knuckle, PIP and DIP; the tip, in the last joint's frame.
         ("point_joints", np.int64, (_F, 3)),
         ("tip_m", np.float64, (_F, 3)),
@@ -122,13 +117,13 @@ SCRATCH: Final = np.dtype(
         # Points as measured, and whether (1) or not (0) they were.
         ("measured", np.float64, (_F, _P, 3)),
         ("usable", np.uint8, (_F, _P)),
-        # Of the robot's joints, the tip after the last; of the virtual points and the robot's tip,
+        # Of the robot's joints, the tip after the last; of the virtual points and the robot's own,
         # the slopes by the joints.
         ("origin", np.float64, (_F, _J + 1, 3)),
         ("axis", np.float64, (_F, _J, 3)),
         ("point", np.float64, (_F, _P, 3)),
         ("slope", np.float64, (_F, _P, _J, 3)),
-        ("tip_slope", np.float64, (_F, _J, 3)),
+        ("own_slope", np.float64, (_F, _P, _J, 3)),
         # Normal equations by finger; what couples thumb (rows) and finger (columns).
         ("hessian", np.float64, (_F, _J, _J)),
         ("coupling", np.float64, (_F, _J, _J)),
@@ -156,8 +151,7 @@ SCRATCH: Final = np.dtype(
         ("members", np.int64, (_F + 1,)),
         ("is_near", np.uint8, (_F,)),
         # Of the innermost loops.
-        ("turn", np.float64, (2, 3, 3)),
-        ("own_slope", np.float64, (2, _J, 3)),
+        ("turn", np.float64, (3, 3)),
         ("row", np.float64, (2, _J)),
         ("bones", np.float64, (3, 3)),
         ("best", np.float64, (_J,)),
@@ -280,25 +274,32 @@ def hand_arrays(hand: HandModel) -> np.ndarray:
     for index, finger in enumerate(hand.fingers):
         row["num_joints"][index] = len(finger.joints)
         row["point_joints"][index] = finger.points
-        row["tip_m"][index] = finger.tip_m
         row["nodes"][index] = solver_indices(finger.chain)
         for point in (1, 2):
             # A finger with fewer joints: one bone follows two of the person's.
             if finger.points[point] == finger.points[point - 1]:
                 row["nodes"][index, point] = -1
+        before = np.eye(3)
         for joint, one in enumerate(finger.joints):
-            row["rotation"][index, joint] = rotation_from_quaternion(np.array(one.q_wxyz))
-            row["position_m"][index, joint] = one.position_m
-            axis = np.array(one.axis) / np.linalg.norm(one.axis)
-            row["axis"][index, joint] = axis
-            row["is_turned"][index, joint] = tuple(one.q_wxyz) != NO_TURN
-            along = int(np.argmax(np.abs(axis)))
-            row["axis_kind"][index, joint] = along if abs(axis[along]) == 1.0 else 3
-            row["axis_sign"][index, joint] = np.sign(axis[along])
+            axes = _axes_around(np.array(one.axis))
+            rotation = before.T @ rotation_from_quaternion(np.array(one.q_wxyz)) @ axes
+            row["rotation"][index, joint] = rotation
+            row["position_m"][index, joint] = before.T @ one.position_m
+            row["is_turned"][index, joint] = not np.array_equal(rotation, np.eye(3))
             row["lower_rad"][index, joint], row["upper_rad"][index, joint] = one.limits_rad
+            before = axes
+        row["tip_m"][index] = before.T @ finger.tip_m
     row["starts_rad"] = row["lower_rad"] + fractions * (row["upper_rad"] - row["lower_rad"])
     row["knuckle_m"][: len(hand.fingers)] = zero_points_m(hand)[:, 0]
     return record
+
+
+def _axes_around(axis: np.ndarray) -> Float64[np.ndarray, "3 3"]:
+    """Right-handed axes whose z is this one; along x, y or z they are exact."""
+    z = axis / np.linalg.norm(axis)
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
 
 
 def joint_places(hand: HandModel) -> Bool[np.ndarray, "fingers 6"]:
