@@ -14,10 +14,10 @@ from benchmarks.clocks.scores import Score, score
 from benchmarks.figures import Figure
 from benchmarks.rounds import interleaved
 from benchmarks.stages import Bar
-from dextouch.clocks import CountingClock, OnlineClock, date_by_counting
+from dextouch.clocks import OnlineClock, date_by_counting
 
 Way = Callable[[Take], np.ndarray]
-COUNTED, NUMBERED, PROVISIONAL = "counted", "numbered", "counted, at once"
+COUNTED, NUMBERED = "counted", "numbered"
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,6 @@ def compare_stampless(*, seconds: float, num_rounds: int, seed: int, bar: Bar) -
     """Compare on streams with sequence numbers only or no counter, at several loss rates."""
     ways: list[tuple[str, Way, bool]] = [
         (COUNTED, _counted, True),
-        (PROVISIONAL, _provisional, True),
         (NUMBERED, _numbered, True),
         ("arrival stamps", ONLINE["arrival stamps"], True),
     ]
@@ -107,11 +106,6 @@ def _measure(way: Way, takes: list[Take], is_online: bool, index: int) -> tuple[
 def _counted(take: Take) -> np.ndarray:
     period_ns = descriptor(take.scene).period_ns()
     return np.asarray(date_by_counting(take.t_host_ns, period_ns=period_ns).t_host_ns)
-
-
-def _provisional(take: Take) -> np.ndarray:
-    clock = CountingClock(descriptor(take.scene).period_ns())
-    return np.array([clock.update(host).provisional_ns for host in take.t_host_ns.tolist()])
 
 
 def _numbered(take: Take) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.store.our_design import arrivals, descriptors
 from benchmarks.store.workload import Workload
-from dextouch.episodes import EpisodeStore, WriteOptions
+from dextouch.episodes import EpisodeStore
 from dextouch.schemas import RecordingAttributes
 
 SPEED = 4.0
@@ -22,8 +22,8 @@ _RECORDING_ID = "live"
 class LiveResult:
     """Result of one paced run.
 
-    `num_late` rows were accepted more than LATE_S late, `num_dropped` images were dropped before
-    the encoder; `finish_s` is the time from the last row to the committed recording.
+    `num_late` rows were accepted more than LATE_S late, `num_dropped` ones are missing from
+    the recording; `finish_s` is the time from the last row to the committed recording.
     """
 
     speed: float
@@ -59,8 +59,7 @@ def write_live(workload: Workload, folder: Path, unit: str, *, speed: float = SP
     )
     store = EpisodeStore(folder)
     num_rows, num_late, worst_lag_s = 0, 0, 0.0
-    options = WriteOptions(when_full="drop")
-    with store.writer(kind="recording", attributes=attributes, options=options) as writer:
+    with store.writer(kind="recording", attributes=attributes) as writer:
         begun_s = time.perf_counter()
         for name, values, stamps in arrivals(workload):
             if not len(stamps):

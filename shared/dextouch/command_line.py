@@ -15,7 +15,6 @@ from typing import Any, TextIO, TypeVar
 STANDARD_OUTPUT = Path("-")
 JSON_HELP = "also write the result as JSON to this file; - for standard output"
 Item = TypeVar("Item")
-_BOOLEANS = {"true": True, "false": False}
 _result_stream: ContextVar[TextIO | None] = ContextVar("result_stream", default=None)
 
 
@@ -34,49 +33,12 @@ def _filled(paragraph: str, width: int, indent: str) -> str:
 
 
 class CommandParser(argparse.ArgumentParser):
-    """Argument parser of a command; its `epilog` shows an example.
-
-    Flags are spelled with dashes and never abbreviated. Two older spellings are still read but not
-    shown: underscores (`--num_steps 8`) and booleans with a value (`--mock true`).
-    """
+    """Parser of a command, whose flags are never abbreviated; its `epilog` shows an example."""
 
     def __init__(self, **kwargs: Any) -> None:  # noqa: ANN401 - argparse's own
         kwargs.setdefault("formatter_class", HelpFormatter)
         kwargs.setdefault("allow_abbrev", False)
         super().__init__(**kwargs)
-
-    def parse_known_args(  # type: ignore[override]
-        self,
-        args: Sequence[str] | None = None,
-        namespace: argparse.Namespace | None = None,
-    ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse known arguments, with older spellings replaced."""
-        given = sys.argv[1:] if args is None else list(args)
-        return super().parse_known_args(self._respelled(given), namespace)
-
-    def _respelled(self, arguments: Sequence[str]) -> list[str]:
-        words: list[str] = []
-        for word in arguments:
-            if words and word in _BOOLEANS and self._is_boolean(words[-1]):
-                words[-1] = _switched(words[-1], word)
-                continue
-            flag, equals, value = word.partition("=")
-            if flag.startswith("--") and flag not in self._option_string_actions:
-                dashed = flag.replace("_", "-")
-                flag = dashed if dashed in self._option_string_actions else flag
-            if value in _BOOLEANS and self._is_boolean(flag):
-                words.append(_switched(flag, value))
-            else:
-                words.append(f"{flag}{equals}{value}")
-        return words
-
-    def _is_boolean(self, flag: str) -> bool:
-        action = self._option_string_actions.get(flag)
-        return isinstance(action, argparse.BooleanOptionalAction) and not flag.startswith("--no-")
-
-
-def _switched(flag: str, value: str) -> str:
-    return flag if _BOOLEANS[value] else f"--no-{flag.removeprefix('--')}"
 
 
 def progress(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:

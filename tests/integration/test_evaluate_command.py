@@ -132,7 +132,7 @@ def evaluate(folder, url, *flags):
         *(sys.executable, "-m", "services.cli.main", "evaluate"),
         *("--real", json.dumps({"url": url, "world": "twin"})),
         *("--imagined", json.dumps({"copy-first": {"url": url, "world": "copy-first"}})),
-        *("--seeds", "90000:90001", "--tasks", "stand_bottle", "--num_steps", "16"),
+        *("--seeds", "90000:90001", "--tasks", "stand_bottle", "--num-steps", "16"),
         *("--builtin", "[]", "--json", "out/report.json", *flags),
     ]
     python_path = os.pathsep.join([str(ROOT), str(ROOT / "shared")])
@@ -157,7 +157,7 @@ def test_policies_of_ones_own_are_scored(folder, url):
         *(folder, url),
         *("--policy", "mine=mypolicy:Reach", "--policy", "mypolicy:NoReset"),
         *("--policy", "tensor=mypolicy:make_tensor", "--html", "out/report.html"),
-        *("--policy_arguments", '{"mine": {"down_m": 0.02}}'),
+        *("--policy-arguments", '{"mine": {"down_m": 0.02}}'),
     )
     assert done.returncode == 0, done.stderr
     report = json.loads((folder / "out/report.json").read_text())
@@ -177,8 +177,8 @@ def test_what_a_policy_does_wrong_is_named_and_the_others_are_scored(folder, url
     done = evaluate(
         *(folder, url, "--policy", "crash=mypolicy:Crashing", "--policy", "good=mypolicy:NoReset"),
         *(word for pair in policies for word in pair),
-        *("--policy_arguments", json.dumps({what: {"what": what} for what in wrong})),
-        *("--num_steps", "32"),
+        *("--policy-arguments", json.dumps({what: {"what": what} for what in wrong})),
+        *("--num-steps", "32"),
     )
     assert done.returncode == 1
     assert "16 of 18 rollouts failed" in done.stderr

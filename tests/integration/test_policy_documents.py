@@ -151,7 +151,7 @@ def test_the_command_of_the_page_scores_the_policy(folder, services, capsys):
     command = here(block(POLICIES, "dextouch evaluate --policy"), services)
     _, *words = shlex.split(command.replace("\\\n", " "))
     words[words.index("90000:90010")] = "90000:90001"
-    assert main.main([*words, "--num_steps", "16", "--builtin", "[]"]) == 0
+    assert main.main([*words, "--num-steps", "16", "--builtin", "[]"]) == 0
     report = json.loads((folder / "report.json").read_text())
     assert [row["policy"] for row in report["policies"]] == ["mine"]
     assert report["imagined_world"] == "world_model"

@@ -29,12 +29,12 @@ class Service:
         place.socket.close()
         self._arguments = [
             "serve",
-            f"--store_url={store.root}",
+            f"--store-url={store.root}",
             f"--port={self.url.rsplit(':', 1)[1]}",
-            "--num_workers=1",
-            f"--max_attempts={max_attempts}",
+            "--num-workers=1",
+            f"--max-attempts={max_attempts}",
             # Jobs are those that the tests ask for.
-            "--align_new=false",
+            "--no-align-new",
         ]
         self._log = (tmp_path / "service.log").open("ab")
         self.process = None

@@ -42,7 +42,7 @@ class Soak:
         environment = os.environ | {
             "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)
         }
-        flags = ["--store_url", str(self.store_folder), "--port", self.url.rsplit(":", 1)[1]]
+        flags = ["--store-url", str(self.store_folder), "--port", self.url.rsplit(":", 1)[1]]
         command = [
             sys.executable,
             "-m",

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from dextouch.clocks.counting_clock import CountedSample as CountedSample
     from dextouch.clocks.counting_clock import CountedTake as CountedTake
     from dextouch.clocks.counting_clock import CountingClock as CountingClock
-    from dextouch.clocks.counting_clock import CountingUpdate as CountingUpdate
     from dextouch.clocks.counting_clock import date_by_counting as date_by_counting
     from dextouch.clocks.online_clock import OnlineClock as OnlineClock
     from dextouch.clocks.round_trips import ClockOffset as ClockOffset

@@ -26,8 +26,6 @@ MAX_WAIT = 6
 MAX_STEADY_SKEW_PPM = 20_000.0
 MAX_STEADY_LOSS = 0.1
 MAX_STEPS_PER_SAMPLE = 0.001
-# Provisional times assume a loss after this many late samples.
-LOOK_BACK = 3
 
 
 class CountedSample(NamedTuple):
@@ -42,18 +40,10 @@ class CountedSample(NamedTuple):
     t_host_ns: int
 
 
-class CountingUpdate(NamedTuple):
-    """Result of an update: the sample's provisional time, and final times of older samples."""
-
-    provisional_ns: int
-    final: tuple[CountedSample, ...]
-
-
 class CountingClock:
     """Estimates the times of samples of a steady device without stamps and sequence numbers.
 
-    Final times are available ten samples later, or once a queue has drained; a provisional one at
-    once.
+    Times are available ten samples later, or once a queue has drained.
 
     Args:
         period_ns: nominal sample period, accurate within a few percent.
@@ -74,7 +64,6 @@ class CountingClock:
         self._index = -1
         self.num_lost = 0
         self._last_final_ns: int | None = None
-        self._last_provisional_ns: int | None = None
 
     @property
     def num_steps(self) -> int:
@@ -96,17 +85,8 @@ class CountingClock:
             and self.num_steps <= MAX_STEPS_PER_SAMPLE * num_arrived
         )
 
-    def update(self, t_host_ns: int) -> CountingUpdate:
-        """Add one arrival on the host's monotonic clock.
-
-        Raises:
-            InvalidInputError: it precedes the last arrival.
-        """
-        final = self.advance(t_host_ns)
-        return CountingUpdate(self._provisional_ns(t_host_ns), final)
-
     def advance(self, t_host_ns: int) -> tuple[CountedSample, ...]:
-        """Like `update`, but returns final times only.
+        """Add one arrival on the host's monotonic clock; returns the samples decided by it.
 
         Raises:
             InvalidInputError: it precedes the last arrival.
@@ -129,23 +109,22 @@ class CountingClock:
         decided = (self._decide(is_last_chance=True) for _ in range(len(self._waiting)))
         return tuple(sample for sample in decided if sample is not None)
 
-    def _lateness_ns(self, first: int, last: int) -> list[float]:
-        """Delay of pending samples if none were lost."""
+    def _lateness_ns(self, count: int) -> list[float]:
+        """Delay of the first pending samples if none were lost."""
         start_ns = self._start_ns if self._start_ns is not None else 0
         period_ns = self._period_ns * (1 + self._envelope.slope_ns_per_s * 1e-9)
         x_ns = (self._index + 1) * self._period_ns
         origin_ns = start_ns + x_ns + round(self._envelope.at(x_ns * 1e-9))
-        waiting = self._waiting
-        return [waiting[k] - origin_ns - k * period_ns for k in range(first, last)]
+        return [self._waiting[k] - origin_ns - k * period_ns for k in range(count)]
 
     def _num_lost_before(self, *, is_last_chance: bool) -> int | None:
         """Number of samples lost before the oldest pending one; None while undecided."""
         if self._index < 0:
             return 0
         threshold_ns = LOST_SHARE * self._period_ns
-        if self._lateness_ns(0, 1)[0] < threshold_ns:
+        if self._lateness_ns(1)[0] < threshold_ns:
             return 0
-        late_ns = self._lateness_ns(0, len(self._waiting))
+        late_ns = self._lateness_ns(len(self._waiting))
         least_ns = min(late_ns)
         if least_ns < threshold_ns:
             return 0
@@ -169,20 +148,6 @@ class CountingClock:
             final_ns = max(final_ns, self._last_final_ns + 1)
         self._last_final_ns = final_ns
         return CountedSample(self._index, final_ns)
-
-    def _provisional_ns(self, t_host_ns: int) -> int:
-        """Provisional time of the newest sample, from past samples only."""
-        estimate_ns = t_host_ns
-        if self._index >= 0 and self._waiting:
-            num = len(self._waiting)
-            late_ns = self._lateness_ns(max(0, num - LOOK_BACK), num)
-            num_lost = max(0, int(min(late_ns) / self._period_ns + 1.0 - LOST_SHARE))
-            waited_ns = late_ns[-1] - num_lost * self._period_ns
-            estimate_ns = t_host_ns - max(0, round(waited_ns))
-        if self._last_provisional_ns is not None:
-            estimate_ns = max(estimate_ns, self._last_provisional_ns + 1)
-        self._last_provisional_ns = estimate_ns
-        return estimate_ns
 
 
 @dataclass(frozen=True)

@@ -7,19 +7,20 @@ crc32c, so a flipped bit or a truncated file is always detected.
 
 import hashlib
 import math
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import google_crc32c
 import numpy as np
+import zstandard
 from jaxtyping import Shaped
 
 from dextouch.episodes.files import disk_errors
-from dextouch.episodes.format import ArrayEntry, shard_path, with_rows
+from dextouch.episodes.format import ZSTD_LEVEL, ArrayEntry, shard_path, with_rows
 from dextouch.episodes.journal import JournalWriter, part_path, read_payload, read_rows
 from dextouch.episodes.sources import ByteSource
-from dextouch.episodes.zstd import compress, decompress
 from dextouch.errors import CorruptDataError, InvalidInputError
 
 CRC_BYTES = 4
@@ -31,6 +32,45 @@ _H264_MIN_BYTES = 4 + 3 + 1
 # Adjacent storage chunks are fetched together up to this many bytes: enough for most windows in one
 # request, while whole arrays are still read in pieces.
 _SPAN_BYTES = 1 << 21
+# Far above current chunks (1 MiB, or one sample), and above the half second of raw images that
+# earlier releases wrote.
+MAX_CHUNK_BYTES = 1 << 29
+
+
+class _Contexts(threading.local):
+    """Contexts of zstd: creating one costs as much as decompressing a storage chunk."""
+
+    def __init__(self) -> None:
+        self.compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
+        self.decompressor = zstandard.ZstdDecompressor()
+
+
+_CONTEXTS = _Contexts()
+
+
+def compress(data: bytes) -> bytes:
+    """Compress bytes to one zstd frame."""
+    return _CONTEXTS.compressor.compress(data)
+
+
+def decompress(frame: bytes, *, size: int, what: str) -> bytes:
+    """Decompress a single zstd frame of exactly `size` bytes.
+
+    Raises:
+        CorruptDataError: another size or trailing data, or more than MAX_CHUNK_BYTES; `what` names
+            the frame in errors.
+    """
+    if size > MAX_CHUNK_BYTES:
+        raise CorruptDataError(f"{what}: is of {size} bytes, expected at most {MAX_CHUNK_BYTES}")
+    try:
+        # Checked before decompression: a decompression bomb declares a size that is never
+        # allocated.
+        said = zstandard.get_frame_parameters(frame).content_size
+        if said != size:
+            raise CorruptDataError(f"{what}: holds {said} bytes, expected {size}")
+        return _CONTEXTS.decompressor.decompress(frame, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise CorruptDataError(f"{what}: no zstd frame of {size} bytes ({error})") from error
 
 
 def with_crc(data: bytes) -> bytes:

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, try_lock, write_file
 from dextouch.episodes.spool_log import (
     LOG_FILE,
+    LOG_MAGIC,
     SpoolLogWriter,
     read_batch,
     read_bodies,
@@ -201,7 +202,7 @@ class SpoolWriter:
             raise ConflictError(f"spool {path.name!r}: another process is writing it")
         self._lock = lock
         try:
-            self._log = SpoolLogWriter(path, end=self._resume() if resume else None)
+            self._log = SpoolLogWriter(path, end=self._resume())
         except BaseException:
             os.close(self._lock)
             raise
@@ -348,7 +349,7 @@ class SpoolWriter:
         return self._streams[name]
 
     def _resume(self) -> int:
-        """Count the samples of an existing log; returns where it goes on."""
+        """Count the samples of the log; returns where it goes on."""
         records = trusted_records(self.path)
         with disk_errors(f"resume spool {self.path.name}"):
             (self.path / CLOSED_FILE).unlink(missing_ok=True)
@@ -372,7 +373,7 @@ def _create(path: Path, attributes: RecordingAttributes) -> None:
             f"spool {attributes.recording_id!r}: got {len(attributes.streams)} streams, expected "
             f"at most {MAX_STREAMS} streams; put some into one stream of a larger shape"
         )
-    # Created under a temporary name, so that a visible spool always has its attributes.
+    # Created under a temporary name, so that a visible spool always has its files.
     unborn = path.with_name(path.name + ".new")
     with disk_errors(f"create spool {path.name}"):
         if path.exists():
@@ -380,4 +381,5 @@ def _create(path: Path, attributes: RecordingAttributes) -> None:
         shutil.rmtree(unborn, ignore_errors=True)
         unborn.mkdir(parents=True)
         write_file(unborn / RECORDING_FILE, attributes.model_dump_json().encode())
+        write_file(unborn / LOG_FILE, LOG_MAGIC)
         unborn.rename(path)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import BinaryIO
 
 import google_crc32c
 import numpy as np
@@ -88,26 +89,21 @@ class LogBytes:
     beyond the end of a mapping kills the process (SIGBUS).
     """
 
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self._num_bytes = os.fstat(descriptor).st_size
-        self._block, self._block_start = b"", 0
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._num_bytes = file, os.fstat(file.fileno()).st_size
 
     def __len__(self) -> int:
         return self._num_bytes
 
     def read(self, start: int, length: int) -> bytes:
         """Bytes start … start + length − 1, fewer at the end."""
-        low = start - self._block_start
-        if low < 0 or low + length > len(self._block):
-            self._block = os.pread(self._descriptor, max(length, _BLOCK_BYTES), start)
-            self._block_start, low = start, 0
-        return self._block[low : low + length]
+        self._file.seek(start)
+        return self._file.read(length)
 
     def find(self, mark: bytes, start: int) -> int:
         """Offset of the next occurrence of `mark`; -1 if there is none."""
         while start < self._num_bytes:
-            block = os.pread(self._descriptor, _SEARCH_BYTES, start)
+            block = self.read(start, _SEARCH_BYTES)
             place = block.find(mark)
             if place >= 0:
                 return start + place
@@ -127,8 +123,8 @@ def open_log(folder: Path) -> Iterator[LogBytes]:
     with disk_errors(f"read log of spool {folder.name!r}"):
         if not (folder / LOG_FILE).is_file():
             raise CorruptDataError(f"spool {folder.name!r}: {LOG_FILE} is missing")
-        with (folder / LOG_FILE).open("rb") as file:
-            yield LogBytes(file.fileno())
+        with (folder / LOG_FILE).open("rb", buffering=_BLOCK_BYTES) as file:
+            yield LogBytes(file)
 
 
 def find_records(data: LogBytes) -> LogRecords:
@@ -268,19 +264,17 @@ def _next_header(data: LogBytes, place: int) -> int:
 class SpoolLogWriter:
     """Appends records to a spool's log; each append is one write.
 
-    `end` is None for a new log, otherwise the offset to continue at, where the file is truncated.
+    `end` is the offset to continue at, where the file is truncated.
 
     Raises:
-        StorageError: the file exists already, or cannot be created.
+        StorageError: the file cannot be opened.
     """
 
-    def __init__(self, folder: Path, *, end: int | None = None) -> None:
-        self._what = f"log of spool {folder.name!r}"
+    def __init__(self, folder: Path, *, end: int) -> None:
+        self._what, self._end = f"log of spool {folder.name!r}", end
         self._file = -1
-        self._end = len(LOG_MAGIC) if end is None else max(end, len(LOG_MAGIC))
-        flags = os.O_RDWR | os.O_CREAT | (os.O_EXCL if end is None else 0)
         with disk_errors(f"open {self._what}"):
-            self._file = os.open(folder / LOG_FILE, flags, 0o644)
+            self._file = os.open(folder / LOG_FILE, os.O_RDWR)
             os.pwrite(self._file, LOG_MAGIC, 0)
             self._cut(self._end)
 
@@ -330,9 +324,6 @@ class SpoolLogWriter:
 
 def trusted_records(folder: Path) -> LogRecords:
     """The records of a log without those at its end whose body never reached the disk."""
-    if not (folder / LOG_FILE).exists():
-        # The process died before it created the log.
-        SpoolLogWriter(folder).close()
     records = read_records(folder)
     num_rows = len(records.rows)
     with open_log(folder) as data:

@@ -1,7 +1,6 @@
 """Recovery of abandoned stages: a terminated writer's data becomes a group marked as recovered."""
 
 import hashlib
-import math
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -44,7 +43,6 @@ from dextouch.episodes.staged_group import (
     read_committed,
     read_stage,
 )
-from dextouch.episodes.zstd import content_bytes
 from dextouch.errors import CorruptDataError, DexTouchError, StorageError
 from dextouch.schemas import RecordingAttributes
 
@@ -241,8 +239,6 @@ def _cut_array(stage: Path, name: str, entry: ArrayEntry, num_samples: int) -> A
             f"{stage.name}: array {name!r} has no storage chunk that ends after "
             f"{num_samples} samples; it was not written by this release"
         )
-    if entry.codec == "zstd" and num_kept:
-        entry = _as_written(entry, read_payload(stage, name, rows[0]))
     digest = hashlib.sha256()
     for row in rows[:num_kept]:
         payload = read_payload(stage, name, row)[:-CRC_BYTES]
@@ -256,18 +252,6 @@ def _cut_array(stage: Path, name: str, entry: ArrayEntry, num_samples: int) -> A
     finally:
         log.close()
     return with_rows(entry, num_samples).model_copy(update={"sha256": digest.hexdigest()})
-
-
-def _as_written(entry: ArrayEntry, payload: bytes) -> ArrayEntry:
-    """The entry with the chunk length that the log actually has.
-
-    Earlier releases always wrote half a second of samples per chunk.
-    """
-    row_bytes = np.dtype(entry.dtype).itemsize * math.prod(entry.shape[1:])
-    chunk_rows, rest = divmod(content_bytes(payload), row_bytes)
-    if rest or not chunk_rows:
-        return entry
-    return entry.model_copy(update={"chunk_rows": chunk_rows})
 
 
 def _as_recovered(attributes: Attributes, is_taken: IsTaken) -> Attributes:

@@ -4,7 +4,6 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -30,7 +29,6 @@ from dextouch.images import DEFAULT_QUALITY, encode_jpeg
 from dextouch.streams import StreamDescriptor, check_encoded_image
 
 MAX_WAITING_IMAGES = 32
-WhenFull = Literal["wait", "drop"]
 Stamps = Mapping[str, np.ndarray]
 
 
@@ -41,8 +39,6 @@ class WriteOptions(FrozenModel):
         sync: sync every storage chunk to disk. Otherwise only committed groups survive a power
             loss, while everything written survives a crash of the process.
         threads: whether images are encoded in background threads, one per camera.
-        when_full: backpressure of the encoder queue: "wait" blocks the caller, "drop" drops and
-            counts the image, as a live take needs.
         recoverable: whether an interrupted group is kept: at once after an exception or Ctrl-C, by
             `EpisodeStore.recover` after a kill or on a full disk. None: recordings only, since
             episodes can be recomputed from their recording. False suits writers that can start
@@ -52,7 +48,6 @@ class WriteOptions(FrozenModel):
 
     sync: bool = False
     threads: bool = True
-    when_full: WhenFull = "wait"
     recoverable: bool | None = None
     video: VideoSettings = VideoSettings()
 
@@ -86,11 +81,6 @@ class StreamWriter:
             for name, entry in entries.items()
         }
 
-    @property
-    def num_dropped(self) -> int:
-        """Number of images dropped because the queue was full."""
-        return 0 if self._queue is None else self._queue.num_dropped
-
     def append(self, values: np.ndarray, stamps: Stamps) -> None:
         """Append a block with all stamps of the kind; raises as `EpisodeWriter.append`."""
         name = self.descriptor.name
@@ -120,14 +110,10 @@ class StreamWriter:
         ):
             self._write(values, stamps)
         else:
-            self._enqueue(values, stamps)
-
-    def _enqueue(self, values: np.ndarray, stamps: Stamps) -> None:
-        # Once there is a queue, everything goes through it to keep the order.
-        if self._queue is None:
-            name, when_full = self.descriptor.name, self._options.when_full
-            self._queue = _ImageQueue(self._write, name=name, when_full=when_full)
-        self._queue.put(values, stamps)
+            # Once there is a queue, everything goes through it to keep the order.
+            if self._queue is None:
+                self._queue = _ImageQueue(self._write, name=name)
+            self._queue.put(values, stamps)
 
     def _check_order(self, stamps_ns: np.ndarray) -> None:
         first_ns, last_ns, least = int(stamps_ns[0]), self._last_stamp_ns, self._least_step_ns
@@ -294,11 +280,8 @@ class _EncodedImages:
 class _ImageQueue:
     """Writes blocks of images of a stream in order, in a background thread, with backpressure."""
 
-    def __init__(
-        self, write: Callable[[np.ndarray, Stamps], None], *, name: str, when_full: WhenFull
-    ) -> None:
-        self.num_dropped = 0
-        self._write, self._when_full = write, when_full
+    def __init__(self, write: Callable[[np.ndarray, Stamps], None], *, name: str) -> None:
+        self._write = write
         self._waiting: deque[tuple[Future[None], int]] = deque()
         self._spare: deque[np.ndarray] = deque(maxlen=MAX_WAITING_IMAGES)
         self._num_images = 0
@@ -310,9 +293,6 @@ class _ImageQueue:
             self._take_oldest()
         # A block larger than the queue is accepted when the queue is empty.
         while self._waiting and self._num_images + len(values) > MAX_WAITING_IMAGES:
-            if self._when_full == "drop":
-                self.num_dropped += len(values)
-                return
             self._take_oldest()
         kept = {name: column.copy() for name, column in stamps.items()}
         work = self._thread.submit(self._hand_on, self._copy(values), kept)

@@ -16,7 +16,6 @@ from dextouch.episodes.format import (
     attributes_id,
     kind_of,
     stream_arrays,
-    with_counts,
 )
 from dextouch.episodes.staged_group import commit_stage, write_stage
 from dextouch.episodes.staging_recovery import RecoveredGroup, recover_stage
@@ -36,7 +35,6 @@ from dextouch.streams import (
     StreamDescriptor,
 )
 
-DROPPED_IMAGES = "dropped_before_encoder"
 # Values, and stamps by name.
 Block = tuple[np.ndarray, dict[str, np.ndarray]]
 
@@ -226,7 +224,7 @@ class EpisodeWriter:
                 stream.keep()
         try:
             with suppress(StorageError):
-                write_stage(self._stage, self._with_losses())
+                write_stage(self._stage, self._with_streams())
             group = self._complete()
         except DexTouchError as failure:
             where = f" in {self._stage}" if self._stage.exists() else ""
@@ -258,16 +256,11 @@ class EpisodeWriter:
             for stream in self._streams.values()
             for name, entry in stream.finish().items()
         }
-        commit_stage(self._stage, self._target, self._with_losses(), entries)
+        commit_stage(self._stage, self._target, self._with_streams(), entries)
 
     def _with_streams(self) -> Attributes:
         descriptors = tuple(stream.descriptor for stream in self._streams.values())
         return self._attributes.model_copy(update={"streams": descriptors})
-
-    def _with_losses(self) -> Attributes:
-        """The attributes with counts of images dropped by this writer."""
-        dropped = {name: s.num_dropped for name, s in self._streams.items() if s.num_dropped}
-        return with_counts(self._with_streams(), DROPPED_IMAGES, dropped)
 
 
 def write_blocks(

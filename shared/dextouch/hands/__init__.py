@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from dextouch.hands.skeleton import solver_indices as solver_indices
     from dextouch.hands.tracker_nodes import FINGER_METACARPALS as FINGER_METACARPALS
     from dextouch.hands.tracker_nodes import NO_KEYPOINT as NO_KEYPOINT
-    from dextouch.hands.tracker_nodes import TreeNode as TreeNode
     from dextouch.hands.tracker_nodes import node_order as node_order
-    from dextouch.hands.tracker_nodes import nodes_of_tree as nodes_of_tree
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)

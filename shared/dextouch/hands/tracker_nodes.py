@@ -1,8 +1,8 @@
 """Mapping of a hand tracker's nodes, in any order and naming, to our 25 keypoints.
 
 Node ids are opaque and orders differ even between products of one manufacturer, so nodes are
-identified by chain and joint, or by chain and distance from the wrist. Joint names differ as well,
-and some are shifted by one joint; the names of a chain are interpreted together.
+identified by chain and joint. Joint names differ as well, and some are shifted by one joint; the
+names of a chain are interpreted together.
 """
 
 from collections import Counter
@@ -73,18 +73,6 @@ class NodeOrder:
         return keypoints
 
 
-@dataclass(frozen=True)
-class TreeNode:
-    """A node by its parent: ids are opaque, the root's parent is None or itself.
-
-    At least one node of each chain needs `chain`, since the tree alone does not identify it.
-    """
-
-    id: int
-    parent: int | None
-    chain: str | None = None
-
-
 def node_order(nodes: Sequence[Node], *, may_lack: Collection[Node] = ()) -> NodeOrder:
     """Assign nodes given by chain and joint.
 
@@ -131,69 +119,3 @@ def _in_our_words(nodes: Sequence[Node]) -> list[Node | None]:
                 joints = zip(scheme, ours[-len(scheme) :], strict=True)
                 words |= {(chain, theirs): (chain, joint) for theirs, joint in joints}
     return [None if _PALM in node else words.get(node, node) for node in named]
-
-
-def nodes_of_tree(tree: Sequence[TreeNode]) -> list[Node]:
-    """Chain and joint of nodes given by their parents, in the same order.
-
-    The root is the wrist, each of its children starts a chain. The thumb has four nodes; another
-    chain has five, or four if it begins at its knuckle.
-
-    Raises:
-        InvalidInputError: duplicate ids, no root or several, a cycle, or a chain that branches, has
-            another number of nodes, no name or two names. `node_order` checks that all chains are
-            present.
-    """
-    num_ids = len({node.id for node in tree})
-    roots = [node.id for node in tree if node.parent in (None, node.id)]
-    if num_ids < len(tree) or len(roots) != 1:
-        raise InvalidInputError(
-            f"hand tree: got {len(tree)} nodes with {num_ids} different ids and roots {roots}, "
-            "expected all ids different and one node, the wrist, without another node as parent"
-        )
-    children: dict[int | None, list[TreeNode]] = {}
-    for node in tree:
-        if node.id != roots[0]:
-            children.setdefault(node.parent, []).append(node)
-    found: dict[int, Node] = {roots[0]: (WRIST, WRIST)}
-    for first in children.get(roots[0], []):
-        path = [first]
-        while following := children.get(path[-1].id):
-            if len(following) > 1:
-                raise InvalidInputError(
-                    f"hand tree: node {path[-1].id} has the children "
-                    f"{[node.id for node in following]}; only the wrist has several, each the "
-                    "first node of a chain"
-                )
-            path += following
-        found |= zip((node.id for node in path), _names(path), strict=True)
-    lost = [node for node in tree if node.id not in found]
-    if lost:
-        raise InvalidInputError(
-            f"hand tree: nodes {[node.id for node in lost]} do not lead back to the wrist "
-            f"{roots[0]}; their parents are {[node.parent for node in lost]}"
-        )
-    return [found[node.id] for node in tree]
-
-
-def _names(path: Sequence[TreeNode]) -> list[Node]:
-    """Chain and joint of the nodes of one chain, counted from the tip."""
-    ids = [node.id for node in path]
-    labels = {node.chain.lower() for node in path if node.chain is not None}
-    chains = {_CHAIN_WORDS.get(label, label) for label in labels}
-    if len(chains) != 1:
-        raise InvalidInputError(
-            f"hand tree: the chain of nodes {ids} is called {sorted(chains) or 'nothing'}, "
-            f"expected one of {list(CHAINS)} at one of its nodes at least"
-        )
-    (chain,) = chains
-    if chain == _PALM:
-        return [(_PALM, _PALM)] * len(path)
-    joints = THUMB_JOINTS if chain == "thumb" else FINGER_JOINTS
-    allowed = {len(joints)} if chain == "thumb" else {len(joints), len(joints) - 1}
-    if chain not in CHAINS or len(path) not in allowed:
-        raise InvalidInputError(
-            f"hand tree: {chain!r} has {len(path)} nodes {ids}, expected one of "
-            f"{list(CHAINS)}: the thumb with 4 nodes, another finger with 5, or 4 from its knuckle"
-        )
-    return [(chain, joint) for joint in joints[-len(path) :]]

@@ -6,6 +6,7 @@ radial (thumb side) to ulnar, so that a left and a right hand doing the same thi
 numbers.
 """
 
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -29,7 +30,6 @@ PALM_PITCH_M = (0.006, 0.005)
 TIP_TAXEL_AREA_M2 = TIP_PITCH_M**2
 PALM_TAXEL_AREA_M2 = PALM_PITCH_M[0] * PALM_PITCH_M[1]
 
-GLOVE_MODELS = ("dextouch_v1",)
 _SCAN_SHAPE = (18, 20)
 
 
@@ -40,15 +40,14 @@ def taxel_areas_m2() -> np.ndarray:
     return areas
 
 
-def raw_indices(*, side: Side, glove_model: str = "dextouch_v1") -> Int64[np.ndarray, "320"]:
-    """Raw cell of each taxel.
+@cache
+def raw_indices(*, side: Side) -> Int64[np.ndarray, "320"]:
+    """Raw cell of each taxel; read-only.
 
-    `dextouch_v1` scans 18 rows × 20 columns. Rows 0–3 hold the five fingertips side by side,
+    A glove scans 18 rows × 20 columns. Rows 0–3 hold the five fingertips side by side,
     rows 4–15 the palm row by row, rows 16–17 are unused (40 cells). The left glove is wired as
     the mirror image: its columns run the other way.
     """
-    if glove_model not in GLOVE_MODELS:
-        raise UnknownNameError("glove model", glove_model, list(GLOVE_MODELS))
     if side not in SIDES:
         raise UnknownNameError("side", side, list(SIDES))
     cells = np.arange(NUM_RAW_TAXELS).reshape(_SCAN_SHAPE)
@@ -56,45 +55,36 @@ def raw_indices(*, side: Side, glove_model: str = "dextouch_v1") -> Int64[np.nda
         cells = cells[:, ::-1]
     tips = cells[:4].reshape(4, NUM_FINGERTIPS, 4).transpose(1, 0, 2).ravel()
     palm = cells[4:16].ravel()
-    return np.concatenate([tips, palm]).astype(np.int64)
+    indices = np.concatenate([tips, palm]).astype(np.int64)
+    indices.flags.writeable = False
+    return indices
 
 
-_RAW_INDICES = {side: raw_indices(side=side) for side in SIDES}
-
-
-def _indices(side: Side, glove_model: str) -> Int64[np.ndarray, "320"]:
-    if glove_model == "dextouch_v1" and side in _RAW_INDICES:
-        return _RAW_INDICES[side]
-    return raw_indices(side=side, glove_model=glove_model)
-
-
-def select_taxels(raw: np.ndarray, *, side: Side, glove_model: str = "dextouch_v1") -> np.ndarray:
+def select_taxels(raw: np.ndarray, *, side: Side) -> np.ndarray:
     """The 320 taxels, in anatomical order, of raw readings [..., 360]; dtype is kept.
 
     Raises:
         ShapeError: the last axis is not 360.
-        UnknownNameError: unknown side or glove model.
+        UnknownNameError: unknown side.
     """
     raw = np.asarray(raw)
     if raw.shape[-1:] != (NUM_RAW_TAXELS,):
         raise ShapeError(f"raw taxels: got shape {raw.shape}, expected [..., {NUM_RAW_TAXELS}]")
-    return raw[..., _indices(side, glove_model)]
+    return raw[..., raw_indices(side=side)]
 
 
-def expand_taxels(
-    taxels: np.ndarray, *, side: Side, glove_model: str = "dextouch_v1"
-) -> np.ndarray:
+def expand_taxels(taxels: np.ndarray, *, side: Side) -> np.ndarray:
     """Raw readings [..., 360] from taxels [..., 320]; cells without a taxel are zero.
 
     Raises:
         ShapeError: the last axis is not 320.
-        UnknownNameError: unknown side or glove model.
+        UnknownNameError: unknown side.
     """
     taxels = np.asarray(taxels)
     if taxels.shape[-1:] != (NUM_TAXELS,):
         raise ShapeError(f"taxels: got shape {taxels.shape}, expected [..., {NUM_TAXELS}]")
     raw = np.zeros((*taxels.shape[:-1], NUM_RAW_TAXELS), dtype=taxels.dtype)
-    raw[..., _indices(side, glove_model)] = taxels
+    raw[..., raw_indices(side=side)] = taxels
     return raw
 
 

@@ -50,7 +50,7 @@ def test_a_mock_station_is_healthy_unless_asked():
 
 def test_environment_and_flags(monkeypatch):
     monkeypatch.setenv("DEXTOUCH_ACQUISITION_STATION", "desk_3")
-    settings = load_settings(AcquisitionSettings, ["--mock", "true", "--seed", "4"])
+    settings = load_settings(AcquisitionSettings, ["--mock", "--seed", "4"])
     assert (settings.station, settings.mock, settings.seed) == ("desk_3", True, 4)
 
 
@@ -59,14 +59,14 @@ def test_the_spools_safety_and_the_mocks_links_are_options_too(monkeypatch):
     assert SpoolSafety(defaults.flush_period_s, defaults.min_free_bytes) == SpoolSafety()
     monkeypatch.setenv("DEXTOUCH_ACQUISITION_FLUSH_PERIOD_S", "0.1")
     monkeypatch.setenv("DEXTOUCH_ACQUISITION_MOCK_LINKS__TRACKERS", "bridge")
-    flags = ["--min_free_bytes", "1000", "--mock_links.images", "h264"]
+    flags = ["--min-free-bytes", "1000", "--mock-links.images", "h264"]
     settings = load_settings(AcquisitionSettings, flags)
     assert (settings.flush_period_s, settings.min_free_bytes) == (0.1, 1000)
     assert settings.mock_links == MockLinks(trackers="bridge", images="h264")
 
 
 @pytest.mark.parametrize(
-    "flags", [["--flush_period_s", "0"], ["--min_free_bytes", "-1"], ["--mock_links.gloves", "x"]]
+    "flags", [["--flush-period-s", "0"], ["--min-free-bytes", "-1"], ["--mock-links.gloves", "x"]]
 )
 def test_impossible_options_are_refused(flags):
     with pytest.raises(InvalidInputError):

@@ -1,5 +1,7 @@
 """Statistics of a dataset against the plain computation with numpy."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from dextouch.bridges.lerobot.frames import (
     SAMPLED_SIDE_PX,
     combine,
     image_statistics,
-    sample_places,
+    sampled_images,
     value_statistics,
 )
 
@@ -70,8 +72,26 @@ def test_two_parts_together_are_the_whole(parts):
         np.testing.assert_allclose(got[name], weights @ np.stack(each))
 
 
-def test_sampled_places_are_spread_over_all():
-    assert list(sample_places(3)) == [0, 1, 2]
-    places = list(sample_places(1000, 5))
-    assert places == [0, 250, 500, 749, 999]
-    assert len(set(sample_places(101))) == 100
+class Camera:
+    """Reader whose image k holds the number k."""
+
+    def __init__(self, unit):
+        self.streams = {"camera": SimpleNamespace(unit=unit)}
+
+    def images_at(self, name, indices):
+        return np.asarray(indices)[:, None]
+
+
+@pytest.mark.parametrize(
+    ("unit", "indices", "expected"),
+    [
+        ("jpeg", range(3), [0, 1, 2]),
+        ("rgb8", [4, 4, 5], [4, 5]),
+        ("h264", range(3, 30), [3, 8, 16, 24]),
+    ],
+)
+def test_sampled_images_are_spread_over_all(unit, indices, expected):
+    found = sampled_images.__wrapped__(Camera(unit), "camera", np.array(indices))
+    assert [int(image[0]) for image in found] == expected
+    many = list(sampled_images.__wrapped__(Camera("jpeg"), "camera", np.arange(1000)))
+    assert (len(many), int(many[-1][0])) == (100, 999)

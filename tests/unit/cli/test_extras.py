@@ -47,7 +47,7 @@ COMMANDS = (
     "up",
     "twin record --task stand_bottle --seeds 0",
     "twin serve --help",
-    "station serve --mock_store x",
+    "station serve --mock-store x",
     "station calibrate show nothing",
     "store list",
     "export --format mcap nothing --to x.mcap",

@@ -228,7 +228,7 @@ def test_command_line(store, capsys, tmp_path):
 
 
 def test_serve_refuses_bad_settings(capsys):
-    assert main(["store", "serve", "--max_page", "0"]) == 3
+    assert main(["store", "serve", "--max-page", "0"]) == 3
     assert "max_page" in capsys.readouterr().err
     assert main(["store", "serve", "--host", "192.0.2.1"]) == 3
     assert "api_keys" in capsys.readouterr().err

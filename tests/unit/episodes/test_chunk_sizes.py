@@ -5,7 +5,6 @@ import os
 
 import numpy as np
 import pytest
-import zarr
 from pydantic import ValidationError
 
 from dextouch.episodes import WriteOptions, stream_arrays
@@ -125,26 +124,6 @@ def test_an_episode_with_half_a_second_of_large_images_still_opens(store, monkey
     reader = store.recording("take-1")
     reader.verify()
     np.testing.assert_array_equal(reader.images("raw"), raw_images(0, 31)["values"])
-
-
-def test_a_killed_take_of_large_images_of_an_older_release_is_completed(store, monkeypatch):
-    """Its log has 15 images a storage chunk, where today there are four."""
-    with monkeypatch.context() as patch:
-        patch.setattr("dextouch.episodes.format.CHUNK_BYTES", 2**40)
-        images = stream((240, 320, 3), "uint8", kind="image", unit="rgb8")
-        writer = store.writer(kind="recording", attributes=take(images))
-        for number in range(31):
-            writer.append("raw", **raw_images(number, 1))
-        for part in writer._streams.values():
-            part.close()
-        os.close(writer._lock)
-    (group,) = store.recover()
-    assert group.num_samples == {"raw": 30}
-    reader = store.recording("take-1")
-    reader.verify()
-    np.testing.assert_array_equal(reader.images("raw"), raw_images(0, 30)["values"])
-    shape = zarr.open_group(store.root / "recordings" / "take-1", mode="r")["raw"].chunks
-    assert shape == (15, 240, 320, 3)
 
 
 def repeated_zeros(num_bytes):

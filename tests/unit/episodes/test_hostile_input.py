@@ -7,7 +7,6 @@ import pytest
 from numcodecs.zstd import Zstd
 
 from dextouch.episodes.shards import ShardReader, with_crc
-from dextouch.episodes.zstd import frame_bytes
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError
 from tests.unit.episodes.hostile_group import (
     ID,
@@ -309,16 +308,6 @@ def test_bombs_are_not_unpacked(store, folder, bomb):
     write_shard(path, [with_crc(bomb(chunks[0][:-4])), *chunks[1:]])
     with pytest.raises(CorruptDataError, match=r"storage chunk 0|need at least"):
         store.open(ID).read(TOUCH)
-
-
-@pytest.mark.parametrize("size", [0, 1, 255, 256, 65_791, 65_792, 1 << 20])
-@pytest.mark.parametrize("checksum", [False, True])
-def test_the_end_of_a_frame_is_where_it_is(size, checksum):
-    rng = np.random.default_rng(size)
-    for data in (bytes(size), rng.bytes(size)):
-        encoded = Zstd(1, checksum=checksum).encode(data)
-        assert frame_bytes(encoded + b"more") == len(encoded)
-        assert frame_bytes(encoded[:-1]) is None
 
 
 DEEP = b'{"attributes":{"dextouch":' + b"[" * 200_000 + b"]" * 200_000 + b"}}"

@@ -8,9 +8,8 @@ import pytest
 
 from dextouch.episodes import shards
 from dextouch.episodes.format import ArrayEntry
-from dextouch.episodes.shards import ShardReader, decode_rows, with_crc
+from dextouch.episodes.shards import ShardReader, compress, decode_rows, with_crc
 from dextouch.episodes.sources import LocalFile
-from dextouch.episodes.zstd import compress
 from dextouch.errors import CorruptDataError, StorageError
 
 ROWS_EACH = 30

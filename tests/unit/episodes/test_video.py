@@ -2,7 +2,6 @@
 
 import fcntl
 import os
-import threading
 
 import numpy as np
 import pytest
@@ -201,29 +200,6 @@ def test_plain_and_encoded_images_are_not_mixed(store, encoder):
 def test_odd_sizes_are_refused_at_once(store, shape):
     with pytest.raises(InvalidInputError, match="even"):
         store.writer(kind="recording", attributes=attributes(camera(shape=shape)))
-
-
-def test_what_finds_the_queue_full_is_dropped_and_counted(store, monkeypatch):
-    gate = threading.Event()
-    real = GopEncoder.encode
-
-    def slow(self, image):
-        gate.wait()
-        return real(self, image)
-
-    monkeypatch.setattr(GopEncoder, "encode", slow)
-    images = moving_images(50)
-    options = WriteOptions(when_full="drop")
-    with store.writer(kind="recording", attributes=attributes(camera()), options=options) as writer:
-        for index, image in enumerate(images):
-            writer.append("camera_head", values=image[None], t_host_ns=stamps(1, index))
-        gate.set()
-    reader = store.recording("take-1")
-    (entry,) = reader.attributes.ledger
-    assert (entry.event, entry.count) == ("dropped_before_encoder", 18)
-    kept = reader.read("camera_head").t_host_ns
-    assert kept.tolist() == list(range(32))
-    assert psnr_db(reader.images("camera_head"), images[kept]) > 30
 
 
 def test_a_full_disk_in_the_encoders_thread_is_said(store, file_size_limit):

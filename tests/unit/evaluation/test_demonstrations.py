@@ -108,8 +108,8 @@ def test_pictures_of_an_episode(url):
 def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     output, figures = tmp_path / "probe.safetensors", tmp_path / "figures.json"
     flags = ["--episodes", url, "--output", str(output), "--json", str(figures)]
-    training = ["--training.num_training_steps", "3", "--training.held_out_share", "0.5"]
-    training += ["--training.development_share", "0.2"]
+    training = ["--training.num-training-steps", "3", "--training.held-out-share", "0.5"]
+    training += ["--training.development-share", "0.2"]
     assert run_command(["train", "probe", *flags, *training]) == 0
     assert "held_out_accuracy" in capsys.readouterr().out
     probe = SuccessProbe.load(output)
@@ -119,8 +119,8 @@ def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
 
 def test_policies_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     output = tmp_path / "policy.safetensors"
-    training = ["--training.num_training_steps", "4", "--training.held_out_share", "0.5"]
-    flags = ["--episodes", url, "--output", str(output), "--early_at", "0.5"]
+    training = ["--training.num-training-steps", "4", "--training.held-out-share", "0.5"]
+    flags = ["--episodes", url, "--output", str(output), "--early-at", "0.5"]
     assert run_command(["train", "policy", *flags, *training]) == 0
     assert capsys.readouterr().out.count("wrist_error_mm_of_mean_chunk ") == 2
     finished, early = (
@@ -164,7 +164,7 @@ def test_the_command_line_refuses_clearly():
     with pytest.raises(InvalidInputError, match="episodes"):
         run_command(["train", "policy"])
     with pytest.raises(InvalidInputError, match="early_at"):
-        run_command(["train", "policy", "--episodes", "x", "--early_at", "1.5"])
+        run_command(["train", "policy", "--episodes", "x", "--early-at", "1.5"])
 
 
 def test_starts_are_told_apart_by_image_and_touch():

@@ -37,7 +37,7 @@ def test_a_study_without_a_single_imagined_ending_is_reported(
             *("--real", json.dumps({"url": url, "world": "judge"})),
             *("--imagined", json.dumps({"dream": {"url": url, "world": "stuck"}})),
             *("--probe", str(tmp_path / "probe.safetensors"), "--builtin", '["hold"]'),
-            *("--tasks", "reach", "--seeds", "2000:2002", "--num_steps", "16"),
+            *("--tasks", "reach", "--seeds", "2000:2002", "--num-steps", "16"),
             *("--json", str(tmp_path / "report.json"), "--html", str(tmp_path / "report.html")),
         ]
     )
@@ -70,7 +70,7 @@ def test_a_report_is_written_before_anything_is_printed(
             [
                 *("--real", json.dumps({"url": url, "world": "judge"})),
                 *("--probe", str(tmp_path / "probe.safetensors"), "--builtin", '["hold"]'),
-                *("--tasks", "reach", "--seeds", "2000:2001", "--num_steps", "16"),
+                *("--tasks", "reach", "--seeds", "2000:2001", "--num-steps", "16"),
                 *("--json", str(tmp_path / "report.json")),
                 *("--html", str(tmp_path / "report.html")),
             ]

@@ -1,4 +1,4 @@
-"""Nodes of a tracked hand are found by what they are called or hang on, in any order."""
+"""Nodes of a tracked hand are found by what they are called, in any order."""
 
 import numpy as np
 import pytest
@@ -14,9 +14,7 @@ from dextouch.hands import (
     NODES,
     NUM_KEYPOINTS,
     WRIST,
-    TreeNode,
     node_order,
-    nodes_of_tree,
 )
 from dextouch.hands.skeleton import THUMB_JOINTS
 
@@ -49,23 +47,6 @@ def manus_ros2(chains):
     words = dict(zip(FINGER_JOINTS, ("MCP", "PIP", "IP", "DIP", "TIP"), strict=True))
     fingers = [(c.title(), words[j]) for c in chains for j in joints_of(c)]
     return [("Hand", "Invalid"), *fingers]
-
-
-def tree_of(chains, rng, *, num_metacarpals=4):
-    """A hand tree with random ids in random order, and what each node truly is."""
-    ids = iter(rng.permutation(1000)[:NUM_KEYPOINTS].tolist())
-    root = next(ids)
-    nodes, truth = [TreeNode(root, root)], {root: (WRIST, WRIST)}
-    for chain in chains:
-        ours = "little" if chain == "pinky" else chain
-        joints = joints_of(ours)
-        parent = root
-        for joint in joints if chain == "thumb" or num_metacarpals else joints[1:]:
-            node_id = next(ids)
-            nodes.append(TreeNode(node_id, parent, chain if joint == "tip" else None))
-            truth[node_id], parent = (ours, joint), node_id
-    order = rng.permutation(len(nodes))
-    return [nodes[index] for index in order], truth
 
 
 @given(ORDERS)
@@ -140,51 +121,3 @@ def test_half_translated_words_are_refused():
     nodes = [(c, "mcp" if (c, j) == ("ring", "proximal") else j) for c, j in NODES]
     with pytest.raises(InvalidInputError, match=r"unknown \[\('ring', 'mcp'\)\]"):
         node_order(nodes)
-
-
-@pytest.mark.parametrize("seed", range(10))
-@pytest.mark.parametrize("chains", [LINUX_CHAINS, WINDOWS_CHAINS])
-def test_a_tree_of_opaque_ids_gives_the_nodes(chains, seed):
-    tree, truth = tree_of(chains, np.random.default_rng(seed))
-    nodes = nodes_of_tree(tree)
-    assert nodes == [truth[node.id] for node in tree]
-    assert sorted(node_order(nodes).places) == list(range(NUM_KEYPOINTS))
-
-
-def test_a_tree_may_begin_at_the_knuckles():
-    tree, truth = tree_of(WINDOWS_CHAINS, np.random.default_rng(1), num_metacarpals=0)
-    nodes = nodes_of_tree(tree)
-    assert nodes == [truth[node.id] for node in tree]
-    assert node_order(nodes, may_lack=FINGER_METACARPALS).absent == FINGER_METACARPALS
-
-
-def test_broken_trees_are_refused():
-    tree, truth = tree_of(WINDOWS_CHAINS, np.random.default_rng(2))
-    place = {truth[node.id]: index for index, node in enumerate(tree)}
-
-    def with_node(name, **changes):
-        nodes = list(tree)
-        old = nodes[place[name]]
-        nodes[place[name]] = TreeNode(**{**vars(old), **changes})
-        return nodes
-
-    ids = {name: tree[index].id for name, index in place.items()}
-    broken = {
-        "roots": with_node(("ring", "distal"), parent=None),
-        "different ids": with_node(("ring", "tip"), id=ids["ring", "distal"]),
-        "has the children": with_node(("ring", "tip"), parent=ids["ring", "intermediate"]),
-        r"called \['little', 'thumb'\]": with_node(
-            ("thumb", "metacarpal"), parent=ids["little", "tip"]
-        ),
-        "do not lead back": with_node(("ring", "metacarpal"), parent=ids["ring", "tip"]),
-        "called nothing": with_node(("ring", "tip"), chain=None),
-        r"called \['index', 'ring'\]": with_node(("ring", "distal"), chain="index"),
-        "has 5 nodes": with_node(("ring", "tip"), chain="thumb"),
-        "'tail'": with_node(("ring", "tip"), chain="tail"),
-    }
-    for words, nodes in broken.items():
-        with pytest.raises(InvalidInputError, match=words):
-            nodes_of_tree(nodes)
-    # A chain that is there twice is for `node_order` to see.
-    with pytest.raises(InvalidInputError, match=r"missing .*'ring', 'tip'"):
-        node_order(nodes_of_tree(with_node(("ring", "tip"), chain="middle")))

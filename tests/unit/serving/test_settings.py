@@ -31,7 +31,7 @@ class ProbeSettings(ServiceSettings):
 def test_flags_stand_above_the_environment(monkeypatch):
     monkeypatch.setenv("DEXTOUCH_PROBE_PORT", "8101")
     monkeypatch.setenv("DEXTOUCH_PROBE_RATE_HZ", "30")
-    settings = load_settings(ProbeSettings, ["--rate_hz", "60"])
+    settings = load_settings(ProbeSettings, ["--rate-hz", "60"])
     assert (settings.port, settings.rate_hz) == (8101, 60.0)
 
 
@@ -63,7 +63,7 @@ def test_open_addresses_need_keys(monkeypatch):
 )
 def test_host_names_that_could_never_match_are_refused(name):
     with pytest.raises(InvalidInputError, match=r"allowed_hosts.*without its port"):
-        load_settings(ProbeSettings, ["--allowed_hosts", json.dumps([name])])
+        load_settings(ProbeSettings, ["--allowed-hosts", json.dumps([name])])
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_host_names_that_could_never_match_are_refused(name):
 )
 def test_origins_that_could_never_match_are_refused(origin):
     with pytest.raises(InvalidInputError, match=r"allowed_origins.*got .*, expected "):
-        load_settings(ProbeSettings, ["--allowed_origins", json.dumps([origin])])
+        load_settings(ProbeSettings, ["--allowed-origins", json.dumps([origin])])
 
 
 def test_settings_are_frozen_and_closed():
@@ -123,10 +123,10 @@ class CommandSettings(ServiceSettings):
     "flags",
     [
         "--num-steps 3 --is-mock --names a --names b --station.rate-hz 2",
-        "--num_steps 3 --is_mock true --names a,b --station.rate_hz=2",
+        "--num-steps 3 --is-mock --names a,b --station.rate-hz=2",
     ],
 )
-def test_both_spellings_of_flags_are_read(flags):
+def test_flags_are_read(flags):
     settings = load_settings(CommandSettings, flags.split())
     assert (settings.num_steps, settings.is_mock) == (3, True)
     assert (settings.names, settings.station.rate_hz) == (("a", "b"), 2.0)

@@ -22,17 +22,12 @@ from dextouch.bridges.lerobot.frames import (
     combine,
     frames_of,
     image_statistics,
-    sample_places,
+    sampled_images,
     value_statistics,
 )
-from dextouch.bridges.lerobot.video import (
-    CameraVideo,
-    decode_entry_points,
-    encode_images,
-    stored_units,
-)
+from dextouch.bridges.lerobot.video import CameraVideo, encode_images, stored_units
 from dextouch.bridges.model_grid import BLOCK_IMAGES
-from dextouch.episodes import EpisodeReader, VideoSettings, disk_errors, is_keyframe
+from dextouch.episodes import EpisodeReader, VideoSettings, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, ShapeError
 
 # Rows of the table of episodes that are written together.
@@ -207,18 +202,16 @@ class _Dataset:
         statistics = {name: value_statistics(column) for name, column in columns.items()}
         how: dict[str, Literal["remuxed", "encoded"]] = {}
         for camera in self._cameras:
-            units, how[camera] = self._access_units(reader, camera, frames.image_indices[camera])
-            what, shape = f"{where}: {camera!r}", reader.streams[camera].shape
-            place = self._videos[camera].append(units, where=what)
+            indices = frames.image_indices[camera]
+            units, how[camera] = self._access_units(reader, camera, indices)
+            place = self._videos[camera].append(units, where=f"{where}: {camera!r}")
             key = f"videos/{layout.IMAGES}{camera}"
             chunk_file = layout.file_place(place.file_number)
             row[f"{key}/chunk_index"], row[f"{key}/file_index"] = chunk_file
             row[f"{key}/from_timestamp"] = place.from_timestamp_s
             row[f"{key}/to_timestamp"] = place.to_timestamp_s
-            entries = [data for data in units if is_keyframe(data)]
-            sampled = [entries[place] for place in sample_places(len(entries))]
-            images = decode_entry_points(sampled, shape, where=what)
-            statistics[layout.IMAGES + camera] = image_statistics(images)
+            sampled = sampled_images(reader, camera, indices)
+            statistics[layout.IMAGES + camera] = image_statistics(sampled)
         file_number = self._data.append(_data_table(self._features, columns))
         row["data/chunk_index"], row["data/file_index"] = layout.file_place(file_number)
         row["dataset_from_index"] = self.num_frames

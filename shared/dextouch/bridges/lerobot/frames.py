@@ -1,6 +1,6 @@
 """Frames of a dataset: an episode resampled to one row per frame, and statistics of features."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -9,7 +9,13 @@ from jaxtyping import Bool, Float32, Int64, Shaped, UInt8
 
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.layout import Grid
-from dextouch.episodes import EpisodeReader, mean_over_ranges, nearest_indices, step_ranges
+from dextouch.episodes import (
+    GOP_IMAGES,
+    EpisodeReader,
+    mean_over_ranges,
+    nearest_indices,
+    step_ranges,
+)
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import bracket, interpolate_linear, interpolate_poses
 from dextouch.hands.actions import (
@@ -20,6 +26,7 @@ from dextouch.hands.actions import (
     poses_from_actions,
 )
 from dextouch.schemas import ActionKind
+from dextouch.streams import H264_UNIT
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
 QUANTILES: Final = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
@@ -233,7 +240,15 @@ def combine(first: Statistics | None, second: Statistics) -> Statistics:
     return combined
 
 
-def sample_places(count: int, most: int = SAMPLED_IMAGES) -> list[int]:
-    """Evenly spread indices below `count`, at most `most` of them."""
-    places: list[int] = np.rint(np.linspace(0, count - 1, min(count, most))).astype(int).tolist()
-    return places
+def sampled_images(
+    reader: EpisodeReader, camera: str, indices: np.ndarray
+) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """Images of a camera, evenly spread over those of the frames, at most SAMPLED_IMAGES.
+
+    Of H.264 the first images of groups, which are decoded alone.
+    """
+    places = np.linspace(0, len(indices) - 1, min(len(indices), SAMPLED_IMAGES))
+    chosen = indices[np.rint(places).astype(np.int64)]
+    if reader.streams[camera].unit == H264_UNIT:
+        chosen = np.maximum(chosen - chosen % GOP_IMAGES, indices[0])
+    return (reader.images_at(camera, index[None])[0] for index in np.unique(chosen))

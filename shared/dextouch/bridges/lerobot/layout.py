@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -40,7 +41,7 @@ Feature = dict[str, Any]
 Features = dict[str, Feature]
 Grid = Literal["model", "camera", "uniform"]
 
-_FIELD = re.compile(r"\{([a-z_]+)(?::0(\d{1,2})d)?\}")
+_TEMPLATE = re.compile(r"([^{}]|\{[a-z_]+(:0\d{1,2}d)?\})*")
 
 
 class Sidecar(FrozenModel):
@@ -126,21 +127,13 @@ def fill_path(template: str, **values: int | str) -> str:
     Raises:
         InvalidInputError: a field that is not among `values`, or any other brace.
     """
-
-    def field(match: re.Match[str]) -> str:
-        name, width = match[1], match[2]
-        if name not in values:
-            raise InvalidInputError(
-                f"path template {template!r}: got field {name!r}, expected {sorted(values)}"
-            )
-        return str(values[name]).zfill(int(width or 0))
-
-    filled = _FIELD.sub(field, template)
-    if "{" in filled or "}" in filled:
-        raise InvalidInputError(
-            f"path template {template!r}: expected fields like {{chunk_index:03d}} only"
-        )
-    return filled
+    with suppress(KeyError, ValueError):
+        if _TEMPLATE.fullmatch(template):
+            return template.format(**values)
+    raise InvalidInputError(
+        f"path template {template!r}: expected fields like {{chunk_index:03d}} only, "
+        f"of {sorted(values)}"
+    )
 
 
 def numbered_path(folder: Path, template: str, number: int, **values: str) -> Path:

@@ -17,11 +17,9 @@ from jaxtyping import UInt8
 
 from dextouch.bridges.lerobot.layout import VIDEO_FILE_MB, VIDEO_PATH, numbered_path
 from dextouch.episodes import (
-    FULL_FORM,
     EpisodeReader,
     GopEncoder,
     VideoSettings,
-    decoder_of_this_thread,
     disk_errors,
     is_keyframe,
     parameter_sets,
@@ -260,21 +258,3 @@ def encode_images(
             )
         units.append(encoder.encode(image))
     return units
-
-
-def decode_entry_points(
-    access_units: Iterable[bytes], shape: tuple[int, ...], *, where: str
-) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Decode access units that are each decodable on their own to RGB images [h, w, 3].
-
-    Raises:
-        CorruptDataError: an access unit that cannot be decoded, or is of another size.
-    """
-    decoder = decoder_of_this_thread(*shape[:2])
-    for index, data in enumerate(access_units):
-        image = np.empty((1, *shape), dtype=np.uint8)
-        try:
-            decoder.decode([data], [0], FULL_FORM, image)
-        except CorruptDataError as error:
-            raise CorruptDataError(f"{where}: entry point {index} is damaged ({error})") from error
-        yield image[0]

@@ -46,6 +46,11 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 Size = Annotated[int, Field(ge=1, le=1 << 20)]
 
 
+class _Zstd(FrozenModel):
+    id: Literal["zstd"] = "zstd"
+    level: int = ZSTD_LEVEL
+
+
 class ArrayMetadata(FrozenModel):
     """`.zarray` of one array; only the features modelled here are supported."""
 
@@ -53,7 +58,7 @@ class ArrayMetadata(FrozenModel):
     shape: tuple[Annotated[int, Field(ge=0, le=MAX_ROWS)], ...] = Field(min_length=1, max_length=6)
     chunks: tuple[Size, ...] = Field(min_length=1, max_length=6)
     dtype: Literal["|b1", "|u1", "<u2", "<i8", "<f4", "<f8"]
-    compressor: dict[str, Any] | None
+    compressor: _Zstd = _Zstd()
     fill_value: float | bool | None = 0
     order: Literal["C"] = "C"
     filters: None = None
@@ -79,7 +84,6 @@ class _NewArray:
                 "shape": (self.num_rows + len(self.pending), *row_shape),
                 "chunks": (self.chunk_rows, *row_shape),
                 "dtype": dtype,
-                "compressor": {"id": "zstd", "level": ZSTD_LEVEL},
                 "fill_value": False if dtype == "|b1" else 0,
             }
         )
@@ -211,8 +215,7 @@ class ZarrZipReader:
 
         Raises:
             NotFoundError: no such array.
-            StorageError: an unsupported kind of array.
-            CorruptDataError: invalid metadata.
+            CorruptDataError: invalid metadata, or an unsupported kind of array.
         """
         if name not in self._arrays:
             key = f"{name}/.zarray"
@@ -227,12 +230,6 @@ class ZarrZipReader:
         return self._arrays[name]
 
     def _check(self, name: str, metadata: ArrayMetadata) -> None:
-        codec = None if metadata.compressor is None else metadata.compressor.get("id")
-        if metadata.compressor is not None and codec != "zstd":
-            raise StorageError(
-                f"{self._path}: {name} is compressed as {codec!r}, expected 'zstd' or none; write "
-                "it again with that compressor"
-            )
         if metadata.chunks[1:] != metadata.shape[1:]:
             raise CorruptDataError(
                 f"{self._path}: {name} has storage chunks {metadata.chunks} for shape "
@@ -268,14 +265,13 @@ class ZarrZipReader:
         if key not in self._entries:
             raise CorruptDataError(f"{self._path}: {key} is missing; export it again")
         num_bytes = metadata.chunk_bytes()
-        data = self._bytes(key, MAX_CHUNK_BYTES)
-        if metadata.compressor is not None:
-            try:
-                with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-                    # At most one byte more than expected, never an unbounded output.
-                    data = stream.read(num_bytes + 1)
-            except zstandard.ZstdError as error:
-                raise CorruptDataError(f"{self._path}: {key} is damaged ({error})") from error
+        frame = self._bytes(key, MAX_CHUNK_BYTES)
+        try:
+            with zstandard.ZstdDecompressor().stream_reader(frame) as stream:
+                # At most one byte more than expected, never an unbounded output.
+                data = stream.read(num_bytes + 1)
+        except zstandard.ZstdError as error:
+            raise CorruptDataError(f"{self._path}: {key} is damaged ({error})") from error
         if len(data) != num_bytes:
             raise CorruptDataError(
                 f"{self._path}: {key} holds {len(data)} bytes or more, expected {num_bytes}"

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import google_crc32c
 import numpy as np
+import zstandard
 
 from dextouch.episodes.care.inspection import open_contents
 from dextouch.episodes.format import (
@@ -43,7 +44,6 @@ from dextouch.episodes.spool_log import body_at, body_of, find_records, open_log
 from dextouch.episodes.staged_group import new_stage
 from dextouch.episodes.staging_recovery import free_id, ids_below
 from dextouch.episodes.writer import Block, write_blocks
-from dextouch.episodes.zstd import frame_bytes
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.schemas import LineageEntry
 from dextouch.streams import StreamDescriptor, check_batch, decode_body, encoded_values
@@ -354,9 +354,14 @@ def _chunk_bytes(data: bytes, start: int, entry: ArrayEntry) -> int:
 def _encoded_bytes(data: bytes, start: int, entry: ArrayEntry) -> int:
     """Length declared by a zstd frame or a group of pictures; 0 if there is none."""
     if entry.codec == "zstd":
-        # Only block headers are parsed, which is far less than is copied.
-        longest = entry.chunk_rows * math.prod(entry.shape[1:]) * np.dtype(entry.dtype).itemsize
-        return frame_bytes(data[start : start + longest + longest // 8 + 1024]) or 0
+        size = entry.chunk_rows * math.prod(entry.shape[1:]) * np.dtype(entry.dtype).itemsize
+        rest = data[start : start + size + size // 8 + 1024]
+        frame = zstandard.ZstdDecompressor().decompressobj()
+        with suppress(zstandard.ZstdError):
+            # Nothing larger than a storage chunk is decompressed.
+            if zstandard.get_frame_parameters(rest).content_size == size:
+                frame.decompress(rest)
+        return len(rest) - len(frame.unused_data) if frame.eof else 0
     count = int.from_bytes(data[start : start + 4], "little")
     head = 4 * (1 + count)
     if not 1 <= count <= entry.chunk_rows or len(data) < start + head:

@@ -1,0 +1,117 @@
+"""Formats of the spool: logs written by hand, golden ones, and those of version 1."""
+
+import shutil
+import struct
+
+import google_crc32c
+import numpy as np
+import pytest
+
+from dextouch.episodes import spool
+from dextouch.episodes.spool_log import LOG_FILE
+from dextouch.errors import (
+    CorruptDataError,
+)
+from dextouch.streams import encode_body
+from tests.unit.episodes.spooled_batches import (
+    ATTRIBUTES,
+    GOLDEN,
+    assert_same,
+    glove_batch,
+    golden_batch,
+    recover,
+)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "spool" / "take-1"
+
+
+def columns(batch):
+    """The body of a record of format 1."""
+    return b"".join(
+        np.asarray(column).astype(dtype).tobytes()
+        for column, dtype in zip(vars(batch).values(), ("<i8", "<i8", "<i8", "<u2"), strict=True)
+    )
+
+
+def rows(batch):
+    """The body of a record of format 2."""
+    return b"".join(
+        struct.pack("<qqq360H", host, device, number, *values)
+        for host, device, number, values in zip(*vars(batch).values(), strict=True)
+    )
+
+
+FORMATS = {"1": (b"DXTBLOG\x01", b"DXTR", columns), "2": (b"DXTBLOG\x02", b"DXTS", rows)}
+
+
+def record(version, place, batch, *, first_sample, stream=0):
+    """A record of a log as docs/episode_format.md describes it, of a stream of numbers."""
+    _, mark, layout = FORMATS[version]
+    body = layout(batch)
+    counts = (stream, len(batch), len(body), google_crc32c.value(body))
+    header = struct.pack("<4sQQIIII", mark, place, first_sample, *counts)
+    return header + struct.pack("<I", google_crc32c.value(header)) + body
+
+
+@pytest.mark.parametrize("version", FORMATS)
+@pytest.mark.parametrize("first_sample", [0, 1, 2, 3, 2**63])
+def test_a_log_written_by_hand_is_read_if_its_samples_follow_each_other(
+    path, first_sample, version
+):
+    spool.SpoolWriter(path, ATTRIBUTES).close()
+    data = FORMATS[version][0]
+    data += record(version, len(data), glove_batch(0, 2), first_sample=0)
+    data += record(version, len(data), glove_batch(2, 3), first_sample=first_sample)
+    (path / LOG_FILE).write_bytes(data)
+    if first_sample == 2:
+        assert_same(spool.SpoolReader(path).read("glove_left"), glove_batch(0, 5))
+        return
+    for read in (lambda: spool.SpoolReader(path).read("glove_left"), lambda: recover(path)):
+        with pytest.raises(CorruptDataError, match="stream number 0 do not follow each other"):
+            read()
+
+
+@pytest.mark.parametrize("version", FORMATS)
+def test_the_golden_spool_of_a_format_is_read_and_goes_on(tmp_path, version):
+    """A station or an upload may be older than this release."""
+    shutil.copytree(GOLDEN / f"spool_v{version}", path := tmp_path / "take-1")
+    reader = spool.SpoolReader(path)
+    for name, stream in reader.streams.items():
+        assert_same(reader.read(name), golden_batch(stream, 0, 6))
+        assert_same(reader.read(name, 2, 5), golden_batch(stream, 2, 3))
+        body = encode_body(stream, golden_batch(stream, 1, 3))
+        assert (reader.appended(name, 1), reader.body(name, 1, 4)) == (body, body)
+        # Within records of several samples, as an upload of fixed batches cuts them.
+        assert reader.body(name, 2, 5) == encode_body(stream, golden_batch(stream, 2, 3))
+    with spool.SpoolWriter.resume(path) as writer:
+        for stream in reader.streams.values():
+            writer.append(stream.name, golden_batch(stream, 6, 2))
+    for name, stream in reader.streams.items():
+        assert_same(spool.SpoolReader(path).read(name), golden_batch(stream, 0, 8))
+
+
+def test_the_bytes_of_a_log_never_change(tmp_path):
+    golden = GOLDEN / "spool_v2"
+    attributes = spool.read_attributes(golden)
+    with spool.SpoolWriter(tmp_path / "take-1", attributes) as writer:
+        for stream in attributes.streams:
+            for first, count in ((0, 1), (1, 3), (4, 2)):
+                writer.append(stream.name, golden_batch(stream, first, count))
+    assert (tmp_path / "take-1" / LOG_FILE).read_bytes() == (golden / LOG_FILE).read_bytes()
+
+
+@pytest.mark.parametrize("stream", ["glove_left", "camera_head"])
+def test_an_old_record_of_another_stream_is_refused(tmp_path, stream):
+    shutil.copytree(GOLDEN / "spool_v1", path := tmp_path / "take-1")
+    attributes = spool.read_attributes(path)
+    other = {"glove_left": {"shape": (5,)}, "camera_head": {"unit": "rgb8"}}[stream]
+    streams = tuple(
+        s.model_copy(update=other) if s.name == stream else s for s in attributes.streams
+    )
+    changed = attributes.model_copy(update={"streams": streams})
+    (path / "recording.json").write_text(changed.model_dump_json())
+    with pytest.raises(CorruptDataError, match=r"spool 'take-1': .* written for another stream"):
+        spool.SpoolReader(path).read(stream)
