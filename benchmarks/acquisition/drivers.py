@@ -158,13 +158,13 @@ def _trackers(rng: np.random.Generator) -> list[DeviceTalk]:
             "finger tracker, bridge",
             partial(BridgeFingerTrackerDecoder, "left"),
             _packets(bridged_fingers),
-            [bridged_fingers.hello()],
+            [bridged_fingers.hello],
         ),
         DeviceTalk(
             "pose tracker, bridge",
             partial(BridgePoseTrackerDecoder, "wrist_left"),
             _packets(bridged_poses),
-            [bridged_poses.hello()],
+            [bridged_poses.hello],
         ),
     ]
 

@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 
 from dextouch.errors import DeviceError
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices.tactile_glove.driver import MAGIC, TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.transports.ports import SerialTransport
@@ -105,7 +105,7 @@ def _driver(index: int, port: str) -> Driver:
         f"glove_{index}",
         transport=SerialTransport(partial(str, port)),
         decoder=TactileGloveDecoder("left"),
-        clock=RealClock(),
+        clock=StationClock(),
     )
 
 

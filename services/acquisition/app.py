@@ -9,7 +9,7 @@ from starlette.concurrency import run_in_threadpool
 
 from dextouch.episodes import disk_errors
 from dextouch.serving import create_service_app, serve
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.health import HealthCollector
 from services.acquisition.memory import keep_for_life
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 def _real_station(settings: AcquisitionSettings) -> Station:
     """A station of real devices; those that are absent are waited for in the background."""
-    clock = RealClock()
+    clock = StationClock()
     return Station(
         name=settings.station,
         drivers=build_drivers(settings.devices, clock),
@@ -45,7 +45,7 @@ def _mock_station(settings: AcquisitionSettings) -> "MockStation":
     streams, known = pattern_streams(), pattern_calibration()
     if settings.mock_store is not None and settings.mock_episode_id is not None:
         from dextouch.episodes import EpisodeStore
-        from services.acquisition.mocks.episode import replay_calibration, replay_streams
+        from services.acquisition.mocks.replay import replay_calibration, replay_streams
 
         episode = EpisodeStore(settings.mock_store).open(settings.mock_episode_id)
         streams, known = replay_streams(episode), {**known, **replay_calibration(episode)}
@@ -54,7 +54,7 @@ def _mock_station(settings: AcquisitionSettings) -> "MockStation":
         streams,
         FaultScript.first_light() if is_disturbed else FaultScript(),
         settings.seed,
-        RealClock(),
+        StationClock(),
         spool_root=settings.spool,
         name=settings.station,
         calibration={**known, **load_calibration(settings.calibration)},

@@ -5,52 +5,13 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 # Far more than the fraction of a millisecond that reading two clocks or slewing one takes.
 MIN_NOTICED_NS = 100_000_000
 
 
-@runtime_checkable
-class Waiter(Protocol):
-    """One thread's way to wait on a clock; used by one thread, cancelled by any."""
-
-    def wait_until(self, t_ns: int) -> bool:
-        """Block until the clock shows `t_ns`; False when cancelled."""
-        ...
-
-    def cancel(self) -> None:
-        """End the present wait, and every later one, at once."""
-        ...
-
-    def close(self) -> None:
-        """Stop taking part in the clock."""
-        ...
-
-
-@runtime_checkable
-class StationClock(Protocol):
-    """Monotonic nanoseconds of the station's host."""
-
-    def now_ns(self) -> int:
-        """The time now."""
-        ...
-
-    def waiter(self, *, drives_time: bool = False) -> Waiter:
-        """A new waiter. `drives_time` only matters to a virtual clock."""
-        ...
-
-    def suspended_ns(self) -> int:
-        """How long the host has slept since the clock was made."""
-        ...
-
-    def wall_offset_ns(self) -> int:
-        """Wall clock minus a monotonic clock; a jump means that the wall clock was set."""
-        ...
-
-
-class RealClock:
-    """The host's monotonic clock.
+class StationClock:
+    """Monotonic clock of the station's host, in nanoseconds.
 
     It continues while the host is suspended, unlike `time.monotonic_ns`, and cannot be set.
     """
@@ -62,17 +23,17 @@ class RealClock:
         """Nanoseconds since the origin of `time.monotonic_ns`, including time in suspend."""
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - self._suspended_before_ns
 
-    def waiter(self, *, drives_time: bool = False) -> Waiter:
-        """A waiter that sleeps."""
+    def waiter(self, *, drives_time: bool = False) -> "Waiter":
+        """A new waiter. `drives_time` only matters to a virtual clock."""
         del drives_time
-        return _RealWaiter(self)
+        return Waiter(self)
 
     def suspended_ns(self) -> int:
         """How long the host has slept since the clock was made."""
         return _suspended_ns() - self._suspended_before_ns
 
     def wall_offset_ns(self) -> int:
-        """Wall clock minus the time since boot."""
+        """Wall clock minus the time since boot; a jump means that the wall clock was set."""
         return time.time_ns() - time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
@@ -82,25 +43,30 @@ def _suspended_ns() -> int:
     return asleep_ns if asleep_ns >= 1_000_000 else 0
 
 
-class _RealWaiter:
-    def __init__(self, clock: RealClock) -> None:
+class Waiter:
+    """One thread's way to wait on a clock; used by one thread, cancelled by any."""
+
+    def __init__(self, clock: StationClock) -> None:
         self._clock = clock
         self._cancelled = threading.Event()
 
     def wait_until(self, t_ns: int) -> bool:
+        """Block until the clock shows `t_ns`; False when cancelled."""
         while (remaining_ns := t_ns - self._clock.now_ns()) > 0:
             if self._cancelled.wait(remaining_ns / 1e9):
                 return False
         return not self._cancelled.is_set()
 
     def cancel(self) -> None:
+        """End the present wait, and every later one, at once."""
         self._cancelled.set()
 
     def close(self) -> None:
+        """Stop taking part in the clock."""
         self._cancelled.set()
 
 
-class VirtualClock:
+class VirtualClock(StationClock):
     """Virtual clock that jumps to the next target as soon as all threads wait.
 
     The time moves when every open waiter waits and at least one of them drives time; it moves to
@@ -142,46 +108,42 @@ class VirtualClock:
 
     def advance(self) -> None:
         """Move the time and wake who is due; the caller holds the lock."""
-        targets = [w.target_ns for w in self.open_waiters if w.target_ns is not None]
-        if len(targets) < len(self.open_waiters) or not any(
-            w.drives_time for w in self.open_waiters
-        ):
-            due_ns = self._now_ns
-        else:
-            due_ns = max(self._now_ns, min(targets))
-        self._now_ns = due_ns
-        for waiter in self.open_waiters:
-            if waiter.target_ns is not None and waiter.target_ns <= due_ns:
+        waiters = self.open_waiters
+        targets = [w.target_ns for w in waiters if w.target_ns is not None]
+        if len(targets) == len(waiters) and any(w.drives_time for w in waiters):
+            self._now_ns = max(self._now_ns, min(targets))
+        for waiter in waiters:
+            if waiter.target_ns is not None and waiter.target_ns <= self._now_ns:
                 waiter.target_ns = None
                 waiter.woken.notify()
 
 
-class _VirtualWaiter:
+class _VirtualWaiter(Waiter):
     def __init__(self, clock: VirtualClock, *, drives_time: bool) -> None:
-        self._clock = clock
+        self._time = clock
         self.drives_time = drives_time
         self.woken = threading.Condition(clock.lock)
         self.target_ns: int | None = None
         self._is_cancelled = False
 
     def wait_until(self, t_ns: int) -> bool:
-        with self._clock.lock:
+        with self._time.lock:
             self.target_ns = t_ns
-            self._clock.advance()
+            self._time.advance()
             while self.target_ns is not None and not self._is_cancelled:
                 self.woken.wait()
             self.target_ns = None
             return not self._is_cancelled
 
     def cancel(self) -> None:
-        with self._clock.lock:
+        with self._time.lock:
             self._is_cancelled = True
             self.woken.notify()
 
     def close(self) -> None:
-        with self._clock.lock:
-            self._clock.open_waiters.discard(self)
-            self._clock.advance()
+        with self._time.lock:
+            self._time.open_waiters.discard(self)
+            self._time.advance()
 
 
 class PeriodicCall:

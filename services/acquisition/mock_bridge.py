@@ -12,12 +12,12 @@ import sys
 import numpy as np
 
 from dextouch.tactile.layout import Side
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import ROUND_S, pattern_streams
-from services.acquisition.mocks.replay import MockDevice
+from services.acquisition.mocks.replay import MockDevice, MockPlace
 from services.acquisition.mocks.sdk_link import BridgeServer, BridgeSource, signs_of_life
 
 
@@ -43,10 +43,9 @@ def main() -> None:
     if is_hand != (options.kind == "finger_tracker"):
         parser.error(f"a {options.kind} cannot sit at {options.place!r}")
     source = pattern_source(options.kind, options.place, seed=options.seed)
-    server, clock = BridgeServer(source.hello, port=options.port), RealClock()
-    device = MockDevice(
-        "bridge", source=source, port=server, faults=DeviceFaults(), seed=options.seed
-    )
+    server, clock = BridgeServer(source.hello, port=options.port), StationClock()
+    place = MockPlace("bridge", pattern_streams()[0], DeviceFaults(), options.seed, clock)
+    device = MockDevice(place, source, server)
     server.plug()
     signs_of_life(device, source.magic, clock).start()
     sys.stdout.write(json.dumps({"port": server.port}) + "\n")

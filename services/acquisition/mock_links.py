@@ -5,17 +5,16 @@ from typing import Literal
 from pydantic import Field, field_validator
 
 from dextouch.frozen_model import FrozenModel
-from services.acquisition.devices.registry import OLD_PROTOCOLS, kind_names
+from services.acquisition.devices.registry import kind_names
 
 
 class MockLinks(FrozenModel):
     """Which of the ways that real stations know the mock devices of a station take.
 
     Attributes:
-        gloves: the kind of both gloves, ours (`dextouch`, `wuji` and `justfloat` are short for
-            them) or one that another package brings. Each says what a calibrated station knows of
-            it.
-        trackers: finger and pose trackers by HID, by USB, or behind an SDK's bridge.
+        gloves: the kind of both gloves, ours or one that another package brings. Each says what a
+            calibrated station knows of it.
+        trackers: finger and pose trackers by HID, or behind an SDK's bridge.
         cameras: images over a socket, or from a camera on the station's own bus.
         wrists: whether a robot or pose trackers give the wrists where there is a robot's state; its
             packets hold them in any case.
@@ -25,7 +24,7 @@ class MockLinks(FrozenModel):
     gloves: str = Field(
         default="tactile_glove", description="kind of both gloves, ours or of another package"
     )
-    trackers: Literal["hid", "usb", "bridge"] = Field(
+    trackers: Literal["hid", "bridge"] = Field(
         default="hid", description="how finger and pose trackers are connected"
     )
     wrists: Literal["robot", "trackers"] = Field(
@@ -41,7 +40,6 @@ class MockLinks(FrozenModel):
     @field_validator("gloves")
     @classmethod
     def _is_known(cls, gloves: str) -> str:
-        known = sorted({*OLD_PROTOCOLS, *kind_names()})
-        if gloves not in known:
-            raise ValueError(f"got {gloves!r}, expected a kind of glove: {', '.join(known)}")
-        return OLD_PROTOCOLS.get(gloves, gloves)
+        if gloves not in kind_names():
+            raise ValueError(f"got {gloves!r}, expected a kind of glove: {', '.join(kind_names())}")
+        return gloves

@@ -1,7 +1,7 @@
 """A station whose devices are simulated and play one episode, through the real drivers."""
 
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
@@ -11,7 +11,7 @@ import structlog
 
 from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.schemas import Matrix, SaveTake, TakeCheck, TakePrompt
-from dextouch.tactile.layout import SIDES, Side
+from dextouch.tactile.layout import SIDES
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.devices.camera.driver import CameraDecoder
 from services.acquisition.devices.camera.mock import CameraSource
@@ -30,10 +30,11 @@ from services.acquisition.drivers.base import Decoder, Driver
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Ledger
-from services.acquisition.mocks.place import MockPair, MockPlace, TrackerPlace
 from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import (
     MockDevice,
+    MockPair,
+    MockPlace,
     PacketSource,
     ReplayStream,
     device_rng,
@@ -79,8 +80,15 @@ def mock_glove_of(kind_name: str, place: MockPlace) -> MockPair:
     return pair
 
 
-class MockFactory:
-    """Builds the devices that a set of streams needs.
+def build_mocks(
+    streams: Sequence[ReplayStream],
+    *,
+    faults: FaultScript,
+    seed: int,
+    clock: StationClock,
+    links: MockLinks | None = None,
+) -> list[MockPair]:
+    """The mock devices that a set of streams needs.
 
     Args:
         streams: of one episode; streams with ground truth only are omitted.
@@ -88,105 +96,71 @@ class MockFactory:
         seed: of noise, calibration and faults.
         clock: of the station.
         links: how the devices are connected, and their protocols.
+
+    Raises:
+        InvalidInputError: two streams of one name, or none that any device sends.
     """
+    links, named = links or MockLinks(), {stream.descriptor.name: stream for stream in streams}
+    if len(named) != len(streams):
+        raise InvalidInputError("mock station: two streams of the same name")
 
-    def __init__(
-        self,
-        streams: Sequence[ReplayStream],
-        *,
-        faults: FaultScript,
-        seed: int,
-        clock: StationClock,
-        links: MockLinks | None = None,
-    ) -> None:
-        self._streams = {stream.descriptor.name: stream for stream in streams}
-        if len(self._streams) != len(streams):
-            raise InvalidInputError("mock station: two streams of the same name")
-        self._faults = faults
-        self._seed = seed
-        self._clock = clock
-        self._links = links or MockLinks()
+    def place(name: str, stream: str) -> MockPlace:
+        return MockPlace(name, named[stream], faults.of(name), seed, clock, links.trackers)
 
-    def build(self) -> list[MockPair]:
-        """One pair a device.
-
-        Raises:
-            InvalidInputError: no stream that any device sends.
-        """
-        pairs = [pair for side in SIDES for pair in self._hand(side)]
-        trackers = [*WRISTS, "head"]
-        if "joints_measured" in self._streams:
-            by_trackers = WRISTS if self._links.wrists == "trackers" else ()
-            pairs.append(self._robot([name for name in STREAM_SIZES if name not in by_trackers]))
-            trackers = ["head", *by_trackers]
-        pairs += [
-            mock_pose_tracker(self._streams[name], self._place(f"pose_tracker_{name}"))
-            for name in trackers
-            if name in self._streams
-        ]
-        pairs += [self._camera(name) for name in self._streams if name.startswith("camera_")]
-        if not pairs:
-            raise InvalidInputError(
-                f"mock station: got streams {sorted(self._streams)}, expected tactile_…, "
-                "keypoints_…, wrist_…, head, camera_… or joints_…"
-            )
-        return pairs
-
-    def calibration(self, pairs: Sequence[MockPair]) -> dict[str, Matrix]:
-        """What a calibrated station knows of these devices, as each of them says."""
-        return {name: matrix for pair in pairs for name, matrix in pair.calibration.items()}
-
-    def latencies(self, pairs: Sequence[MockPair]) -> dict[str, Matrix]:
-        """Path delay of each stream, wrong by about its sigma as a measured one would be."""
-        record: dict[str, Matrix] = {}
-        for pair in pairs:
-            rng = device_rng(self._seed, f"latency_{pair.device.name}")
-            faults = self._faults.of(pair.device.name)
-            error_ms = LATENCY_SIGMA_MS * rng.standard_normal() if faults.path_delay_ms else 0.0
-            measured_ns = round(max(0.0, faults.path_delay_ms + error_ms) * 1e6)
-            for descriptor in pair.driver.descriptors:
-                sigma_ns = LATENCY_SIGMA_MS * 1e6
-                record[f"{descriptor.name}_latency_ns"] = ((float(measured_ns),),)
-                record[f"{descriptor.name}_latency_sigma_ns"] = ((sigma_ns,),)
-        return record
-
-    def _hand(self, side: Side) -> Iterator[MockPair]:
-        tactile = self._streams.get(f"tactile_{side}")
-        if tactile is not None:
-            faults = self._faults.of(f"glove_{side}")
-            place = MockPlace(side, tactile, faults, self._seed, self._clock)
-            yield mock_glove_of(self._links.gloves, place)
-        keypoints = self._streams.get(f"keypoints_{side}")
-        if keypoints is not None:
-            yield mock_finger_tracker(side, keypoints, self._place(f"finger_tracker_{side}"))
-
-    def _place(self, name: str) -> TrackerPlace:
-        return TrackerPlace(self._links.trackers, self._faults.of(name), self._seed, self._clock)
-
-    def _robot(self, recorded: Sequence[str]) -> MockPair:
-        source = RobotStateSource({n: s for n, s in self._streams.items() if n in STREAM_SIZES})
-        return self._on_socket("robot_state", source, RobotStateDecoder(recorded))
-
-    def _camera(self, stream: str) -> MockPair:
-        replay, images = self._streams[stream], self._links.images
-        if self._links.cameras == "station":
-            return video_camera(
-                replay,
-                faults=self._faults.of(stream),
-                seed=self._seed,
-                clock=self._clock,
-                encoding=images,
-            )
-        height_px, width_px = replay.descriptor.shape[:2]
-        decoder = CameraDecoder(stream, height_px=height_px, width_px=width_px, encoding=images)
-        return self._on_socket(stream, CameraSource(replay, encoding=images), decoder)
-
-    def _on_socket(self, name: str, source: PacketSource, decoder: Decoder) -> MockPair:
-        port, faults = SocketPort(name), self._faults.of(name)
-        return MockPair(
-            MockDevice(name, source=source, port=port, faults=faults, seed=self._seed),
-            Driver(name, transport=port.transport, decoder=decoder, clock=self._clock),
+    pairs = []
+    for side in SIDES:
+        if (tactile := f"tactile_{side}") in named:
+            pairs.append(mock_glove_of(links.gloves, place(f"glove_{side}", tactile)))
+        if (keypoints := f"keypoints_{side}") in named:
+            pairs.append(mock_finger_tracker(place(f"finger_tracker_{side}", keypoints)))
+    trackers = [*WRISTS, "head"]
+    if "joints_measured" in named:
+        by_trackers = WRISTS if links.wrists == "trackers" else ()
+        source = RobotStateSource({n: s for n, s in named.items() if n in STREAM_SIZES})
+        decoder = RobotStateDecoder([name for name in STREAM_SIZES if name not in by_trackers])
+        pairs.append(_on_socket(place("robot_state", "joints_measured"), source, decoder))
+        trackers = ["head", *by_trackers]
+    pairs += [mock_pose_tracker(place(f"pose_tracker_{n}", n)) for n in trackers if n in named]
+    pairs += [_camera(place(n, n), links) for n in named if n.startswith("camera_")]
+    if not pairs:
+        raise InvalidInputError(
+            f"mock station: got streams {sorted(named)}, expected tactile_…, keypoints_…, "
+            "wrist_…, head, camera_… or joints_…"
         )
+    return pairs
+
+
+def _camera(place: MockPlace, links: MockLinks) -> MockPair:
+    if links.cameras == "station":
+        return video_camera(place, encoding=links.images)
+    height_px, width_px = place.stream.descriptor.shape[:2]
+    decoder = CameraDecoder(
+        place.name, height_px=height_px, width_px=width_px, encoding=links.images
+    )
+    return _on_socket(place, CameraSource(place.stream, encoding=links.images), decoder)
+
+
+def _on_socket(place: MockPlace, source: PacketSource, decoder: Decoder) -> MockPair:
+    port = SocketPort(place.name)
+    driver = Driver(place.name, transport=port.transport, decoder=decoder, clock=place.clock)
+    return MockPair(MockDevice(place, source, port), driver)
+
+
+def _known_of(pairs: Sequence[MockPair], seed: int) -> dict[str, Matrix]:
+    """What a calibrated station knows of these devices.
+
+    The path delay of each stream is wrong by about its sigma, as a measured one would be.
+    """
+    known: dict[str, Matrix] = {}
+    for pair in pairs:
+        known |= pair.calibration
+        rng, faults = device_rng(seed, f"latency_{pair.device.name}"), pair.device.faults
+        error_ms = LATENCY_SIGMA_MS * rng.standard_normal() if faults.path_delay_ms else 0.0
+        measured_ns = round(max(0.0, faults.path_delay_ms + error_ms) * 1e6)
+        for descriptor in pair.driver.descriptors:
+            known[f"{descriptor.name}_latency_ns"] = ((float(measured_ns),),)
+            known[f"{descriptor.name}_latency_sigma_ns"] = ((LATENCY_SIGMA_MS * 1e6,),)
+    return known
 
 
 @dataclass(frozen=True)
@@ -207,7 +181,7 @@ class MockStation:
         faults: what disturbs the devices.
         seed: of everything random.
         clock: a `VirtualClock` records a take in a fraction of its length, exactly repeatable; a
-            `RealClock` lets real time and the operating system play their part.
+            `StationClock` lets real time and the operating system play their part.
         spool_root: folder of the takes.
         name: of the station.
         calibration: matrices beyond the gloves' and the path delays (such as `K_head`).
@@ -228,8 +202,7 @@ class MockStation:
         links: MockLinks | None = None,
         safety: SpoolSafety | None = None,
     ) -> None:
-        factory = MockFactory(streams, faults=faults, seed=seed, clock=clock, links=links)
-        self.pairs = factory.build()
+        self.pairs = build_mocks(streams, faults=faults, seed=seed, clock=clock, links=links)
         self._clock = clock
         self._seed = seed
         # One round of all streams: the last sample and one period of its stream.
@@ -239,16 +212,12 @@ class MockStation:
             drivers=[pair.driver for pair in self.pairs],
             spool_root=spool_root,
             clock=clock,
-            calibration={
-                **factory.calibration(self.pairs),
-                **factory.latencies(self.pairs),
-                **(calibration or {}),
-            },
+            calibration={**_known_of(self.pairs, seed), **(calibration or {})},
             safety=safety,
         )
         self._players: list[tuple[threading.Thread, Waiter]] = []
         self._failures: list[str] = []
-        self._epoch_ns: int | None = None
+        self._epoch_ns = 0
 
     def __enter__(self) -> "MockStation":
         self.start()
@@ -293,7 +262,7 @@ class MockStation:
         recorder.arm(prompt)
         status = recorder.record(recording_id)
         start_ns = self._clock.now_ns() + LEAD_NS
-        self._play(start_ns, laps=1)
+        self._play(start_ns)
         for thread, _ in self._players:
             thread.join()
         self._drain()
@@ -317,20 +286,18 @@ class MockStation:
         """
         if isinstance(self._clock, VirtualClock):
             raise InvalidInputError("play_forever: needs a real clock")
-        self._play(self._clock.now_ns() + LIVE_LEAD_NS, laps=None)
+        self._play(self._clock.now_ns() + LIVE_LEAD_NS, forever=True)
 
-    def _play(self, start_ns: int, *, laps: int | None) -> None:
+    def _play(self, start_ns: int, *, forever: bool = False) -> None:
         # The devices' clocks and counters go on from one take to the next.
-        if self._epoch_ns is None:
-            self._epoch_ns = start_ns
-        offset_ns = start_ns - self._epoch_ns
+        self._epoch_ns = self._epoch_ns or start_ns
         # All waiters exist before the first thread runs: a virtual clock waits for all of them.
         waiters = [self._clock.waiter(drives_time=True) for _ in self.pairs]
         self._players = [
             (
                 threading.Thread(
                     target=self._run,
-                    args=(pair, waiter, (self._epoch_ns, offset_ns), laps),
+                    args=(pair, waiter, start_ns - self._epoch_ns, forever),
                     name=f"mock-{pair.device.name}",
                     daemon=True,
                 ),
@@ -341,23 +308,18 @@ class MockStation:
         for thread, _ in self._players:
             thread.start()
 
-    def _run(
-        self, pair: MockPair, waiter: Waiter, start: tuple[int, int], laps: int | None
-    ) -> None:
-        epoch_ns, first_offset_ns = start
+    def _run(self, pair: MockPair, waiter: Waiter, offset_ns: int, forever: bool) -> None:  # noqa: FBT001 - of a thread
+        device, epoch_ns = pair.device, self._epoch_ns
         with closing(waiter):
-            lap = 0
             try:
-                while laps is None or lap < laps:
-                    offset_ns = first_offset_ns + lap * self._lap_ns
-                    if not pair.device.play(
-                        self._clock, waiter, start_host_ns=epoch_ns, offset_ns=offset_ns
-                    ):
-                        return
-                    lap += 1
+                while (
+                    device.play(self._clock, waiter, start_host_ns=epoch_ns, offset_ns=offset_ns)
+                    and forever
+                ):
+                    offset_ns += self._lap_ns
             except (DeviceError, InvalidInputError) as error:
-                self._failures.append(f"{pair.device.name}: {error.message}")
-                logger.exception("stop_mock_device", device=pair.device.name)
+                self._failures.append(f"{device.name}: {error.message}")
+                logger.exception("stop_mock_device", device=device.name)
 
     def _drain(self) -> None:
         for pair in self.pairs:

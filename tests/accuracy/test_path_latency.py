@@ -8,11 +8,10 @@ from contextlib import closing
 import numpy as np
 
 from dextouch.streams import StreamDescriptor
-from services.acquisition.clock import RealClock, VirtualClock
+from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mock_glove
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.place import MockPlace
-from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.replay import MockPlace, ReplayStream
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
 
@@ -58,7 +57,7 @@ class SimulatedHost(VirtualClock):
             self._now_ns = max(self._now_ns, t_ns)
 
 
-class Playing:
+class Playing(Waiter):
     """The waiter of a device that plays: time goes on, and ten times a second answers are asked."""
 
     def __init__(self, host, watch):
@@ -91,7 +90,7 @@ class Glove:
             skew_ppm=float(rng.uniform(-80, 80)),
         )
         pair = mock_glove(
-            MockPlace("left", truth(), self.faults, seed, self.host),
+            MockPlace("glove_left", truth(), self.faults, seed, self.host),
             calibration=GloveCalibration.seeded("left", seed),
         )
         self.device = pair.device
@@ -100,7 +99,7 @@ class Glove:
         self.supervisor = DeviceSupervisor(pair.driver, sink=self._accept, clock=self.host)
         # Nothing is asked by a virtual clock, whose time would stand still meanwhile; this one's
         # goes on.
-        self.watch = PathWatch([self.supervisor], clock=RealClock())
+        self.watch = PathWatch([self.supervisor], clock=StationClock())
 
     def _accept(self, readings):
         self.watch.accept(readings)

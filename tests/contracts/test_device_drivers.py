@@ -23,11 +23,12 @@ from services.acquisition.devices.robot_state.driver import STREAM_SIZES
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.sdk_link import BridgeDriver
 from services.acquisition.mock_links import MockLinks
-from services.acquisition.mock_station import MockFactory
+from services.acquisition.mock_station import build_mocks
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
 from services.acquisition.mocks.sdk_link import BridgePort
+from tests.unit.acquisition.usb_bus import usb_trackers
 
 BOOT_NS = 4_000_000_000_000
 # The promise is tried by `make slow`; the default run must not need an idle machine.
@@ -126,8 +127,8 @@ class CameraSubject(Subject):
 
 def build(streams, links):
     clock = VirtualClock()
-    factory = MockFactory(streams, faults=FaultScript(), seed=1, clock=clock, links=links)
-    return {pair.device.name: pair for pair in factory.build()}, clock
+    pairs = build_mocks(streams, faults=FaultScript(), seed=1, clock=clock, links=links)
+    return {pair.device.name: pair for pair in pairs}, clock
 
 
 def from_factory(name, other=None, streams=None, links=None):
@@ -175,17 +176,25 @@ def poses(links):
     return from_factory("pose_tracker_wrist_left", "pose_tracker_wrist_right", links=links)
 
 
-HID, USB, BRIDGE = (MockLinks(trackers=link) for link in ("hid", "usb", "bridge"))
+def by_usb(make):
+    def make_by_usb():
+        with usb_trackers():
+            return make()
+
+    return make_by_usb
+
+
+HID, BRIDGE = (MockLinks(trackers=link) for link in ("hid", "bridge"))
 SUBJECTS = {
     "glove by serial": from_factory("glove_left", "glove_right"),
     "wuji glove by serial": from_factory(
-        "glove_left", "glove_right", links=MockLinks(gloves="wuji")
+        "glove_left", "glove_right", links=MockLinks(gloves="wuji_glove")
     ),
     "fingers by hid": fingers(HID),
-    "fingers by usb": fingers(USB),
+    "fingers by usb": by_usb(fingers(HID)),
     "fingers by bridge": fingers(BRIDGE),
     "pose by hid": poses(HID),
-    "pose by usb": poses(USB),
+    "pose by usb": by_usb(poses(HID)),
     "pose by bridge": poses(BRIDGE),
     "camera by bridge": from_factory("camera_head"),
     "camera of the station": station_camera,

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from services.acquisition.clock import StationClock
 from services.acquisition.devices.finger_tracker.driver import DESCRIPTOR_REPORT
 from services.acquisition.devices.finger_tracker.mock import FingerTrackerSource
 from services.acquisition.devices.robot_state.driver import STREAM_SIZES
 from services.acquisition.health import TICK_NS, HealthMonitor
 from services.acquisition.mock_links import MockLinks
-from services.acquisition.mock_station import MockFactory
+from services.acquisition.mock_station import build_mocks
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 from services.acquisition.supervisor import DeviceSupervisor
@@ -29,7 +30,7 @@ CAMERAS = ("camera_head", "camera_wrist_left", "camera_wrist_right")
 FINGERS, WRISTS = ("keypoints_left", "keypoints_right"), ("wrist_left", "wrist_right")
 
 
-class SetClock:
+class SetClock(StationClock):
     """A clock that shows what it was set to."""
 
     def __init__(self):
@@ -117,11 +118,12 @@ def run(names, links, minutes):
     clock, rng = SetClock(), np.random.default_rng(7)
     known = [*pattern_streams(ROUND_S), *(s for s in robot_streams() if "joints_measured" in names)]
     streams = {s.descriptor.name: noisy(s, rng) for s in known if s.descriptor.name in names}
-    factory = MockFactory(
+    pairs = build_mocks(
         list(streams.values()), faults=FaultScript(), seed=3, clock=clock, links=links
     )
-    pairs = factory.build()
-    calibration = {**pattern_calibration(), **factory.calibration(pairs)}
+    calibration = pattern_calibration()
+    for pair in pairs:
+        calibration |= pair.calibration
     devices = [Played(pair, clock, seed) for seed, pair in enumerate(pairs)]
     supervisors = [device.supervisor for device in devices]
     monitor = HealthMonitor(supervisors, calibration=calibration, clock=clock, station="s")
@@ -142,12 +144,12 @@ def run(names, links, minutes):
 OURS = MockLinks()
 STATIONS = {
     "small": (("tactile_left", HEAD), OURS),
-    "small_wuji": (("tactile_left", HEAD), MockLinks(gloves="wuji")),
-    "small_justfloat": (("tactile_left", HEAD), MockLinks(gloves="justfloat")),
+    "small_wuji": (("tactile_left", HEAD), MockLinks(gloves="wuji_glove")),
+    "small_justfloat": (("tactile_left", HEAD), MockLinks(gloves="justfloat_glove")),
     "human": ((*GLOVES, *FINGERS, *WRISTS, HEAD, *CAMERAS), OURS),
     "robot": ((*GLOVES, HEAD, *CAMERAS, *STREAM_SIZES), OURS),
-    "wuji": ((*GLOVES, HEAD), MockLinks(gloves="wuji")),
-    "justfloat": ((*GLOVES, HEAD), MockLinks(gloves="justfloat")),
+    "wuji": ((*GLOVES, HEAD), MockLinks(gloves="wuji_glove")),
+    "justfloat": ((*GLOVES, HEAD), MockLinks(gloves="justfloat_glove")),
 }
 
 

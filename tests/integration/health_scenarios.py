@@ -8,7 +8,7 @@ import numpy as np
 
 from dextouch.errors import DeviceError
 from dextouch.schemas import HealthEvent, TakePrompt
-from services.acquisition.clock import VirtualClock
+from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices.station_camera.driver import StationCamera
 from services.acquisition.health import STATION, DiskJudge
 from services.acquisition.mock_links import MockLinks
@@ -16,8 +16,7 @@ from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.ledger import Fate, Ledger
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
-from services.acquisition.mocks.place import MockPair
-from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.replay import MockPair, ReplayStream
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")
 # The device with the fault stands beside a head tracker that is never disturbed.
@@ -218,7 +217,7 @@ def stamp_early(_: MockStation, pair: MockPair) -> None:
     """What is read waits for 60 ms in the host before it is spooled."""
     clock = pair.driver._clock
 
-    class Early:
+    class Early(StationClock):
         def now_ns(self):
             return clock.now_ns() - EARLY_NS
 
@@ -301,7 +300,7 @@ def is_later(mock: MockStation, pair: MockPair) -> bool:
     return start_ns > 0 and mock.station.clock.now_ns() >= start_ns + AT_S * 1e9
 
 
-WUJI, BARE = MockLinks(gloves="wuji"), MockLinks(gloves="justfloat")
+WUJI, BARE = MockLinks(gloves="wuji_glove"), MockLinks(gloves="justfloat_glove")
 OWN_CAMERA = MockLinks(cameras="station")
 SHORT, PAUSE = ((AT_S, AT_S + 0.15),), ((AT_S, AT_S + 0.8),)
 

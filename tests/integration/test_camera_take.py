@@ -20,7 +20,7 @@ from services.acquisition.drivers.image_encoding import GroupGate
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
-from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.replay import MockPlace, ReplayStream
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader
 from services.alignment.synchronization.stream_clock import time_stream
@@ -84,11 +84,9 @@ def replay(count):
 def record(stream, encoding, spool_root, **faults):
     """One take of one camera on the station; the driver, and what the mock did."""
     clock = VirtualClock()
+    disturbed = DeviceFaults(path_delay_ms=DELAY_MS, **faults)
     pair = video_camera(
-        stream,
-        faults=DeviceFaults(path_delay_ms=DELAY_MS, **faults),
-        seed=3,
-        clock=clock,
+        MockPlace("camera_head", stream, disturbed, 3, clock),
         encoding=encoding,
         latency_ms=12.0,
         latency_sigma_ms=0.5,
@@ -195,7 +193,8 @@ def test_a_take_of_a_running_camera_begins_with_a_group(tmp_path):
     """What a recorder does with `begin_take` and gates."""
     clock = VirtualClock()
     stream = replay(45)
-    pair = video_camera(stream, faults=DeviceFaults(), seed=3, clock=clock, encoding="h264")
+    place = MockPlace("camera_head", stream, DeviceFaults(), 3, clock)
+    pair = video_camera(place, encoding="h264")
     driver, port = pair.driver, pair.device.port
     port.plug()
     driver.open()

@@ -19,13 +19,13 @@ PAGE = TutorialPage.read("add_a_device")
 STATIONS = """
 import sys
 from dextouch.serving.settings import load_settings
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.settings import AcquisitionSettings
 
 for flags in {flags!r}:
     settings = load_settings(AcquisitionSettings, flags)
-    drivers = build_drivers(settings.devices, RealClock()) if settings.devices else ()
+    drivers = build_drivers(settings.devices, StationClock()) if settings.devices else ()
     print(settings.mock_links.gloves, *(f"{{d.name}} {{d.descriptors[0].shape}}" for d in drivers))
 print(*(m for m in sys.modules if m == "t64_glove.mock" or ".mocks" in m))
 """

@@ -10,11 +10,10 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import StreamDescriptor
 from services.acquisition import path_latency
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mock_glove
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.place import MockPlace
-from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.replay import MockPlace, ReplayStream
 from services.acquisition.station import Station
 
 SECONDS = 20
@@ -36,9 +35,9 @@ def station(tmp_path, monkeypatch):
     count = SECONDS * 60
     t_ns = np.arange(count, dtype=np.int64) * 16_666_667
     stream = ReplayStream(descriptor, t_ns, np.zeros((count, 320), dtype=np.float32))
-    clock, glove = RealClock(), GloveCalibration.seeded("left", 1)
+    clock, glove = StationClock(), GloveCalibration.seeded("left", 1)
     faults = DeviceFaults(path_delay_ms=PATH_DELAY_MS, jitter_ms=0.5, skew_ppm=60)
-    pair = mock_glove(MockPlace("left", stream, faults, 1, clock), calibration=glove)
+    pair = mock_glove(MockPlace("glove_left", stream, faults, 1, clock), calibration=glove)
     pair.device.port.plug()
     station = Station(
         name="test",

@@ -1,6 +1,7 @@
 """Each fault of the mocks: counted under a name, nothing invented, other streams as ever."""
 
 import os
+from contextlib import nullcontext
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.ledger import Fate
 from tests.integration.recording_streams import human_streams, robot_streams, stream
 from tests.unit.acquisition.ledgers import accepted
+from tests.unit.acquisition.usb_bus import usb_trackers
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")
 GLOVE, FINGERS, TRACKER, CAMERA = (
@@ -34,8 +36,8 @@ STREAM_OF = {
 NEIGHBOR = "head"
 WRAP = 2**32 - 40
 OURS = MockLinks()
-USB, BRIDGE = MockLinks(trackers="usb"), MockLinks(trackers="bridge")
-WUJI, JUSTFLOAT = MockLinks(gloves="wuji"), MockLinks(gloves="justfloat")
+USB, BRIDGE = "trackers on USB", MockLinks(trackers="bridge")
+WUJI, JUSTFLOAT = MockLinks(gloves="wuji_glove"), MockLinks(gloves="justfloat_glove")
 OWN_CAMERA = MockLinks(cameras="station")
 
 
@@ -50,7 +52,7 @@ class Script(NamedTuple):
     fault: dict
     events: tuple[str, ...]
     fate: Fate | None = None
-    links: MockLinks = OURS
+    links: MockLinks | str = OURS
     seconds: float = 1.3
 
 
@@ -196,7 +198,10 @@ def record(script, fault, folder):
     names = (STREAM_OF[script.device], NEIGHBOR)
     streams = [s for s in human_streams(script.seconds) if s.descriptor.name in names]
     faults = FaultScript(devices={script.device: DeviceFaults.model_validate(fault)})
-    station = MockStation(streams, faults, 5, VirtualClock(), spool_root=folder, links=script.links)
+    by_usb = script.links == USB
+    with usb_trackers() if by_usb else nullcontext():
+        links = OURS if by_usb else script.links
+        station = MockStation(streams, faults, 5, VirtualClock(), spool_root=folder, links=links)
     with station:
         take = station.run_take(PROMPT, recording_id="take")
         errors = {s.driver.name: s.last_error or "" for s in station.station.supervisors}

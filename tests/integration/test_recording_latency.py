@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dextouch.schemas import TakePrompt
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.recorder import Take
@@ -27,7 +27,7 @@ CAMERAS = ("camera_head", "camera_wrist_left", "camera_wrist_right")
 def measure(folder):
     """Delays of every packet of one glove of a whole station, printed as JSON (ms)."""
     streams = human_streams(SECONDS, CAMERAS)
-    with MockStation(streams, FaultScript(), 1, RealClock(), spool_root=Path(folder)) as mock:
+    with MockStation(streams, FaultScript(), 1, StationClock(), spool_root=Path(folder)) as mock:
         sent_ns, spooled_ns, live_ns = {}, {}, {}
         device = next(p.device for p in mock.pairs if p.device.name == "glove_left")
         make_units = device.source.units

@@ -7,7 +7,7 @@ from dextouch.clocks import fit_clock
 from dextouch.episodes.spool import SpoolReader
 from dextouch.schemas import TakePrompt
 from dextouch.tactile.layout import select_taxels
-from services.acquisition.clock import RealClock, VirtualClock
+from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import LEDGER_FILE, MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
@@ -174,7 +174,7 @@ def test_jpeg_cameras_stay_compressed(tmp_path):
 
 def test_real_time_on_a_pty(tmp_path):
     streams = [s for s in human_streams(0.5) if s.descriptor.name == "tactile_left"]
-    take, spool, _ = record(streams, FaultScript(), tmp_path, clock=RealClock())
+    take, spool, _ = record(streams, FaultScript(), tmp_path, clock=StationClock())
     batch = spool.read("tactile_left")
     np.testing.assert_array_equal(batch.sequence, np.arange(30))
     late_ns = batch.t_host_ns - true_times_ns(take.ledger.of("glove_left"), batch.sequence)

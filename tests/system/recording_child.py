@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from dextouch.schemas import TakePrompt
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
@@ -16,7 +16,7 @@ def main(spool: str, seed: str) -> None:
         pattern_streams(),
         FaultScript.first_light(),
         int(seed),
-        RealClock(),
+        StationClock(),
         spool_root=Path(spool),
     )
     mock.start()

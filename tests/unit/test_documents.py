@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.stages import STAGES
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.settings import AcquisitionSettings
 from services.cli import main
@@ -69,7 +69,7 @@ def test_station_settings_of_the_guide_are_taken(monkeypatch):
     assert len(pairs) == len(settings.model_fields_set)
     trackers, cameras = {"finger_tracker", "pose_tracker"}, {"camera", "station_camera"}
     assert kinds == {"tactile_glove", "wuji_glove"} | trackers | cameras
-    names = [driver.name for driver in build_drivers(settings.devices, RealClock())]
+    names = [driver.name for driver in build_drivers(settings.devices, StationClock())]
     assert len(names) == len(settings.devices)
 
 

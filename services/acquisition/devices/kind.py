@@ -54,8 +54,8 @@ class DeviceKind(Generic[SettingsT]):
     """One kind of device: how it is called, configured, read and simulated.
 
     Our own kinds and those of other packages are found by the entry point `dextouch.devices`, whose
-    name is that of the kind. The decoder of a glove provides its cells (`TellsCells`), so that
-    health checks treat real and simulated gloves alike.
+    name is that of the kind. The decoder of a glove provides its `cells`, so that health checks
+    treat real and simulated gloves alike.
 
     Attributes:
         name: the value of `kind` in a station's settings: a-z, 0-9 and `_`.

@@ -40,12 +40,6 @@ IMPORT_FAILURES = (
     RuntimeError,
     DexTouchError,
 )
-# How kinds of gloves were called before they were kinds: `tactile_glove` with such a `protocol`.
-OLD_PROTOCOLS = {
-    "dextouch": "tactile_glove",
-    "wuji": "wuji_glove",
-    "justfloat": "justfloat_glove",
-}
 _MATRICES = TypeAdapter(dict[str, Matrix])
 
 
@@ -128,14 +122,11 @@ def _validated(value: object) -> DeviceSettings:
         raise ValueError(  # noqa: TRY004 - pydantic gathers ValueErrors of all devices
             f"got {value!r}, expected a map that names its kind: {', '.join(kind_names())}"
         )
-    told: dict[str, Any] = dict(value)
-    if told["kind"] == "tactile_glove" and told.get("protocol") in OLD_PROTOCOLS:
-        told["kind"] = OLD_PROTOCOLS[told.pop("protocol")]
     try:
-        settings = device_kind(told["kind"]).settings
+        settings = device_kind(value["kind"]).settings
     except InvalidInputError as error:
         raise ValueError(error.message) from error
-    return settings.model_validate(told)
+    return settings.model_validate(value)
 
 
 ChosenDevice = Annotated[SerializeAsAny[DeviceSettings], BeforeValidator(_validated)]

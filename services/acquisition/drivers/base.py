@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Generic, Protocol, runtime_checkable
+from typing import Generic
 
 from dextouch.errors import DeviceError
 from dextouch.schemas import Matrix
@@ -24,30 +24,53 @@ from services.acquisition.transports.ports import Transport, TransportInfo
 Readings = dict[str, list[Sample]]
 
 
-@runtime_checkable
-class Decoder(Protocol):
-    """Bytes of one device → samples by stream, in the order in which they were taken."""
+@dataclass(frozen=True)
+class CellLayout:
+    """Layout and range of a glove's cells, for health checks.
+
+    Attributes:
+        full_scale: the largest reading, in the unit of the stream.
+        grid: rows and columns of the cells of a sample, in row-major order; None if the neighbours
+            of cells are unknown. Cells that read NaN from the start do not exist.
+    """
+
+    full_scale: float
+    grid: tuple[int, int] | None
+
+
+class Decoder(ABC):
+    """Bytes of one device → samples by stream, in the order in which they were taken.
+
+    Attributes:
+        descriptors: the streams it gives.
+        statistics: what was seen so far.
+        cells: full scale and grid of a glove's cells, by which health judges them; None where the
+            decoder does not know them, or gives several streams.
+    """
+
+    descriptors: tuple[StreamDescriptor, ...]
+    statistics: DecoderStatistics
+    cells: CellLayout | None = None
 
     @property
-    def statistics(self) -> DecoderStatistics:
-        """What was seen so far."""
-        ...
+    def quality(self) -> ImageQuality | None:
+        """What a camera's images are like; None where nobody looks at them."""
+        return None
 
-    @property
-    def descriptors(self) -> tuple[StreamDescriptor, ...]:
-        """The streams it gives."""
-        ...
+    def events(self) -> Mapping[str, int]:
+        """Counts since the start besides the statistics, by name; a take's ledger lists them so."""
+        return {}
 
+    @abstractmethod
     def reset(self) -> None:
         """Forget half a packet, since the link was lost."""
-        ...
 
+    @abstractmethod
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """Samples completed by `data`, which arrived at `t_host_ns`."""
-        ...
 
 
-class StreamDecoder(ABC, Generic[Found]):
+class StreamDecoder(Decoder, Generic[Found]):
     """Base of a decoder whose packets become samples of one stream.
 
     Args:
@@ -56,7 +79,7 @@ class StreamDecoder(ABC, Generic[Found]):
     """
 
     def __init__(self, descriptor: StreamDescriptor, packets: PortionedSearch[Found]) -> None:
-        self.descriptors: tuple[StreamDescriptor, ...] = (descriptor,)
+        self.descriptors = (descriptor,)
         self.statistics = packets.statistics
         self._packets = packets
         self._name = descriptor.name
@@ -97,49 +120,6 @@ def hand_name(side: Side, label: str | None = None) -> str:
     return side if label is None else f"{side}_{label}"
 
 
-@dataclass(frozen=True)
-class CellLayout:
-    """Layout and range of a glove's cells, for health checks.
-
-    Attributes:
-        full_scale: the largest reading, in the unit of the stream.
-        grid: rows and columns of the cells of a sample, in row-major order; None if the neighbours
-            of cells are unknown. Cells that read NaN from the start do not exist.
-    """
-
-    full_scale: float
-    grid: tuple[int, int] | None
-
-
-@runtime_checkable
-class TellsCells(Protocol):
-    """A glove's decoder that knows what its cells can show; it gives one stream."""
-
-    @property
-    def cells(self) -> CellLayout:
-        """Full scale and grid of the cells."""
-        ...
-
-
-@runtime_checkable
-class TellsQuality(Protocol):
-    """A decoder of images that looks at them."""
-
-    @property
-    def quality(self) -> ImageQuality:
-        """What they are like."""
-        ...
-
-
-@runtime_checkable
-class CountsEvents(Protocol):
-    """A decoder that counts more than its statistics, such as a tracker's poses left out."""
-
-    def events(self) -> Mapping[str, int]:
-        """Counts since the start by name; the ledger of a take lists them so."""
-        ...
-
-
 class Driver:
     """One device: opens its transport, stamps what arrives, decodes it.
 
@@ -167,7 +147,7 @@ class Driver:
     @property
     def quality(self) -> ImageQuality | None:
         """What a camera's images are like; None of other devices."""
-        return self.decoder.quality if isinstance(self.decoder, TellsQuality) else None
+        return self.decoder.quality
 
     def begin_take(self) -> Mapping[str, Matrix]:
         """A take begins: what comes from now on must be readable without what came before.
@@ -184,9 +164,7 @@ class Driver:
 
     def events(self) -> dict[str, int]:
         """All that the decoder and this driver counted since the start, by name."""
-        events: dict[str, int] = dict(vars(self.statistics))
-        if isinstance(self.decoder, CountsEvents):
-            events.update(self.decoder.events())
+        events = {**vars(self.statistics), **self.decoder.events()}
         return events if self.quality is None else {**events, **self.quality.events()}
 
     def open(self) -> None:

@@ -19,7 +19,7 @@ from dextouch.schemas import Matrix
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import NUM_TAXELS, Side, join_pads, raw_indices, split_pads
 from services.acquisition.devices.tactile_glove.driver import FULL_SCALE_COUNTS
-from services.acquisition.drivers.base import CellLayout, Decoder, TellsCells
+from services.acquisition.drivers.base import CellLayout, Decoder
 from services.acquisition.glove_record import NO_CELL, GloveRecord, mapped_cells
 from services.acquisition.health.codes import CODES
 from services.acquisition.health.evaluation import Evaluation, Finding
@@ -200,10 +200,11 @@ def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellJudg
             has not.
         NotFoundError: the map is of another size.
     """
-    if not isinstance(decoder, TellsCells):
+    layout = decoder.cells
+    if layout is None:
         return None
     (descriptor,) = decoder.descriptors
-    layout, num_cells = decoder.cells, math.prod(descriptor.shape)
+    num_cells = math.prod(descriptor.shape)
     if layout.grid is not None and math.prod(layout.grid) != num_cells:
         raise InvalidInputError(
             f"{descriptor.device}: got cells on a grid of {layout.grid} in a sample of {num_cells} "

@@ -7,9 +7,16 @@ from services.acquisition.mocks.faults import (
     Pinned,
     without_first,
 )
-from services.acquisition.mocks.place import MockPair, MockPlace, serial_mock
 from services.acquisition.mocks.ports import HidPort, MockPort, PtyPort, SocketPort
-from services.acquisition.mocks.replay import MockDevice, PacketSource, ReplayStream, at_rate
+from services.acquisition.mocks.replay import (
+    MockDevice,
+    MockPair,
+    MockPlace,
+    PacketSource,
+    ReplayStream,
+    at_rate,
+    serial_mock,
+)
 
 __all__ = [
     "DeviceFaults",

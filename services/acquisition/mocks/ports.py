@@ -7,24 +7,23 @@ import select
 import socket
 import threading
 import tty
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar
 
 from dextouch.errors import DeviceError
 from services.acquisition.transports.ports import (
+    HandleTransport,
     HidDevice,
     HidTransport,
     SerialTransport,
     SocketTransport,
     Transport,
-    TransportInfo,
 )
 
 # A host that is merely busy loses nothing, as behind a real device with buffers of its own.
 SEND_TIMEOUT_S = 20.0
-HID_RING_REPORTS = 63
 # What a device says to what the host writes.
 Answer = Callable[[bytes], list[bytes]]
 
@@ -78,7 +77,7 @@ class Link:
                 raise DeviceError(f"mock device: the host {text} for {SEND_TIMEOUT_S:.0f} s")
 
 
-class WatchedTransport:
+class WatchedTransport(HandleTransport[Transport]):
     """The host's transport, telling the mock how far the host is.
 
     What a read returned counts as processed when the reader comes back for more: by then it has
@@ -99,66 +98,68 @@ class WatchedTransport:
         on_open: Callable[[], None] | None = None,
         on_write: Callable[[int], None] | None = None,
     ) -> None:
+        super().__init__(transport.info)
         self._transport = transport
         self._link = link
         self._on_open = on_open
         self._on_write = on_write
         self._pending = 0
 
-    @property
-    def info(self) -> TransportInfo:
-        """Where it leads."""
-        return self._transport.info
-
-    def open(self) -> None:
-        """Open and tell."""
+    def _connect(self) -> Transport:
         self._transport.open()
+        self.info = self._transport.info
         self._pending = 0
         self._link.set_open(is_open=True)
         if self._on_open is not None:
             self._on_open()
+        return self._transport
 
-    def read(self) -> bytes:
-        """Tell, then read."""
+    def _receive(self, handle: Transport) -> bytes:
         self._link.add_consumed(self._pending)
         self._pending = 0
-        data = self._transport.read()
+        data = handle.read()
         self._pending = len(data)
         return data
 
-    def write(self, data: bytes) -> None:
-        """Write, and tell."""
-        self._transport.write(data)
+    def _send(self, handle: Transport, data: bytes) -> None:
+        handle.write(data)
         if self._on_write is not None:
             self._on_write(len(data))
 
-    def close(self) -> None:
-        """Close and tell."""
-        self._transport.close()
+    def _release(self, handle: Transport) -> None:
+        handle.close()
         self._link.set_open(is_open=False)
 
 
-@runtime_checkable
-class MockPort(Protocol):
-    """The device's end; `has_bit_errors` where no checksum below ours guards the line."""
+class MockPort(ABC):
+    """The device's end of a link.
 
-    link: Link
-    has_bit_errors: bool
+    Attributes:
+        link: how far the host is.
+        transport: the host's end.
+        has_bit_errors: whether no checksum below ours guards the line.
+    """
 
+    has_bit_errors: ClassVar[bool] = False
+    transport: Transport
+
+    def __init__(self) -> None:
+        self.link = Link()
+
+    @abstractmethod
     def send(self, unit: bytes) -> bool:
         """Send bytes or one report; False when the host's buffer was full."""
-        ...
 
+    @abstractmethod
     def plug(self) -> None:
         """Become visible to the host."""
-        ...
 
+    @abstractmethod
     def unplug(self) -> None:
         """Vanish."""
-        ...
 
 
-class PtyPort:
+class PtyPort(MockPort):
     """A serial device: a pseudo terminal with a new name at every plugging.
 
     Args:
@@ -169,7 +170,7 @@ class PtyPort:
     has_bit_errors = True
 
     def __init__(self, name: str, answer: Answer | None = None) -> None:
-        self.link = Link()
+        super().__init__()
         self._name = name
         self._answer = answer
         self._master: int | None = None
@@ -224,31 +225,32 @@ class PtyPort:
             self.send(unit)
 
 
-@dataclass(kw_only=True)
-class ReportDevice:
-    """A model of a device behind a real library, which keeps some reports for its host.
-
-    `on_write` takes the reports of the host.
-    """
+class ReportPort(MockPort):
+    """A device of reports or images, of which the host's library keeps the first unread ones."""
 
     max_reports: ClassVar[int]
-    on_write: Callable[[bytes], None] | None = None
-    is_plugged: bool = False
-    _reports: deque[bytes] = field(default_factory=deque)
-    _changed: threading.Condition = field(default_factory=threading.Condition)
 
-    def set_plugged(self, *, plugged: bool) -> None:
-        """Plug it in or pull it out."""
-        with self._changed:
-            self.is_plugged = plugged
-            self._changed.notify_all()
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_plugged = False
+        self._reports: deque[bytes] = deque()
+        self._changed = threading.Condition()
 
-    def push(self, report: bytes) -> bool:
-        """A report (or half of one) for the host; False when as many wait as it can keep."""
+    def plug(self) -> None:
+        """Plug in."""
+        self._set_plugged(plugged=True)
+
+    def unplug(self) -> None:
+        """Pull out: a waiting host notices at once."""
+        self._set_plugged(plugged=False)
+
+    def send(self, unit: bytes) -> bool:
+        """A report into the buffer; False when as many wait as it can keep."""
         with self._changed:
-            if len(self._reports) >= self.max_reports:
+            if not self.is_plugged or len(self._reports) >= self.max_reports:
                 return False
-            self._reports.append(report)
+            self.link.add_sent(len(unit))
+            self._reports.append(unit)
             self._changed.notify_all()
             return True
 
@@ -257,94 +259,73 @@ class ReportDevice:
         with self._changed:
             self._reports.clear()
 
+    def fetch(self, timeout_s: float) -> bytes:
+        """The oldest report; b"" when none comes in time.
 
-class FakeHid(ReportDevice):
-    """Behaves like an opened hidapi device.
+        Raises:
+            OSError: unplugged.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._reports or not self.is_plugged, timeout_s)
+            self.check_plugged()
+            return self._reports.popleft() if self._reports else b""
+
+    def check_plugged(self) -> None:
+        """Fail as the host's library does with a device that has gone.
+
+        Raises:
+            OSError: unplugged.
+        """
+        if not self.is_plugged:
+            raise OSError(errno.EIO, "read error")
+
+    def _set_plugged(self, *, plugged: bool) -> None:
+        with self._changed:
+            self.is_plugged = plugged
+            self._changed.notify_all()
+
+
+class HidPort(ReportPort):
+    """A HID device whose host end is the real HID transport, for which it is hidapi.
 
     `read` gives [] when idle and OSError when unplugged; a ring keeps 63 reports and silently
     loses the newest; `write` counts one byte more than it was given.
+
+    Args:
+        name: of the device; also its serial number.
+        answer: what the device says to a report of the host.
     """
 
-    max_reports = HID_RING_REPORTS
+    max_reports = 63
+
+    def __init__(self, name: str, answer: Answer | None = None) -> None:
+        super().__init__()
+        self._answer = answer
+        transport = HidTransport(self.open, address=f"mock:{name}", serial_number=name)
+        self.transport = WatchedTransport(transport, self.link)
 
     def open(self) -> HidDevice:
         """What hidapi's open does: reports that came before are not seen."""
-        self._check()
+        self.check_plugged()
         self.flush()
         return self
 
     def read(self, max_length: int, timeout_ms: int = 0) -> list[int]:
         """One report or []."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._reports or not self.is_plugged, timeout_ms / 1000)
-            self._check()
-            return list(self._reports.popleft()[:max_length]) if self._reports else []
+        return list(self.fetch(timeout_ms / 1000)[:max_length])
 
     def write(self, buff: bytes) -> int:
-        """A report to the device."""
-        self._check()
-        if self.on_write is not None:
-            self.on_write(bytes(buff))
+        """A report to the device, which answers in the host's thread."""
+        self.check_plugged()
+        for unit in self._answer(bytes(buff)) if self._answer is not None else []:
+            self.send(unit)
         return len(buff) + 1
 
     def close(self) -> None:
         """Nothing is held."""
 
-    def _check(self) -> None:
-        if not self.is_plugged:
-            raise OSError(errno.EIO, "read error")
 
-
-class ReportPort:
-    """A device of reports whose host end is a real transport.
-
-    Args:
-        device: the model that the transport's library is given.
-        transport: the host's end, not opened.
-        answer: what the device says to a report of the host.
-    """
-
-    has_bit_errors = False
-
-    def __init__(self, device: ReportDevice, transport: Transport, answer: Answer | None) -> None:
-        self.link = Link()
-        self.device = device
-        self._answer = answer
-        if answer is not None:
-            device.on_write = self._hear
-        self.transport = WatchedTransport(transport, self.link)
-
-    def plug(self) -> None:
-        """Plug in."""
-        self.device.set_plugged(plugged=True)
-
-    def unplug(self) -> None:
-        """Pull out."""
-        self.device.set_plugged(plugged=False)
-
-    def send(self, unit: bytes) -> bool:
-        """A report into the device's buffer."""
-        self.link.add_sent(len(unit))
-        taken = self.device.push(unit)
-        if not taken:
-            self.link.add_sent(-len(unit))
-        return taken
-
-    def _hear(self, report: bytes) -> None:
-        for unit in self._answer(report) if self._answer is not None else []:
-            self.send(unit)
-
-
-class HidPort(ReportPort):
-    """A HID device whose host end is the real HID transport on a `FakeHid`."""
-
-    def __init__(self, name: str, answer: Answer | None = None) -> None:
-        device = FakeHid()
-        transport = HidTransport(device.open, address=f"mock:{name}", serial_number=name)
-        super().__init__(device, transport, answer)
-
-
-class SocketPort:
+class SocketPort(MockPort):
     """A device behind a socket: every connection of the host is a new pair.
 
     Args:
@@ -352,10 +333,8 @@ class SocketPort:
         on_open: called when the host has connected.
     """
 
-    has_bit_errors = False
-
     def __init__(self, name: str, on_open: Callable[[], None] | None = None) -> None:
-        self.link = Link()
+        super().__init__()
         self._plugged = False
         self._device_end: socket.socket | None = None
         transport = SocketTransport(self._connect, address=f"mock:{name}")

@@ -1,20 +1,25 @@
-"""A device that plays a stream of an episode as packets."""
+"""A device that plays a stream of an episode as packets, and the driver on its other end."""
 
 import heapq
 import threading
 import zlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Int64, Shaped
 
+from dextouch.episodes import EpisodeReader
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.schemas import Matrix
 from dextouch.streams import StreamDescriptor
+from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
+from services.acquisition.drivers.base import Decoder, Driver
 from services.acquisition.drivers.packets import SEQUENCE_MODULUS
 from services.acquisition.mocks.faults import (
     DeviceFaults,
@@ -30,7 +35,9 @@ from services.acquisition.mocks.faults import (
     make_schedule,
 )
 from services.acquisition.mocks.ledger import DeviceLedger, Fate
-from services.acquisition.mocks.ports import MockPort
+from services.acquisition.mocks.ports import MockPort, PtyPort
+
+PLAYED_KINDS = ("tactile", "keypoints", "pose", "image", "robot_state")
 
 
 @dataclass(frozen=True)
@@ -60,37 +67,52 @@ class ReplayStream:
             raise NonFiniteError(f"replay stream {name!r}: NaN or infinity in the values")
 
 
-@runtime_checkable
-class PacketSource(Protocol):
-    """What one device says: packets made from replay streams."""
+class PacketSource(ABC):
+    """What one device says: packets made from replay streams.
 
-    @property
-    def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """When each sample is taken."""
-        ...
+    Attributes:
+        t_ns: when each sample is taken.
+        edits: faults inside its packets; by default those of our documented devices.
+    """
 
+    t_ns: Int64[np.ndarray, " n"]
+    edits: PacketEdits = OurPacketEdits()
+
+    @abstractmethod
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """The packet of sample `index`, as the units that the port sends (reports, or one)."""
-        ...
-
-
-@runtime_checkable
-class LabelledSource(Protocol):
-    """A source that knows which of its samples are wrong in themselves."""
 
     def fate(self, index: int) -> Fate:
         """What becomes of sample `index` if its packet arrives: SENT of a good one."""
-        ...
+        del index
+        return Fate.SENT
 
 
-@runtime_checkable
-class OtherFamilySource(Protocol):
-    """A source of packets that are not ours, which knows how faults inside them look."""
+@dataclass(frozen=True)
+class MockPlace:
+    """Place of one device in a mock station.
+
+    Attributes:
+        name: of the device, such as `glove_left`.
+        stream: what it plays; of a glove the pressures, float32 [n, 320] in kPa in anatomical order
+            (`dextouch.tactile.layout`); `at_rate` resamples them to the rate of a glove.
+        faults: what disturbs the device. Its source sees to `dead_taxels`, raw cells that read 0.
+        seed: of everything random.
+        clock: of the station.
+        link: of a tracker.
+    """
+
+    name: str
+    stream: ReplayStream
+    faults: DeviceFaults
+    seed: int
+    clock: StationClock
+    link: Literal["hid", "bridge"] = "hid"
 
     @property
-    def edits(self) -> PacketEdits:
-        """Faults inside its packets."""
-        ...
+    def side(self) -> Side:
+        """The hand that the device's name ends with."""
+        return "left" if self.name.endswith("left") else "right"
 
 
 class _Event(NamedTuple):
@@ -105,27 +127,22 @@ class MockDevice:
     """Plays a packet source through a port, disturbed by its faults, keeping a ledger.
 
     Args:
-        name: of the device.
+        place: its name, faults and seed.
         source: what it says.
         port: where it says it.
-        faults: what goes wrong.
-        seed: of everything random here.
     """
 
-    def __init__(
-        self, name: str, *, source: PacketSource, port: MockPort, faults: DeviceFaults, seed: int
-    ) -> None:
-        self.name = name
+    def __init__(self, place: MockPlace, source: PacketSource, port: MockPort) -> None:
+        faults = place.faults
+        self.name = place.name
         self.source = source
         self.port = port
         self.faults = faults
-        self._rng = device_rng(seed, name)
+        self._rng = device_rng(place.seed, place.name)
         self._boot_ns = boot_time_ns(self._rng)
         self._bit_error_rate = faults.bit_error_rate if port.has_bit_errors else 0.0
         self._byte_loss_rate = faults.byte_loss_rate if port.has_bit_errors else 0.0
-        self._edits: PacketEdits = OurPacketEdits()
-        if isinstance(source, OtherFamilySource):
-            self._edits = source.edits
+        self._edits = source.edits
         pinned: dict[Pinned, tuple[int, ...]] = {
             "stuck": faults.stuck_taxels,
             "saturated": faults.saturated_taxels,
@@ -212,8 +229,7 @@ class MockDevice:
         elif schedule.is_dropped[index]:
             fate = Fate.DROPPED
         else:
-            if isinstance(self.source, LabelledSource):
-                fate = self.source.fate(index)
+            fate = self.source.fate(index)
             units = self.source.units(index, sequence, t_device_ns)
             units, fate = self._edit(units, int(schedule.t_true_ns[index]), fate)
             fate, flips = self._deliver(units, fate)
@@ -286,6 +302,42 @@ class MockDevice:
         )
 
 
+@dataclass(frozen=True)
+class MockPair:
+    """A simulated device and the real driver on its other end.
+
+    Attributes:
+        device: plays the packets.
+        driver: reads them.
+        calibration: matrices by name that a calibrated station knows of such a device, such as
+            `tactile_left_tare_counts`; none where its maker's devices come without them.
+    """
+
+    device: MockDevice
+    driver: Driver
+    calibration: Mapping[str, Matrix] = field(default_factory=dict)
+
+
+def serial_mock(
+    place: MockPlace,
+    *,
+    source: PacketSource,
+    decoder: Decoder,
+    calibration: Mapping[str, Matrix] | None = None,
+) -> MockPair:
+    """A simulated device on a pseudo terminal, read by the real serial transport.
+
+    Args:
+        place: where it stands.
+        source: what it sends.
+        decoder: of its driver.
+        calibration: what a calibrated station knows of it.
+    """
+    port = PtyPort(place.name)
+    driver = Driver(place.name, transport=port.transport, decoder=decoder, clock=place.clock)
+    return MockPair(MockDevice(place, source, port), driver, calibration or {})
+
+
 def device_rng(seed: int, name: str) -> np.random.Generator:
     """The same random numbers for the same seed and device, whatever other devices there are."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
@@ -303,3 +355,21 @@ def at_rate(stream: ReplayStream, rate_hz: float) -> ReplayStream:
     t_ns = stream.t_ns[0] + np.rint(index * (1e9 / stream.descriptor.nominal_rate_hz))
     descriptor = stream.descriptor.model_copy(update={"nominal_rate_hz": rate_hz})
     return ReplayStream(descriptor, t_ns.astype(np.int64), values.astype(stream.values.dtype))
+
+
+def replay_streams(reader: EpisodeReader) -> list[ReplayStream]:
+    """Every stream of a stored episode that a device could have sent."""
+    streams = []
+    for name, descriptor in reader.streams.items():
+        if descriptor.kind not in PLAYED_KINDS or name == "object_poses":
+            continue
+        data = reader.read(name)
+        plain = descriptor.model_copy(update={"unit": "rgb8"})
+        wanted = plain if descriptor.kind == "image" else descriptor
+        streams.append(ReplayStream(wanted, data.t_ref_ns, data.values))
+    return streams
+
+
+def replay_calibration(reader: EpisodeReader) -> dict[str, Matrix]:
+    """What a stored episode knows of its cameras and mounts."""
+    return {**reader.attributes.calibration, "K_head": reader.attributes.K_head}

@@ -3,20 +3,19 @@
 import contextlib
 import socket
 import threading
-from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
 from services.acquisition.clock import PeriodicCall, StationClock, VirtualClock
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.sdk_link import (
+    PROTOCOL,
+    PROTOCOL_VERSION,
     BridgeDecoder,
     BridgeDriver,
     BridgeHello,
     FrameConvention,
 )
-from services.acquisition.mocks.place import MockPair, TrackerPlace
-from services.acquisition.mocks.ports import SEND_TIMEOUT_S, Link, SocketPort
-from services.acquisition.mocks.replay import MockDevice, PacketSource
+from services.acquisition.mocks.ports import SEND_TIMEOUT_S, MockPort, SocketPort
+from services.acquisition.mocks.replay import MockDevice, MockPair, MockPlace, PacketSource
 
 # A left-handed sender in centimetres, and OpenVR's own frame: y up, looking along −z.
 LEFT_HANDED = FrameConvention(handedness="left", axes=("+x", "+y", "-z"))
@@ -25,26 +24,29 @@ SOFTWARE = "dextouch mock bridge 1"
 LIFE_PERIOD_NS = 50_000_000
 
 
-@runtime_checkable
-class BridgeSource(PacketSource, Protocol):
-    """What one bridge process says."""
+class BridgeSource(PacketSource):
+    """What one bridge process says.
+
+    Attributes:
+        magic: of its packets.
+        hello: the first line of a connection.
+    """
 
     magic: bytes
+    hello: bytes
 
-    def hello(self) -> bytes:
-        """The first line of a connection."""
-        ...
+
+def mock_hello(**says: object) -> bytes:
+    """First line of a mock bridge's connections: `BridgeHello` without protocol and software."""
+    made = {"protocol": PROTOCOL, "version": PROTOCOL_VERSION, "software": SOFTWARE, **says}
+    hello = BridgeHello.model_validate(made)
+    return hello.model_dump_json(exclude_none=True).encode() + b"\n"
 
 
 def sign_of_life(magic: bytes, sequence: int, t_device_ns: int) -> bytes:
     """A packet without a payload."""
     packet = Packet(VERSION, SOURCES["none"], sequence, t_device_ns, b"")
     return encode_packet(magic, packet)
-
-
-def hello_line(hello: BridgeHello) -> bytes:
-    """A hello as it is sent."""
-    return hello.model_dump_json(exclude_none=True).encode() + b"\n"
 
 
 class BridgePort(SocketPort):
@@ -54,11 +56,11 @@ class BridgePort(SocketPort):
     clock finds it silent while the device says nothing.
     """
 
-    def __init__(self, name: str, hello: Callable[[], bytes]) -> None:
+    def __init__(self, name: str, hello: bytes) -> None:
         # The hello that waits in every new connection counts as sent.
-        super().__init__(name, on_open=lambda: self.link.add_sent(len(hello())))
+        super().__init__(name, on_open=lambda: self.link.add_sent(len(self.hello)))
         self.life: PeriodicCall | None = None
-        self._hello = hello
+        self.hello = hello
 
     def plug(self) -> None:
         """Accept connections, and show that the bridge lives."""
@@ -75,7 +77,7 @@ class BridgePort(SocketPort):
     def _connect(self) -> socket.socket:
         host_end = super()._connect()
         if self._device_end is not None:
-            self._device_end.sendall(self._hello())
+            self._device_end.sendall(self.hello)
         return host_end
 
 
@@ -88,20 +90,18 @@ def signs_of_life(device: MockDevice, magic: bytes, clock: StationClock) -> Peri
     return PeriodicCall(show_life, period_ns=LIFE_PERIOD_NS, clock=clock, name="bridge-life")
 
 
-def bridged_pair(
-    name: str, source: BridgeSource, decoder: BridgeDecoder, place: TrackerPlace
-) -> MockPair:
+def bridged_pair(place: MockPlace, source: BridgeSource, decoder: BridgeDecoder) -> MockPair:
     """A simulated device behind a bridge, and the driver that asks the bridge for it."""
-    port, clock = BridgePort(name, source.hello), place.clock
-    device = MockDevice(name, source=source, port=port, faults=place.faults, seed=place.seed)
+    port, clock = BridgePort(place.name, source.hello), place.clock
+    device = MockDevice(place, source, port)
     # With a virtual clock, time stands while nothing is sent.
     if not isinstance(clock, VirtualClock):
         port.life = signs_of_life(device, source.magic, clock)
-    driver = BridgeDriver(name, transport=port.transport, decoder=decoder, clock=clock)
+    driver = BridgeDriver(place.name, transport=port.transport, decoder=decoder, clock=clock)
     return MockPair(device, driver)
 
 
-class BridgeServer:
+class BridgeServer(MockPort):
     """A bridge process's socket: says hello to every connection and sends all of them the same.
 
     Args:
@@ -109,10 +109,8 @@ class BridgeServer:
         port: to listen on; any free one if 0.
     """
 
-    has_bit_errors = False
-
-    def __init__(self, hello: Callable[[], bytes], *, port: int = 0) -> None:
-        self.link = Link()
+    def __init__(self, hello: bytes, *, port: int = 0) -> None:
+        super().__init__()
         self._hello = hello
         self._lock = threading.Lock()
         self._connections: list[socket.socket] = []
@@ -161,5 +159,5 @@ class BridgeServer:
             connection.settimeout(SEND_TIMEOUT_S)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             with self._lock, contextlib.suppress(OSError):
-                connection.sendall(self._hello())
+                connection.sendall(self._hello)
                 self._connections.append(connection)

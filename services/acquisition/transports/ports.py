@@ -8,7 +8,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
 import structlog
 
@@ -46,36 +46,10 @@ class TransportInfo:
         return f"{self.kind} {self.address}"
 
 
-@runtime_checkable
-class Transport(Protocol):
-    """A way to one device. Every failure of the link is a DeviceError."""
-
-    @property
-    def info(self) -> TransportInfo:
-        """Where it leads."""
-        ...
-
-    def open(self) -> None:
-        """Open the link; an open one is closed first."""
-        ...
-
-    def read(self) -> bytes:
-        """What has arrived, waiting a moment for the first byte; b"" means: nothing yet."""
-        ...
-
-    def write(self, data: bytes) -> None:
-        """Send all of `data`."""
-        ...
-
-    def close(self) -> None:
-        """Close the link; closing twice is fine."""
-        ...
-
-
 class HandleTransport(ABC, Generic[Handle]):
-    """Base of transports over what a library opens: a port, a device, a socket, a camera.
+    """Way to one device, over what a library opens: a port, a device, a socket, a camera.
 
-    An OSError of the library is the loss of the device.
+    Every failure of the link is a DeviceError; an OSError of the library is one.
 
     Args:
         info: where it leads.
@@ -148,6 +122,9 @@ class HandleTransport(ABC, Generic[Handle]):
     @abstractmethod
     def _release(self, handle: Handle) -> None:
         """Close what `_connect` gave."""
+
+
+Transport = HandleTransport[Any]
 
 
 def find_port(serial_number: str) -> str:

@@ -26,12 +26,11 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 from dextouch.schemas import Matrix, RecordingAttributes, SaveTake, TakePrompt, matrix_rows
 from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
-from services.acquisition.clock import RealClock, VirtualClock
+from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.mock_station import MockStation, MockTake
-from services.acquisition.mocks.episode import replay_calibration, replay_streams
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Fate
-from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.replay import ReplayStream, replay_calibration, replay_streams
 from services.acquisition.path_latency import add_latencies
 from services.acquisition.uploader import Uploader
 from services.alignment.calibration.tactile_gain import TaxelPress, calibrate_glove
@@ -255,7 +254,7 @@ def measure_gloves(
         [_pressed(stream, true_kpa) for stream in gloves.values()],
         FaultScript.first_light(),
         seed,
-        RealClock(),
+        StationClock(),
         spool_root=spool_root,
     ) as station:
         take = station.run_take(CALIBRATION)

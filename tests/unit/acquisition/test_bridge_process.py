@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from dextouch.errors import DeviceError, StaleDataError
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.mock_bridge import pattern_source
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.replay import MockDevice
+from services.acquisition.mocks.replay import MockDevice, MockPlace
 from services.acquisition.mocks.sdk_link import BridgeServer, signs_of_life
 from services.acquisition.settings import AcquisitionSettings
 
@@ -34,7 +34,7 @@ DEVICES = {
 
 def driver_of(kind, port):
     device = {"kind": kind, "link": "bridge", "port": port, **DEVICES[kind][1]}
-    (driver,) = build_drivers(AcquisitionSettings(devices=(device,)).devices, RealClock())
+    (driver,) = build_drivers(AcquisitionSettings(devices=(device,)).devices, StationClock())
     return driver
 
 
@@ -67,8 +67,8 @@ class Bridge:
     def __init__(self, kind):
         self.source = pattern_source(kind, DEVICES[kind][0], seed=0)
         self.server = BridgeServer(self.source.hello)
-        faults = DeviceFaults()
-        self.device = MockDevice("b", source=self.source, port=self.server, faults=faults, seed=0)
+        place = MockPlace("b", pattern_streams()[0], DeviceFaults(), 0, StationClock())
+        self.device = MockDevice(place, self.source, self.server)
 
     def send_sample(self, index, t_device_ns):
         self.device.send_aside(lambda n: b"".join(self.source.units(index, n, t_device_ns)))
@@ -77,7 +77,7 @@ class Bridge:
 @pytest.fixture
 def bridge(kind):
     made = Bridge(kind)
-    life = signs_of_life(made.device, made.source.magic, RealClock())
+    life = signs_of_life(made.device, made.source.magic, StationClock())
     made.server.plug()
     life.start()
     yield made

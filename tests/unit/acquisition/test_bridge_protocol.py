@@ -285,7 +285,7 @@ def test_bytes_never_change():
     pose = np.array([[1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]])
     stream = ReplayStream(descriptor, np.zeros(1, np.int64), pose)
     source = BridgePoseSource(stream, faults=DeviceFaults(), rng=np.random.default_rng(1))
-    assert source.hello() == (
+    assert source.hello == (
         b'{"protocol":"dextouch-bridge","version":1,"kind":"pose_tracker",'
         b'"software":"dextouch mock bridge 1","devices":[{"index":3,"serial_number":"LHR-left",'
         b'"source":"left"}],"frame":{"handedness":"right","axes":["+x","+z","-y"]},'

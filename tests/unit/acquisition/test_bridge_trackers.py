@@ -1,6 +1,7 @@
 """Trackers behind bridges: frames against closed forms, gates against the mock's truth."""
 
 import itertools
+import json
 import math
 
 import numpy as np
@@ -40,7 +41,6 @@ from services.acquisition.mocks.sdk_link import (
     LEFT_HANDED,
     Y_UP,
     BridgePort,
-    hello_line,
     sign_of_life,
 )
 
@@ -54,6 +54,11 @@ def fingers(side="left", seed=1, **settings):
     return BridgeFingerTrackerSource(STREAMS[f"keypoints_{side}"], side=side, rng=rng, **settings)
 
 
+def hello_with(source, **changes):
+    """The first line of a source's bridge, which says something else."""
+    return json.dumps({**json.loads(source.hello), **changes}).encode() + b"\n"
+
+
 def poses(stream="wrist_left", **settings):
     rng = np.random.default_rng(1)
     return BridgePoseSource(STREAMS[stream], faults=DeviceFaults(), rng=rng, **settings)
@@ -61,7 +66,7 @@ def poses(stream="wrist_left", **settings):
 
 def play(source, decoder, delay_ns=lambda index: 2 * MS):
     (stream,) = (descriptor.name for descriptor in decoder.descriptors)
-    assert decoder.decode(source.hello(), 0) == {}
+    assert decoder.decode(source.hello, 0) == {}
     samples = []
     for index, t_ns in enumerate(source.t_ns):
         for unit in source.units(index, index, BOOT_NS + int(t_ns)):
@@ -223,7 +228,7 @@ def test_only_the_running_result_counts():
 @pytest.mark.parametrize("flag", [0, 1])
 def test_no_flag_makes_a_sample(result, flag):
     decoder = BridgePoseTrackerDecoder("wrist_left")
-    decoder.decode(poses().hello(), 0)
+    decoder.decode(poses().hello, 0)
     assert decoder.decode(pose_packet(result=result, flag=flag), 1) == {}
     assert decoder.tracking["occluded"] == 1
 
@@ -236,7 +241,7 @@ def pose_packet(result=200, flag=1, seconds=1.0, R=None, index=POSE_INDEX, sourc
 
 def test_a_running_pose_that_is_flagged_invalid_is_left_out():
     decoder = BridgePoseTrackerDecoder("wrist_left")
-    decoder.decode(poses().hello(), 0)
+    decoder.decode(poses().hello, 0)
     assert decoder.decode(pose_packet(flag=0), 1) == {}
 
 
@@ -252,14 +257,14 @@ def test_a_running_pose_that_is_flagged_invalid_is_left_out():
 )
 def test_poses_that_are_none_are_refused_and_counted(damage):
     decoder = BridgePoseTrackerDecoder("wrist_left")
-    decoder.decode(poses().hello(), 0)
+    decoder.decode(poses().hello, 0)
     assert decoder.decode(pose_packet(**damage), 1) == {}
     assert decoder.statistics.refused == 1
 
 
 def test_other_devices_of_the_bridge_are_not_ours():
     decoder = BridgePoseTrackerDecoder("wrist_left")
-    decoder.decode(poses().hello(), 0)
+    decoder.decode(poses().hello, 0)
     assert decoder.decode(pose_packet(index=POSE_INDEX + 1), 1) == {}
     assert not any(decoder.tracking.values())
 
@@ -288,8 +293,8 @@ def test_old_data_is_left_out_and_marked(kind):
 
 def test_two_hands_of_one_bridge_are_told_apart():
     left, right = fingers("left"), fingers("right")
-    devices = (left._hello.devices[0], right._hello.devices[0].model_copy(update={"index": 1}))
-    hello = hello_line(left._hello.model_copy(update={"devices": devices}))
+    devices = [*json.loads(left.hello)["devices"], *json.loads(right.hello)["devices"]]
+    hello = hello_with(left, devices=[{**d, "index": i} for i, d in enumerate(devices)])
     decoder = BridgeFingerTrackerDecoder("left")
     data = hello + left.units(0, 0, 1)[0] + right.units(0, 1, 2)[0] + left.units(1, 2, 3 * MS)[0]
     samples = decoder.decode(data, 10 * MS)["keypoints_left"]
@@ -300,7 +305,7 @@ def test_two_hands_of_one_bridge_are_told_apart():
 def test_a_hand_that_was_not_announced_is_refused():
     decoder = BridgeFingerTrackerDecoder("left")
     with pytest.raises(DeviceError, match="'right'"):
-        decoder.decode(fingers("left").hello() + fingers("right").units(0, 0, 1)[0], 1)
+        decoder.decode(fingers("left").hello + fingers("right").units(0, 0, 1)[0], 1)
 
 
 @pytest.mark.parametrize(
@@ -312,9 +317,9 @@ def test_a_hand_that_was_not_announced_is_refused():
     ],
 )
 def test_nodes_that_are_not_the_25_are_refused(nodes, words):
-    hello = fingers()._hello.model_copy(update={"nodes": nodes})
+    hello = hello_with(fingers(), nodes=nodes)
     with pytest.raises(DeviceError, match=words) as caught:
-        BridgeFingerTrackerDecoder("left").decode(hello_line(hello), 1)
+        BridgeFingerTrackerDecoder("left").decode(hello, 1)
     assert caught.value.details["event"] == "wrong_nodes"
 
 
@@ -369,8 +374,8 @@ def test_a_sign_of_life_is_no_sample_but_ends_the_silence(stage):
 
 
 def test_samples_that_come_with_the_hello_are_not_lost(stage):
-    hello, (unit,) = stage.source.hello(), stage.source.units(0, 0, 5)
-    stage.port._hello = lambda: hello + unit
+    hello, (unit,) = stage.source.hello, stage.source.units(0, 0, 5)
+    stage.port.hello = hello + unit
     stage.driver.open()
     (sample,) = stage.driver.read()["wrist_left"]
     assert sample.sequence == 0
@@ -378,6 +383,6 @@ def test_samples_that_come_with_the_hello_are_not_lost(stage):
 
 def test_a_bridge_without_a_hello_is_refused(stage, monkeypatch):
     monkeypatch.setattr("services.acquisition.drivers.sdk_link.HELLO_READS", 2)
-    stage.port._hello = lambda: b"{"
+    stage.port.hello = b"{"
     with pytest.raises(DeviceError, match="no hello"):
         stage.driver.open()

@@ -6,7 +6,7 @@ import pytest
 from dextouch.episodes import is_keyframe
 from dextouch.errors import DeviceError
 from dextouch.streams import StreamDescriptor
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.devices.camera.driver import (
     ENCODING_CODES,
@@ -121,7 +121,7 @@ def test_the_other_encoding_is_a_device_error():
 def test_quality_of_a_bridges_images(encoding):
     decoder = decoder_of(encoding)
     driver = Driver(
-        "camera_head", transport=SocketPort("c").transport, decoder=decoder, clock=RealClock()
+        "camera_head", transport=SocketPort("c").transport, decoder=decoder, clock=StationClock()
     )
     decoded(decoder, packets(40, encoding))
     assert driver.quality.num_images == 40
@@ -142,6 +142,6 @@ def test_a_damaged_jpeg_is_counted_and_recorded_as_it_came():
 
 def test_settings_of_a_bridge_take_h264():
     wanted = {"kind": "camera", "stream": "camera_head", "port": 5000, "encoding": "h264"}
-    (driver,) = build_drivers(AcquisitionSettings(devices=[wanted]).devices, RealClock())
+    (driver,) = build_drivers(AcquisitionSettings(devices=[wanted]).devices, StationClock())
     assert driver.quality is not None
     assert driver.descriptors[0].unit == "h264"

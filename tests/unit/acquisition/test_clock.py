@@ -1,7 +1,7 @@
 import threading
 from contextlib import closing
 
-from services.acquisition.clock import RealClock, VirtualClock
+from services.acquisition.clock import StationClock, VirtualClock
 
 
 def run_all(targets):
@@ -69,7 +69,7 @@ def test_past_targets_return_at_once():
 
 
 def test_real_clock_waits_and_is_cancelled():
-    clock = RealClock()
+    clock = StationClock()
     waiter = clock.waiter()
     start_ns = clock.now_ns()
     assert waiter.wait_until(start_ns + 2_000_000)

@@ -7,7 +7,7 @@ import pytest
 
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.serving import load_settings
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices import DeviceKind, build_drivers, device_kind, kind_names
 from services.acquisition.settings import AcquisitionSettings
 
@@ -89,7 +89,7 @@ def test_another_package_brings_a_kind_which_is_loaded_when_it_is_named(install)
     }
     # Its build gives no driver, which is told before anything is opened.
     with pytest.raises(InvalidInputError, match=r"'elbow': build gave str, expected a .*Driver"):
-        build_drivers([device], RealClock())
+        build_drivers([device], StationClock())
 
 
 @pytest.mark.parametrize(
@@ -153,20 +153,17 @@ def test_a_kind_that_nobody_brings_is_unknown():
 
 
 @pytest.mark.parametrize(
-    ("old", "new"),
+    "kind",
     [
-        ({"protocol": "dextouch"}, "tactile_glove"),
-        ({"protocol": "wuji"}, "wuji_glove"),
-        (
-            {"protocol": "justfloat", "num_values": 401, "full_scale": 4095, "rate_hz": 60},
-            "justfloat_glove",
-        ),
+        {"kind": "tactile_glove"},
+        {"kind": "wuji_glove"},
+        {"kind": "justfloat_glove", "num_values": 401, "full_scale": 4095, "rate_hz": 60},
     ],
 )
-def test_gloves_named_by_protocol_are_still_read(old, new):
-    told = {"kind": "tactile_glove", "side": "left", "port": "/dev/ttyACM0", **old}
+def test_settings_of_a_glove_are_read_again_as_they_are_written(kind):
+    told = {"side": "left", "port": "/dev/ttyACM0", **kind}
     settings = AcquisitionSettings(devices=[told])
-    assert settings.devices[0].kind == new
+    assert settings.devices[0].kind == kind["kind"]
     assert AcquisitionSettings(devices=settings.model_dump()["devices"]).devices == settings.devices
-    (driver,) = build_drivers(settings.devices, RealClock())
+    (driver,) = build_drivers(settings.devices, StationClock())
     assert driver.name == "glove_left"

@@ -7,7 +7,7 @@ import pytest
 
 from dextouch.errors import DeviceError, InvalidInputError, PacketError
 from dextouch.streams import StreamDescriptor
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices.justfloat_glove.mock import mock_justfloat_glove
 from services.acquisition.devices.tactile_glove.driver import (
     TactileGlove,
@@ -19,9 +19,8 @@ from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mo
 from services.acquisition.devices.wuji_glove.mock import mock_wuji_glove
 from services.acquisition.drivers.packets import Packet
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.place import MockPlace
 from services.acquisition.mocks.ports import PtyPort
-from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.replay import MockPlace, ReplayStream
 
 
 def pressures(count=20):
@@ -39,7 +38,7 @@ def pressures(count=20):
 
 def make(side="left", **options):
     return mock_glove(
-        MockPlace(side, pressures(), DeviceFaults(), 1, RealClock()),
+        MockPlace(f"glove_{side}", pressures(), DeviceFaults(), 1, StationClock()),
         calibration=GloveCalibration.seeded(side, 1),
         **options,
     )
@@ -147,7 +146,7 @@ def test_swapped_gloves_are_named():
 def test_two_gloves_are_told_apart_by_serial_number(glove):
     """The ports of two gloves are exchanged: each driver refuses the other's by its number."""
     driver = TactileGlove(
-        "left", transport=glove.device.port.transport, clock=RealClock(), serial_number="G-77"
+        "left", transport=glove.device.port.transport, clock=StationClock(), serial_number="G-77"
     )
     with pytest.raises(DeviceError, match=r"'glove_left' at /dev/pts/\d+ is not 'G-77'"):
         driver.open()
@@ -157,7 +156,7 @@ def test_two_gloves_are_told_apart_by_serial_number(glove):
 def test_a_silent_device_is_an_error():
     port = PtyPort("mute")
     port.plug()
-    driver = TactileGlove("left", transport=port.transport, clock=RealClock())
+    driver = TactileGlove("left", transport=port.transport, clock=StationClock())
     with pytest.raises(DeviceError, match="no answer to identify"):
         driver.open()
     driver.close()
@@ -181,7 +180,7 @@ def test_commands_with_bit_errors_are_asked_again(glove, monkeypatch):
 
 @pytest.mark.parametrize("make_glove", [mock_wuji_glove, mock_justfloat_glove])
 def test_vendor_gloves_speak_over_a_terminal(make_glove):
-    pair = make_glove(MockPlace("left", pressures(), DeviceFaults(), 1, RealClock()))
+    pair = make_glove(MockPlace("glove_left", pressures(), DeviceFaults(), 1, StationClock()))
     pair.device.port.plug()
     pair.driver.open()
     for index in range(6):

@@ -7,7 +7,7 @@ from dextouch.episodes import GopEncoder, VideoSettings
 from dextouch.errors import NotFoundError
 from dextouch.images import decode_jpeg
 from dextouch.streams import Sample, encoded_values
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.devices.camera.driver import CameraSettings
 from services.acquisition.station import LiveView
@@ -23,7 +23,7 @@ def samples():
 
 
 def test_the_newest_image_is_shown(samples):
-    view = LiveView(build_drivers([CAMERA], RealClock()), {})
+    view = LiveView(build_drivers([CAMERA], StationClock()), {})
     view.accept({"camera_head": samples[3:6]})
     with pytest.raises(NotFoundError, match="key frame"):
         view.jpeg("camera_head", 10)

@@ -7,18 +7,16 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import DeviceError
 from dextouch.schemas import TakePrompt
 from services.acquisition.app import create_app
-from services.acquisition.clock import RealClock, VirtualClock
+from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices.camera.driver import CameraDecoder
-from services.acquisition.devices.finger_tracker.driver import FingerTracker
 from services.acquisition.devices.station_camera.driver import StationCamera
 from services.acquisition.drivers.sdk_link import BridgeDriver
 from services.acquisition.mock_links import MockLinks
-from services.acquisition.mock_station import MockFactory, MockStation
+from services.acquisition.mock_station import MockStation, build_mocks
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import at_rate
 from services.acquisition.settings import AcquisitionSettings
-from services.acquisition.transports.usb import UsbTransport
 from tests.integration.recording_streams import human_streams, robot_streams
 from tests.unit.acquisition.ledgers import accepted
 
@@ -30,15 +28,15 @@ def streams(*names):
 
 
 def build(names, clock=None, **links):
-    factory = MockFactory(
+    pairs = build_mocks(
         streams(*names),
         faults=FaultScript(),
         seed=1,
         clock=clock or VirtualClock(),
         links=MockLinks(**links),
     )
-    pairs = factory.build()
-    return factory.calibration(pairs), [pair.driver for pair in pairs]
+    known = {name: matrix for pair in pairs for name, matrix in pair.calibration.items()}
+    return known, [pair.driver for pair in pairs]
 
 
 def test_by_default_they_are_linked_as_ever():
@@ -51,9 +49,6 @@ def test_each_link_has_the_driver_of_a_real_station():
     trackers = ("keypoints_left", "head")
     _, drivers = build(trackers, trackers="bridge")
     assert [type(driver) for driver in drivers] == [BridgeDriver, BridgeDriver]
-    _, drivers = build(trackers, trackers="usb")
-    assert isinstance(drivers[0], FingerTracker)
-    assert all(isinstance(d.transport._transport, UsbTransport) for d in drivers)
     _, (camera,) = build(("camera_head",), images="h264")
     assert (type(camera.decoder), camera.descriptors[0].unit) == (CameraDecoder, "h264")
     _, (camera,) = build(("camera_head",), cameras="station", images="jpeg")
@@ -65,17 +60,16 @@ def test_trackers_may_give_the_wrists_beside_a_robot():
     made = list({stream.descriptor.name: stream for stream in made}.values())
     names = {}
     for wrists in ("robot", "trackers"):
-        factory = MockFactory(
-            made, faults=FaultScript(), seed=1, clock=VirtualClock(), links=MockLinks(wrists=wrists)
-        )
-        drivers = [pair.driver for pair in factory.build()]
+        links = MockLinks(wrists=wrists)
+        pairs = build_mocks(made, faults=FaultScript(), seed=1, clock=VirtualClock(), links=links)
+        drivers = [pair.driver for pair in pairs]
         names[wrists] = [d.name for driver in drivers for d in driver.descriptors]
         assert ("pose_tracker_wrist_left" in [d.name for d in drivers]) == (wrists == "trackers")
     assert sorted(names["robot"]) == sorted(names["trackers"])
     assert len(set(names["robot"])) == len(names["robot"])
 
 
-@pytest.mark.parametrize(("gloves", "num_values"), [("wuji", 768), ("justfloat", 401)])
+@pytest.mark.parametrize(("gloves", "num_values"), [("wuji_glove", 768), ("justfloat_glove", 401)])
 def test_gloves_of_others_come_without_our_calibration(gloves, num_values):
     calibration, (glove,) = build(("tactile_left",), gloves=gloves)
     assert glove.descriptors[0].shape == (num_values,)
@@ -85,8 +79,8 @@ def test_gloves_of_others_come_without_our_calibration(gloves, num_values):
 @pytest.mark.parametrize(
     "links",
     [
-        MockLinks(gloves="wuji", trackers="usb", cameras="station", images="jpeg"),
-        MockLinks(gloves="justfloat", trackers="bridge", images="h264"),
+        MockLinks(gloves="wuji_glove", cameras="station", images="jpeg"),
+        MockLinks(gloves="justfloat_glove", trackers="bridge", images="h264"),
     ],
 )
 def test_a_take_by_other_links_is_whole(links, tmp_path):
@@ -110,15 +104,15 @@ def test_a_bridge_without_samples_shows_that_it_lives(tmp_path):
         streams("head"),
         FaultScript(),
         1,
-        RealClock(),
+        StationClock(),
         spool_root=tmp_path,
         links=MockLinks(trackers="bridge"),
     )
     with station:
         supervisor = station.station.supervisors[0]
-        waiter = RealClock().waiter()
+        waiter = StationClock().waiter()
         # Longer than a silent bridge would be kept.
-        waiter.wait_until(RealClock().now_ns() + 600_000_000)
+        waiter.wait_until(StationClock().now_ns() + 600_000_000)
         assert supervisor.reconnects == 0
         assert supervisor.driver.statistics.packets >= 5
         take = station.run_take(PROMPT, recording_id="take")
@@ -132,7 +126,7 @@ def test_a_bridge_without_samples_shows_that_it_lives(tmp_path):
 
 def test_a_fault_that_a_device_cannot_have_is_said_so(tmp_path):
     faults = FaultScript(others=DeviceFaults(wrong_side_from_s=0.2))
-    links = MockLinks(gloves="justfloat")
+    links = MockLinks(gloves="justfloat_glove")
     station = MockStation(
         streams("tactile_left"), faults, 1, VirtualClock(), spool_root=tmp_path, links=links
     )
@@ -151,7 +145,7 @@ def test_a_stream_at_another_rate_is_interpolated():
 
 
 async def test_the_setting_reaches_the_service(tmp_path):
-    links = MockLinks(gloves="wuji", trackers="bridge", cameras="station")
+    links = MockLinks(gloves="wuji_glove", trackers="bridge", cameras="station")
     settings = AcquisitionSettings(spool=tmp_path, mock=True, mock_links=links)
     app = create_app(settings)
     async with app.router.lifespan_context(app):

@@ -6,19 +6,26 @@ from pydantic import ValidationError
 
 from dextouch.errors import DeviceError, InvalidInputError, NotFoundError
 from dextouch.streams import Sample, StreamDescriptor
-from services.acquisition.clock import RealClock
-from services.acquisition.devices import CellLayout, DecoderStatistics, Driver, build_drivers
+from services.acquisition.clock import StationClock
+from services.acquisition.devices import (
+    CellLayout,
+    Decoder,
+    DecoderStatistics,
+    Driver,
+    build_drivers,
+)
 from services.acquisition.devices.pose_tracker.driver import MAGIC, PAYLOAD, PoseTrackerDecoder
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
 from services.acquisition.glove_record import is_ours
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import LiveView
+from services.acquisition.transports.ports import SerialTransport
 
 IDS = {"vendor_id": 1, "product_id": 2}
 
 
-class SmallGlove:
+class SmallGlove(Decoder):
     """A decoder of four cells in a row, which nothing feeds."""
 
     statistics = DecoderStatistics()
@@ -43,25 +50,14 @@ class SmallGlove:
         return {}
 
 
-class NoTransport:
-    info = None
-
-    def open(self):
-        pass
-
-    def read(self):
-        return b""
-
-    def write(self, data):
-        pass
-
-    def close(self):
-        pass
-
-
 @pytest.fixture
 def small_glove():
-    return Driver("glove_left", transport=NoTransport(), decoder=SmallGlove(), clock=RealClock())
+    return Driver(
+        "glove_left",
+        transport=SerialTransport(lambda: ""),
+        decoder=SmallGlove(),
+        clock=StationClock(),
+    )
 
 
 def calibration(cells):
@@ -106,7 +102,7 @@ def test_other_places_and_cameras_are_settings():
         {"kind": "camera", "stream": "camera_table", "port": 2},
         {"kind": "station_camera", "stream": "camera_ceiling", "serial_number": "C4"},
     ]
-    drivers = build_drivers(AcquisitionSettings(devices=devices).devices, RealClock())
+    drivers = build_drivers(AcquisitionSettings(devices=devices).devices, StationClock())
     found = [(d.name, d.descriptors[0].name, d.descriptors[0].side) for d in drivers]
     assert found == [
         ("pose_tracker_elbow_left", "elbow_left", "left"),
@@ -127,7 +123,7 @@ def test_eight_gloves_are_told_apart_by_labels():
         {"kind": kind, "side": side, "label": kind, "port": f"/dev/{kind}_{side}", **kinds[kind]}
         for kind, side in gloves
     ]
-    drivers = build_drivers(AcquisitionSettings(devices=devices).devices, RealClock())
+    drivers = build_drivers(AcquisitionSettings(devices=devices).devices, StationClock())
     assert [driver.name for driver in drivers] == [
         "glove_left",
         "glove_right",

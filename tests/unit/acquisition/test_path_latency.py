@@ -10,7 +10,7 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import DeviceError
 from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
-from services.acquisition.clock import RealClock, VirtualClock
+from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices.tactile_glove.driver import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health import HealthCollector, HealthMonitor
@@ -39,7 +39,7 @@ class SimulatedGlove(Driver):
             "glove_left",
             transport=port.transport,
             decoder=TactileGloveDecoder("left"),
-            clock=clock or RealClock(),
+            clock=clock or StationClock(),
         )
         self.rng = np.random.default_rng(seed)
         self.latency_ns = int(self.rng.uniform(0.5e6, 40e6))
@@ -81,7 +81,7 @@ class SimulatedGlove(Driver):
 
 
 def watched(glove, clock=None):
-    clock = clock or RealClock()
+    clock = clock or StationClock()
     supervisor = DeviceSupervisor(glove, sink=lambda *_: None, clock=clock)
     supervisor.connected.set()
     glove.watch = PathWatch([supervisor], clock=clock)
@@ -121,7 +121,7 @@ def test_a_silent_device_is_counted_and_left_alone_for_longer_and_longer():
 def test_a_driver_that_fails_is_said_and_the_others_are_still_asked(monkeypatch):
     broken, glove = SimulatedGlove(), SimulatedGlove(1)
     supervisors = [watched(broken), watched(glove)]
-    watch = broken.watch = glove.watch = PathWatch(supervisors, clock=RealClock())
+    watch = broken.watch = glove.watch = PathWatch(supervisors, clock=StationClock())
     monkeypatch.setattr(broken, "time_round_trip", lambda: None)
     with capture_logs() as logs:
         watch.look()

@@ -14,7 +14,7 @@ from dextouch.errors import InvalidInputError, StorageFullError
 from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition import supervisor
-from services.acquisition.clock import RealClock, VirtualClock
+from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort
@@ -235,7 +235,7 @@ def test_the_real_clock_tells_of_sleep_and_settings(monkeypatch):
     monkeypatch.setattr(time, "clock_gettime_ns", lambda _: shown["boot"])
     monkeypatch.setattr(time, "monotonic_ns", lambda: shown["monotonic"])
     monkeypatch.setattr(time, "time_ns", lambda: shown["wall"])
-    clock = RealClock()
+    clock = StationClock()
     offset_ns = clock.wall_offset_ns()
     assert (clock.now_ns(), clock.suspended_ns()) == (30 * 10**9, 0)
     shown["boot"] += 7 * 10**9  # asleep for 6 s of 7

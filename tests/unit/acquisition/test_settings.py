@@ -6,7 +6,7 @@ from pydantic import ValidationError
 from dextouch.errors import InvalidInputError, StorageError
 from dextouch.serving import ServiceSettings, load_settings
 from services.acquisition.app import create_app
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.settings import AcquisitionSettings
@@ -74,7 +74,7 @@ def test_impossible_options_are_refused(flags):
 
 
 def test_real_devices_become_drivers():
-    drivers = build_drivers(AcquisitionSettings(devices=DEVICES).devices, RealClock())
+    drivers = build_drivers(AcquisitionSettings(devices=DEVICES).devices, StationClock())
     assert [driver.name for driver in drivers] == [
         "glove_left",
         "glove_right",
@@ -110,7 +110,7 @@ def test_two_devices_of_one_stream_are_refused_by_name():
     tracker = {"kind": "pose_tracker", "stream": "wrist_left", "vendor_id": 1, "product_id": 4}
     settings = AcquisitionSettings(devices=(*DEVICES, tracker))
     with pytest.raises(InvalidInputError, match=r"'wrist_left'.*'robot_state'.*pose_tracker_wri"):
-        build_drivers(settings.devices, RealClock())
+        build_drivers(settings.devices, StationClock())
 
 
 def test_a_robot_beside_trackers_gives_the_streams_that_it_is_asked_for():
@@ -121,7 +121,7 @@ def test_a_robot_beside_trackers_gives_the_streams_that_it_is_asked_for():
     ]
     robot = {**DEVICES[-1], "streams": names}
     settings = AcquisitionSettings(devices=(*DEVICES[:-1], *trackers, robot))
-    *_, driver = build_drivers(settings.devices, RealClock())
+    *_, driver = build_drivers(settings.devices, StationClock())
     assert tuple(d.name for d in driver.descriptors) == names
 
 
@@ -129,7 +129,7 @@ def test_a_robot_beside_trackers_gives_the_streams_that_it_is_asked_for():
 def test_a_robot_without_known_streams_is_refused(streams):
     flags = ["--devices", json.dumps([{**DEVICES[-1], "streams": streams}])]
     with pytest.raises(InvalidInputError):
-        build_drivers(load_settings(AcquisitionSettings, flags).devices, RealClock())
+        build_drivers(load_settings(AcquisitionSettings, flags).devices, StationClock())
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_a_robot_without_known_streams_is_refused(streams):
 def test_impossible_stations_are_refused(devices):
     settings = AcquisitionSettings(devices=devices)
     with pytest.raises(InvalidInputError, match=r"station|serial_number"):
-        build_drivers(settings.devices, RealClock())
+        build_drivers(settings.devices, StationClock())
 
 
 def test_calibration_file(tmp_path):

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from dextouch.episodes import is_keyframe
 from dextouch.errors import DeviceError, InvalidInputError
-from services.acquisition.clock import RealClock, VirtualClock
+from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.devices.station_camera.capture import (
     CapturedImage,
@@ -319,7 +319,7 @@ DEVICE = {"kind": "station_camera", "stream": "camera_head", "serial_number": "A
 def test_settings_become_a_driver_that_says_what_is_known():
     wanted = DEVICE | {"latency_ms": 35.5, "latency_sigma_ms": 1.5, "exposure_ms": 8}
     settings = AcquisitionSettings(devices=[wanted | {"encoding": "h264"}])
-    (driver,) = build_drivers(settings.devices, RealClock())
+    (driver,) = build_drivers(settings.devices, StationClock())
     assert isinstance(driver, StationCamera)
     assert driver.descriptors[0].unit == "h264"
     assert driver.calibration() == {
@@ -336,4 +336,4 @@ def test_settings_that_cannot_be():
         AcquisitionSettings(devices=[DEVICE | {"latency_ms": 30}])
     nameless = AcquisitionSettings(devices=[DEVICE | {"serial_number": None}])
     with pytest.raises(InvalidInputError, match="serial_number or its device"):
-        build_drivers(nameless.devices, RealClock())
+        build_drivers(nameless.devices, StationClock())

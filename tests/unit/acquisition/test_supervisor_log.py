@@ -3,13 +3,14 @@
 from structlog.testing import capture_logs
 
 from dextouch.errors import DeviceError
+from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.supervisor import DeviceSupervisor
 
 
-class Waits:
+class Waits(StationClock, Waiter):
     """A clock that jumps to the end of every wait; after the last one the station stops."""
 
     def __init__(self, num_waits):

@@ -45,12 +45,12 @@ def pose_reports():
 
 def finger_bridge():
     source = BridgeFingerTrackerSource(STREAMS["keypoints_left"], side="left", rng=rng())
-    return BridgeFingerTrackerDecoder("left"), [source.hello()], source
+    return BridgeFingerTrackerDecoder("left"), [source.hello], source
 
 
 def pose_bridge():
     source = BridgePoseSource(STREAMS["wrist_left"], faults=PERFECT, rng=rng())
-    return BridgePoseTrackerDecoder("wrist_left"), [source.hello()], source
+    return BridgePoseTrackerDecoder("wrist_left"), [source.hello], source
 
 
 MAKERS = (finger_reports, pose_reports, finger_bridge, pose_bridge)

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices.pose_tracker.driver import (
     BridgePoseTrackerDecoder,
     PoseTrackerDecoder,
@@ -18,8 +18,8 @@ from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.mocks.sdk_link import BridgePort
-from services.acquisition.mocks.usb_backend import UsbPort
 from services.acquisition.supervisor import DeviceSupervisor
+from tests.unit.acquisition.usb_bus import UsbPort
 
 # The promises are tried by `make slow`; the default run must not need an idle machine.
 within_s = pytest.mark.parametrize(
@@ -36,7 +36,7 @@ class Rig:
     def __init__(self, link):
         source_class = BridgePoseSource if link == "bridge" else PoseTrackerSource
         self.source = source_class(STREAM, faults=DeviceFaults(), rng=np.random.default_rng(1))
-        clock = RealClock()
+        clock = StationClock()
         if link == "bridge":
             self.port = BridgePort("LHR-left", self.source.hello)
             decoder = BridgePoseTrackerDecoder("wrist_left", serial_number="LHR-left")

@@ -2,7 +2,7 @@ import pytest
 from pydantic import ValidationError
 
 from dextouch.errors import DeviceError
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.settings import AcquisitionSettings
 
@@ -29,7 +29,7 @@ DEVICES = (
 @pytest.mark.parametrize("device", DEVICES, ids=lambda device: device["kind"])
 def test_each_link_makes_a_driver(device, link):
     settings = AcquisitionSettings(devices=({**device, **LINKS[link]},))
-    (driver,) = build_drivers(settings.devices, RealClock())
+    (driver,) = build_drivers(settings.devices, StationClock())
     assert str(driver.info) == ADDRESSES[link]
     assert driver.descriptors[0].name in {"wrist_left", "keypoints_left"}
 
@@ -56,6 +56,6 @@ def test_contradictory_links_are_refused(device, link):
 def test_an_absent_bridge_is_a_device_error(link, tmp_path, unused_tcp_port):
     where = {"path": str(tmp_path / "none.sock")} if "path" in link else {"port": unused_tcp_port}
     device = {**DEVICES[0], "link": "bridge", **where}
-    (driver,) = build_drivers(AcquisitionSettings(devices=(device,)).devices, RealClock())
+    (driver,) = build_drivers(AcquisitionSettings(devices=(device,)).devices, StationClock())
     with pytest.raises(DeviceError, match="cannot be opened"):
         driver.open()

@@ -6,9 +6,14 @@ import pytest
 import usb.core
 
 from dextouch.errors import DeviceError
-from services.acquisition.mocks.usb_backend import ENDPOINT_IN, ENDPOINT_OUT, FIFO_REPORTS
 from services.acquisition.transports.usb import UsbAddress, UsbTransport
-from tests.unit.acquisition.usb_bus import OddUsbBus, OddUsbDevice
+from tests.unit.acquisition.usb_bus import (
+    ENDPOINT_IN,
+    ENDPOINT_OUT,
+    FIFO_REPORTS,
+    OddUsbBus,
+    OddUsbDevice,
+)
 
 REPORT = bytes(range(64))
 IDS = (0x28DE, 0x2300)

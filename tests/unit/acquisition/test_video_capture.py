@@ -6,7 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from dextouch.errors import DeviceError
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices.station_camera.capture import (
     CapturedImage,
     OpenCvCapture,
@@ -77,7 +77,7 @@ def test_a_video_file_comes_back_in_the_right_colours(video):
 
 def test_a_video_file_through_the_driver_has_arrival_stamps_only(video):
     link = FileCapture(lambda: video, REQUEST)
-    camera = StationCamera(REQUEST, link=link, clock=RealClock(), max_encode_wait_s=20.0)
+    camera = StationCamera(REQUEST, link=link, clock=StationClock(), max_encode_wait_s=20.0)
     camera.open()
     samples = [camera.read()["camera_head"][0] for _ in range(NUM_IMAGES)]
     with pytest.raises(DeviceError, match="no more images"):

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from dextouch.errors import DeviceError
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
 
 # How long anything may take on an emulated processor.
@@ -51,7 +51,7 @@ def opened():
     drivers = []
 
     def opener(settings):
-        (driver,) = build_drivers([settings], RealClock())
+        (driver,) = build_drivers([settings], StationClock())
         drivers.append(driver)
         reopen(driver)
         return driver

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from services.acquisition.clock import RealClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.devices.tactile_glove.driver import TactileGloveSettings
 from services.acquisition.devices.tactile_glove.mock import GloveAnswers
@@ -129,7 +129,7 @@ def test_a_station_reads_on_when_its_glove_is_put_back(plug, measured):
     glove = GloveOnALine(gadget)
     glove.packets = (data for number in count() for data in packets.glove_packets(number, 1))
     glove.start()
-    clock, samples = RealClock(), []
+    clock, samples = StationClock(), []
     settings = TactileGloveSettings(side="left", serial_number="GLOVE-L")
     (driver,) = build_drivers([settings], clock)
     station = DeviceSupervisor(

@@ -3,10 +3,10 @@
 from services.acquisition.devices.camera.driver import ENCODING_CODES, MAGIC, PAYLOAD_HEADER
 from services.acquisition.drivers.image_encoding import ImageEncoder, ImageEncoding
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.replay import PacketSource, ReplayStream
 
 
-class CameraSource:
+class CameraSource(PacketSource):
     """Packets of one camera.
 
     Args:

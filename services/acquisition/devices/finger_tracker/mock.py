@@ -21,29 +21,30 @@ from services.acquisition.drivers.reports import (
     DESCRIPTOR_REPORT,
     split_into_reports,
 )
-from services.acquisition.drivers.sdk_link import (
-    PROTOCOL,
-    PROTOCOL_VERSION,
-    BridgedDevice,
-    BridgeHello,
-    FrameConvention,
-)
+from services.acquisition.drivers.sdk_link import FrameConvention
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.ledger import Fate
-from services.acquisition.mocks.place import REPORT_PORTS, MockPair, TrackerPlace
-from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
+from services.acquisition.mocks.ports import HidPort
+from services.acquisition.mocks.replay import (
+    MockDevice,
+    MockPair,
+    MockPlace,
+    PacketSource,
+    ReplayStream,
+    device_rng,
+)
 from services.acquisition.mocks.sdk_link import (
     LEFT_HANDED,
-    SOFTWARE,
+    BridgeSource,
     bridged_pair,
-    hello_line,
+    mock_hello,
 )
 
 # What an occluded tracker does not see.
 _HIDDEN = chain_indices("thumb")
 
 
-class TrackedFingers:
+class TrackedFingers(PacketSource):
     """What a finger tracker sees of a hand: points with noise, and nodes that are hidden.
 
     Args:
@@ -110,7 +111,7 @@ class FingerTrackerSource(TrackedFingers):
         return split_into_reports(DESCRIPTOR_REPORT, 0, encode_packet(DESCRIPTOR_MAGIC, packet))
 
 
-class BridgeFingerTrackerSource(TrackedFingers):
+class BridgeFingerTrackerSource(TrackedFingers, BridgeSource):
     """A finger tracker's SDK: in its own frame and centimetres, nodes in its own order.
 
     Args:
@@ -134,20 +135,13 @@ class BridgeFingerTrackerSource(TrackedFingers):
     ) -> None:
         super().__init__(stream, side=side, rng=rng, faults=faults)
         self._ours_from_theirs = frame.ours_from_theirs()
-        self._hello = BridgeHello(
-            protocol=PROTOCOL,
-            version=PROTOCOL_VERSION,
+        self.hello = mock_hello(
             kind="finger_tracker",
-            software=SOFTWARE,
-            devices=(BridgedDevice(index=0, serial_number=f"MF-{side}", source=side),),
+            devices=({"index": 0, "serial_number": f"MF-{side}", "source": side},),
             frame=frame,
             length_unit="cm",
             nodes=tuple(NODES[node] for node in self._order),
         )
-
-    def hello(self) -> bytes:
-        """Who is there, and the order of the nodes."""
-        return hello_line(self._hello)
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet."""
@@ -157,21 +151,15 @@ class BridgeFingerTrackerSource(TrackedFingers):
         return 100.0 * points_m @ self._ours_from_theirs
 
 
-def mock_finger_tracker(side: Side, stream: ReplayStream, place: TrackerPlace) -> MockPair:
-    """A finger tracker of one hand.
-
-    Args:
-        side: which hand.
-        stream: [n, 25, 3] in m, wrist frame.
-        place: link, faults, seed and clock.
-    """
-    name, faults = f"finger_tracker_{side}", place.faults
-    rng = device_rng(place.seed, f"noise_{name}")
+def mock_finger_tracker(place: MockPlace) -> MockPair:
+    """A finger tracker of one hand; the stream of its place is [n, 25, 3] in m, wrist frame."""
+    rng = device_rng(place.seed, f"noise_{place.name}")
     if place.link == "bridge":
-        bridge = BridgeFingerTrackerSource(stream, side=side, rng=rng, faults=faults)
-        return bridged_pair(name, bridge, BridgeFingerTrackerDecoder(side), place)
-    source = FingerTrackerSource(stream, side=side, rng=rng, faults=faults)
-    port = REPORT_PORTS[place.link](name, answer=source.answer)
-    driver = FingerTracker(name, side, transport=port.transport, clock=place.clock)
-    device = MockDevice(name, source=source, port=port, faults=faults, seed=place.seed)
-    return MockPair(device, driver)
+        bridge = BridgeFingerTrackerSource(
+            place.stream, side=place.side, rng=rng, faults=place.faults
+        )
+        return bridged_pair(place, bridge, BridgeFingerTrackerDecoder(place.side))
+    source = FingerTrackerSource(place.stream, side=place.side, rng=rng, faults=place.faults)
+    port = HidPort(place.name, answer=source.answer)
+    driver = FingerTracker(place.name, place.side, transport=port.transport, clock=place.clock)
+    return MockPair(MockDevice(place, source, port), driver)

@@ -8,8 +8,13 @@ from jaxtyping import Float32
 from dextouch.tactile.layout import NUM_TAXELS
 from services.acquisition.devices.justfloat_glove.driver import TAIL, JustFloatGloveDecoder
 from services.acquisition.mocks.faults import PacketEdits, Pinned, without_first
-from services.acquisition.mocks.place import MockPair, MockPlace, serial_mock
-from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.replay import (
+    MockPair,
+    MockPlace,
+    PacketSource,
+    ReplayStream,
+    serial_mock,
+)
 
 COUNTS_PER_KPA = 40.0
 NUM_VALUES = 401
@@ -44,7 +49,7 @@ class JustFloatPacketEdits(PacketEdits):
         return encode_justfloat(without_first(_values(data)))
 
 
-class JustFloatGloveSource:
+class JustFloatGloveSource(PacketSource):
     """Packets of one glove: the taxels' counts, then zeros in the slots that mean nothing.
 
     Args:

@@ -23,23 +23,19 @@ from services.acquisition.devices.pose_tracker.poses import TrackingState, sourc
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
-from services.acquisition.drivers.sdk_link import (
-    PROTOCOL,
-    PROTOCOL_VERSION,
-    BridgedDevice,
-    BridgeHello,
-    FrameConvention,
-)
+from services.acquisition.drivers.sdk_link import FrameConvention
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.ledger import Fate
-from services.acquisition.mocks.place import REPORT_PORTS, MockPair, TrackerPlace
-from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
-from services.acquisition.mocks.sdk_link import (
-    SOFTWARE,
-    Y_UP,
-    bridged_pair,
-    hello_line,
+from services.acquisition.mocks.ports import HidPort
+from services.acquisition.mocks.replay import (
+    MockDevice,
+    MockPair,
+    MockPlace,
+    PacketSource,
+    ReplayStream,
+    device_rng,
 )
+from services.acquisition.mocks.sdk_link import Y_UP, BridgeSource, bridged_pair, mock_hello
 
 POSE_INDEX = 3
 RESULTS = {
@@ -54,7 +50,7 @@ DRIFT_M_PER_S = 0.5
 JUMP_M = (1.0, 0.0, 0.0)
 
 
-class TrackedPoses:
+class TrackedPoses(PacketSource):
     """What a tracker says of a body: poses with noise and tracking faults, and the truth of these.
 
     Args:
@@ -138,7 +134,7 @@ def add_pose_noise(
     return noisy
 
 
-class BridgePoseSource(TrackedPoses):
+class BridgePoseSource(TrackedPoses, BridgeSource):
     """An OpenVR-like source of one tracker: y up, matrices, and a flag that stays set when lost.
 
     Args:
@@ -162,19 +158,9 @@ class BridgePoseSource(TrackedPoses):
         self._theirs_from_ours = frame.ours_from_theirs().T
         number = f"LHR-{self.source}"
         device = {"index": POSE_INDEX, "serial_number": number, "source": self.source}
-        self._hello = BridgeHello(
-            protocol=PROTOCOL,
-            version=PROTOCOL_VERSION,
-            kind="pose_tracker",
-            software=SOFTWARE,
-            devices=(BridgedDevice.model_validate(device),),
-            frame=frame,
-            length_unit="m",
+        self.hello = mock_hello(
+            kind="pose_tracker", devices=(device,), frame=frame, length_unit="m"
         )
-
-    def hello(self) -> bytes:
-        """Who is there."""
-        return hello_line(self._hello)
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet; its pose is flagged valid whatever the result says."""
@@ -191,22 +177,15 @@ class BridgePoseSource(TrackedPoses):
         return np.concatenate([R, (self.poses[:, :3] @ M.T)[:, :, None]], axis=2)
 
 
-def mock_pose_tracker(stream: ReplayStream, place: TrackerPlace) -> MockPair:
-    """A pose tracker.
-
-    Args:
-        stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
-        place: link, faults, seed and clock.
-    """
+def mock_pose_tracker(place: MockPlace) -> MockPair:
+    """A pose tracker; the stream of its place is [n, 7], x y z (m) qw qx qy qz in the world."""
+    stream, faults = place.stream, place.faults
     where = stream.descriptor.name
-    name, faults = f"pose_tracker_{where}", place.faults
-    rng = device_rng(place.seed, f"noise_{name}")
+    rng = device_rng(place.seed, f"noise_{place.name}")
     if place.link == "bridge":
         bridge = BridgePoseSource(stream, faults=faults, rng=rng)
-        return bridged_pair(name, bridge, BridgePoseTrackerDecoder(where), place)
-    source = PoseTrackerSource(stream, faults=faults, rng=rng)
-    port = REPORT_PORTS[place.link](name)
+        return bridged_pair(place, bridge, BridgePoseTrackerDecoder(where))
+    source, port = PoseTrackerSource(stream, faults=faults, rng=rng), HidPort(place.name)
     decoder = PoseTrackerDecoder(where)
-    driver = Driver(name, transport=port.transport, decoder=decoder, clock=place.clock)
-    device = MockDevice(name, source=source, port=port, faults=faults, seed=place.seed)
-    return MockPair(device, driver)
+    driver = Driver(place.name, transport=port.transport, decoder=decoder, clock=place.clock)
+    return MockPair(MockDevice(place, source, port), driver)

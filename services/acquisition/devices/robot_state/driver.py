@@ -11,7 +11,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor, StreamKind
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kind import DeviceKind, TcpSettings
-from services.acquisition.drivers.base import Driver, Readings, check_packet
+from services.acquisition.drivers.base import Decoder, Driver, Readings, check_packet
 from services.acquisition.drivers.packets import PacketDecoder
 from services.acquisition.transports.ports import tcp_transport
 
@@ -56,7 +56,7 @@ def robot_descriptor(stream: str) -> StreamDescriptor:
     )
 
 
-class RobotStateDecoder:
+class RobotStateDecoder(Decoder):
     """One packet gives one sample of each stream, all with the same stamps.
 
     Args:

@@ -7,10 +7,10 @@ import numpy as np
 from dextouch.errors import InvalidInputError
 from services.acquisition.devices.robot_state.driver import MAGIC, STREAM_SIZES
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.replay import PacketSource, ReplayStream
 
 
-class RobotStateSource:
+class RobotStateSource(PacketSource):
     """Packets of one robot.
 
     Args:

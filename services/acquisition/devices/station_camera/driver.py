@@ -29,7 +29,7 @@ from services.acquisition.devices.station_camera.capture import (
     find_camera,
     nanoseconds,
 )
-from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.base import Decoder, Driver, Readings
 from services.acquisition.drivers.image_encoding import (
     EncodingQueue,
     ImageEncoder,
@@ -51,7 +51,7 @@ MAX_AHEAD_NS = 100_000
 MAX_BAD_STAMPS = 10
 
 
-class DriverStamps:
+class DriverStamps(Decoder):
     """The decoder's part of a camera that gives images and no bytes: judges its driver's stamps.
 
     Gives each image its device time and number, or refuses it and counts that. The number counts
@@ -60,32 +60,26 @@ class DriverStamps:
 
     def __init__(self, settings: StationCameraSettings) -> None:
         self.statistics = DecoderStatistics()
+        # Without device time once the driver's stamps proved useless.
+        self.descriptors = (
+            StreamDescriptor(
+                name=settings.stream,
+                kind="image",
+                shape=(*settings.size_px, 3),
+                dtype="uint8",
+                unit=settings.encoding,
+                nominal_rate_hz=settings.rate_hz,
+                frame=settings.stream,
+                device=settings.stream,
+                capabilities=ClockCapabilities(device_time=True, tick_ns=STAMP_TICK_NS),
+            ),
+        )
         self.usable: bool | None = None
         self.least_delay_ns: int | None = None
         self._settings = settings
         self._last_ns: int | None = None
         self._number = 0
         self._num_bad = 0
-
-    @property
-    def descriptors(self) -> tuple[StreamDescriptor, ...]:
-        """The image stream; without device time once the driver's stamps proved useless."""
-        settings = self._settings
-        has_time = self.usable is not False
-        descriptor = StreamDescriptor(
-            name=settings.stream,
-            kind="image",
-            shape=(*settings.size_px, 3),
-            dtype="uint8",
-            unit=settings.encoding,
-            nominal_rate_hz=settings.rate_hz,
-            frame=settings.stream,
-            device=settings.stream,
-            capabilities=ClockCapabilities(
-                device_time=has_time, tick_ns=STAMP_TICK_NS if has_time else 1
-            ),
-        )
-        return (descriptor,)
 
     def reset(self) -> None:
         """There is no half image."""
@@ -106,7 +100,9 @@ class DriverStamps:
             DeviceError: the stamps have left the host's clock; they are not used any more.
         """
         if self.usable is None:
-            self.usable = _is_plausible(t_driver_ns, t_host_ns, MAX_FIRST_AGE_NS)
+            self.usable = True
+            if not _is_plausible(t_driver_ns, t_host_ns, MAX_FIRST_AGE_NS):
+                self._give_up()
         if not self.usable:
             return NO_DEVICE_TIME, NO_SEQUENCE
         if t_driver_ns is None or not _is_plausible(t_driver_ns, t_host_ns, MAX_AGE_NS):
@@ -129,11 +125,17 @@ class DriverStamps:
             self.least_delay_ns = delay_ns
         return t_driver_ns, self._number
 
+    def _give_up(self) -> None:
+        self.usable = False
+        (descriptor,) = self.descriptors
+        without = {"capabilities": ClockCapabilities()}
+        self.descriptors = (descriptor.model_copy(update=without),)
+
     def _refuse(self) -> None:
         self.statistics.refused += 1
         self._num_bad += 1
         if self._num_bad >= MAX_BAD_STAMPS:
-            self.usable = False
+            self._give_up()
             raise DeviceError(
                 f"{self._settings.stream}: {self._num_bad} timestamps in a row are "
                 "not on this host's clock, unlike the first ones; from now on its images have "

@@ -16,58 +16,32 @@ from services.acquisition.devices.station_camera.capture import (
     StationCameraSettings,
 )
 from services.acquisition.devices.station_camera.driver import StationCamera
-from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.place import MockPair
-from services.acquisition.mocks.ports import Link, ReportDevice
-from services.acquisition.mocks.replay import MockDevice, ReplayStream
+from services.acquisition.mocks.ports import ReportPort
+from services.acquisition.mocks.replay import (
+    MockDevice,
+    MockPair,
+    MockPlace,
+    PacketSource,
+    ReplayStream,
+)
 
 UNIT_HEADER = struct.Struct("<qHH")
 # With a virtual clock, time must not go on while an image is being encoded.
 LOCKSTEP_WAIT_S = 20.0
 
 
-class VideoPort(ReportDevice):
+class VideoPort(ReportPort):
     """The device's end of a camera; each opening of the host gets a new capture."""
 
     # V4L2 drivers fill their buffers and lose later images.
     max_reports = 4
-    has_bit_errors = False
+    transport: "MockCapture"
 
     def __init__(self, name: str) -> None:
         super().__init__()
-        self.link = Link()
         # What the camera states, if anything.
         self.exposure_ns: int | None = None
         self.transport = MockCapture(self, name)
-
-    def plug(self) -> None:
-        """Plug in."""
-        self.set_plugged(plugged=True)
-
-    def unplug(self) -> None:
-        """Pull out: a waiting host notices at once."""
-        self.flush()
-        self.set_plugged(plugged=False)
-
-    def send(self, unit: bytes) -> bool:
-        """An image is there; False when all buffers were full."""
-        self.link.add_sent(len(unit))
-        taken = self.is_plugged and self.push(unit)
-        if not taken:
-            self.link.add_sent(-len(unit))
-        return taken
-
-    def take(self, timeout_s: float) -> bytes:
-        """The oldest image; b"" when none comes in time.
-
-        Raises:
-            DeviceError: unplugged.
-        """
-        with self._changed:
-            self._changed.wait_for(lambda: self._reports or not self.is_plugged, timeout_s)
-            if not self.is_plugged:
-                raise DeviceError(f"{self.transport.info}: unplugged while reading")
-            return self._reports.popleft() if self._reports else b""
 
 
 class MockCapture(CaptureLink[VideoPort]):
@@ -82,7 +56,10 @@ class MockCapture(CaptureLink[VideoPort]):
         """Fetch the next image; images fetched before have been processed by now."""
         port = self._opened()
         port.link.add_consumed(len(self._unit))
-        self._unit = port.take(timeout_s)
+        try:
+            self._unit = port.fetch(timeout_s)
+        except OSError as error:
+            raise DeviceError(f"{self.info}: unplugged while reading") from error
         return bool(self._unit)
 
     def retrieve(self) -> CapturedImage | None:
@@ -95,8 +72,7 @@ class MockCapture(CaptureLink[VideoPort]):
 
     def _connect(self) -> VideoPort:
         port = self._port
-        if not port.is_plugged:
-            raise DeviceError(f"{self.info}: is not plugged in")
+        port.check_plugged()
         port.flush()
         port.link.set_open(is_open=True)
         self.exposure_ns, self._unit = port.exposure_ns, b""
@@ -106,7 +82,7 @@ class MockCapture(CaptureLink[VideoPort]):
         handle.link.set_open(is_open=False)
 
 
-class VideoSource:
+class VideoSource(PacketSource):
     """Images with the stamps of the kernel.
 
     Args:
@@ -135,34 +111,25 @@ class VideoDevice(MockDevice):
         return super().play(clock, waiter, start_host_ns=start_host_ns, offset_ns=offset_ns)
 
 
-def video_camera(
-    stream: ReplayStream,
-    *,
-    faults: DeviceFaults,
-    seed: int,
-    clock: StationClock,
-    **settings: float | str,
-) -> MockPair:
+def video_camera(place: MockPlace, **settings: float | str) -> MockPair:
     """A mock camera that plays a stream of images, and its driver.
 
     Args:
-        stream: of the episode.
-        faults: what disturbs it.
-        seed: of everything random.
-        clock: of the station.
+        place: where it stands; its name is that of the stream.
         settings: what the station knows of the camera besides its size and rate, such as its
             `encoding`.
     """
-    name = stream.descriptor.name
-    port = VideoPort(name)
-    height_px, width_px = stream.descriptor.shape[:2]
-    known = {"height_px": height_px, "width_px": width_px, **settings}
-    rate_hz = stream.descriptor.nominal_rate_hz
+    port, descriptor = VideoPort(place.name), place.stream.descriptor
+    known = {
+        "stream": place.name,
+        "rate_hz": descriptor.nominal_rate_hz,
+        "height_px": descriptor.shape[0],
+        "width_px": descriptor.shape[1],
+    }
     driver = StationCamera(
-        StationCameraSettings.model_validate({"stream": name, "rate_hz": rate_hz, **known}),
+        StationCameraSettings.model_validate({**known, **settings}),
         link=port.transport,
-        clock=clock,
+        clock=place.clock,
         max_encode_wait_s=LOCKSTEP_WAIT_S,
     )
-    device = VideoDevice(name, source=VideoSource(stream), port=port, faults=faults, seed=seed)
-    return MockPair(device, driver)
+    return MockPair(VideoDevice(place, VideoSource(place.stream), port), driver)

@@ -30,9 +30,15 @@ from services.acquisition.drivers.packets import (
     encode_packet,
 )
 from services.acquisition.mocks.faults import OurPacketEdits, Pinned, edit_ours
-from services.acquisition.mocks.place import MockPair, MockPlace
 from services.acquisition.mocks.ports import PtyPort
-from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
+from services.acquisition.mocks.replay import (
+    MockDevice,
+    MockPair,
+    MockPlace,
+    PacketSource,
+    ReplayStream,
+    device_rng,
+)
 
 FIRMWARE = (1, 0, 0)
 OFFSET_COUNTS = 120.0
@@ -136,7 +142,7 @@ def mock_glove(
         told, serial_number=name, device_time_ns=lambda: _device_time_ns(device, place.clock)
     )
     port = PtyPort(name, answer=answers.answer)
-    device = MockDevice(name, source=source, port=port, faults=place.faults, seed=place.seed)
+    device = MockDevice(place, source, port)
     driver = TactileGlove(side, transport=port.transport, clock=place.clock, serial_number=name)
     return MockPair(device, driver, glove.matrices(side))
 
@@ -155,7 +161,7 @@ class GlovePacketEdits(OurPacketEdits):
         return edit_ours(data, pinned)
 
 
-class TactileGloveSource:
+class TactileGloveSource(PacketSource):
     """Packets of one glove.
 
     Args:

@@ -24,8 +24,14 @@ from services.acquisition.devices.wuji_glove.driver import (
     crc16,
 )
 from services.acquisition.mocks.faults import PacketEdits, Pinned, without_first
-from services.acquisition.mocks.place import MockPair, MockPlace, serial_mock
-from services.acquisition.mocks.replay import ReplayStream, at_rate
+from services.acquisition.mocks.replay import (
+    MockPair,
+    MockPlace,
+    PacketSource,
+    ReplayStream,
+    at_rate,
+    serial_mock,
+)
 
 FULL_SCALE_KPA = 100.0
 # What pinned cells show, in parts of full scale.
@@ -72,7 +78,7 @@ class WujiPacketEdits(PacketEdits):
         return _edited(data, lambda hand, cells: (1 - hand, cells))
 
 
-class WujiGloveSource:
+class WujiGloveSource(PacketSource):
     """Packets of one glove.
 
     Args:
