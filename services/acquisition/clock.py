@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
 
 # Far more than the fraction of a millisecond that reading two clocks or slewing one takes.
 MIN_NOTICED_NS = 100_000_000
@@ -25,7 +24,6 @@ class StationClock:
 
     def waiter(self, *, drives_time: bool = False) -> "Waiter":
         """A new waiter. `drives_time` only matters to a virtual clock."""
-        del drives_time
         return Waiter(self)
 
     def suspended_ns(self) -> int:
@@ -185,45 +183,29 @@ class PeriodicCall:
                 self._call()
 
 
-@dataclass
-class HostEvent:
-    """How often something happened to the host, when first and for how long altogether."""
-
-    count: int = 0
-    first_t_host_ns: int = 0
-    total_ns: int = 0
-
-    def add(self, t_host_ns: int, duration_ns: int) -> None:
-        """Once more."""
-        if not self.count:
-            self.first_t_host_ns = t_host_ns
-        self.count += 1
-        self.total_ns += duration_ns
-
-
 class HostWatch:
     """Finds out, at every `look`, whether the host slept or its wall clock was set meanwhile.
 
     Neither touches the stamps: the station's clock counts on through sleep and nobody sets it. But
     both explain things (a gap in all streams; a `started_at` that does not fit), so they are told.
+
+    Attributes:
+        events: by name, when each was noticed on the station's clock and how long it was, in ns.
     """
 
     def __init__(self, clock: StationClock) -> None:
         self._clock = clock
-        self.events = {"host_suspended": HostEvent(), "wall_clock_set": HostEvent()}
-        self._suspended_ns, self._wall_offset_ns = clock.suspended_ns(), clock.wall_offset_ns()
+        self.events: dict[str, list[tuple[int, int]]] = {"host_suspended": [], "wall_clock_set": []}
+        self._before_ns = clock.suspended_ns(), clock.wall_offset_ns()
 
     def look(self) -> None:
         """Compare with the last look."""
-        suspended_ns = self._clock.suspended_ns()
-        wall_offset_ns = self._clock.wall_offset_ns()
-        asleep_ns = suspended_ns - self._suspended_ns
-        if asleep_ns > MIN_NOTICED_NS:
-            self.events["host_suspended"].add(self._clock.now_ns(), asleep_ns)
-        set_ns = wall_offset_ns - self._wall_offset_ns
-        if abs(set_ns) > MIN_NOTICED_NS:
-            self.events["wall_clock_set"].add(self._clock.now_ns(), abs(set_ns))
-        self._suspended_ns, self._wall_offset_ns = suspended_ns, wall_offset_ns
+        after_ns = self._clock.suspended_ns(), self._clock.wall_offset_ns()
+        steps_ns = (abs(b - a) for a, b in zip(self._before_ns, after_ns, strict=True))
+        for events, step_ns in zip(self.events.values(), steps_ns, strict=True):
+            if step_ns > MIN_NOTICED_NS:
+                events.append((self._clock.now_ns(), step_ns))
+        self._before_ns = after_ns
 
     def problems(self) -> tuple[str, ...]:
         """What happened, in words."""
@@ -234,7 +216,7 @@ class HostWatch:
             "are not affected, but started_at may be wrong",
         }
         return tuple(
-            texts[name].format(s=event.total_ns / 1e9)
-            for name, event in self.events.items()
-            if event.count
+            texts[name].format(s=sum(step_ns for _, step_ns in events) / 1e9)
+            for name, events in self.events.items()
+            if events
         )

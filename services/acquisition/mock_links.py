@@ -9,17 +9,7 @@ from services.acquisition.devices.registry import kind_names
 
 
 class MockLinks(FrozenModel):
-    """Which of the ways that real stations know the mock devices of a station take.
-
-    Attributes:
-        gloves: the kind of both gloves, ours or one that another package brings. Each says what a
-            calibrated station knows of it.
-        trackers: finger and pose trackers by HID, or behind an SDK's bridge.
-        cameras: images over a socket, or from a camera on the station's own bus.
-        wrists: whether a robot or pose trackers give the wrists where there is a robot's state; its
-            packets hold them in any case.
-        images: how images are encoded: by the bridge, or by the station for a camera of its own.
-    """
+    """Which of the ways that real stations know the mock devices of a station take."""
 
     gloves: str = Field(
         default="tactile_glove", description="kind of both gloves, ours or of another package"
@@ -28,13 +18,13 @@ class MockLinks(FrozenModel):
         default="hid", description="how finger and pose trackers are connected"
     )
     wrists: Literal["robot", "trackers"] = Field(
-        default="robot", description="what gives the poses of the wrists"
+        default="robot", description="what gives the poses of the wrists where there is a robot"
     )
     cameras: Literal["bridge", "station"] = Field(
         default="bridge", description="images over a socket, or from a camera on the station's bus"
     )
     images: Literal["rgb8", "jpeg", "h264"] = Field(
-        default="rgb8", description="how images are encoded"
+        default="rgb8", description="how the bridge, or the station, encodes images"
     )
 
     @field_validator("gloves")

@@ -305,10 +305,10 @@ class TakeWatch:
             name = fact.descriptor.name
             entries += [LedgerEntry(stream=name, event=e, count=n) for e, n in counted.items() if n]
         entries += [
-            LedgerEntry(stream=name, event=event, count=e.count, first_t_host_ns=e.first_t_host_ns)
+            LedgerEntry(stream=name, event=event, count=len(e), first_t_host_ns=e[0][0])
             for name in self.streams
             for event, e in self._host.events.items()
-            if e.count
+            if e
         ]
         known = {(entry.stream, entry.event) for entry in entries}
         # Where the devices count the same event themselves, their count is the exact one.

@@ -12,11 +12,16 @@ from services.acquisition.devices.tactile_glove.driver import (
     MAGIC,
     REQUEST,
     TactileGloveDecoder,
-    encode_request,
 )
 from services.acquisition.devices.wuji_glove.driver import WujiGloveDecoder
 from services.acquisition.devices.wuji_glove.mock import encode_wuji
-from services.acquisition.drivers.packets import Packet, PacketDecoder, encode_packet
+from services.acquisition.drivers.packets import (
+    SOURCES,
+    VERSION,
+    Packet,
+    PacketDecoder,
+    encode_packet,
+)
 
 NUM_VALUES = 401
 FULL_SCALE = 4095.0
@@ -64,8 +69,9 @@ class _Requests:
 
 def _request(sequence, rng):
     command, argument = int(rng.integers(256)), int(rng.integers(65536))
-    data = encode_request(command, argument=argument, request=sequence)
-    return data, REQUEST.pack(command, argument)
+    payload = REQUEST.pack(command, argument)
+    packet = Packet(VERSION, SOURCES["none"], sequence, 0, payload)
+    return encode_packet(COMMAND_MAGIC, packet), payload
 
 
 def _justfloat_decoder():

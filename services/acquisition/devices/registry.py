@@ -75,7 +75,6 @@ def _package_of(point: EntryPoint) -> str:
 @lru_cache(maxsize=4)
 def _points(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     """Ours, then those of installed packages; looking through the folders of `path` takes 0.1 s."""
-    del path
     ours = [
         EntryPoint(folder.name, f"{__package__}.{folder.name}.driver:KIND", ENTRY_POINT_GROUP)
         for folder in pkgutil.iter_modules([str(Path(__file__).parent)])

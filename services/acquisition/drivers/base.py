@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Generic
+from typing import Any, Generic
 
 from dextouch.errors import DeviceError
 from dextouch.schemas import Matrix
@@ -118,6 +118,14 @@ class StreamDecoder(Decoder, Generic[Found]):
 def hand_name(side: Side, label: str | None = None) -> str:
     """A hand's part in names of streams and devices: `left`, or `left_LABEL` of a further one."""
     return side if label is None else f"{side}_{label}"
+
+
+def glove_stream(side: Side, label: str | None, **about: Any) -> StreamDescriptor:  # noqa: ANN401 - fields of a descriptor
+    """The raw stream of one glove; `about` are shape, dtype, unit, rate and clock of its family."""
+    hand = hand_name(side, label)
+    return StreamDescriptor(
+        name=f"tactile_{hand}", kind="tactile", side=side, device=f"glove_{hand}", **about
+    )
 
 
 class Driver:

@@ -53,8 +53,8 @@ class SequenceCounter:
 
     A decreasing number is a late packet if it is missing among the last 64 and its time of the
     device is not before theirs, a repeated one if it came among these at the same time, otherwise
-    a restart of the device. The frames of a `FrameSearch` that are late or repeated are left out,
-    which leaves a gap.
+    a restart of the device, once where the number never changes. The frames of a `FrameSearch` that
+    are late or repeated are left out, which leaves a gap.
     """
 
     def __init__(self, statistics: DecoderStatistics, *, bits: int) -> None:
@@ -98,8 +98,9 @@ class SequenceCounter:
         if self._is_repeated(came) and not (is_restarted and t_device_ns is None):
             statistics.repeated += 1
             return
-        if 0 < step < self._modulus // 2 and not is_restarted:
-            statistics.lost += step - 1
+        stands_still = step == 0 and self._stands_still(sequence)
+        if (0 < step < self._modulus // 2 or stands_still) and not is_restarted:
+            statistics.lost += max(0, step - 1)
             self._go_on(sequence, step)
         else:
             statistics.restarts += 1
@@ -115,6 +116,11 @@ class SequenceCounter:
         # As long before the oldest of the newest packets as that is before the newest one.
         reach_ns = max(2 * (newest_ns - min(times_ns)), MIN_LATE_NS)
         return newest_ns - reach_ns <= t_device_ns <= newest_ns
+
+    def _stands_still(self, sequence: int) -> bool:
+        """Whether the newest two packets had this number, too: the device does not count."""
+        came = self._came
+        return len(came) > 1 and came[-1][0] == came[-2][0] == sequence
 
     def _is_repeated(self, came: tuple[int, int | None]) -> bool:
         if self._last is None or (self._last - came[0]) % self._modulus >= LATE_PACKETS:

@@ -105,5 +105,4 @@ class ReportDecoder(StreamDecoder[Packet]):
 
     def _is_data(self, report_id: int, body: bytes) -> bool:
         """Whether a message is a data packet; what else it is was taken in."""
-        del report_id, body
         return True

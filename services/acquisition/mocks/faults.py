@@ -225,27 +225,22 @@ class PacketEdits:
 
     def is_marked_when_nan(self, units: Sequence[bytes]) -> bool:
         """Whether a driver records a NaN as a missing part of a sample, and refuses no packet."""
-        del units
         return False
 
     def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
         """Raw cells of a glove that show the same whatever presses them."""
-        del data, cells, how
         raise _cannot("a taxel that is pinned")
 
     def put_nan(self, data: bytes) -> bytes:
         """The first number that is one is none."""
-        del data
         raise _cannot("a number that can be NaN")
 
     def other_side(self, data: bytes) -> bytes:
         """The packet of the other hand's device."""
-        del data
         raise _cannot("a hand")
 
     def other_version(self, data: bytes) -> bytes:
         """The packet of a device with newer firmware."""
-        del data
         raise _cannot("a version")
 
 

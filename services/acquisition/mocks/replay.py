@@ -84,7 +84,6 @@ class PacketSource(ABC):
 
     def fate(self, index: int) -> Fate:
         """What becomes of sample `index` if its packet arrives: SENT of a good one."""
-        del index
         return Fate.SENT
 
 

@@ -73,6 +73,16 @@ def test_opening_asks_who_it_is(glove):
     assert glove.driver.identity.side == "left"
 
 
+def test_a_driver_that_was_started_anew_is_answered_too(glove):
+    """Its requests are numbered as those of the first one were."""
+    transport, host = glove.device.port.transport, StationClock()
+    for _ in range(2):
+        driver = TactileGlove("left", transport=transport, clock=host)
+        driver.open()
+        assert driver.identity.serial_number == "glove_left"
+        driver.close()
+
+
 def test_samples_that_come_during_a_request_are_kept(glove):
     glove.driver.open()
     play(glove, range(5))

@@ -53,7 +53,7 @@ def test_header_is_as_documented(rng):
 
 
 def test_samples_carry_counts_and_stamps(rng):
-    decoder = TactileGloveDecoder()
+    decoder = TactileGloveDecoder("left")
     data = glove_packet(3, rng)
     (sample,) = decoder.feed(data, 55)
     assert sample.t_host_ns == 55
@@ -146,6 +146,7 @@ def test_a_packet_that_was_overtaken_is_late_and_no_loss(sequences, expected):
         ([(5, 50), (6, 60), (5, 50), (7, 70)], {"repeated": 1}),
         ([(5, 50), (6, 60), (5, 3), (6, 13)], {"restarts": 1}),
         ([(5, 50), (5, 60), (6, 70)], {"restarts": 1}),
+        ([(5, 50), (5, 60), (5, 70), (5, 80), (5, 90)], {"restarts": 1}),
         ([(5, 50), (7, 70), (6, 60), (6, 60), (8, 80)], {"late": 1, "repeated": 1}),
     ],
 )

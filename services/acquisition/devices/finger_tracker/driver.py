@@ -223,7 +223,6 @@ class BridgeFingerTrackerDecoder(BridgeDecoder):
 
     def _learn(self, hello: BridgeHello, chosen: BridgedDevice) -> None:
         """The order of the nodes and the frame."""
-        del chosen
         try:
             self._order = np.array(resolve_nodes(hello.nodes or ()))
         except PacketError as error:

@@ -13,11 +13,11 @@ from jaxtyping import Float32
 from pydantic import Field
 
 from dextouch.errors import DeviceError, InvalidInputError
-from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
+from dextouch.streams import ClockCapabilities, Sample
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kind import DeviceKind, GloveSettings, serial_transport
-from services.acquisition.drivers.base import CellLayout, Driver, StreamDecoder, hand_name
+from services.acquisition.drivers.base import CellLayout, Driver, StreamDecoder, glove_stream
 from services.acquisition.drivers.packets import PortionedSearch
 
 TAIL = b"\x00\x00\x80\x7f"
@@ -155,29 +155,21 @@ class JustFloatGloveDecoder(StreamDecoder[bytes]):
         label: str | None = None,
     ) -> None:
         frames = JustFloatFrames(num_values, full_scale)
-        descriptor = justfloat_descriptor(side, num_values=num_values, rate_hz=rate_hz, label=label)
+        # The device sends neither its unit nor its time.
+        descriptor = glove_stream(
+            side,
+            label,
+            shape=(num_values,),
+            dtype="float32",
+            unit="raw",
+            nominal_rate_hz=rate_hz,
+            capabilities=ClockCapabilities(),
+        )
         super().__init__(descriptor, frames)
         self.cells = CellLayout(full_scale, grid=None)
 
     def _sample(self, packet: bytes, t_host_ns: int) -> Sample:
         return Sample(t_host_ns, np.frombuffer(packet, _VALUE))
-
-
-def justfloat_descriptor(
-    side: Side, *, num_values: int, rate_hz: float, label: str | None = None
-) -> StreamDescriptor:
-    """The raw stream of one glove; the device sends neither its unit nor its time."""
-    return StreamDescriptor(
-        name=f"tactile_{hand_name(side, label)}",
-        kind="tactile",
-        shape=(num_values,),
-        dtype="float32",
-        unit="raw",
-        nominal_rate_hz=rate_hz,
-        side=side,
-        device=f"glove_{hand_name(side, label)}",
-        capabilities=ClockCapabilities(),
-    )
 
 
 def bits_of(full_scale: float) -> int:

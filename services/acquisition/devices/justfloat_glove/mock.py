@@ -69,7 +69,6 @@ class JustFloatGloveSource(PacketSource):
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet; the device sends neither sequence number nor time."""
-        del sequence, t_device_ns
         return [encode_justfloat(self._values[index])]
 
 

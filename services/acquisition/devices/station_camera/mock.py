@@ -95,7 +95,6 @@ class VideoSource(PacketSource):
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One image; cameras have no sequence."""
-        del sequence
         image = self._images[index]
         return [UNIT_HEADER.pack(t_device_ns, *image.shape[:2]) + image.tobytes()]
 

@@ -21,6 +21,7 @@ from services.acquisition.drivers.base import (
     Readings,
     StreamDecoder,
     check_packet,
+    glove_stream,
     hand_name,
 )
 from services.acquisition.drivers.packets import (
@@ -35,7 +36,7 @@ from services.acquisition.transports.ports import Transport
 
 COMMAND_MAGIC = b"DXTC"
 REPLY_MAGIC = b"DXTR"
-# command, argument
+# command, argument (of no command yet: 0)
 REQUEST = struct.Struct("<BxH")
 # command, status
 REPLY_HEAD = struct.Struct("<BBxx")
@@ -78,16 +79,18 @@ class GloveIdentity:
     side: str
 
 
-def encode_request(command: int, *, request: int, argument: int = 0) -> bytes:
+def encode_request(command: int, *, request: int) -> bytes:
     """Bytes of one request; `request` comes back in the reply's sequence field."""
-    packet = Packet(VERSION, SOURCES["none"], request, 0, REQUEST.pack(command, argument))
+    packet = Packet(VERSION, SOURCES["none"], request, 0, REQUEST.pack(command, 0))
     return encode_packet(COMMAND_MAGIC, packet)
 
 
-def encode_reply(request: Packet, status: Status, body: bytes, *, made: Packet) -> bytes:
-    """Bytes of the answer to `request`; `made` gives the device's source and time."""
+def encode_reply(
+    request: Packet, status: Status, body: bytes, *, source: int, t_device_ns: int
+) -> bytes:
+    """Bytes of the answer to `request`, sent by the device at `t_device_ns`."""
     payload = REPLY_HEAD.pack(request.payload[0], status) + body
-    packet = Packet(VERSION, made.source, request.sequence, made.t_device_ns, payload)
+    packet = Packet(VERSION, source, request.sequence, t_device_ns, payload)
     return encode_packet(REPLY_MAGIC, packet)
 
 
@@ -151,15 +154,13 @@ def _check_size(what: str, body: bytes, size: int) -> None:
 
 def glove_descriptor(side: Side, label: str | None = None) -> StreamDescriptor:
     """The raw stream of one glove."""
-    return StreamDescriptor(
-        name=f"tactile_{hand_name(side, label)}",
-        kind="tactile",
+    return glove_stream(
+        side,
+        label,
         shape=(NUM_RAW_TAXELS,),
         dtype="uint16",
         unit="counts",
         nominal_rate_hz=NOMINAL_RATE_HZ,
-        side=side,
-        device=f"glove_{hand_name(side, label)}",
         capabilities=ClockCapabilities(crc=True, sequence=True, device_time=True),
     )
 
@@ -168,7 +169,7 @@ class TactileGloveDecoder(StreamDecoder[Packet]):
     """Decodes one glove's byte stream to uint16 counts [360] in raw scan order.
 
     Args:
-        side: which glove it must be; None takes any.
+        side: which glove it must be.
         on_reply: takes each reply to a command with its arrival; without it replies are passed
             over.
         label: of a further glove of this hand.
@@ -176,7 +177,7 @@ class TactileGloveDecoder(StreamDecoder[Packet]):
 
     def __init__(
         self,
-        side: Side | None = None,
+        side: Side,
         *,
         on_reply: Callable[[Packet, int], None] | None = None,
         label: str | None = None,
@@ -187,10 +188,9 @@ class TactileGloveDecoder(StreamDecoder[Packet]):
             max_payload=PAYLOAD_BYTES,
             others={REPLY_MAGIC: (MIN_REPLY, MAX_REPLY)},
         )
-        # Where the side is open, the stream is named for the left hand.
-        super().__init__(glove_descriptor(side or "left", label), packets)
-        self._side: Side | None = side
-        self._device = f"glove_{'any' if side is None else hand_name(side, label)}"
+        super().__init__(glove_descriptor(side, label), packets)
+        self._side = side
+        self._device = f"glove_{hand_name(side, label)}"
         self._on_reply = on_reply
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:

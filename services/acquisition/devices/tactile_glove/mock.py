@@ -67,8 +67,10 @@ class GloveAnswers:
             Command.TIME_SYNC: TIME_SYNC.pack,
         }
         self._device_time_ns = device_time_ns
+        # Requests are no sequence: a driver that was started anew counts from 1 again.
+        sizes = (REQUEST.size, REQUEST.size)
         self._requests = PacketDecoder(
-            COMMAND_MAGIC, min_payload=REQUEST.size, max_payload=REQUEST.size
+            MAGIC, min_payload=0, max_payload=0, others={COMMAND_MAGIC: sizes}
         )
 
     def answer(self, data: bytes) -> list[bytes]:
@@ -77,11 +79,12 @@ class GloveAnswers:
         return [self._reply(packet, t_received_ns) for packet in self._requests.feed(data)]
 
     def _reply(self, packet: Packet, t_received_ns: int) -> bytes:
-        body = self._bodies.get(REQUEST.unpack(packet.payload)[0])
-        made = Packet(VERSION, SOURCES[self._side], 0, self._device_time_ns(), b"")
-        if body is None:
-            return encode_reply(packet, Status.UNKNOWN_COMMAND, b"", made=made)
-        return encode_reply(packet, Status.OK, body(t_received_ns), made=made)
+        make = self._bodies.get(REQUEST.unpack(packet.payload)[0])
+        status, body = Status.UNKNOWN_COMMAND, b""
+        if make is not None:
+            status, body = Status.OK, make(t_received_ns)
+        source, t_device_ns = SOURCES[self._side], self._device_time_ns()
+        return encode_reply(packet, status, body, source=source, t_device_ns=t_device_ns)
 
 
 @dataclass(frozen=True)

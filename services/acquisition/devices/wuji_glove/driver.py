@@ -9,14 +9,12 @@ import numpy as np
 from jaxtyping import Float32
 
 from dextouch.errors import DeviceError
-from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
+from dextouch.streams import ClockCapabilities, Sample
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kind import DeviceKind, GloveSettings, serial_transport
-from services.acquisition.drivers.base import CellLayout, Driver, StreamDecoder, hand_name
-from services.acquisition.drivers.packets import (
-    FrameSearch,
-)
+from services.acquisition.drivers.base import CellLayout, Driver, StreamDecoder, glove_stream
+from services.acquisition.drivers.packets import FrameSearch
 
 MARK = b"\xaa\x55"
 PACKET_BYTES = 3088
@@ -90,56 +88,46 @@ class WujiFrames(FrameSearch[WujiPacket]):
 
 
 class WujiGloveDecoder(StreamDecoder[WujiPacket]):
-    """Decodes one glove's byte stream to float32 [768] of full scale, row by row.
+    """Decodes one glove's byte stream to float32 [768] of full scale, 0 … 1, row by row.
 
     Cells that the glove has not are NaN, as it sends them.
 
     Args:
-        side: which glove it must be; None takes any.
+        side: which glove it must be.
         label: of a further glove of this hand.
     """
 
     cells = CellLayout(1.0, GRID)
 
-    def __init__(self, side: Side | None = None, *, label: str | None = None) -> None:
-        # Where the side is open, the stream is named for the left hand.
-        super().__init__(wuji_descriptor(side or "left", label), WujiFrames())
-        self._side: Side | None = side
+    def __init__(self, side: Side, *, label: str | None = None) -> None:
+        descriptor = glove_stream(
+            side,
+            label,
+            shape=(NUM_CELLS,),
+            dtype="float32",
+            unit="full_scale",
+            nominal_rate_hz=NOMINAL_RATE_HZ,
+            capabilities=ClockCapabilities(
+                crc=True,
+                sequence=True,
+                sequence_bits=SEQUENCE_BITS,
+                device_time=True,
+                tick_ns=TICK_NS,
+                device_time_bits=TIME_BITS,
+            ),
+        )
+        super().__init__(descriptor, WujiFrames())
+        self._side = side
 
     def _sample(self, packet: WujiPacket, t_host_ns: int) -> Sample:
-        self._check_hand(packet.hand)
-        return Sample(t_host_ns, packet.cells, packet.time_ms * TICK_NS, packet.sequence)
-
-    def _check_hand(self, hand: int) -> None:
-        side = HANDS.get(hand)
-        if side is None or self._side not in (None, side):
+        side = HANDS.get(packet.hand)
+        if side != self._side:
             raise DeviceError(
-                f"glove_{self._side or 'any'}: says it is hand {hand} ({side!r}), expected "
-                f"{self._side or 'left or right'!r}; are left and right swapped?",
+                f"glove_{self._side}: says it is hand {packet.hand} ({side!r}), expected "
+                f"{self._side!r}; are left and right swapped?",
                 event="wrong_side",
             )
-
-
-def wuji_descriptor(side: Side, label: str | None = None) -> StreamDescriptor:
-    """The raw stream of one glove; `unit` is the share of full scale, 0 … 1."""
-    return StreamDescriptor(
-        name=f"tactile_{hand_name(side, label)}",
-        kind="tactile",
-        shape=(NUM_CELLS,),
-        dtype="float32",
-        unit="full_scale",
-        nominal_rate_hz=NOMINAL_RATE_HZ,
-        side=side,
-        device=f"glove_{hand_name(side, label)}",
-        capabilities=ClockCapabilities(
-            crc=True,
-            sequence=True,
-            sequence_bits=SEQUENCE_BITS,
-            device_time=True,
-            tick_ns=TICK_NS,
-            device_time_bits=TIME_BITS,
-        ),
-    )
+        return Sample(t_host_ns, packet.cells, packet.time_ms * TICK_NS, packet.sequence)
 
 
 def crc16(data: bytes) -> int:

@@ -56,7 +56,6 @@ class WujiPacketEdits(PacketEdits):
 
     def is_marked_when_nan(self, units: Sequence[bytes]) -> bool:
         """A cell may be NaN."""
-        del units
         return True
 
     def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
