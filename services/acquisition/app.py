@@ -16,7 +16,7 @@ from services.acquisition.memory import keep_for_life
 from services.acquisition.routes import recorder_router, station_router
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import Station
-from services.acquisition.supervisor import SpoolSafety
+from services.acquisition.take import SpoolSafety
 from services.acquisition.uploader import Uploader, recover_spool
 
 if TYPE_CHECKING:

@@ -170,12 +170,16 @@ class PeriodicCall:
         self._running = waiter, thread
         thread.start()
 
+    def cancel(self) -> None:
+        """End after the call that is under way, which may be this one; waits for nothing."""
+        if self._running is not None:
+            self._running[0].cancel()
+
     def stop(self) -> None:
         """End the thread, after the call that is under way; nothing if it was never started."""
         if self._running is not None:
-            waiter, thread = self._running
-            waiter.cancel()
-            thread.join()
+            self.cancel()
+            self._running[1].join()
 
     def _run(self, waiter: Waiter) -> None:
         with closing(waiter):

@@ -40,7 +40,7 @@ from services.acquisition.mocks.replay import (
     device_rng,
 )
 from services.acquisition.station import Station
-from services.acquisition.supervisor import SpoolSafety
+from services.acquisition.take import SpoolSafety
 
 LATENCY_SIGMA_MS = 0.2
 WRISTS = ("wrist_left", "wrist_right")

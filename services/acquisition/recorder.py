@@ -14,7 +14,7 @@ import structlog
 from dextouch.clocks import PathLatency
 from dextouch.episodes import disk_errors
 from dextouch.episodes.spool import SpoolWriter
-from dextouch.errors import ConflictError, StorageError
+from dextouch.errors import ConflictError
 from dextouch.schemas import (
     Matrix,
     RecorderAction,
@@ -25,14 +25,12 @@ from dextouch.schemas import (
     TakeCheck,
     TakePrompt,
 )
-from dextouch.streams import H264_UNIT, EncodedBatch, Sample, SampleBatch
 from services.acquisition.clock import StationClock
-from services.acquisition.drivers.base import Driver, Readings
-from services.acquisition.drivers.image_encoding import GroupGate
+from services.acquisition.drivers.base import Driver
 from services.acquisition.health import HealthMonitor
 from services.acquisition.memory import give_back_free_memory
 from services.acquisition.path_latency import add_latencies
-from services.acquisition.supervisor import SpoolFlusher, SpoolSafety, check_free_space
+from services.acquisition.take import SpoolSafety, Take, check_free_space
 from services.acquisition.take_check import DeviceEvents, TakeWatch
 
 logger = structlog.get_logger(__name__)
@@ -69,88 +67,6 @@ class TakeOptions:
     device_events: Callable[[], DeviceEvents] | None = None
     health: HealthMonitor | None = None
     latencies: Callable[[], Mapping[str, PathLatency]] = dict
-
-
-class Take:
-    """One running or ended take: reader threads append to its spool, a thread of its own flushes.
-
-    The only lock that readers take is held for the write of one append: data is encoded before, and
-    other threads wait for the disk.
-
-    Args:
-        spool: new, of this take.
-        watch: of its streams and devices.
-        clock: of the station.
-        safety: of the spool.
-    """
-
-    def __init__(
-        self, spool: SpoolWriter, watch: TakeWatch, *, clock: StationClock, safety: SpoolSafety
-    ) -> None:
-        self.spool = spool
-        self.watch = watch
-        self._failure: str | None = None
-        self._lock = threading.RLock()
-        self._gates = {s.name: GroupGate() for s in spool.attributes.streams if s.unit == H264_UNIT}
-        self._flusher = SpoolFlusher(
-            spool.path, safety=safety, clock=clock, on_tick=watch.look, on_failure=self._end
-        )
-
-    def accept(self, readings: Readings) -> None:
-        """Append new readings (called by the reader threads); nothing after the end.
-
-        A stream's readings come from one thread, so its bytes are made before the lock is taken.
-        """
-        if self.watch.has_ended:
-            return
-        encoded = [self._encode(name, samples) for name, samples in readings.items()]
-        with self._lock:
-            try:
-                for record, samples in encoded:
-                    if record is not None and not self.watch.has_ended:
-                        self.spool.append_record(record)
-                        self.watch.streams[record.stream_name].add(samples)
-            except StorageError as error:
-                self._end(error)
-
-    def _encode(self, name: str, samples: list[Sample]) -> tuple[EncodedBatch | None, list[Sample]]:
-        if name in self._gates:
-            # Of video only what can be looked at without what came before the take.
-            samples = self._gates[name].admit(samples)
-        if not samples:
-            return None, samples
-        return self.spool.encode(name, SampleBatch.from_samples(samples)), samples
-
-    def end(self) -> TakeCheck:
-        """Accept no more readings, flush the spool to the disk and check the take."""
-        self._end()
-        self._flusher.join()
-        self.watch.look()
-        if self._failure is None:
-            try:
-                self.spool.flush()
-            except StorageError as error:
-                self._failure = error.message
-        return self.watch.check()
-
-    def release(self) -> None:
-        """Give threads and files back; what was spooled stays as it is."""
-        self._end()
-        self._flusher.join()
-        self.spool.abandon()
-
-    def problems(self) -> tuple[str, ...]:
-        """What ended or disturbed the take as a whole."""
-        failure = (self._failure,) if self._failure else ()
-        return (*failure, *self.watch.host_problems())
-
-    def _end(self, error: StorageError | None = None) -> None:
-        with self._lock:
-            if error is not None and not self.watch.has_ended:
-                self._failure = error.message
-                logger.error("stop_take_by_disk", error=error.message)
-            self.watch.end()
-            self._flusher.cancel()
 
 
 class Recorder:

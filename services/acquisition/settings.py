@@ -9,7 +9,7 @@ from dextouch.data_folder import default_spool
 from dextouch.serving import ServiceSettings, service_config
 from services.acquisition.devices.registry import ChosenDevice
 from services.acquisition.mock_links import MockLinks
-from services.acquisition.supervisor import SpoolSafety
+from services.acquisition.take import SpoolSafety
 
 
 class AcquisitionSettings(ServiceSettings):

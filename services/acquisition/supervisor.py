@@ -1,19 +1,14 @@
-"""Reader threads of devices, with reconnection, and the flush thread of the spool."""
+"""Reader threads of devices, with reconnection."""
 
-import os
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import structlog
 from jaxtyping import UInt16
 
-from dextouch.episodes import disk_errors
-from dextouch.episodes.spool import LOG_FILE
-from dextouch.errors import DeviceError, InvalidInputError, StorageError, StorageFullError
+from dextouch.errors import DeviceError
 from dextouch.streams import Sample
 from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.drivers.base import Driver, Readings
@@ -39,7 +34,6 @@ EVENTS = (
     "driver_failure",
 )
 Sink = Callable[[Readings], None]
-MEBIBYTE = 2**20
 
 
 @dataclass
@@ -204,108 +198,3 @@ class DeviceSupervisor:
             if self._waiter is not None:
                 self._waiter.close()
                 self._waiter = None
-
-
-@dataclass(frozen=True)
-class SpoolSafety:
-    """How much a power loss may cost, and how much space is kept for closing a take.
-
-    Raises:
-        InvalidInputError: a period that is no positive number of seconds, or negative bytes.
-    """
-
-    flush_period_s: float = 0.5
-    min_free_bytes: int = 64 * MEBIBYTE
-
-    def __post_init__(self) -> None:
-        if not 0 < self.flush_period_s <= 3600 or self.min_free_bytes < 0:
-            raise InvalidInputError(
-                f"spool safety: got a period of {self.flush_period_s} s and {self.min_free_bytes} "
-                "bytes to keep free, expected 0 … 3600 s and no negative number"
-            )
-
-
-def check_free_space(folder: Path, safety: SpoolSafety) -> None:
-    """Refuse to write on where so little is left that a take could not be closed any more.
-
-    Raises:
-        StorageFullError: less than `min_free_bytes` are left.
-    """
-    with disk_errors(f"measure free space of {folder}"):
-        disk = os.statvfs(folder)
-    free_bytes = disk.f_bavail * disk.f_frsize
-    if free_bytes < safety.min_free_bytes:
-        raise StorageFullError(
-            f"spool {folder.name!r}: no space left to continue: "
-            f"{free_bytes / MEBIBYTE:.0f} MiB free, {safety.min_free_bytes / MEBIBYTE:.0f} MiB are "
-            "reserved for closing takes; the data recorded so far can be saved; free space before "
-            "the next take",
-            free_bytes=free_bytes,
-        )
-
-
-class SpoolFlusher:
-    """A thread that makes a growing spool survive a power loss, again and again.
-
-    It has its own descriptor of the log, so it needs no lock of the writers and they never wait
-    for it; the disk's error, or a disk that is nearly full, ends it and is reported once.
-
-    Args:
-        path: of the spool.
-        safety: how often, and how much space must be left.
-        clock: of the station.
-        on_tick: called in the thread before each flush.
-        on_failure: called in the thread with what went wrong.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        *,
-        safety: SpoolSafety,
-        clock: StationClock,
-        on_tick: Callable[[], None],
-        on_failure: Callable[[StorageError], None],
-    ) -> None:
-        self._path = path
-        self._safety = safety
-        self._clock = clock
-        with disk_errors(f"open log of spool {path.name!r}"):
-            self._log = os.open(path / LOG_FILE, os.O_RDONLY)
-        self._waiter = clock.waiter()
-        # The thread alone keeps the callbacks, and lets them go at its end. Kept here, they would
-        # hold their take, which holds this: a circle, not free before it is looked for.
-        self._thread = threading.Thread(
-            target=self._run, args=(on_tick, on_failure), name="flush-spool", daemon=True
-        )
-        self._thread.start()
-
-    def cancel(self) -> None:
-        """End after the flush that is under way; waits for nothing."""
-        self._waiter.cancel()
-
-    def join(self) -> None:
-        """Wait until it has ended (not to be called in its own thread)."""
-        self._waiter.cancel()
-        self._thread.join()
-
-    def _run(self, on_tick: Callable[[], None], on_failure: Callable[[StorageError], None]) -> None:
-        period_ns = round(self._safety.flush_period_s * 1e9)
-        # A simulated clock stands still until the failure is reported: the waiter closes after it.
-        with closing(self._waiter) as waiter:
-            try:
-                due_ns = self._clock.now_ns() + period_ns
-                while waiter.wait_until(due_ns):
-                    on_tick()
-                    self._flush()
-                    # After a long stop of the process one flush is enough.
-                    due_ns = max(due_ns, self._clock.now_ns()) + period_ns
-            except StorageError as error:
-                on_failure(error)
-            finally:
-                os.close(self._log)
-
-    def _flush(self) -> None:
-        check_free_space(self._path, self._safety)
-        with disk_errors(f"flush spool {self._path.name!r}"):
-            os.fdatasync(self._log)

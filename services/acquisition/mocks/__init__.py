@@ -4,8 +4,8 @@ from services.acquisition.mocks.faults import (
     DeviceFaults,
     FaultScript,
     PacketEdits,
+    PacketFields,
     Pinned,
-    without_first,
 )
 from services.acquisition.mocks.ports import HidPort, MockPort, PtyPort, SocketPort
 from services.acquisition.mocks.replay import (
@@ -27,6 +27,7 @@ __all__ = [
     "MockPlace",
     "MockPort",
     "PacketEdits",
+    "PacketFields",
     "PacketSource",
     "Pinned",
     "PtyPort",
@@ -34,5 +35,4 @@ __all__ = [
     "SocketPort",
     "at_rate",
     "serial_mock",
-    "without_first",
 ]

@@ -4,8 +4,9 @@ Each family of packets has its own `PacketEdits`. What a family cannot say (a ha
 cannot be said wrongly either: such a fault is refused.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
@@ -36,13 +37,14 @@ MAX_BOOT_NS = 10**12
 OUR_MAGIC = b"DX"
 FINGER_MAGIC = b"DXFT"
 # Where the numbers of a payload begin, and what they are.
-FLOATS = {
+NUMBERS = {
+    b"DXTG": (0, "<u2"),
     FINGER_MAGIC: (4, "<f4"),
     b"DXPT": (4, "<f4"),
     b"DXPM": (16, "<f4"),
     b"DXRS": (0, "<f8"),
 }
-OTHER_SIDE = {SOURCES["left"]: SOURCES["right"], SOURCES["right"]: SOURCES["left"]}
+SOURCE_NAMES = {number: name for name, number in SOURCES.items()}
 
 Edit = Callable[[bytes], bytes]
 Pinned = Literal["stuck", "saturated"]
@@ -211,12 +213,35 @@ def lose_bytes(data: bytes, rate: float, rng: np.random.Generator) -> tuple[byte
     return rest.tobytes(), num_lost
 
 
-class PacketEdits:
-    """Faults inside one packet; a family overrides those that its devices can have.
+@dataclass
+class PacketFields:
+    """What faults change inside a packet; None where the packets of a family do not tell it."""
+
+    numbers: np.ndarray | None = None
+    side: str | None = None
+    version: int | None = None
+
+
+class PacketEdits(ABC):
+    """Faults inside one packet, by what its family takes it apart to and packs again.
 
     The last four methods take the bytes of one whole packet and give those of the changed one, its
-    checksum right. Those that are not overridden raise InvalidInputError.
+    checksum right; they raise InvalidInputError for what packets of the family do not tell.
+
+    Args:
+        pinned: what a pinned raw cell of a glove shows; none of what has no cells.
     """
+
+    def __init__(self, pinned: Mapping[Pinned, float] | None = None) -> None:
+        self._pinned = pinned or {}
+
+    @abstractmethod
+    def fields(self, data: bytes) -> PacketFields:
+        """What a packet tells; its numbers may be changed."""
+
+    @abstractmethod
+    def packed(self, data: bytes, fields: PacketFields) -> bytes:
+        """A packet with other fields."""
 
     def apply(self, units: Sequence[bytes], edits: Sequence[Edit]) -> list[bytes]:
         """The units that a port sends for one packet, after edits of the packet."""
@@ -229,23 +254,64 @@ class PacketEdits:
 
     def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
         """Raw cells of a glove that show the same whatever presses them."""
-        raise _cannot("a taxel that is pinned")
+        fields = self.fields(data)
+        if fields.numbers is None or how not in self._pinned:
+            raise _cannot("a taxel that is pinned")
+        fields.numbers[list(cells)] = self._pinned[how]
+        return self.packed(data, fields)
 
     def put_nan(self, data: bytes) -> bytes:
         """The first number that is one is none."""
-        raise _cannot("a number that can be NaN")
+        fields = self.fields(data)
+        numbers = fields.numbers
+        if numbers is None or numbers.dtype.kind != "f":
+            raise _cannot("a number that can be NaN")
+        numbers[np.flatnonzero(np.isfinite(numbers))[0]] = np.nan
+        return self.packed(data, fields)
 
     def other_side(self, data: bytes) -> bytes:
         """The packet of the other hand's device."""
-        raise _cannot("a hand")
+        fields = self.fields(data)
+        if fields.side is None:
+            raise _cannot("a hand")
+        fields.side = "right" if fields.side == "left" else "left"
+        return self.packed(data, fields)
 
     def other_version(self, data: bytes) -> bytes:
         """The packet of a device with newer firmware."""
-        raise _cannot("a version")
+        fields = self.fields(data)
+        if fields.version is None:
+            raise _cannot("a version")
+        fields.version += 1
+        return self.packed(data, fields)
 
 
 class OurPacketEdits(PacketEdits):
     """Faults inside the packets of our documented devices (docs/device_packets.md)."""
+
+    def fields(self, data: bytes) -> PacketFields:
+        """Version, source, and the numbers of those payloads that hold some."""
+        magic = data[:MAGIC_SIZE]
+        if not magic.startswith(OUR_MAGIC):
+            raise InvalidInputError(
+                f"mock fault: got a packet that begins with {magic!r}, expected one of ours; give "
+                "its source PacketEdits of its family"
+            )
+        _, version, source, *_ = HEADER.unpack_from(data)
+        numbers = None
+        if magic in NUMBERS:
+            start, dtype = NUMBERS[magic]
+            numbers = np.frombuffer(data[HEADER.size + start : -CRC.size], dtype).copy()
+        return PacketFields(numbers, SOURCE_NAMES[source], version)
+
+    def packed(self, data: bytes, fields: PacketFields) -> bytes:
+        """A packet with other fields; its numbers stand at the end of the payload."""
+        magic, _, _, _, sequence, t_device_ns = HEADER.unpack_from(data)
+        payload = data[HEADER.size : -CRC.size]
+        if fields.numbers is not None:
+            payload = payload[: -fields.numbers.nbytes] + fields.numbers.tobytes()
+        source, version = SOURCES[fields.side or "none"], fields.version or VERSION
+        return encode_packet(magic, Packet(version, source, sequence, t_device_ns, payload))
 
     def apply(self, units: Sequence[bytes], edits: Sequence[Edit]) -> list[bytes]:
         """Joins the reports of a packet for the edits, and splits it again.
@@ -270,28 +336,6 @@ class OurPacketEdits(PacketEdits):
         start = REPORT_HEADER.size if _is_report(units[0]) else 0
         return units[0].startswith(FINGER_MAGIC, start)
 
-    def put_nan(self, data: bytes) -> bytes:
-        """The first number of a payload of floats."""
-
-        def change(magic: bytes, packet: Packet) -> Packet:
-            if magic not in FLOATS:
-                raise _cannot("a number that can be NaN")
-            start, dtype = FLOATS[magic]
-            values = without_first(np.frombuffer(packet.payload, dtype=dtype, offset=start))
-            return replace(packet, payload=packet.payload[:start] + values.tobytes())
-
-        return edit_ours(data, change)
-
-    def other_side(self, data: bytes) -> bytes:
-        """Left says right, and any other left."""
-        return edit_ours(
-            data, lambda _, p: replace(p, source=OTHER_SIDE.get(p.source, SOURCES["left"]))
-        )
-
-    def other_version(self, data: bytes) -> bytes:
-        """The next version."""
-        return edit_ours(data, lambda _, p: replace(p, version=VERSION + 1))
-
 
 def halve_units(units: Sequence[bytes]) -> list[bytes]:
     """The first half of a packet's bytes, or of its reports."""
@@ -299,31 +343,6 @@ def halve_units(units: Sequence[bytes]) -> list[bytes]:
         return list(units[: len(units) // 2])
     whole = units[0]
     return [whole[: len(whole) // 2]]
-
-
-def without_first(values: np.ndarray) -> np.ndarray:
-    """The numbers with NaN in place of the first that is finite."""
-    values = values.copy()
-    values[np.flatnonzero(np.isfinite(values))[0]] = np.nan
-    return values
-
-
-def edit_ours(data: bytes, change: Callable[[bytes, Packet], Packet]) -> bytes:
-    """A packet of our documented devices after a change of its content.
-
-    Raises:
-        InvalidInputError: no such packet, or a fault that this one cannot have.
-    """
-    magic = data[:MAGIC_SIZE]
-    if not magic.startswith(OUR_MAGIC):
-        raise InvalidInputError(
-            f"mock fault: got a packet that begins with {magic!r}, expected one of ours; give its "
-            "source PacketEdits of its family"
-        )
-    _, version, source, length, sequence, t_device_ns = HEADER.unpack_from(data)
-    payload = data[HEADER.size : len(data) - CRC.size]
-    packet = Packet(version, source, sequence, t_device_ns, payload[:length])
-    return encode_packet(magic, change(magic, packet))
 
 
 def _cannot(what: str) -> InvalidInputError:

@@ -13,13 +13,13 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, StorageFullError
 from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
-from services.acquisition import supervisor
+from services.acquisition import take
 from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.recorder import Recorder, TakeOptions
-from services.acquisition.supervisor import SpoolSafety
+from services.acquisition.take import SpoolSafety
 
 PROMPT = TakePrompt(task="stand_bottle", instruction="stand the bottle up")
 ANYWAY = SaveTake(accept_incomplete=True)
@@ -90,7 +90,7 @@ def test_the_log_reaches_the_disk_again_and_again(
     recorder = make_recorder(flush_period_s=period_s)
     recorder.arm(PROMPT)
     recorder.record("take")
-    monkeypatch.setattr(supervisor.os, "fdatasync", watch)
+    monkeypatch.setattr(take.os, "fdatasync", watch)
     play(recorder, clock, 205)
     running = len(synced_bytes)
     assert running == flushes
@@ -111,7 +111,7 @@ def test_readers_do_not_wait_for_the_disk(make_recorder, clock, monkeypatch):
     recorder = make_recorder(flush_period_s=0.1)
     recorder.arm(PROMPT)
     recorder.record("take")
-    monkeypatch.setattr(supervisor.os, "fdatasync", hang)
+    monkeypatch.setattr(take.os, "fdatasync", hang)
     waiter = clock.waiter(drives_time=True)
     mover = threading.Thread(target=waiter.wait_until, args=(clock.now_ns() + 10**9,))
     mover.start()
@@ -135,7 +135,7 @@ def test_a_disk_that_cannot_flush_ends_the_take(make_recorder, clock, monkeypatc
     recorder.arm(PROMPT)
     recorder.record("take")
     play(recorder, clock, 5)
-    monkeypatch.setattr(supervisor.os, "fdatasync", broken)
+    monkeypatch.setattr(take.os, "fdatasync", broken)
     play(recorder, clock, 30, first=5)
     monkeypatch.undo()
     status = recorder.status()
@@ -178,7 +178,7 @@ def test_a_nearly_full_disk_ends_the_take_before_anything_is_lost(
         found[4] = (1 << 20) // found[1] - 1  # f_bavail
         return os.statvfs_result(found)
 
-    monkeypatch.setattr(supervisor.os, "statvfs", nearly_full)
+    monkeypatch.setattr(take.os, "statvfs", nearly_full)
     play(recorder, clock, 30, first=15)
     status = recorder.status()
     assert status.state == "checking"

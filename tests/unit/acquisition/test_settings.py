@@ -10,7 +10,7 @@ from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.settings import AcquisitionSettings
-from services.acquisition.supervisor import SpoolSafety
+from services.acquisition.take import SpoolSafety
 
 OPTIONS = {
     "station",

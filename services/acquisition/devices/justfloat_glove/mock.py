@@ -7,7 +7,7 @@ from jaxtyping import Float32
 
 from dextouch.tactile.layout import NUM_TAXELS
 from services.acquisition.devices.justfloat_glove.driver import TAIL, JustFloatGloveDecoder
-from services.acquisition.mocks.faults import PacketEdits, Pinned, without_first
+from services.acquisition.mocks.faults import PacketEdits, PacketFields, Pinned
 from services.acquisition.mocks.replay import (
     MockPair,
     MockPlace,
@@ -20,7 +20,7 @@ COUNTS_PER_KPA = 40.0
 NUM_VALUES = 401
 FULL_SCALE = 4095.0
 # What pinned cells show.
-PINNED = {"stuck": 1_000.0, "saturated": FULL_SCALE}
+PINNED: dict[Pinned, float] = {"stuck": 1_000.0, "saturated": FULL_SCALE}
 
 
 def mock_justfloat_glove(place: MockPlace) -> MockPair:
@@ -38,15 +38,13 @@ def mock_justfloat_glove(place: MockPlace) -> MockPair:
 class JustFloatPacketEdits(PacketEdits):
     """Faults inside a packet that contains only numbers, without hand and version."""
 
-    def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
-        """Numbers by their place."""
-        values = _values(data).copy()
-        values[list(cells)] = PINNED[how]
-        return encode_justfloat(values)
+    def fields(self, data: bytes) -> PacketFields:
+        """All numbers."""
+        return PacketFields(np.frombuffer(data[: -len(TAIL)], "<f4").copy())
 
-    def put_nan(self, data: bytes) -> bytes:
-        """The first number."""
-        return encode_justfloat(without_first(_values(data)))
+    def packed(self, data: bytes, fields: PacketFields) -> bytes:
+        """A packet of these numbers."""
+        return data if fields.numbers is None else encode_justfloat(fields.numbers)
 
 
 class JustFloatGloveSource(PacketSource):
@@ -57,7 +55,7 @@ class JustFloatGloveSource(PacketSource):
         dead_taxels: places in the packet that read zero.
     """
 
-    edits = JustFloatPacketEdits()
+    edits = JustFloatPacketEdits(PINNED)
 
     def __init__(self, stream: ReplayStream, *, dead_taxels: Sequence[int] = ()) -> None:
         # No device sends the negative zero that rounding leaves of noise.
@@ -75,7 +73,3 @@ class JustFloatGloveSource(PacketSource):
 def encode_justfloat(values: Float32[np.ndarray, " n"]) -> bytes:
     """Bytes of one packet."""
     return values.astype("<f4").tobytes() + TAIL
-
-
-def _values(data: bytes) -> Float32[np.ndarray, " n"]:
-    return np.frombuffer(data[: -len(TAIL)], "<f4")

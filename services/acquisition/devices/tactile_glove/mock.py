@@ -1,7 +1,7 @@
 """Simulated glove of our own protocol, with its own offsets and gains, that answers requests."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
@@ -29,7 +29,7 @@ from services.acquisition.drivers.packets import (
     PacketDecoder,
     encode_packet,
 )
-from services.acquisition.mocks.faults import OurPacketEdits, Pinned, edit_ours
+from services.acquisition.mocks.faults import OurPacketEdits, Pinned
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.mocks.replay import (
     MockDevice,
@@ -46,7 +46,7 @@ GAIN_COUNTS_PER_KPA = 40.0
 OFFSET_SPREAD_COUNTS = 10.0
 GAIN_SPREAD = 0.05
 # What pinned cells show.
-PINNED = {"stuck": 1_000, "saturated": FULL_SCALE_COUNTS}
+PINNED: dict[Pinned, float] = {"stuck": 1_000.0, "saturated": float(FULL_SCALE_COUNTS)}
 
 
 class GloveAnswers:
@@ -150,20 +150,6 @@ def mock_glove(
     return MockPair(device, driver, glove.matrices(side))
 
 
-class GlovePacketEdits(OurPacketEdits):
-    """Faults inside our glove's packet: pinned cells besides what all of ours can have."""
-
-    def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
-        """Raw cells in scan order."""
-
-        def pinned(_: bytes, packet: Packet) -> Packet:
-            counts = np.frombuffer(packet.payload, "<u2").copy()
-            counts[list(cells)] = PINNED[how]
-            return replace(packet, payload=counts.tobytes())
-
-        return edit_ours(data, pinned)
-
-
 class TactileGloveSource(PacketSource):
     """Packets of one glove.
 
@@ -174,7 +160,7 @@ class TactileGloveSource(PacketSource):
         dead_taxels: raw cells that read zero.
     """
 
-    edits = GlovePacketEdits()
+    edits = OurPacketEdits(PINNED)
 
     def __init__(
         self,

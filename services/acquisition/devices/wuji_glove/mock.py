@@ -1,6 +1,6 @@
 """A simulated Wuji glove: its packets, with pressures on a chosen grid."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float32
@@ -23,7 +23,7 @@ from services.acquisition.devices.wuji_glove.driver import (
     WujiGloveDecoder,
     crc16,
 )
-from services.acquisition.mocks.faults import PacketEdits, Pinned, without_first
+from services.acquisition.mocks.faults import PacketEdits, PacketFields, Pinned
 from services.acquisition.mocks.replay import (
     MockPair,
     MockPlace,
@@ -35,7 +35,7 @@ from services.acquisition.mocks.replay import (
 
 FULL_SCALE_KPA = 100.0
 # What pinned cells show, in parts of full scale.
-PINNED = {"stuck": 0.25, "saturated": 1.0}
+PINNED: dict[Pinned, float] = {"stuck": 0.25, "saturated": 1.0}
 # Which cells the real glove has is not public: the mock's grid is its own choice.
 _FINGER_ROWS = slice(0, 4)
 _PALM_ROWS, _PALM_COLUMNS = slice(6, 21), slice(8, 24)
@@ -52,29 +52,22 @@ def mock_wuji_glove(place: MockPlace) -> MockPair:
 
 
 class WujiPacketEdits(PacketEdits):
-    """Faults inside a Wuji glove's packet."""
+    """Faults inside a Wuji glove's packet, which tells its hand and no version."""
+
+    def fields(self, data: bytes) -> PacketFields:
+        """Hand and cells of the grid, row by row."""
+        cells = np.frombuffer(data, "<f4", NUM_CELLS, HEAD.size).copy()
+        return PacketFields(cells, HANDS[HEAD.unpack_from(data)[2]])
+
+    def packed(self, data: bytes, fields: PacketFields) -> bytes:
+        """A packet of these cells and this hand."""
+        sequence, time_ms = STAMPS.unpack_from(data, CRC_OFFSET - STAMPS.size)
+        hand = 0 if fields.side == "left" else 1
+        return encode_wuji(hand, sequence, time_ms, np.asarray(fields.numbers).tobytes())
 
     def is_marked_when_nan(self, units: Sequence[bytes]) -> bool:
         """A cell may be NaN."""
-        return True
-
-    def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
-        """Cells of the grid, row by row."""
-
-        def pinned(hand: int, grid: np.ndarray) -> tuple[int, np.ndarray]:
-            grid = grid.copy()
-            grid[list(cells)] = PINNED[how]
-            return hand, grid
-
-        return _edited(data, pinned)
-
-    def put_nan(self, data: bytes) -> bytes:
-        """The first cell."""
-        return _edited(data, lambda hand, cells: (hand, without_first(cells)))
-
-    def other_side(self, data: bytes) -> bytes:
-        """The other hand's number."""
-        return _edited(data, lambda hand, cells: (1 - hand, cells))
+        return bool(units)
 
 
 class WujiGloveSource(PacketSource):
@@ -86,7 +79,7 @@ class WujiGloveSource(PacketSource):
         dead_taxels: cells of the grid, row by row, that read zero.
     """
 
-    edits = WujiPacketEdits()
+    edits = WujiPacketEdits(PINNED)
 
     def __init__(
         self,
@@ -122,13 +115,3 @@ def encode_wuji(hand: int, sequence: int, time_ms: int, cells: bytes) -> bytes:
     packet = HEAD.pack(MARK, PACKET_BYTES, hand) + cells
     packet += STAMPS.pack(sequence % (1 << SEQUENCE_BITS), time_ms % (1 << TIME_BITS))
     return packet + CRC.pack(crc16(packet[len(MARK) :]))
-
-
-def _edited(data: bytes, change: Callable[[int, np.ndarray], tuple[int, np.ndarray]]) -> bytes:
-    hand = HEAD.unpack_from(data)[2]
-    hand, cells = change(hand, np.frombuffer(data, "<f4", NUM_CELLS, HEAD.size))
-    packet = bytearray(data)
-    HEAD.pack_into(packet, 0, MARK, PACKET_BYTES, hand)
-    packet[HEAD.size : HEAD.size + cells.nbytes] = cells.tobytes()
-    CRC.pack_into(packet, CRC_OFFSET, crc16(bytes(packet[len(MARK) : CRC_OFFSET])))
-    return bytes(packet)
