@@ -60,7 +60,7 @@ PROMISED = {
     },
     "dextouch.clients.gym_env": {"WorldEnv": None},
     "services.acquisition.drivers.tactile_glove": {
-        "TactileGloveDecoder": None,
+        "TactileGloveDecoder": "",
         "TactileGloveDecoder.feed": "self data",
     },
     "services.alignment.calibration.intrinsics": {

@@ -53,7 +53,7 @@ def test_header_is_as_documented(rng):
 
 
 def test_samples_carry_counts_and_stamps(rng):
-    decoder = TactileGloveDecoder("left")
+    decoder = TactileGloveDecoder()
     data = glove_packet(3, rng)
     (sample,) = decoder.feed(data, 55)
     assert sample.t_host_ns == 55

@@ -169,7 +169,7 @@ class TactileGloveDecoder(StreamDecoder[Packet]):
     """Decodes one glove's byte stream to uint16 counts [360] in raw scan order.
 
     Args:
-        side: which glove it must be.
+        side: which glove it must be; None takes any.
         on_reply: takes each reply to a command with its arrival; without it replies are passed
             over.
         label: of a further glove of this hand.
@@ -177,7 +177,7 @@ class TactileGloveDecoder(StreamDecoder[Packet]):
 
     def __init__(
         self,
-        side: Side,
+        side: Side | None = None,
         *,
         on_reply: Callable[[Packet, int], None] | None = None,
         label: str | None = None,
@@ -188,9 +188,10 @@ class TactileGloveDecoder(StreamDecoder[Packet]):
             max_payload=PAYLOAD_BYTES,
             others={REPLY_MAGIC: (MIN_REPLY, MAX_REPLY)},
         )
-        super().__init__(glove_descriptor(side, label), packets)
-        self._side = side
-        self._device = f"glove_{hand_name(side, label)}"
+        # Where the side is open, the stream is named for the left hand.
+        super().__init__(glove_descriptor(side or "left", label), packets)
+        self._side: Side | None = side
+        self._device = f"glove_{'any' if side is None else hand_name(side, label)}"
         self._on_reply = on_reply
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
