@@ -20,6 +20,7 @@ from dextouch.hands.actions import (
     pose_to_9d,
     poses_from_actions,
     reanchor,
+    relative_pose_9d,
 )
 from services.alignment.calibration.hand_eye import solve_hand_eye, solve_robot_base
 from services.alignment.calibration.motion import move
@@ -78,13 +79,6 @@ def moved(trajectory, T):
     )
 
 
-def relative_to_first(Ts):
-    """Actions [n, 9] of a wrist alone, anchored at its first pose."""
-    joints = np.zeros((len(Ts), 20))
-    trajectory = HandTrajectory(Ts, Ts, joints, joints, Ts)
-    return actions_from_poses(trajectory, trajectory.anchor(0))[:, POSE_SLICES[0]]
-
-
 def difference(Ts_a, Ts_b):
     """Largest distance (m) and angle (degrees) of two sets of poses."""
     distance_m, angle_rad = pose_difference(Ts_a.reshape(-1, 4, 4), Ts_b.reshape(-1, 4, 4))
@@ -112,7 +106,7 @@ def test_the_first_step_is_exactly_the_identity():
                 again = reanchor(actions, 3)
                 assert again[3, part].tolist() == [0, 0, 0, 1, 0, 0, 0, 1, 0]
         for poses in poses_of(trajectory):
-            assert relative_to_first(poses)[0].tolist() == IDENTITY_POSE_9D.tolist()
+            assert relative_pose_9d(poses)[0].tolist() == IDENTITY_POSE_9D.tolist()
 
 
 def test_a_wrist_that_rests_does_not_move():
@@ -150,8 +144,8 @@ def test_actions_do_not_see_any_global_transform(capsys):
 def test_relative_motion_does_not_see_where_the_world_is(new_world, poses):
     T_new_world, Ts = pose_of(new_world), np.stack([pose_of(pose) for pose in poses])
     mount = Ts[-1]
-    motion = relative_to_first(Ts @ mount)
-    again = relative_to_first(T_new_world @ Ts @ mount)
+    motion = relative_pose_9d(Ts @ mount)
+    again = relative_pose_9d(T_new_world @ Ts @ mount)
     np.testing.assert_allclose(again, motion, atol=1e-9)
     np.testing.assert_array_equal(again[0], IDENTITY_POSE_9D)
 

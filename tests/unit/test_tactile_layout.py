@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.errors import ShapeError
+from dextouch.errors import ShapeError, UnknownNameError
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile import contact, heatmap, layout
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration, TactileGloveSource
@@ -115,6 +115,8 @@ def test_pads_round_trip():
 def test_bad_input_is_named():
     with pytest.raises(ShapeError, match="360"):
         layout.select_taxels(np.zeros(320), side="left")
+    with pytest.raises(UnknownNameError, match="dextouch_v1"):
+        layout.select_taxels(np.zeros(360), side="left", glove_model="other")
 
 
 def test_contact_threshold_is_two_kilopascal():

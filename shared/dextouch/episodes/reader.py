@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Literal, TypeVar, overload
 
 import numpy as np
 from jaxtyping import Int64
@@ -104,6 +104,28 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         stamps = self.stamps_ns(name)[low:high].copy()
         return StreamData(stamps, self._values(name, low, high))
 
+    @overload
+    def window(
+        self,
+        start: int,
+        num_steps: int = ...,
+        *,
+        cameras: tuple[str, ...] = ...,
+        action_kind: ActionKind = ...,
+        grid: Literal[True] = ...,
+        form: ImageForm = ...,
+    ) -> Window: ...
+    @overload
+    def window(
+        self,
+        start: int,
+        num_steps: int = ...,
+        *,
+        cameras: tuple[str, ...] = ...,
+        action_kind: ActionKind = ...,
+        grid: Literal[False],
+        form: ImageForm = ...,
+    ) -> NativeWindow: ...
     def window(
         self,
         start: int,
@@ -111,8 +133,9 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         *,
         cameras: tuple[str, ...] = ("camera_head",),
         action_kind: ActionKind = "measured",
+        grid: bool = True,
         form: ImageForm = FULL_FORM,
-    ) -> Window:
+    ) -> Window | NativeWindow:
         """Steps start … start + num_steps − 1, decoding only what they need.
 
         Args:
@@ -120,6 +143,8 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             num_steps: at least 1.
             cameras: image streams to read; the others are not decoded.
             action_kind: measured (reached) or commanded (sent) actions.
+            grid: on the model grid; False gives all streams at their own rates, the camera
+                streams among them only for `cameras` (see `native_window`).
             form: half size or gray images.
 
         Raises:
@@ -133,6 +158,8 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             raise UnknownNameError("action kind", action_kind, list(ACTION_STREAMS))
         stop = start + num_steps
         grid_ns = self._column("action_t_ref_ns")
+        if not grid:
+            return self.native_window(start, num_steps, cameras=cameras, form=form)
         nearest = {name: self._nearest(name, grid_ns[start:stop]) for name in cameras}
         pictures = each_camera(lambda name: self.images_at(name, nearest[name], form=form), cameras)
         left, right = (self._tactile(side, start, stop) for side in SIDES)
@@ -163,7 +190,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         """The time span of steps start … start + num_steps − 1 with every stream at its own rate.
 
         Arguments and errors are those of `window`; `streams` are the streams to read besides the
-        cameras, None for all others.
+        cameras, None for all.
         """
         self._check_steps(start, num_steps)
         self._check_cameras(cameras)

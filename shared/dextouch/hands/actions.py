@@ -96,6 +96,14 @@ def pose_from_9d(pose: np.ndarray) -> Float64[np.ndarray, "*batch 4 4"]:
     return transform(rotation_from_6d(pose[..., 3:]), pose[..., :3])
 
 
+def relative_pose_9d(Ts_world_x: np.ndarray) -> Float64[np.ndarray, "time 9"]:
+    """Poses [T, 4, 4] relative to the first: T_0⁻¹ T_t as 9-D; row 0 is exactly the identity."""
+    Ts = np.asarray(Ts_world_x, dtype=np.float64)
+    if Ts.ndim != 3 or Ts.shape[1:] != (4, 4) or len(Ts) == 0:
+        raise ShapeError(f"poses: got shape {Ts.shape}, expected [T ≥ 1, 4, 4]")
+    return _relative_9d(Ts[0], Ts)
+
+
 def pack_action(
     *,
     wrist_left: np.ndarray,

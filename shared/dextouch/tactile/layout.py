@@ -41,13 +41,15 @@ def taxel_areas_m2() -> np.ndarray:
 
 
 @cache
-def raw_indices(*, side: Side) -> Int64[np.ndarray, "320"]:
+def raw_indices(*, side: Side, glove_model: str = "dextouch_v1") -> Int64[np.ndarray, "320"]:
     """Raw cell of each taxel; read-only.
 
-    A glove scans 18 rows × 20 columns. Rows 0–3 hold the five fingertips side by side,
+    `dextouch_v1` scans 18 rows × 20 columns. Rows 0–3 hold the five fingertips side by side,
     rows 4–15 the palm row by row, rows 16–17 are unused (40 cells). The left glove is wired as
     the mirror image: its columns run the other way.
     """
+    if glove_model != "dextouch_v1":
+        raise UnknownNameError("glove model", glove_model, ["dextouch_v1"])
     if side not in SIDES:
         raise UnknownNameError("side", side, list(SIDES))
     cells = np.arange(NUM_RAW_TAXELS).reshape(_SCAN_SHAPE)
@@ -60,31 +62,33 @@ def raw_indices(*, side: Side) -> Int64[np.ndarray, "320"]:
     return indices
 
 
-def select_taxels(raw: np.ndarray, *, side: Side) -> np.ndarray:
+def select_taxels(raw: np.ndarray, *, side: Side, glove_model: str = "dextouch_v1") -> np.ndarray:
     """The 320 taxels, in anatomical order, of raw readings [..., 360]; dtype is kept.
 
     Raises:
         ShapeError: the last axis is not 360.
-        UnknownNameError: unknown side.
+        UnknownNameError: unknown side or glove model.
     """
     raw = np.asarray(raw)
     if raw.shape[-1:] != (NUM_RAW_TAXELS,):
         raise ShapeError(f"raw taxels: got shape {raw.shape}, expected [..., {NUM_RAW_TAXELS}]")
-    return raw[..., raw_indices(side=side)]
+    return raw[..., raw_indices(side=side, glove_model=glove_model)]
 
 
-def expand_taxels(taxels: np.ndarray, *, side: Side) -> np.ndarray:
+def expand_taxels(
+    taxels: np.ndarray, *, side: Side, glove_model: str = "dextouch_v1"
+) -> np.ndarray:
     """Raw readings [..., 360] from taxels [..., 320]; cells without a taxel are zero.
 
     Raises:
         ShapeError: the last axis is not 320.
-        UnknownNameError: unknown side.
+        UnknownNameError: unknown side or glove model.
     """
     taxels = np.asarray(taxels)
     if taxels.shape[-1:] != (NUM_TAXELS,):
         raise ShapeError(f"taxels: got shape {taxels.shape}, expected [..., {NUM_TAXELS}]")
     raw = np.zeros((*taxels.shape[:-1], NUM_RAW_TAXELS), dtype=taxels.dtype)
-    raw[..., raw_indices(side=side)] = taxels
+    raw[..., raw_indices(side=side, glove_model=glove_model)] = taxels
     return raw
 
 

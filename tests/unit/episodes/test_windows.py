@@ -127,7 +127,7 @@ def test_lost_tactile_samples_are_flagged(made, store):
 
 
 def test_native_rates(made, store):
-    window = made.write(store).native_window(3, 5)
+    window = made.write(store).window(3, 5, grid=False)
     assert len(window.streams["tactile_left"]) == 17
     assert len(window.streams["camera_head"]) == 9
     assert "camera_wrist_left" not in window.streams
