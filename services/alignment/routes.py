@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query, Response, status
 
 from dextouch.schemas import error_from_problem
-from dextouch.serving import JSON, KIB, RequireScope, takes
+from dextouch.serving import JSON, KIB, JsonBody, RequireScope, takes
 from services.alignment.job_runner import JobRunner
 from services.alignment.schemas import (
     ENDED,
@@ -29,7 +29,7 @@ def alignments_router(jobs: JobRunner) -> APIRouter:
     @router.post("", status_code=status.HTTP_202_ACCEPTED)
     @takes({JSON: 256 * KIB})
     async def start(
-        request: AlignmentRequest,
+        request: Annotated[AlignmentRequest, Depends(JsonBody(AlignmentRequest))],
         response: Response,
         wait: bool = Query(default=False),  # noqa: FBT001 - a query parameter
     ) -> AlignmentJob | AlignmentList:

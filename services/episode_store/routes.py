@@ -16,16 +16,18 @@ from dextouch.schemas import (
     RecordingStatus,
     UploadList,
 )
-from dextouch.serving import AS_SET, JSON, MSGPACK, OCTETS, RequireScope, takes
+from dextouch.serving import AS_SET, JSON, KIB, MSGPACK, OCTETS, JsonBody, RequireScope, takes
 from services.episode_store.catalog import Catalog, EpisodeFilter, EpisodeQuery, RecordingQuery
 from services.episode_store.intake import Intake
 from services.episode_store.reading import Answer, SpanQuery, StoreReader, WindowQuery
 
+Attributes = Annotated[RecordingAttributes, Depends(JsonBody(RecordingAttributes))]
+Finish = Annotated[FinishRecording, Depends(JsonBody(FinishRecording))]
 Responses = dict[int | str, dict[str, Any]]
 MAY_READ = Depends(RequireScope("store_read"))
 MAY_WRITE = Depends(RequireScope("store_write"))
 # Room for the calibration and descriptors of a station, or the ledger of a take.
-MAX_ATTRIBUTES_BYTES = 2**20
+MAX_ATTRIBUTES_BYTES = 256 * KIB
 WINDOW_MSGPACK = "application/vnd.dextouch.window+msgpack"
 # Committed content is immutable but may be deleted: clients must revalidate.
 CACHE_CONTROL = "private, no-cache"
@@ -41,7 +43,7 @@ def uploads_router(intake: Intake) -> APIRouter:
 
     @router.post("/recordings", status_code=201, tags=["recordings"], dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def create(attributes: RecordingAttributes) -> RecordingStatus:
+    def create(attributes: Attributes) -> RecordingStatus:
         """Begin an upload, or return the status of an existing one."""
         return intake.create(attributes)
 
@@ -62,7 +64,7 @@ def uploads_router(intake: Intake) -> APIRouter:
 
     @router.post("/recordings/{recording_id}/finish", tags=["recordings"], dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def finish(recording_id: str, body: FinishRecording) -> RecordingStatus:
+    def finish(recording_id: str, body: Finish) -> RecordingStatus:
         """Commit a complete upload."""
         return intake.finish(recording_id, body)
 

@@ -8,6 +8,7 @@ from typing import Any, Final, Literal, TypeVar
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 from pydantic import BaseModel, Field, ValidationError, field_validator
+from pydantic_core import from_json
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
 from dextouch.frozen_model import FrozenModel
@@ -374,8 +375,9 @@ def validate_fields(model: type[ModelT], fields: object, *, where: str) -> Model
         InvalidInputError: wrong fields; the message begins with `where`.
     """
     try:
-        if isinstance(fields, bytes):
-            return model.model_validate_json(fields)
-        return model.model_validate(fields)
+        # Not model_validate_json, which converts unknown parts once per mistake.
+        return model.model_validate(from_json(fields) if isinstance(fields, bytes) else fields)
     except ValidationError as error:
         raise InvalidInputError(f"{where}: {first_problems(error)}") from error
+    except ValueError as error:
+        raise InvalidInputError(f"{where}: Invalid JSON: {error}") from error

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from dextouch.serving.guard import media_type as media_type
     from dextouch.serving.guard import not_signed_in as not_signed_in
     from dextouch.serving.guard import takes as takes
+    from dextouch.serving.json_bodies import JsonBody as JsonBody
     from dextouch.serving.logs import configure_logging as configure_logging
     from dextouch.serving.settings import MAX_WEBSOCKET_BYTES as MAX_WEBSOCKET_BYTES
     from dextouch.serving.settings import ServiceSettings as ServiceSettings

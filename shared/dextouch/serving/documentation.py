@@ -7,7 +7,7 @@ method and parameters the refusals, all of them problem+json.
 
 from collections.abc import Iterator, Sequence
 from http import HTTPStatus
-from typing import Any
+from typing import Any, TypeVar
 
 from fastapi import APIRouter, FastAPI
 from fastapi.dependencies.models import Dependant
@@ -15,7 +15,9 @@ from fastapi.routing import APIRoute
 
 from dextouch.schemas import PROBLEM_MEDIA_TYPE, Problem
 from dextouch.serving.guard import JSON, SAFE_METHODS, RequireScope, body_rule
+from dextouch.serving.json_bodies import JsonBody
 
+CallT = TypeVar("CallT")
 KEY_SCHEME = "api_key"
 BEARER = {"type": "http", "scheme": "bearer", "description": "A key of the service's settings."}
 BINARY = {"type": "string", "format": "binary"}
@@ -48,11 +50,15 @@ def document_service(
     schemas.pop("HTTPValidationError", None)
     schemas.pop("ValidationError", None)
     for operation, route, method in _operations(document, routers):
-        scopes = list(_scopes(route.dependant))
+        scopes = [needed.scope for needed in _dependencies(route.dependant, RequireScope)]
         if scopes:
             document["components"].setdefault("securitySchemes", {})[KEY_SCHEME] = BEARER
             keyed = {KEY_SCHEME: scopes}
             operation["security"] = [keyed] if needs_key else [keyed, {}]
+        for body in _dependencies(route.dependant, JsonBody):
+            schema = body.model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas |= schema.pop("$defs", {})
+            operation["requestBody"] = {"required": True, "content": {JSON: {"schema": schema}}}
         _document_body(operation, route)
         _document_refusals(operation, method, has_scope=bool(scopes))
     return document
@@ -69,12 +75,12 @@ def _operations(
                     yield document["paths"][route.path_format][method.lower()], route, method
 
 
-def _scopes(dependant: Dependant) -> Iterator[str]:
-    """Scopes that the dependencies of a route require."""
+def _dependencies(dependant: Dependant, kind: type[CallT]) -> Iterator[CallT]:
+    """Dependencies of a route of one kind, in order."""
     for dependency in dependant.dependencies:
-        if isinstance(dependency.call, RequireScope):
-            yield dependency.call.scope
-        yield from _scopes(dependency)
+        if isinstance(dependency.call, kind):
+            yield dependency.call
+        yield from _dependencies(dependency, kind)
 
 
 def _document_body(operation: dict[str, Any], route: APIRoute) -> None:
