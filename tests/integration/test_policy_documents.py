@@ -147,6 +147,13 @@ def test_the_environment_of_the_page_runs(folder, services, capsys):
     assert "chunks ended at step 80 success: False" in capsys.readouterr().out
 
 
+def test_the_vector_environment_of_the_page_runs(folder, services):
+    script = folder / "try_vector.py"
+    script.write_text(here(block(POLICIES, "WorldVectorEnv("), services))
+    left = runpy.run_path(str(script))
+    assert left["info"]["last_step"].tolist() == [32, 32]
+
+
 def test_the_command_of_the_page_scores_the_policy(folder, services, capsys):
     command = here(block(POLICIES, "dextouch evaluate --policy"), services)
     _, *words = shlex.split(command.replace("\\\n", " "))

@@ -1,18 +1,24 @@
-"""Gymnasium environment of a served world; one environment step is one action chunk.
+"""Gymnasium environments of a served world, single and vector; one step is one action chunk.
 
     env = WorldEnv(RolloutClient(url), world="twin", task="stand_bottle", instruction="…")
     observation, info = env.reset(seed=3)
     observation, reward, terminated, truncated, info = env.step(actions)  # [chunk_steps, 67]
 
-Gymnasium's autoreset draws a new start by itself; to compare policies from matched starts use
-`AutoresetMode.DISABLED` and a seed for every reset.
+`WorldVectorEnv` steps several at the same time, so that the service computes them in batches.
+Gymnasium's autoreset would draw new starts by itself, but policies are compared from matched ones;
+so it is disabled there, and every reset has its seeds.
 """
 
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar, cast
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
+from jaxtyping import Bool, Float, Float64
 
 from dextouch.clients.rollouts import Rollout, RolloutClient
 from dextouch.errors import EndedError, InvalidInputError, UnknownNameError
@@ -27,6 +33,7 @@ MAX_TACTILE_KPA = 1e6
 MAX_REACHED = 1e6
 
 SeenNow = dict[str, Any]
+ResultT = TypeVar("ResultT")
 
 
 class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
@@ -59,7 +66,7 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         max_chunks: int = 5,
     ) -> None:
         self.metadata = {"render_modes": []}
-        self._client = client
+        self.client = client
         self._rollout: Rollout | None = None
         self._task = task
         self._instruction = instruction
@@ -92,7 +99,7 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         start_seed = int(self.np_random.integers(2**31)) if seed is None else seed
         self.close()
         init = (options or {}).get("init")
-        self._rollout = self._client.start(
+        self._rollout = self.client.start(
             world=self.description.name,
             task=self._task,
             seed=start_seed,
@@ -130,6 +137,130 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
             "doubt": rollout.observation.doubt,
             "ended": None,
         }
+
+
+class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
+    """Several environments of a served world that step at the same time.
+
+    Autoreset is disabled: once an episode has ended, its environment must be reset before the next
+    step, by `options={"reset_mask": terminations | truncations}`. If a reset or a step raises, some
+    environments may have done it and others not; reset all of them.
+
+    Args:
+        envs: of equal spaces, each with a client of its own, since a client is not thread-safe.
+            They are closed with this one; their clients stay open.
+    """
+
+    def __init__(self, envs: Sequence[WorldEnv]) -> None:
+        first = envs[0]
+        if len({id(env.client) for env in envs}) < len(envs):
+            raise InvalidInputError("envs: two have the same client, expected one for each")
+        for env in envs:
+            if (env.observation_space, env.action_space) != (
+                first.observation_space,
+                first.action_space,
+            ):
+                raise InvalidInputError("envs: their spaces differ, expected equal ones")
+        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.DISABLED}
+        self.num_envs = len(envs)
+        self.single_observation_space = first.observation_space
+        self.single_action_space = first.action_space
+        self.observation_space = batch_space(first.observation_space, self.num_envs)
+        self.action_space = batch_space(first.action_space, self.num_envs)
+        self._envs = envs
+        self._threads = ThreadPoolExecutor(self.num_envs, "world_env")
+        self._seen: list[SeenNow] = [{}] * self.num_envs
+        self._needs_reset = np.ones(self.num_envs, bool)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[SeenNow, dict[str, Any]]:
+        """Start new rollouts.
+
+        Args:
+            seed: one for each environment, or that of the first, counted up for the others.
+            options: {"reset_mask": bool array [num_envs]} leaves the others as they are;
+                {"inits": sequence} starts each from its own (observation, anchor, K_head).
+        """
+        rest = dict(options or {})
+        chosen = self._chosen(rest.pop("reset_mask", None))
+        inits = rest.pop("inits", None)
+        if rest:
+            raise UnknownNameError("reset option", sorted(rest)[0], ["inits", "reset_mask"])
+        seeds = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
+        for name, values in (("seed", seeds), ("inits", inits)):
+            if values is not None and len(values) != self.num_envs:
+                raise InvalidInputError(f"{name}: got {len(values)}, expected {self.num_envs}")
+
+        def begin(i: int) -> tuple[SeenNow, dict[str, Any]]:
+            options = None if inits is None else {"init": inits[i]}
+            return self._envs[i].reset(seed=None if seeds is None else seeds[i], options=options)
+
+        self._needs_reset[chosen] = True
+        infos: dict[str, Any] = {}
+        for i, (seen, info) in zip(chosen, self._together(begin, chosen), strict=True):
+            self._seen[i] = seen
+            infos = self._add_info(infos, info, i)
+        self._needs_reset[chosen] = False
+        return self._batch(), infos
+
+    def step(
+        self, actions: Float[np.ndarray, "envs steps 67"]
+    ) -> tuple[
+        SeenNow,
+        Float64[np.ndarray, " envs"],
+        Bool[np.ndarray, " envs"],
+        Bool[np.ndarray, " envs"],
+        dict[str, Any],
+    ]:
+        """Advance every environment by one chunk, relative to its start's poses."""
+        if self._needs_reset.any():
+            raise InvalidInputError(
+                f"step: environments {np.flatnonzero(self._needs_reset).tolist()} have no episode; "
+                "reset them first, with options={'reset_mask': …}"
+            )
+        self._needs_reset[:] = True
+        every = range(self.num_envs)
+        results = self._together(lambda i: self._envs[i].step(actions[i]), every)
+        self._seen, rewards, terminated, truncated, each = map(list, zip(*results, strict=True))
+        infos: dict[str, Any] = {}
+        for i, info in enumerate(each):
+            infos = self._add_info(infos, info, i)
+        self._needs_reset = np.logical_or(terminated, truncated)
+        return self._batch(), np.array(rewards), np.array(terminated), np.array(truncated), infos
+
+    def close_extras(self) -> None:
+        """End the running rollouts."""
+        self._together(lambda i: self._envs[i].close(), range(self.num_envs))
+        self._threads.shutdown()
+
+    def _chosen(self, mask: object) -> list[int]:
+        """Indices of the environments to reset."""
+        if mask is None:
+            return list(range(self.num_envs))
+        array = np.asarray(mask)
+        if array.shape != (self.num_envs,) or array.dtype != bool or not array.any():
+            raise InvalidInputError(
+                f"reset_mask: got {mask!r}, expected {self.num_envs} booleans, one of them true"
+            )
+        if not all(self._seen[i] for i in np.flatnonzero(~array)):
+            raise InvalidInputError("reset_mask: expected none at the first reset")
+        return [int(i) for i in np.flatnonzero(array)]
+
+    def _together(self, call: Callable[[int], ResultT], chosen: Iterable[int]) -> list[ResultT]:
+        """Call with each index in a thread of its own; raises the first error once all are done."""
+        pending = [self._threads.submit(call, i) for i in chosen]
+        errors = [future.exception() for future in pending]
+        for error in filter(None, errors):
+            raise error
+        return [future.result() for future in pending]
+
+    def _batch(self) -> SeenNow:
+        empty = cast(SeenNow, create_empty_array(self.single_observation_space, self.num_envs))
+        return dict(concatenate(self.single_observation_space, self._seen, empty))
 
 
 def _observation_space(description: WorldDescription) -> spaces.Space[SeenNow]:

@@ -1,11 +1,16 @@
-"""The gymnasium environment: gymnasium's own checker, matched seeds, ends and truncation."""
+"""The gymnasium environments: gymnasium's own checker and vector, matched seeds, ends, masks."""
+
+import threading
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 from dextouch.clients import RolloutClient
-from dextouch.clients.gym_env import WorldEnv
+from dextouch.clients.gym_env import WorldEnv, WorldVectorEnv
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from tests.unit.worlds.fakes import K_HEAD, SumWorld, actions, anchor, observation
@@ -15,14 +20,37 @@ ASKED = {"task": "stand_bottle", "instruction": "stand the bottle"}
 
 
 @pytest.fixture(scope="module")
-def client():
+def url():
     world = SumWorld()
     worlds = {"sum": world, "copy-first": CopyFirstWorld.beside(world.description)}
-    with (
-        served(create_world_app(worlds, WorldServiceSettings())) as url,
-        RolloutClient(url) as opened,
-    ):
+    with served(create_world_app(worlds, WorldServiceSettings())) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def client(url):
+    with RolloutClient(url) as opened:
         yield opened
+
+
+@pytest.fixture
+def make_envs(url):
+    """Several single environments, each with its own client."""
+    with ExitStack() as opened:
+
+        def make(num_envs, kind=WorldEnv, **given):
+            given = {"world": "sum", "chunk_steps": 4, "max_chunks": 3} | ASKED | given
+            clients = [opened.enter_context(RolloutClient(url)) for _ in range(num_envs)]
+            return [kind(each, **given) for each in clients]
+
+        yield make
+
+
+@pytest.fixture
+def vector(make_envs):
+    made = WorldVectorEnv(make_envs(3))
+    yield made
+    made.close()
 
 
 @pytest.fixture
@@ -88,3 +116,115 @@ def test_abandoned_episodes_are_ended_at_the_service(client):
     for seed in range(100):  # More than the service keeps alive.
         env.reset(seed=seed)
     env.close()
+
+
+def assert_equal(ours, theirs):
+    """Equal in keys, dtypes, shapes and values."""
+    if isinstance(theirs, dict):
+        assert list(ours) == list(theirs)
+        for name in theirs:
+            assert_equal(ours[name], theirs[name])
+    elif isinstance(theirs, tuple):
+        for one, other in zip(ours, theirs, strict=True):
+            assert_equal(one, other)
+    else:
+        assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape)
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_the_vector_is_that_of_gymnasium(make_envs, vector):
+    """SyncVectorEnv of the same single environments, which steps one after the other."""
+    makers = [lambda env=env: env for env in make_envs(3)]
+    theirs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
+    assert vector.metadata == theirs.metadata
+    assert vector.observation_space == theirs.observation_space
+    assert vector.action_space == theirs.action_space
+    assert_equal(vector.reset(seed=[97, 3, 98]), theirs.reset(seed=[97, 3, 98]))
+    chunks = np.stack([actions(4), actions(4), actions(4, 10.0)])
+    ours = vector.step(chunks)
+    assert_equal(ours, theirs.step(chunks))
+    terminations, truncations = ours[2:4]
+    assert terminations.tolist() == [False, False, True]
+    mask = terminations | truncations
+    for _ in range(2):
+        with pytest.raises(InvalidInputError, match=r"environments \[2\] have no episode"):
+            vector.step(chunks)
+    again = [one.reset(seed=40, options={"reset_mask": mask.copy()}) for one in (vector, theirs)]
+    assert_equal(*again)
+    rest = np.stack([actions(4)] * 3)
+    assert_equal(vector.step(rest), theirs.step(rest))
+    theirs.close()
+
+
+def test_the_vector_keeps_gymnasiums_promises(vector):
+    first, info = vector.reset(seed=5)
+    assert vector.observation_space.contains(first)
+    kept = {name: array.copy() for name, array in first.items()}
+    vector.action_space.seed(1)
+    assert vector.action_space.contains(np.stack([actions(4)] * 3))
+    seen, rewards, *_ = vector.step(np.stack([actions(4, 0.2)] * 3))
+    assert vector.observation_space.contains(seen)
+    assert rewards.dtype == np.float64
+    assert_equal(first, kept)
+    assert_equal(vector.reset(seed=5), (first, info))
+    wrapped = DictInfoToList(RecordEpisodeStatistics(vector))
+    _, infos = wrapped.reset(seed=5)
+    assert [one["last_step"] for one in infos] == [0, 0, 0]
+
+
+def test_the_vector_steps_all_at_the_same_time(make_envs):
+    meet = threading.Barrier(4, timeout=30)
+
+    class Meeting(WorldEnv):
+        def reset(self, **given):
+            meet.wait()
+            return super().reset(**given)
+
+        def step(self, action):
+            meet.wait()
+            return super().step(action)
+
+    env = WorldVectorEnv(make_envs(4, Meeting))
+    env.reset(seed=0)
+    env.step(np.stack([actions(4)] * 4))
+    env.close()
+
+
+def test_each_of_the_vector_begins_from_its_own_observation(make_envs):
+    env = WorldVectorEnv(make_envs(2, world="copy-first"))
+    starts = [observation(seed=7), observation(seed=8)]
+    inits = [(start, anchor(), K_HEAD) for start in starts]
+    seen, _ = env.reset(seed=1, options={"inits": inits})
+    for tactile_kpa, start in zip(seen["tactile_kpa"], starts, strict=True):
+        np.testing.assert_array_equal(tactile_kpa, start.tactile_kpa[0])
+    env.close()
+
+
+def test_wrong_use_of_the_vector_is_named(make_envs, vector):
+    envs = make_envs(2)
+    with pytest.raises(InvalidInputError, match="same client"):
+        WorldVectorEnv([envs[0], envs[0]])
+    with pytest.raises(InvalidInputError, match="spaces differ"):
+        WorldVectorEnv([envs[0], *make_envs(1, chunk_steps=8)])
+    with pytest.raises(InvalidInputError, match=r"environments \[0, 1, 2\] have no episode"):
+        vector.step(np.stack([actions(4)] * 3))
+    with pytest.raises(UnknownNameError, match="valid: inits, reset_mask"):
+        vector.reset(options={"init": None})
+    for seed in ([1, 2], range(4)):
+        with pytest.raises(InvalidInputError, match=r"seed: got \d, expected 3"):
+            vector.reset(seed=seed)
+    with pytest.raises(InvalidInputError, match="none at the first reset"):
+        vector.reset(options={"reset_mask": np.array([True, False, True])})
+    for mask in ([True, False], [1, 0, 1], [False] * 3, "all"):
+        with pytest.raises(InvalidInputError, match="reset_mask: got"):
+            vector.reset(options={"reset_mask": mask})
+
+
+def test_a_step_that_fails_in_one_environment_needs_a_reset_of_all(vector):
+    vector.reset(seed=0)
+    with pytest.raises(InvalidInputError, match="joint 1e6"):
+        vector.step(np.stack([actions(4), actions(4, 1e6), actions(4)]))
+    with pytest.raises(InvalidInputError, match=r"environments \[0, 1, 2\]"):
+        vector.step(np.stack([actions(4)] * 3))
+    vector.reset(seed=0)
+    vector.step(np.stack([actions(4)] * 3))
