@@ -20,17 +20,17 @@ $(VENV)/.runtime: pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all]'
 	touch $@
 
-# aiowuji holds the maker's model of the hand, for tests; alone, since its driver has telemetry on.
+# aiowuji contains the manufacturer's hand model, for tests; --no-deps, since they include a driver with telemetry.
 $(VENV)/.dev: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt --no-deps aiowuji
 	touch $@ $(VENV)/.runtime
 
-demo: $(VENV)/.runtime   ## record, align, imagine and score, on this machine
+demo: $(VENV)/.runtime   ## record, align, predict and evaluate on this machine
 	$(BIN)/dextouch demo
 
-# Bytecode is kept, since tests start many processes that would each compile all modules anew.
+# Bytecode is cached, since tests start many processes that would otherwise each compile all modules.
 test: $(VENV)/.dev       ## the default test run (seven to eight minutes on two cores)
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n logical --dist loadfile
 
@@ -43,11 +43,11 @@ wheel-test: $(VENV)/.dev   ## build the wheel, install it outside the checkout, 
 vm: $(VENV)/.dev         ## real drivers on a Debian kernel's devices; apt-get install qemu-system-x86 busybox-static cpio kmod
 	$(BIN)/python -m pytest -q -s -m vm tests/vm
 
-fuzz: $(VENV)/.dev       ## mutate packets of all gloves, guided by coverage, then requests to all services; ARGS="--seconds 600"
+fuzz: $(VENV)/.dev       ## fuzz glove packets, guided by coverage, then requests to all services; ARGS="--seconds 600"
 	PYTHONPATH=.:shared $(BIN)/python -m tests.fuzz.mutate $(ARGS)
 	$(BIN)/python -m pytest -q -m slow tests/integration/test_openapi_conformance.py
 
-mutants: $(VENV)/.dev    ## plant known bugs one by one and count those that a test notices; ARGS="--area geometry"
+mutants: $(VENV)/.dev    ## plant known bugs one at a time and count those that a test detects; ARGS="--area geometry"
 	PYTHONPATH=.:shared $(BIN)/python -m tests.mutants.run $(ARGS)
 
 check: $(VENV)/.dev      ## format, lint, types, import contracts
@@ -56,7 +56,7 @@ check: $(VENV)/.dev      ## format, lint, types, import contracts
 	$(BIN)/mypy -p dextouch -p services -p benchmarks
 	PYTHONPATH=.:shared $(BIN)/lint-imports
 
-bench: $(VENV)/.dev      ## time the stages against their errors, one after another; STAGE=clocks ARGS="--quick" for one
+bench: $(VENV)/.dev      ## measure time and error of each stage; STAGE=clocks ARGS="--quick" for one
 	@missed=; for stage in $(STAGE); do echo "== $$stage"; \
 	$(BIN)/python -m benchmarks $$stage --out runs/bench $(ARGS) || missed="$$missed $$stage"; done; \
 	if [ -n "$$missed" ]; then echo "make bench: failed:$$missed" >&2; exit 1; fi
@@ -64,8 +64,8 @@ bench: $(VENV)/.dev      ## time the stages against their errors, one after anot
 stress: $(VENV)/.dev     ## check every stage against numerical hazards; ARGS="--quick", or names of stages
 	$(BIN)/python -m benchmarks stress $(ARGS)
 
-# Every step goes on where it was broken off. The last one says which bounds are met, and which figures are those of docs/evaluator.json.
-reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state model, its judge and the cloned policies anew, in runs/reproduce
+# Run again to resume after an interruption. The last step reports which bounds are met and which figures match docs/evaluator.json.
+reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's state model, success probe and cloned policies, and measure them, in runs/reproduce
 	$(BIN)/dextouch train data --store $(MADE)/train --count 600 --images 4
 	$(BIN)/dextouch train data --store $(MADE)/train --tasks insert_peg,place_phone --count 650 --images 4
 	$(BIN)/dextouch train data --store $(MADE)/train --tasks place_shoes --count 750 --images 4
@@ -97,10 +97,10 @@ fix: $(VENV)/.dev        ## format the code and apply automatic lint fixes
 $(LEROBOT_VENV)/.complete: $(LEROBOT)/make_venv.sh $(LEROBOT)/requirements.txt $(LEROBOT)/prepare.py
 	PYTHON=$(PYTHON) $(LEROBOT)/make_venv.sh $(LEROBOT_VENV)
 
-bench-lerobot: $(LEROBOT_VENV)/.complete   ## opt-in: our store beside LeRobotDataset v3; ARGS="--rounds 5"
+bench-lerobot: $(LEROBOT_VENV)/.complete   ## opt-in: compare our store with LeRobotDataset v3; ARGS="--rounds 5"
 	$(LEROBOT_VENV)/bin/python $(LEROBOT)/bench.py --out runs/bench_lerobot $(ARGS)
 
-check-lerobot-export: $(LEROBOT_VENV)/.complete   ## opt-in: our exports open in lerobot itself
+check-lerobot-export: $(LEROBOT_VENV)/.complete   ## opt-in: check that lerobot itself opens our exports
 	$(LEROBOT_VENV)/bin/python $(LEROBOT)/check_export.py
 
 $(OPENPI_VENV)/.complete:
@@ -108,7 +108,7 @@ $(OPENPI_VENV)/.complete:
 	$(OPENPI_VENV)/bin/pip install --quiet --disable-pip-version-check openpi-client==0.1.2 'websockets>=13' typing_extensions
 	touch $@
 
-check-openpi: $(VENV)/.dev $(OPENPI_VENV)/.complete   ## opt-in: openpi's own client and packing, both ways
+check-openpi: $(VENV)/.dev $(OPENPI_VENV)/.complete   ## opt-in: check interoperability with openpi's own client and packing
 	$(BIN)/python tests/system/openpi/check.py $(OPENPI_VENV)/bin/python
 
 # The site reads the docstrings of dextouch and needs neither torch nor mujoco, so it has an environment of its own.
