@@ -1,1 +1,1 @@
-"""The world model: learns joint futures of sight and touch from episodes and serves them."""
+"""The world model: networks that predict images and touch, their training and serving."""

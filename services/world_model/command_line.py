@@ -28,7 +28,7 @@ def run_train(arguments: list[str]) -> int:
     columns = (
         TextColumn("training"),
         BarColumn(),
-        TextColumn("step {task.fields[step]}  sight {task.fields[video]:.3f}"),
+        TextColumn("step {task.fields[step]}  video {task.fields[video]:.3f}"),
         TextColumn("touch {task.fields[tactile]:.3f}"),
         TimeRemainingColumn(),
     )

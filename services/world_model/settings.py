@@ -140,9 +140,15 @@ class CoreSettings(FrozenModel):
     weight_decay: WeightDecay = 0.05
     ema_decay: AverageDecay = 0.99
     first_fraction: float = Field(default=0.6, ge=0, le=1, description="share of whole episodes")
-    measured_fraction: float = Field(default=0.15, ge=0, le=1, description="measured actions")
-    held_fraction: float = Field(default=0.04, ge=0, le=1, description="share of hands held still")
-    pose_noise_m: float = Field(default=0.0025, ge=0, description="noise on true start poses")
+    measured_fraction: float = Field(
+        default=0.15, ge=0, le=1, description="share of examples with measured actions"
+    )
+    held_fraction: float = Field(
+        default=0.04, ge=0, le=1, description="share of examples with the hands held still"
+    )
+    pose_noise_m: float = Field(
+        default=0.0025, ge=0, description="noise on ground-truth start poses"
+    )
     weights: CoreLossWeights = Field(
         default=CoreLossWeights(), description="weights of the training targets"
     )

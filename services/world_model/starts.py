@@ -70,7 +70,7 @@ def observed_start(start: RolloutStart, *, tasks: Sequence[str]) -> ObservedStar
     if len(observation) != 1:
         raise ShapeError(f"start: got {len(observation)} observed steps, expected one")
     if not np.isfinite(observation.tactile_kpa).all():
-        raise NonFiniteError("start: touch holds NaN or infinity; mask the sensor first")
+        raise NonFiniteError("start: touch contains NaN or infinity; mask the faulty taxels first")
     reached = observation.action_reached[-1].copy()
     for part in POSE_SLICES:
         reached[part] = IDENTITY_POSE_9D
@@ -93,12 +93,12 @@ def check_geometry(anchor: AnchorPoses, K_head: Float64[np.ndarray, "3 3"]) -> N
     """
     Ts = np.stack([np.asarray(T, dtype=np.float64) for T in anchor.as_tuple()])
     if not (np.isfinite(Ts).all() and np.isfinite(K_head).all()):
-        raise NonFiniteError("start: anchor or K_head hold NaN or infinity")
+        raise NonFiniteError("start: anchor or K_head contain NaN or infinity")
     far_m = float(np.abs(Ts[:, :3, 3]).max())
     if far_m > MAX_ANCHOR_M:
         raise InvalidInputError(
             f"start: an anchor pose lies {far_m:.3g} m from the world's origin, expected at most "
-            f"{MAX_ANCHOR_M} m; give poses in the frame of the table"
+            f"{MAX_ANCHOR_M} m; send poses in the frame of the table"
         )
     focal_px, centre_px = np.diag(K_head)[:2], np.abs(K_head[:2, 2])
     if focal_px.min() < 1.0 or max(focal_px.max(), centre_px.max()) > MAX_CAMERA_PX:

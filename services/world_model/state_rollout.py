@@ -65,8 +65,8 @@ def rollout_from_bytes(data: bytes, metadata: StateMetadata, digest: str) -> Sta
     fields, arrays = unpack(data, max_bytes=MAX_SNAPSHOT_BYTES)
     if fields.get("digest") != digest:
         raise InvalidInputError(
-            f"snapshot: of world {str(fields.get('digest'))[:12]!r}, expected {digest[:12]!r}; "
-            "restore it in the world that made it"
+            f"snapshot: made by world {str(fields.get('digest'))[:12]!r}, expected "
+            f"{digest[:12]!r}; restore it in the world that made it"
         )
     config, name = metadata.dynamics, fields.get("task")
     step, moving = fields.get("step"), fields.get("num_moving")

@@ -289,7 +289,7 @@ class StateWorld:
         if state.num_moving > DOUBTED_HORIZONS * bounds.horizon_latents:
             reason = "hands moved longer than in any episode of training"
         elif not found:
-            reason = "an object of the task was not found at the start, or members disagree whether"
+            reason = "an object of the task was not found at the start, or not by all members"
         elif disagreement_m > bounds.disagreement_m:
             reason = (
                 f"members disagree by {1e3 * disagreement_m:.0f} mm about an object, more than "
@@ -355,5 +355,5 @@ def _refuse_non_finite(imagined: ImaginedSteps) -> None:
     ):
         if not torch.isfinite(values).all():
             raise UnavailableError(
-                f"state model: its {what} hold NaN or infinity; the rollout did not advance"
+                f"state model: its {what} contain NaN or infinity; the rollout did not advance"
             )

@@ -205,7 +205,7 @@ class ModelWorld:
         fields, arrays = unpack(data, max_bytes=MAX_SNAPSHOT_BYTES)
         if fields.get("digest") != self._digest:
             raise InvalidInputError(
-                f"snapshot: of world {str(fields.get('digest'))[:12]!r}, expected "
+                f"snapshot: made by world {str(fields.get('digest'))[:12]!r}, expected "
                 f"{self._digest[:12]!r}; restore it in the world that made it"
             )
         step, words = fields.get("step"), fields.get("instruction")
@@ -319,5 +319,5 @@ def _refuse_non_finite(future: Prediction) -> None:
     for what, values in (("image", future.images), ("touch", future.tactile_kpa)):
         if not torch.isfinite(values).all():
             raise UnavailableError(
-                f"world model: its {what} holds NaN or infinity; the rollout did not advance"
+                f"world model: its {what} contains NaN or infinity; the rollout did not advance"
             )

@@ -54,10 +54,10 @@ def hand_motion(
     Args:
         actions: relative to `anchor`.
         anchor: T_world poses that the actions are relative to.
-        validated: `check_actions` has returned these actions, and they need no second look.
+        validated: the actions were returned by `check_actions` and are not checked again.
 
     Raises:
-        DegenerateRotationError: the actions hold a degenerate rotation.
+        DegenerateRotationError: the actions contain a degenerate rotation.
     """
     poses = poses_from_actions(actions, anchor, validated=validated)
     Ts = np.stack([poses.Ts_world_wrist_left, poses.Ts_world_wrist_right], axis=1)

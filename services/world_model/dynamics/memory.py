@@ -167,10 +167,10 @@ def _checked(
                 f"snapshot: {name} is {got}, expected {dtype} {shape} of this world's own snapshot"
             )
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise NonFiniteError(f"snapshot: {name} holds NaN or infinity")
+            raise NonFiniteError(f"snapshot: {name} contains NaN or infinity")
         if array.dtype.kind == "f" and np.abs(array).max() > _LARGEST:
             raise InvalidInputError(
-                f"snapshot: {name} holds numbers up to {np.abs(array).max():.3g}, expected at most "
+                f"snapshot: {name} has values up to {np.abs(array).max():.3g}, expected at most "
                 f"{_LARGEST:.0e}"
             )
         found[name] = torch.from_numpy(np.array(array))

@@ -34,7 +34,7 @@ class ObjectPoses:
 
 
 def objects_from_poses(poses: Shaped[np.ndarray, "*batch objects 7"]) -> ObjectPoses:
-    """Fill slots with true poses (x y z in metres, qw qx qy qz); further slots stay empty."""
+    """Fill slots with known poses (x y z in metres, qw qx qy qz); further slots stay empty."""
     T = transform_from_pose(np.asarray(poses, dtype=np.float64))
     batch, count = T.shape[:-3], T.shape[-3]
     position = np.zeros((*batch, MAX_OBJECTS, 3), dtype=np.float32)

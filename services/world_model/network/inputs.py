@@ -94,7 +94,7 @@ def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -
     Raises:
         ShapeError: wrong array shapes, or requests of different lengths.
         NonFiniteError: NaN or infinity.
-        DegenerateRotationError: the actions hold a degenerate rotation.
+        DegenerateRotationError: the actions contain a degenerate rotation.
         UnknownNameError: unknown action kind.
         InvalidInputError: poses or angles out of physical range, or no request.
     """
@@ -181,10 +181,10 @@ def _checked_anchor(anchor: AnchorPoses) -> np.ndarray:
     if Ts.shape != (3, 4, 4):
         raise ShapeError(f"anchor: got shape {Ts.shape}, expected three 4x4 transforms")
     if not np.isfinite(Ts).all():
-        raise NonFiniteError("anchor: holds NaN or infinity, expected rigid transforms")
+        raise NonFiniteError("anchor: contains NaN or infinity, expected rigid transforms")
     if (error := rigid_error(Ts)) > 1e-3:
         raise InvalidInputError(
-            f"anchor: no rigid transform (RᵀR differs from the identity by {error:.2g}), "
+            f"anchor: not a rigid transform (RᵀR differs from the identity by {error:.2g}), "
             "expected T_world_wrist_left, T_world_wrist_right, T_world_camera_head"
         )
     return Ts.round(DECIMALS) + 0.0
@@ -195,10 +195,10 @@ def _checked_camera(K_head: np.ndarray) -> np.ndarray:
     if K.shape != (3, 3):
         raise ShapeError(f"K_head: got shape {K.shape}, expected [3, 3]")
     if not np.isfinite(K).all():
-        raise NonFiniteError("K_head: holds NaN or infinity")
+        raise NonFiniteError("K_head: contains NaN or infinity")
     if K[0, 0] <= 0 or K[1, 1] <= 0:
         raise InvalidInputError(
-            f"K_head: focal lengths {K[0, 0]:.3g} and {K[1, 1]:.3g} px, expected positive ones"
+            f"K_head: got focal lengths {K[0, 0]:.3g} and {K[1, 1]:.3g} px, expected positive ones"
         )
     return K
 
@@ -216,7 +216,7 @@ def _checked_tactile(request: PredictionRequest) -> np.ndarray:
     if tactile.shape != (2, NUM_TAXELS):
         raise ShapeError(f"first touch: got shape {tactile.shape}, expected [2, {NUM_TAXELS}]")
     if not np.isfinite(tactile).all():
-        raise NonFiniteError("first touch: holds NaN or infinity; repair or mask the sensor first")
+        raise NonFiniteError("first touch: contains NaN or infinity; mask the faulty taxels first")
     if tactile.max() > MAX_PRESSURE_KPA:
         raise InvalidInputError(
             f"first touch: got {tactile.max():.3g} kPa, expected at most {MAX_PRESSURE_KPA:.0e}"

@@ -87,7 +87,7 @@ class JointWorldModel(nn.Module):
         images: UInt8[Tensor, "batch time px px 3"],
         tactile_kpa: Float32[Tensor, "batch time 2 320"],
     ) -> JointLatents:
-        """Anchored residuals of true windows in units of their deviation; the training target."""
+        """Anchored residuals of recorded windows in units of their deviation; training target."""
         video, tactile = self.codec.encode(to_unit(images)), self.tokenizer.encode(tactile_kpa)
         return JointLatents(
             (video - video[:, :1]) / self.video_residual_std,
@@ -183,7 +183,7 @@ class JointWorldModel(nn.Module):
         if others:
             raise InvalidInputError(
                 f"world model: got weights of {', '.join(sorted(map(str, others)))}, expected "
-                "float32; ask for precision='bfloat16' to have matrix products in bfloat16"
+                "float32; use precision='bfloat16' for matrix products in bfloat16"
             )
         return self.video_residual_std.device
 

@@ -1,6 +1,6 @@
 """Raster of both hands in the head image, drawn from the poses and joint angles of a window.
 
-The paper conditions by AdaLN alone; the raster of the projected hands is an addition. It tells the
+The paper conditions by AdaLN alone; the raster of the projected hands is an addition. It shows the
 network, to within about one cell, where in the image the hands will be.
 """
 

@@ -13,7 +13,7 @@ from services.world_model.rendering.scene_states import SceneStates
 
 @dataclass(frozen=True)
 class SceneClip:
-    """Images of one episode at `steps`, with the true state at each of them.
+    """Images of one episode at `steps`, with the ground-truth state at each of them.
 
     `boxes_m` holds centre and half sizes (x y z, x y z) of each object's box in the object frame.
     """
@@ -29,7 +29,7 @@ class SceneClip:
         if len(lengths) > 1 or len(self.steps) < 2:
             raise ShapeError(
                 f"scene clip: got {len(self.steps)} steps, {len(self.images)} images and "
-                f"{len(self.states)} states, expected at least two of each and as many of all"
+                f"{len(self.states)} states, expected equal numbers of at least two"
             )
 
     def __len__(self) -> int:

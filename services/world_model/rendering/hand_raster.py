@@ -1,4 +1,4 @@
-"""Drawing of both hands as coloured bones: points of the kinematic chains, splatted.
+"""Drawing of both hands as coloured bones, by splatting points of the kinematic chains.
 
 Each bone is a ribbon of points that faces the camera; a point keeps the colour of its position in
 the start image. A soft depth test resolves occlusion.

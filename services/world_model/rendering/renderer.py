@@ -74,7 +74,7 @@ class Renderer:
         if stacked.object_present.shape[1] != len(boxes_m):
             raise ShapeError(
                 f"renderer: states have {stacked.object_present.shape[1]} object slots but there "
-                f"are {len(boxes_m)} boxes; expected as many"
+                f"are {len(boxes_m)} boxes; expected equal numbers"
             )
         owner = np.zeros(len(states), dtype=np.int64)
         with torch.inference_mode():
@@ -137,5 +137,5 @@ class Renderer:
                 f"({len(start.object_present)}, 6) for the start's object slots"
             )
         if not (np.isfinite(K).all() and np.isfinite(boxes).all()):
-            raise NonFiniteError("renderer: K_head or boxes hold NaN or infinity")
+            raise NonFiniteError("renderer: K_head or boxes contain NaN or infinity")
         return Scenes(start_image[None], K[None], SceneStates.stack([start]), boxes[None])

@@ -85,5 +85,5 @@ class SceneStates:
             bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
             if len(bad):
                 raise NonFiniteError(
-                    f"scene state {bad[0]}: {name} holds NaN or infinity; expected finite numbers"
+                    f"scene state {bad[0]}: {name} contains NaN or infinity; expected finite values"
                 )

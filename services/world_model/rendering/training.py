@@ -1,4 +1,4 @@
-"""Training of the renderer on true states, some of them with pose noise like predicted ones."""
+"""Training of the renderer on ground-truth states, some with the pose noise of predicted ones."""
 
 import copy
 from collections.abc import Callable, Sequence
@@ -63,7 +63,9 @@ class RendererTraining(FrozenModel):
     late_start_fraction: float = Field(
         default=0.5, ge=0, le=1, description="share of pairs with a random start image"
     )
-    shaken_fraction: float = Field(default=0.5, ge=0, le=1, description="pairs with pose noise")
+    shaken_fraction: float = Field(
+        default=0.5, ge=0, le=1, description="share of pairs with pose noise"
+    )
     shake_m: float = Field(default=0.003, ge=0, description="position noise per axis")
     shake_rad: float = Field(default=0.05, ge=0, description="rotation noise per axis")
     uses_bfloat16: bool = Field(

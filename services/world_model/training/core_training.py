@@ -24,7 +24,7 @@ _UNIT_M = 0.05
 _FIT_EPISODES = 400
 # Added to the deviation of features, some of which hardly vary within a task.
 _LEAST_DEVIATION = 0.05
-# How much more often hands are held still from later starts, where fewer scenes allow it.
+# Factor by which hands are held still more often at later starts, where fewer scenes allow it.
 _LATER_HELD = 2.5
 # Objects that moved less than this in the previous latent step count as settled.
 _SETTLED_M = 1e-3
@@ -38,8 +38,8 @@ class CoreData:
     """Training data of cores: episodes, touch latents and the readers' outputs.
 
     `readings` are a reader's objects by start step, for the episodes that the reader was trained
-    on. Since it errs less there than elsewhere, the core is trained equally often on true poses
-    with noise of `pose_noise_m`.
+    on. Since its errors are smaller there than on new scenes, the core is trained equally often on
+    ground-truth poses with noise of `pose_noise_m`.
     """
 
     table: SceneTable

@@ -29,7 +29,7 @@ def load_episodes(url: str, *, splits: Collection[Split] = ()) -> list[EpisodeAr
 
 
 def training_ids(store: EpisodeStore, splits: Collection[Split] = ()) -> list[str]:
-    """Ids of the episodes to train on: those of some splits, and never imagined ones."""
+    """Ids of the episodes to train on: those of the given splits (default: all), none imagined."""
     return [
         episode_id
         for episode_id in store.list()
@@ -46,14 +46,16 @@ def check_rates(rates_hz: set[float], url: str) -> None:
     """
     if not rates_hz:
         raise InvalidInputError(
-            f"episodes: the store {url} holds none; record some first (dextouch twin record)"
+            f"episodes: the store {url} is empty; record some first (dextouch twin record)"
         )
     if len(rates_hz) > 1:
-        raise InvalidInputError(f"episodes: model rates {sorted(rates_hz)} Hz in one store {url}")
+        raise InvalidInputError(
+            f"episodes: the store {url} mixes model rates {sorted(rates_hz)} Hz, expected one"
+        )
 
 
 def read_episode(reader: EpisodeReader) -> EpisodeArrays:
-    """One whole episode as a single window for each kind of action it holds.
+    """Read a whole episode as a single window for each kind of action.
 
     Raises:
         InvalidInputError: the image of a step is missing.
@@ -94,7 +96,7 @@ def split_by_hash(episodes: Sequence[E], *, heldout_percent: int) -> tuple[list[
         (heldout if bucket < heldout_percent else trained).append(episode)
     if not trained or not heldout:
         raise InvalidInputError(
-            f"split: {len(trained)} episodes to train on and {len(heldout)} held out of "
-            f"{len(episodes)}; expected at least one each: give a held-out store or more episodes"
+            f"split: got {len(trained)} training and {len(heldout)} held-out episodes of "
+            f"{len(episodes)}, expected at least one each; add episodes or a held-out store"
         )
     return trained, heldout

@@ -59,13 +59,13 @@ def evaluate_prediction(
         named by the suffix, and num_windows.
 
         - _copy repeats the first step; tactile_mse_zero predicts no touch.
-        - _codec encodes and decodes the truth, which bounds what the model can reach.
+        - _codec encodes and decodes the ground truth: the upper bound for the model.
         - _other_take is the model given the actions of another held-out episode of the same task
           at the same time (absent where no task has two episodes).
         - _hold is the model given actions in which nothing moves; in _hands_still only the head
           moves.
 
-        A model that is no better than with these actions makes no use of its own.
+        A model that is no better with its own actions than with these does not use them.
 
     Raises:
         InvalidInputError: an episode that was trained on, or no window at all.
@@ -78,7 +78,8 @@ def evaluate_prediction(
     ]
     if not places:
         raise InvalidInputError(
-            f"evaluation: {len(episodes)} episodes hold no window of {model.config.max_steps} steps"
+            f"evaluation: got {len(episodes)} episodes without a window of "
+            f"{model.config.max_steps} steps, expected at least one"
         )
     windows = [
         _cut(episode, start, model.config.max_steps, action_kind) for episode, start in places
@@ -112,7 +113,8 @@ def refuse_trained(episodes: Sequence[EpisodeArrays], train_fingerprints: Sequen
     seen = [episode.episode_id for episode in episodes if fingerprint(episode) in trained]
     if seen:
         raise InvalidInputError(
-            f"evaluation: {len(seen)} episodes were trained on {seen[:3]}; expected held-out ones",
+            f"evaluation: the model was trained on {len(seen)} of the episodes {seen[:3]}, "
+            "expected held-out ones",
             episodes=seen,
         )
 

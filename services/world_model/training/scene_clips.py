@@ -1,4 +1,4 @@
-"""Training clips of the renderer from episodes with object poses."""
+"""Conversion of episodes with object poses to training clips of the renderer."""
 
 from collections.abc import Sequence
 

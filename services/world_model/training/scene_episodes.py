@@ -1,4 +1,4 @@
-"""True episodes of a store as arrays on the model grid, with the poses of their objects.
+"""Ground-truth episodes of a store as arrays on the model grid, with their object poses.
 
 Training data of the state model: whole episodes with the pose of every object at every step and the
 outcome. Imagined episodes, truncated episodes and those with an unknown outcome are skipped and
@@ -25,7 +25,7 @@ logger = structlog.get_logger(__name__)
 
 @dataclass(frozen=True)
 class SceneEpisode:
-    """One whole episode; poses and times are relative to its step 0 where they are relative.
+    """One whole episode.
 
     `actions` are the commanded ones where the episode has them (see `action_kind`), and
     `measured_actions` the measured ones; both are relative to `anchor`, the poses of left wrist,
@@ -63,7 +63,7 @@ class SceneEpisode:
 def load_scene_episodes(
     url: str, *, tasks: Collection[str] | None = None, splits: Collection[Split] = ()
 ) -> list[SceneEpisode]:
-    """Load the true episodes of a store, in the order of their ids.
+    """Load the ground-truth episodes of a store, in the order of their ids.
 
     The number of skipped episodes is logged by reason.
 
@@ -92,7 +92,7 @@ def load_scene_episodes(
         logger.warning("skipped_episodes", store=url, reason=reason, count=count)
     if not taken:
         raise InvalidInputError(
-            f"scene episodes: the store {url} has none to train on (left out: {dict(skipped)}); "
+            f"scene episodes: the store {url} has none to train on (skipped: {dict(skipped)}); "
             "record some with `dextouch train data`"
         )
     return taken
@@ -124,8 +124,8 @@ def read_scene_episode(reader: EpisodeReader) -> SceneEpisode:
     attributes = reader.attributes
     if attributes.success is None or attributes.seed is None:
         raise InvalidInputError(
-            f"episode {attributes.episode_id!r}: success {attributes.success}, seed "
-            f"{attributes.seed}; expected both known"
+            f"episode {attributes.episode_id!r}: got success {attributes.success} and seed "
+            f"{attributes.seed}, expected both to be known"
         )
     window = reader.window(0, reader.num_steps, cameras=())
     actions = window.actions
@@ -197,8 +197,8 @@ def split_by_scene(
         (held_out if place_of_scene(episode) < held_out_share else training).append(episode)
     if not training or not held_out:
         raise InvalidInputError(
-            f"split: {len(training)} episodes to train on and {len(held_out)} held out with a "
-            f"share of {held_out_share}; expected at least one each"
+            f"split: got {len(training)} training and {len(held_out)} held-out episodes with a "
+            f"share of {held_out_share}, expected at least one each"
         )
     return training, held_out
 
@@ -215,6 +215,6 @@ def refuse_shared_scenes(
     if shared:
         names = ", ".join(f"{task} seed {seed}" for task, seed in shared[:5])
         raise ConflictError(
-            f"split: {len(shared)} scenes are both trained on and held out ({names}); measure on "
-            "seeds of their own"
+            f"split: {len(shared)} scenes are both trained on and held out ({names}); evaluate on "
+            "other seeds"
         )

@@ -38,8 +38,8 @@ def check_not_learned(heldout: Sequence[TrainingEpisode], ancestor: Checkpoint) 
     both = [episode.episode_id for episode in heldout if episode.content_hash() in learned]
     if both:
         raise InvalidInputError(
-            f"training: the checkpoint to start from was trained on {len(both)} of the held-out "
-            f"episodes {both[:3]}; name a held-out store that it has not seen",
+            f"training: the initial checkpoint was trained on {len(both)} of the held-out "
+            f"episodes {both[:3]}; use a held-out store that it has not seen",
             episodes=both,
         )
 

@@ -29,7 +29,7 @@ class StateFigures:
 
     `figures` hold errors of readers (first member) and objects in mm, and contact F1 and error of
     touch for each chunk of 16 steps, also for repeating the touch before the chunk. Names with
-    `from_16` are of rollouts from the true step 16, and so on; their chunks count from there.
+    `from_16` refer to rollouts from the ground truth at step 16, whose chunks start there.
     `object_mm` is the median position error of an object at the end of a chunk.
     """
 

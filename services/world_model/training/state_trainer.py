@@ -51,7 +51,7 @@ from services.world_model.training.scene_episodes import (
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 from services.world_model.training.state_evaluation import evaluate_dynamics
 
-# Increment on changes of training that make other weights from equal settings and data.
+# Increment when a change of training gives other weights for the same settings and data.
 READER_VERSION, CORE_VERSION, RENDERER_VERSION = 3, 4, 3
 # Largest number of episodes the renderer is trained on; it samples few of their images anyway.
 MAX_CLIPS = 1500
@@ -209,8 +209,8 @@ def _labelled(episodes: list[SceneEpisode], settings: StateTrainSettings) -> lis
     without = {episode.task for episode in episodes} - known
     if without:
         raise InvalidInputError(
-            f"--labelled-share {settings.labelled_share:g}: leaves no scene of "
-            f"{', '.join(sorted(without))} whose object poses are learned from; give a larger one"
+            f"--labelled-share {settings.labelled_share:g}: leaves no labelled scene of "
+            f"{', '.join(sorted(without))}; choose a larger share"
         )
     return labelled
 

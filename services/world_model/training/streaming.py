@@ -91,7 +91,7 @@ class StoredEpisode:
 
 
 def index_episodes(url: str, *, splits: Collection[Split] = ()) -> list[StoredEpisode]:
-    """The true episodes of a store, optionally of some splits; each is read once to be hashed.
+    """Index the episodes of a store, except imagined ones; each is read once to be hashed.
 
     Raises:
         InvalidInputError: the store is empty, mixes model rates, or lacks the image of a step.
@@ -136,7 +136,7 @@ def read_batches(
     num_workers: int = 0,
     start_method: StartMethod | None = None,
 ) -> Generator[WindowBatch, None, None]:
-    """Batches at these places, in order, whatever the number of processes.
+    """Batches at these places, in order, independent of the number of processes.
 
     Args:
         episodes: episodes that the places refer to.

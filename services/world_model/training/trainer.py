@@ -249,7 +249,7 @@ class TrainingRun:
         }
         if others:
             raise ConflictError(
-                "training: the checkpoint to start from has other network settings (stored, "
+                "training: the initial checkpoint has other network settings (stored, "
                 f"requested): {others}; request the stored ones"
             )
         self.model.load_state_dict(checkpoint.model.state_dict())
@@ -320,7 +320,7 @@ class TrainingRun:
             context_noise=self.settings.windows.context_noise,
         )
         total = loss.video + settings.tactile_weight * loss.tactile
-        self.loop.learn(total, sight=loss.video, touch=loss.tactile)
+        self.loop.learn(total, video=loss.video, touch=loss.tactile)
         update_average(
             self.averaged, self.model, decay=settings.ema_decay, num_updates=self.budget.step
         )

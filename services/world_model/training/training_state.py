@@ -86,9 +86,7 @@ def read_state(path: Path, identity: Mapping[str, JsonValue]) -> TrainingState:
         tensors, notes = read_tensors(path, where)
         facts = RunFacts.model_validate_json(notes.get(METADATA_KEY, ""))
     except (CorruptDataError, ValidationError) as error:
-        raise CorruptDataError(
-            f"{where}: unreadable ({error}); remove it to start afresh"
-        ) from error
+        raise CorruptDataError(f"{where}: unreadable ({error}); remove it to start over") from error
     expected = json.loads(json.dumps(dict(identity)))
     names = facts.identity.keys() | expected.keys()
     others = sorted(n for n in names if facts.identity.get(n) != expected.get(n))
@@ -96,8 +94,8 @@ def read_state(path: Path, identity: Mapping[str, JsonValue]) -> TrainingState:
         was = {name: facts.identity.get(name) for name in others}
         now = {name: expected.get(name) for name in others}
         raise ConflictError(
-            f"{where}: of a run with {was}, got {now}; go on with the settings "
-            "and episodes that it began with, or leave --resume away to start afresh"
+            f"{where}: saved by a run with {was}, got {now}; use the settings and episodes of that "
+            "run, or omit --resume to start over"
         )
     return TrainingState(tensors, facts)
 

@@ -121,7 +121,7 @@ def test_training_episodes_cannot_be_judged_on(tiny_model, toy_episodes):
     prints = [fingerprint(toy_episodes[2])]
     with pytest.raises(InvalidInputError, match="toy-2"):
         evaluate_prediction(tiny_model, toy_episodes, train_fingerprints=prints)
-    with pytest.raises(InvalidInputError, match="no window"):
+    with pytest.raises(InvalidInputError, match="without a window"):
         evaluate_prediction(tiny_model, [], train_fingerprints=prints)
 
 

@@ -98,7 +98,7 @@ def test_a_state_of_another_run_is_refused(toy_store, settings, tmp_path):
     data = path.read_bytes()
     for damaged in (data[:100], b"", data[: len(data) // 2]):
         path.write_bytes(damaged)
-        with pytest.raises(CorruptDataError, match="start afresh"):
+        with pytest.raises(CorruptDataError, match="start over"):
             read_state(path, {})
 
 

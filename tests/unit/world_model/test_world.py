@@ -204,7 +204,7 @@ def test_foreign_and_damaged_snapshots_are_refused(world, toy_episode, monkeypat
         with pytest.raises(DexTouchError):
             world.restore(broken)
     monkeypatch.setattr(world, "_digest", "f" * 64)
-    with pytest.raises(InvalidInputError, match="of world"):
+    with pytest.raises(InvalidInputError, match="made by world"):
         world.restore(data)
 
 
@@ -249,7 +249,7 @@ def test_output_that_is_no_number_is_refused(world, toy_episode):
     episode = toy_episode(0)
     state = world.reset(make_start(episode)).state
     world._model.tokenizer.palm_scale.fill_(float("nan"))
-    with pytest.raises(UnavailableError, match="holds NaN"):
+    with pytest.raises(UnavailableError, match="contains NaN"):
         world.step(state, episode.actions["commanded"][1:5], seed=0)
 
 
