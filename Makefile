@@ -11,7 +11,7 @@ DOCS_VENV ?= .venv-docs
 SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow vm fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-openpi wheel-test \
+.PHONY: demo test check slow kills vm fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-openpi wheel-test \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -39,6 +39,9 @@ slow: $(VENV)/.dev       ## the long tests
 
 wheel-test: $(VENV)/.dev   ## build the wheel, install it outside the checkout, run its demo and its services
 	$(BIN)/python -m pytest -q -m slow tests/system/test_wheel.py
+
+kills: $(VENV)/.dev      ## kill -9 one of two workers 20 times while 16 rollouts run; apt-get install redis-server haproxy
+	$(BIN)/python -m pytest -q -s -m slow tests/system/test_worker_kills.py
 
 vm: $(VENV)/.dev         ## real drivers on a Debian kernel's devices; apt-get install qemu-system-x86 busybox-static cpio kmod
 	$(BIN)/python -m pytest -q -s -m vm tests/vm

@@ -14,7 +14,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from dextouch.errors import ConflictError, UnavailableError
-from dextouch.serving import server_options
+from dextouch.serving import ServiceSettings, server_options
 
 BACKLOG = 128
 START_TIMEOUT_S = 60.0
@@ -86,12 +86,11 @@ async def serve_all(
     Raises:
         UnavailableError: a service terminated unexpectedly; the others were shut down.
     """
-    servers = {
-        place.name: Server(
-            uvicorn.Config(app, backlog=BACKLOG, **server_options(app, grace_s=grace_s))
-        )
-        for place, app in placed
-    }
+    servers = {}
+    for place, app in placed:
+        settings: ServiceSettings = getattr(app.state, "settings", None) or ServiceSettings()
+        options = server_options(settings, grace_s=grace_s)
+        servers[place.name] = Server(uvicorn.Config(app, backlog=BACKLOG, **options))
     tasks = {
         place.name: asyncio.create_task(servers[place.name].serve(sockets=[place.socket]))
         for place, _ in placed

@@ -1,5 +1,6 @@
 """HTTP service of the twin and its baseline world."""
 
+from functools import partial
 from typing import Any
 
 from pydantic import Field
@@ -36,4 +37,4 @@ def serve(arguments: list[str]) -> None:
         InvalidInputError: invalid settings.
     """
     settings = load_settings(TwinServiceSettings, arguments)
-    serve_worlds(twin_worlds(settings.scene), settings, name="twin")
+    serve_worlds(partial(twin_worlds, settings.scene), settings, name="twin")

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dextouch.command_line import write_result
 from dextouch.serving import load_settings
-from dextouch.worlds import serve_worlds
+from dextouch.worlds import World, serve_worlds
 from services.world_model.checkpoints import list_checkpoints, read_checkpoint
 from services.world_model.settings import (
     ShowCommand,
@@ -67,14 +68,35 @@ def run_train_state(arguments: list[str]) -> int:
 
 
 def run_serve(arguments: list[str]) -> int:
-    """Serve one checkpoint until SIGINT or SIGTERM."""
+    """Serve one checkpoint until SIGINT or SIGTERM.
+
+    Rollouts that began in another checkpoint continue in it while it is in the same folder.
+    """
+    settings = load_settings(WorldModelSettings, arguments)
+    serve_worlds(
+        partial(_open_worlds, settings),
+        settings,
+        name="world_model",
+        reopen=partial(_open_by_digest, settings),
+    )
+    return 0
+
+
+def _open_worlds(settings: WorldModelSettings) -> dict[str, World[Any]]:
     import torch
 
-    settings = load_settings(WorldModelSettings, arguments)
     torch.set_num_threads(settings.num_threads)
     world = open_world(settings.checkpoint, sampling_steps=settings.sampling_steps)
-    serve_worlds({settings.world_name: world}, settings, name="world_model")
-    return 0
+    return {settings.world_name: world}
+
+
+def _open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> World[Any] | None:
+    """The world of the checkpoint with this digest beside the one that is served."""
+    for path, found in list_checkpoints(settings.checkpoint.parent).items():
+        if found == digest:
+            sampled = None if is_state_checkpoint(path) else settings.sampling_steps
+            return open_world(path, sampling_steps=sampled)
+    return None
 
 
 def run_show(arguments: list[str]) -> int:

@@ -56,18 +56,18 @@ async def test_of_many_writers_exactly_one_wins(state, key):
 async def test_of_many_new_values_only_as_many_as_allowed_are_kept(state, key):
     await state.set(key + "-other", b"", expected_version=0, ttl_s=60.0)
     adds = [
-        state.add(f"{key}:{i}", b"%d" % i, within=key + ":", limit=4, ttl_s=60.0) for i in range(24)
+        state.add(f"{key}:{i}", b"%d" % i, limits={key + ":": 4}, ttl_s=60.0) for i in range(24)
     ]
     assert (await asyncio.gather(*adds)).count(True) == 4
     kept = [f"{key}:{i}" for i in range(24) if await state.get(f"{key}:{i}") is not None]
     assert len(kept) == 4
     stored = await state.get(kept[0])
     assert (stored.value.decode(), stored.version) == (kept[0].rpartition(":")[2], 1)
-    assert not await state.add(key + ":z", b"", within=key + ":", limit=4, ttl_s=60.0)
+    assert not await state.add(key + ":z", b"", limits={key + ":": 4}, ttl_s=60.0)
     await state.delete(kept[0])
-    assert await state.add(key + ":z", b"z", within=key + ":", limit=4, ttl_s=60.0)
+    assert await state.add(key + ":z", b"z", limits={key + ":": 4}, ttl_s=60.0)
     with pytest.raises(ConflictError) as caught:
-        await state.add(key + ":z", b"", within=key + ":", limit=9, ttl_s=60.0)
+        await state.add(key + ":z", b"", limits={key + ":": 9}, ttl_s=60.0)
     assert caught.value.details == {"expected": 0, "got": 1}
     assert (await state.get(key + ":z")).value == b"z"
 
@@ -85,8 +85,8 @@ async def test_delete_makes_room_for_a_new_thing(state, key):
 async def test_a_prefix_is_a_text_and_no_pattern(state, key):
     pattern = key.replace("test:", "tes*:")
     await state.set(key, b"1", expected_version=0, ttl_s=60.0)
-    assert await state.add(pattern + ":a", b"2", within=pattern, limit=1, ttl_s=60.0)
-    assert not await state.add(pattern + ":b", b"3", within=pattern, limit=1, ttl_s=60.0)
+    assert await state.add(pattern + ":a", b"2", limits={pattern: 1}, ttl_s=60.0)
+    assert not await state.add(pattern + ":b", b"3", limits={pattern: 1}, ttl_s=60.0)
 
 
 async def test_values_expire(state, key):
@@ -95,7 +95,7 @@ async def test_values_expire(state, key):
         if await state.get(key) is None:
             break
     assert await state.get(key) is None
-    assert await state.add(key + "-other", b"", within=key, limit=1, ttl_s=60.0)
+    assert await state.add(key + "-other", b"", limits={key: 1}, ttl_s=60.0)
     assert await state.set(key, b"again", expected_version=0, ttl_s=60.0) == 1
 
 

@@ -5,6 +5,7 @@ bodies.
 """
 
 import http.client
+import itertools
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,10 +14,12 @@ from urllib.parse import urlsplit
 from pydantic import ValidationError
 
 from dextouch.errors import InvalidInputError, UnavailableError
-from dextouch.schemas import CLASS_OF_STATUS, Problem, error_from_problem
+from dextouch.schemas import CLASS_OF_STATUS, PROBLEM_MEDIA_TYPE, Problem, error_from_problem
 
 # Pauses before each new attempt after a lost connection.
 RETRY_PAUSES_S = (0.05, 0.2, 0.8)
+# Before further ones, while there is patience.
+LAST_PAUSE_S = 0.8
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,7 @@ class HttpLink:
         *,
         api_key: str | None = None,
         timeout_s: float = 60.0,
+        patience_s: float = 0.0,
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
         parts = urlsplit(url)
@@ -49,7 +53,9 @@ class HttpLink:
         self._where = f"{parts.scheme}://{parts.netloc.rsplit('@', 1)[-1]}"
         self._prefix = parts.path.rstrip("/")
         self._headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
+        self._patience_s = patience_s
         self._pause = pause
+        self._has_answered = False
 
     def request(
         self,
@@ -62,6 +68,10 @@ class HttpLink:
     ) -> Reply:
         """Send a request, again after a lost connection: every request must be idempotent.
 
+        A service that has ever responded may be away for `patience_s`: until then the request is
+        also repeated after responses with `Retry-After`, not before the time it says, and after
+        502, 503 and 504 of a proxy.
+
         Raises:
             UnavailableError: no response after all attempts.
             DexTouchError: the problem that the service reports, as its own class.
@@ -69,10 +79,10 @@ class HttpLink:
         headers = self._headers | {"Accept": accept}
         if body is not None:
             headers["Content-Type"] = content_type
-        problem: Exception | None = None
-        for pause_s in (0.0, *RETRY_PAUSES_S):
-            if pause_s:
-                self._pause(pause_s)
+        began_s, paused_s = time.monotonic(), 0.0
+        problem: Reply | OSError | http.client.HTTPException
+        pauses_s = itertools.chain(RETRY_PAUSES_S, itertools.repeat(LAST_PAUSE_S))
+        for attempt, pause_s in enumerate(pauses_s):
             try:
                 self._connection.request(method, self._prefix + path, body=body, headers=headers)
                 answer = self._connection.getresponse()
@@ -80,16 +90,43 @@ class HttpLink:
             except (OSError, http.client.HTTPException) as error:
                 self._connection.close()
                 problem = error
-                continue
-            return _checked(reply, f"{method} {self._where}{path}")
+                is_over = attempt >= len(RETRY_PAUSES_S)
+            else:
+                self._has_answered = True
+                busy_s = _busy_s(answer)
+                if busy_s is None:
+                    return _checked(reply, f"{method} {self._where}{path}")
+                problem, is_over = reply, True
+                pause_s = max(pause_s, busy_s)  # noqa: PLW2901 - as asked for
+            gone_s = pause_s + max(paused_s, time.monotonic() - began_s)
+            if is_over and gone_s > (self._patience_s if self._has_answered else 0.0):
+                break
+            self._pause(pause_s)
+            paused_s += pause_s
+        if isinstance(problem, Reply):
+            return _checked(problem, f"{method} {self._where}{path}")
+        # Later requests do not wait as long, until it responds again.
+        self._has_answered = False
         raise UnavailableError(
-            f"{method} {self._where}{path}: no answer in {1 + len(RETRY_PAUSES_S)} attempts, last: "
+            f"{method} {self._where}{path}: no answer in {1 + attempt} attempts, last: "
             f"{type(problem).__name__}: {problem}; is the service running?"
         ) from problem
 
     def close(self) -> None:
         """Close the connection; the next request opens it again."""
         self._connection.close()
+
+
+def _busy_s(answer: http.client.HTTPResponse) -> float | None:
+    """How long to wait where the service, or a proxy that has no worker, asks for it, else None."""
+    if answer.status < 400:
+        return None
+    # A date counts as no time.
+    retry_after = answer.getheader("Retry-After")
+    if retry_after is not None:
+        return float(retry_after) if retry_after.isdecimal() else 0.0
+    is_of_proxy = answer.getheader("Content-Type") != PROBLEM_MEDIA_TYPE
+    return 0.0 if answer.status in {502, 503, 504} and is_of_proxy else None
 
 
 def _checked(reply: Reply, where: str) -> Reply:

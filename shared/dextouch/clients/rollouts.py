@@ -53,6 +53,8 @@ class RolloutClient:
         url: of the service.
         api_key: with the scope `rollout`; None where the service requires none.
         timeout_s: for one response.
+        patience_s: how long a service that has ever responded may be full or away, as while
+            another worker takes over; requests are repeated meanwhile.
         selector: cameras and steps to return for every rollout of this client.
     """
 
@@ -62,9 +64,10 @@ class RolloutClient:
         api_key: str | None = None,
         *,
         timeout_s: float = 60.0,
+        patience_s: float = 30.0,
         selector: ReturnSelector = EVERYTHING,
     ) -> None:
-        self._link = HttpLink(url, api_key=api_key, timeout_s=timeout_s)
+        self._link = HttpLink(url, api_key=api_key, timeout_s=timeout_s, patience_s=patience_s)
         self.selector = selector
 
     def selecting(self, selector: ReturnSelector) -> "RolloutClient":

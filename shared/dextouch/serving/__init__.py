@@ -33,5 +33,6 @@ if TYPE_CHECKING:
     from dextouch.serving.state import StateStore as StateStore
     from dextouch.serving.state import Versioned as Versioned
     from dextouch.serving.state import open_state as open_state
+    from dextouch.serving.workers import run_workers as run_workers
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)

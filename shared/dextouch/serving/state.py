@@ -3,7 +3,7 @@
 import asyncio
 import math
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,18 +80,27 @@ class MemoryState:
         self._entries[key] = (written, until_s)
         return written.version
 
-    async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
-        """Write a new value unless `limit` live keys start with `within`; False if they do.
+    async def add(self, key: str, value: bytes, *, limits: Mapping[str, int], ttl_s: float) -> bool:
+        """Write a new value unless a limit is reached; False if one is.
 
-        Counting and writing are atomic, so concurrent callers never exceed the limit.
+        Counting and writing are atomic, so concurrent callers never exceed a limit.
+
+        Args:
+            key: of the value.
+            value: to write.
+            limits: for beginnings of keys, the number of live keys that may begin so.
+            ttl_s: time to live.
 
         Raises:
             ConflictError: the key exists.
         """
         # No await between counting and writing, hence atomic in one event loop.
         self._expire()
-        num_live = sum(other.startswith(within) for other in self._entries)
-        if key not in self._entries and num_live >= limit:
+        is_full = any(
+            sum(other.startswith(within) for other in self._entries) >= limit
+            for within, limit in limits.items()
+        )
+        if key not in self._entries and is_full:
             return False
         await self.set(key, value, expected_version=0, ttl_s=ttl_s)
         return True
@@ -127,13 +136,15 @@ redis.call('PEXPIRE', KEYS[1], ARGV[4])
 return {1, version + 1}
 """
 
-# KEYS[1] key · ARGV: pattern of the keys to count, limit, value, time to live in ms
+# KEYS[1] key · ARGV: value, time to live in ms, then pairs of a pattern of keys and their limit
 # → -1: stored already, 0: no room, 1: written
 ADD = """
 if redis.call('EXISTS', KEYS[1]) == 1 then return -1 end
-if #redis.call('KEYS', ARGV[1]) >= tonumber(ARGV[2]) then return 0 end
-redis.call('HSET', KEYS[1], 'version', 1, 'value', ARGV[3])
-redis.call('PEXPIRE', KEYS[1], ARGV[4])
+for i = 3, #ARGV, 2 do
+  if #redis.call('KEYS', ARGV[i]) >= tonumber(ARGV[i + 1]) then return 0 end
+end
+redis.call('HSET', KEYS[1], 'version', 1, 'value', ARGV[1])
+redis.call('PEXPIRE', KEYS[1], ARGV[2])
 return 1
 """
 
@@ -185,10 +196,12 @@ class RedisState:
             raise _version_conflict(key, expected=expected_version, got=int(version))
         return int(version)
 
-    async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
+    async def add(self, key: str, value: bytes, *, limits: Mapping[str, int], ttl_s: float) -> bool:
         """See MemoryState."""
-        counted = _literal(REDIS_PREFIX + within) + "*"
-        added = await self._run(self._add, key, counted, limit, value, _milliseconds(ttl_s))
+        counted: list[Argument] = []
+        for within, limit in limits.items():
+            counted += [_literal(REDIS_PREFIX + within) + "*", limit]
+        added = await self._run(self._add, key, value, _milliseconds(ttl_s), *counted)
         if added < 0:
             stored = await self.get(key)
             raise _version_conflict(key, expected=0, got=stored.version if stored else 0)

@@ -45,13 +45,14 @@ def openpi_router(service: RolloutService) -> APIRouter:
     @router.websocket("/openpi")
     async def openpi(socket: WebSocket) -> None:
         try:
-            socket.app.state.access.check(socket.headers.get("authorization"), SCOPE)
+            authorization = socket.headers.get("authorization")
+            owner = socket.app.state.access.check(authorization, SCOPE)
         except DexTouchError as error:
             await socket.close(_REFUSED, error.message[:120])
             return
         await socket.accept()
         worlds = [world.model_dump(mode="json") for world in service.worlds()]
-        session = _Session(service)
+        session = _Session(service, owner)
         with suppress(WebSocketDisconnect):
             await socket.send_bytes(pack_openpi({"worlds": worlds, "action_dim": ACTION_DIM}))
             while (message := await socket.receive())["type"] == "websocket.receive":
@@ -68,8 +69,9 @@ def openpi_router(service: RolloutService) -> APIRouter:
 class _Session:
     """The rollout and the selector of one connection."""
 
-    def __init__(self, service: RolloutService) -> None:
+    def __init__(self, service: RolloutService, owner: str) -> None:
         self._service = service
+        self._owner = owner
         self._selector = EVERYTHING
         self._rollout_id: str | None = None
         self._next_chunk = 0
@@ -96,7 +98,9 @@ class _Session:
 
     async def _start(self, message: dict[str, Any]) -> bytes:
         request = _validated(StartRequest, message["start"], "start")
-        answer = await self._service.start(request.world, start_from(request), self._selector)
+        answer = await self._service.start(
+            request.world, start_from(request), self._selector, owner=self._owner
+        )
         return self._repacked(answer)
 
     async def _resume(self, message: dict[str, Any]) -> bytes:

@@ -1,5 +1,7 @@
 """Persistent record of a rollout: progress, the world's snapshot, and the last response."""
 
+import hashlib
+import secrets
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
@@ -15,6 +17,8 @@ KEY_PREFIX = "rollout:"
 MAX_RECORD_BYTES = 2**30
 # Time that a start may wait for others and for its world; after a crash its slot is held that long.
 PLACE_TTL_S = 600.0
+# Of an id, the beginning that all rollouts of one API key share.
+OWNER_LETTERS = 8
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,12 @@ class RolloutRecord:
         return RolloutRecord(info, snapshot, fields["request_sha256"], stored.tail, stored.version)
 
 
+def new_rollout_id(owner: str) -> str:
+    """An id that cannot be guessed, for a rollout begun with the key of this name."""
+    of_owner = hashlib.sha256(owner.encode()).hexdigest()[:OWNER_LETTERS]
+    return of_owner + secrets.token_hex(12)
+
+
 class RecordStore:
     """Rollout records in a state store; every write renews their time to live."""
 
@@ -78,17 +88,26 @@ class RecordStore:
         return await self._store.version(KEY_PREFIX + record.info.id) == record.version
 
     @asynccontextmanager
-    async def place(self, rollout_id: str, *, limit: int) -> AsyncIterator[int]:
-        """Reserve a slot, unless the block fails; yields the version to compute the record from."""
+    async def place(
+        self, rollout_id: str, *, limit: int, limit_per_key: int | None
+    ) -> AsyncIterator[int]:
+        """Reserve a slot, unless the block fails; yields the version to compute the record from.
+
+        Ids of rollouts that were begun with one key start with the same `OWNER_LETTERS` letters.
+        """
         key, ttl_s = KEY_PREFIX + rollout_id, max(self._ttl_s, PLACE_TTL_S)
+        limits, per_key = {KEY_PREFIX: limit}, ""
+        if limit_per_key is not None:
+            limits[KEY_PREFIX + rollout_id[:OWNER_LETTERS]] = limit_per_key
+            per_key = f", or of {limit_per_key} of one key,"
         async with AsyncExitStack() as failed:
             # Also where the reply is lost although the slot was written.
             failed.push_async_callback(self._give_up, key)
-            if not await self._store.add(key, b"", within=KEY_PREFIX, limit=limit, ttl_s=ttl_s):
+            if not await self._store.add(key, b"", limits=limits, ttl_s=ttl_s):
                 raise LimitExceededError(
-                    f"the limit of {limit} rollouts is reached; delete one that is no longer "
-                    f"needed, or try again later: each expires after {self._ttl_s:g} s without a "
-                    "chunk",
+                    f"the limit of {limit} rollouts{per_key} is reached; delete one that is no "
+                    f"longer needed, or try again later: each expires after {self._ttl_s:g} s "
+                    "without a chunk",
                     retry_after_s=1,
                 )
             yield 1

@@ -6,9 +6,9 @@ committed when its record replaces the version it was computed from (compare and
 
 import asyncio
 import hashlib
-import secrets
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakValueDictionary
@@ -20,8 +20,10 @@ from pydantic import Field
 
 from dextouch.errors import (
     ConflictError,
+    DexTouchError,
     EndedError,
     LimitExceededError,
+    UnavailableError,
     UnknownNameError,
 )
 from dextouch.frozen_model import FrozenModel
@@ -36,7 +38,8 @@ from dextouch.schemas import (
 )
 from dextouch.serving import StateStore
 from dextouch.worlds.batcher import StepJob, WorldWorker
-from dextouch.worlds.records import RecordStore, RolloutRecord
+from dextouch.worlds.records import RecordStore, RolloutRecord, new_rollout_id
+from dextouch.worlds.warm_up import first_chunk_s
 from dextouch.worlds.world import (
     StartedRollout,
     World,
@@ -53,6 +56,9 @@ class RolloutLimits(FrozenModel):
     """Limits of this installation; every chunk renews `ttl_s`."""
 
     max_rollouts: int = Field(default=64, ge=1, description="open at the same time")
+    max_rollouts_per_key: int | None = Field(
+        default=None, ge=1, description="of them, begun with one API key; unset: all"
+    )
     max_chunks: int = Field(default=1000, ge=1, description="of one rollout")
     ttl_s: float = Field(
         default=600.0,
@@ -71,10 +77,20 @@ class Answer:
     device_s: float = 0.0
 
 
+# Opens the world of this name and digest, or returns None where it is not to be had.
+Reopen = Callable[[str, str], World[Any] | None]
+
+
 class RolloutService:
     """All rollouts of one process; several processes may share one store.
 
     Bound to one event loop. `close` ends the worlds' threads, not the store.
+
+    Args:
+        worlds: by name; new rollouts begin in them.
+        store: of the records.
+        limits: of this installation.
+        reopen: for rollouts that began in a world of another digest; None refuses them.
     """
 
     def __init__(
@@ -82,8 +98,14 @@ class RolloutService:
         worlds: Mapping[str, World[Any]],
         store: StateStore,
         limits: RolloutLimits | None = None,
+        *,
+        reopen: Reopen | None = None,
     ) -> None:
         self.limits = limits or RolloutLimits()
+        self.is_draining = False
+        self._reopen = reopen
+        self._reopened: dict[tuple[str, str], WorldWorker[Any]] = {}
+        self._reopening = asyncio.Lock()
         self._workers = {name: WorldWorker(world) for name, world in worlds.items()}
         self._records = RecordStore(store, ttl_s=self.limits.ttl_s)
         # The newest states of this process's rollouts, least recently used first, with their
@@ -98,8 +120,25 @@ class RolloutService:
             for name, worker in self._workers.items()
         ]
 
-    async def start(self, world: str, start: RolloutStart, selector: ReturnSelector) -> Answer:
-        """Start a rollout."""
+    def drain(self) -> None:
+        """Refuse new rollouts from now on."""
+        self.is_draining = True
+
+    async def warm_up(self) -> None:
+        """Begin a rollout in each world and advance it, so that the first one of a user is fast."""
+        for name, worker in self._workers.items():
+            try:
+                took_s = await worker.call(first_chunk_s, worker.world)
+                logger.info("world_warmed_up", world=name, duration_s=round(took_s, 3))
+            except DexTouchError as error:
+                # Computed it has, and such a start no user may send.
+                logger.info("world_warmed_up", world=name, refused=error.message)
+
+    async def start(
+        self, world: str, start: RolloutStart, selector: ReturnSelector, *, owner: str = ""
+    ) -> Answer:
+        """Start a rollout; `owner` is the name of the caller's key."""
+        self._refuse_while_draining()
         worker = self._worker(world)
         description = worker.world.description
         begin = check_start(start, description)
@@ -109,8 +148,8 @@ class RolloutService:
             started = worker.world.reset(begin)
             return started, worker.world.snapshot(started.state)
 
-        rollout_id, limit = secrets.token_hex(16), self.limits.max_rollouts
-        async with self._records.place(rollout_id, limit=limit) as placed:
+        rollout_id = new_rollout_id(owner)
+        async with self._place(rollout_id) as placed:
             started, snapshot = await worker.call(reset)
             check_answer(started.observation, description, first_step=0, num_steps=1)
             info = RolloutInfo(
@@ -151,7 +190,7 @@ class RolloutService:
         lock = self._locks.setdefault(rollout_id, asyncio.Lock())
         async with lock:
             record = await self._newest(rollout_id, chunk)
-            worker = self._worker_of(record.info)
+            worker = await self._worker_of(record.info)
             description = worker.world.description
             check_selector(selector, description)
             checked = check_chunk(actions, description)
@@ -180,19 +219,22 @@ class RolloutService:
                     raise
                 return replayed
 
-    async def fork(self, rollout_id: str, *, seed: int | None = None) -> RolloutInfo:
+    async def fork(
+        self, rollout_id: str, *, seed: int | None = None, owner: str = ""
+    ) -> RolloutInfo:
         """Branch at the current step: the copy shares the past and continues independently.
 
         An ended rollout branches before the chunk that ended it. A seed gives the branch its own
         noise.
         """
+        self._refuse_while_draining()
         parent = await self._records.read(rollout_id)
-        self._worker_of(parent.info)
-        changed: dict[str, object] = {"id": secrets.token_hex(16), "ended": None}
+        await self._worker_of(parent.info)
+        changed: dict[str, object] = {"id": new_rollout_id(owner), "ended": None}
         if seed is not None:
             changed["seed"] = seed
         info = parent.info.model_copy(update=changed)
-        async with self._records.place(info.id, limit=self.limits.max_rollouts) as placed:
+        async with self._place(info.id) as placed:
             await self._records.write(RolloutRecord(info, parent.snapshot, version=placed))
         logger.info("rollout_forked", rollout_id=info.id, parent_id=rollout_id)
         return info
@@ -205,7 +247,7 @@ class RolloutService:
 
     def close(self) -> None:
         """End the worlds' threads; rollouts remain in the store."""
-        for worker in self._workers.values():
+        for worker in (*self._workers.values(), *self._reopened.values()):
             worker.close()
 
     async def _newest(self, rollout_id: str, chunk: int) -> RolloutRecord:
@@ -273,17 +315,37 @@ class RolloutService:
             raise UnknownNameError("world", world, list(self._workers))
         return self._workers[world]
 
-    def _worker_of(self, info: RolloutInfo) -> WorldWorker[Any]:
+    def _place(self, rollout_id: str) -> AbstractAsyncContextManager[int]:
+        limit, limit_per_key = self.limits.max_rollouts, self.limits.max_rollouts_per_key
+        return self._records.place(rollout_id, limit=limit, limit_per_key=limit_per_key)
+
+    def _refuse_while_draining(self) -> None:
+        if self.is_draining:
+            raise UnavailableError(
+                "the service is about to end and begins no rollouts; try again", retry_after_s=1
+            )
+
+    async def _worker_of(self, info: RolloutInfo) -> WorldWorker[Any]:
+        """The world that a rollout began in, reopened if this process serves another one."""
         worker = self._worker(info.world)
         digest = worker.world.description.digest
-        if digest != info.world_digest:
+        if digest == info.world_digest:
+            return worker
+        began = (info.world, info.world_digest)
+        async with self._reopening:
+            if began not in self._reopened and self._reopen is not None:
+                world = await asyncio.to_thread(self._reopen, *began)
+                if world is not None:
+                    self._reopened[began] = WorldWorker(world)
+                    logger.info("world_reopened", world=info.world, digest=info.world_digest)
+        if began not in self._reopened:
             raise ConflictError(
                 f"rollout {info.id}: began in world {info.world} of digest "
                 f"{info.world_digest[:12]}, this process has {digest[:12]}; start a new rollout",
                 expected=info.world_digest,
                 got=digest,
             )
-        return worker
+        return self._reopened[began]
 
 
 def chunk_seed(rollout_seed: int, chunk: int, world_digest: str) -> int:

@@ -2,14 +2,15 @@
 
 import base64
 import json
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
 from jaxtyping import Shaped
-from pydantic import Field
+from pydantic import Field, model_validator
 from starlette.concurrency import run_in_threadpool
 
 from dextouch.errors import ShapeError
@@ -39,6 +40,8 @@ from dextouch.serving import (
     media_type,
     open_state,
     run,
+    run_workers,
+    server_options,
     takes,
     timed,
 )
@@ -52,7 +55,7 @@ from dextouch.worlds.chunk_shortcut import (
     wants_json,
 )
 from dextouch.worlds.openpi import openpi_router
-from dextouch.worlds.rollouts import Answer, RolloutLimits, RolloutService
+from dextouch.worlds.rollouts import Answer, Reopen, RolloutLimits, RolloutService
 from dextouch.worlds.world import World
 
 MAX_BODY_BYTES = 2**28
@@ -73,6 +76,8 @@ ANSWER: dict[str, Any] = {"content": {MSGPACK: {}, JSON: {}}}
 
 # From the query: ?steps=last&cameras=camera_head&tactile=false; unknown parameters are refused.
 Selector = Annotated[ReturnSelector, Query()]
+# The name of the caller's key.
+Owner = Annotated[str, Depends(RequireScope(SCOPE))]
 
 
 class WorldServiceSettings(ServiceSettings):
@@ -83,25 +88,62 @@ class WorldServiceSettings(ServiceSettings):
         description="where rollouts are kept: memory:// or redis://HOST:PORT/DB",
     )
     limits: RolloutLimits = RolloutLimits()
+    workers: int = Field(
+        default=1, ge=1, le=64, description="processes on one port; more than 1 need redis://"
+    )
+    drain_s: float = Field(
+        default=0.0,
+        ge=0,
+        le=600,
+        description="seconds after SIGTERM without new rollouts and not ready, before the port is "
+        "closed (of one process)",
+    )
+
+    @model_validator(mode="after")
+    def _workers_share_their_state(self) -> "WorldServiceSettings":
+        if self.workers > 1 and self.state_url == "memory://":
+            raise ValueError(
+                f"workers: got {self.workers} with state_url memory://, which each of them would "
+                "have for itself; set state_url to redis://HOST:PORT/DB"
+            )
+        return self
 
 
 def create_world_app(
-    worlds: Mapping[str, World[Any]], settings: WorldServiceSettings, *, name: str = "worlds"
+    worlds: Mapping[str, World[Any]],
+    settings: WorldServiceSettings,
+    *,
+    name: str = "worlds",
+    reopen: Reopen | None = None,
+    warm_up: bool = False,
 ) -> FastAPI:
-    """Create the application; its shutdown ends the worlds' threads."""
+    """Create the application; its shutdown ends the worlds' threads.
+
+    Args:
+        worlds: by name.
+        settings: of the service.
+        name: of the service.
+        reopen: opens a world by name and digest, for rollouts that began in an earlier one.
+        warm_up: compute a first chunk of each world before the application is ready.
+
+    Returns:
+        The application; `app.state.drain()` refuses new rollouts and makes it not ready.
+    """
     store = open_state(settings.state_url)
-    service = RolloutService(worlds, store, settings.limits)
+    service = RolloutService(worlds, store, settings.limits, reopen=reopen)
     shortcut = ChunkShortcut(service)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        if warm_up:
+            await service.warm_up()
         yield
         service.close()
         await store.close()
 
     async def readiness() -> list[str]:
         await store.ping()
-        return []
+        return ["shutdown"] if service.is_draining else []
 
     app = create_service_app(
         name=name,
@@ -111,15 +153,48 @@ def create_world_app(
         readiness=readiness,
     )
     app.state.shortcut = shortcut
+    app.state.drain = service.drain
     return app
 
 
 def serve_worlds(
-    worlds: Mapping[str, World[Any]], settings: WorldServiceSettings, *, name: str = "worlds"
+    open_worlds: Callable[[], Mapping[str, World[Any]]],
+    settings: WorldServiceSettings,
+    *,
+    name: str = "worlds",
+    reopen: Reopen | None = None,
 ) -> None:
-    """Serve worlds until SIGINT or SIGTERM."""
+    """Serve worlds until SIGINT or SIGTERM, with as many processes as the settings say.
+
+    Args:
+        open_worlds: picklable; called in each process.
+        settings: of the service.
+        name: of the service.
+        reopen: see create_world_app; picklable, too.
+    """
     configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
-    run(create_world_app(worlds, settings, name=name), settings)
+    create_app = partial(_serving_app, open_worlds, settings, name, reopen)
+    if settings.workers == 1:
+        app = create_app()
+        run(app, settings, drain=app.state.drain, drain_s=settings.drain_s)
+        return
+    run_workers(
+        create_app,
+        host=settings.host,
+        port=settings.port,
+        num_workers=settings.workers,
+        options=server_options(settings, grace_s=settings.shutdown_grace_s),
+    )
+
+
+def _serving_app(
+    open_worlds: Callable[[], Mapping[str, World[Any]]],
+    settings: WorldServiceSettings,
+    name: str,
+    reopen: Reopen | None,
+) -> FastAPI:
+    configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
+    return create_world_app(open_worlds(), settings, name=name, reopen=reopen, warm_up=True)
 
 
 def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRouter:
@@ -139,12 +214,12 @@ def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRoute
         openapi_extra=_json_body(StartRequest),
     )
     @takes({JSON: 16 * KIB, MSGPACK: AS_SET})
-    async def start(request: Request, selector: Selector) -> Response:
+    async def start(request: Request, selector: Selector, owner: Owner) -> Response:
         """Start a rollout from a task and seed, or from an observation."""
         with timed(request, "decode"):
             asked, begin = await _start_of(request)
         with timed(request, "world"):
-            answer = await service.start(asked.world, begin, selector)
+            answer = await service.start(asked.world, begin, selector, owner=owner)
         return _response(request, answer, status=201)
 
     @router.get("/rollouts/{rollout_id}")
@@ -175,9 +250,9 @@ def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRoute
 
     @router.post("/rollouts/{rollout_id}/fork", status_code=201)
     @takes({JSON: KIB})
-    async def fork(rollout_id: str, asked: ForkRequest) -> RolloutInfo:
+    async def fork(rollout_id: str, asked: ForkRequest, owner: Owner) -> RolloutInfo:
         """Branch at the current step."""
-        return await service.fork(rollout_id, seed=asked.seed)
+        return await service.fork(rollout_id, seed=asked.seed, owner=owner)
 
     return router
 

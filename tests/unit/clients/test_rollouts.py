@@ -189,6 +189,7 @@ def test_a_closed_rollout_is_gone_and_may_be_closed_again(client):
 
 def test_too_many_rollouts(client):
     started = [client.start(world="sum", **ASKED) for _ in range(8)]
+    client._link._patience_s = 0.0
     with pytest.raises(LimitExceededError, match="the limit of 8 rollouts is reached") as caught:
         client.start(world="sum", **ASKED)
     assert caught.value.details["retry_after_s"] == 1

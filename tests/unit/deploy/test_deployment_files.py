@@ -18,7 +18,8 @@ from services.cli.main import COMMANDS, find_command
 ROOT = Path(__file__).parents[3]
 COMPOSE = ROOT / "docker-compose.yml"
 SERVICES = yaml.safe_load(COMPOSE.read_text())["services"]
-OURS = {name: service for name, service in SERVICES.items() if name != "redis"}
+FOREIGN = ("redis", "gateway")
+OURS = {name: service for name, service in SERVICES.items() if name not in FOREIGN}
 
 
 def validates(path):
@@ -48,7 +49,8 @@ def test_no_privileges(name):
     assert service["security_opt"] == ["no-new-privileges:true"]
     assert not service.get("privileged")
     for port in service.get("ports", []):
-        assert re.fullmatch(r"127\.0\.0\.1:\$\{DEXTOUCH_\w+_PORT:-\d+\}:8000", port)
+        inside = r"\d+" if name == "gateway" else "8000"
+        assert re.fullmatch(rf"127\.0\.0\.1:\$\{{DEXTOUCH_\w+_PORT:-\d+\}}:{inside}", port)
 
 
 @pytest.mark.parametrize("name", [name for name in SERVICES if not SERVICES[name].get("profiles")])
@@ -85,6 +87,29 @@ def test_commands_and_variables_exist(name):
     wanted = {key for key in OURS[name].get("environment", {}) if key.startswith(prefix)}
     unknown = {key for key in wanted if key.split("__")[0] not in known}
     assert not unknown
+
+
+def test_the_gateway_knows_the_services_that_may_have_many_workers():
+    text = (ROOT / "deploy/haproxy/haproxy.cfg").read_text()
+    published = {port.rpartition(":")[2] for port in SERVICES["gateway"]["ports"]}
+    assert set(re.findall(r"^  bind :(\d+)$", text, re.M)) == published
+    behind = dict(re.findall(r"^  server-template (\w+) \d+ (\w+):8000 ", text, re.M))
+    assert set(behind) == set(behind.values()) == {"twin", "world_model"}
+    for name in behind:
+        # A host's port can belong to one worker only.
+        assert "ports" not in SERVICES[name]
+        prefix = f"DEXTOUCH_{name.upper()}_"
+        environment = OURS[name]["environment"]
+        assert environment[prefix + "STATE_URL"].startswith("redis://redis:6379/")
+        # The gateway asks twice a second, and looks elsewhere after two refusals.
+        assert float(environment[prefix + "DRAIN_S"]) > 2 * 0.5
+    assert "check inter 500ms fall 2 " in text
+
+
+def test_rollouts_outlast_a_restart_of_redis():
+    words = SERVICES["redis"]["command"]
+    assert words[words.index("--appendonly") + 1] == "yes"
+    assert "redis:/data" in SERVICES["redis"]["volumes"]
 
 
 def test_image_runs_without_root_and_with_health():

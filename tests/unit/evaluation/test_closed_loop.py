@@ -179,7 +179,7 @@ def test_a_world_that_goes_away_midway_is_missing_from_then_on(client, probe, mo
     kept = []
     with ExitStack() as away:
         app = create_world_app({"far": toy.ToyWorld("far", judge=False)}, WorldServiceSettings())
-        far = away.enter_context(RolloutClient(away.enter_context(served(app))))
+        far = away.enter_context(RolloutClient(away.enter_context(served(app)), patience_s=0.0))
 
         def keep(outcome):
             kept.append(outcome)

@@ -211,7 +211,7 @@ def test_a_world_that_goes_away_stops_the_study_and_costs_no_rows(
 
     def connect(connections):
         both = parts.connect(connections)
-        far = connections.enter_context(RolloutClient(address))
+        far = connections.enter_context(RolloutClient(address, patience_s=0.0))
         worlds = {"dream": WorldAddress(far, "dream")}
         return StudyWorlds.ask(both.addresses["real"], worlds)
 

@@ -66,7 +66,9 @@ class Served:
         limits = {"client_timeout_s": TIMEOUT_S, "max_connections": MAX_CONNECTIONS} | settings
         made = ServiceSettings.model_validate(limits)
         app = create_service_app(name="probe", settings=made, routers=[router])
-        self.server = uvicorn.Server(uvicorn.Config(app, **server_options(app, grace_s=1)))
+        self.server = uvicorn.Server(
+            uvicorn.Config(app, **server_options(app.state.settings, grace_s=1))
+        )
         self._listening = socket.create_server(("127.0.0.1", 0))
         self.address = self._listening.getsockname()
         self.url = "http://{}:{}".format(*self.address)

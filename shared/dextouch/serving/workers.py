@@ -1,0 +1,123 @@
+"""Server processes: one that drains before it stops, or several workers that share one port."""
+
+import gc
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from types import FrameType
+from typing import Any
+
+import structlog
+import uvicorn
+from fastapi import FastAPI
+from uvicorn.config import STARTUP_FAILURE
+from uvicorn.supervisors import Multiprocess
+
+from dextouch.errors import DexTouchError, UnavailableError
+
+logger = structlog.get_logger(__name__)
+
+# A worker that takes longer to start, or does not respond for as long, is replaced.
+WORKER_TIMEOUT_S = 60
+
+
+class DrainingServer(uvicorn.Server):
+    """Server that refuses new work for a while after SIGTERM before it closes its port.
+
+    Load balancers see in that time that it is not ready. A second signal ends it.
+
+    Args:
+        config: of uvicorn.
+        drain: called at SIGTERM, in the event loop's thread; None shuts down at once.
+        drain_s: time until the server shuts down; requests that run then still end.
+    """
+
+    def __init__(
+        self, config: uvicorn.Config, *, drain: Callable[[], object] | None, drain_s: float
+    ) -> None:
+        super().__init__(config)
+        self._drain = drain
+        self._drain_s = drain_s
+        self._stop_at_s: float | None = None
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Begin to drain, or to shut down."""
+        if sig != signal.SIGTERM or self._stop_at_s is not None or self._drain is None:
+            super().handle_exit(sig, frame)
+            return
+        self._drain()
+        self._stop_at_s = time.monotonic() + self._drain_s
+
+    async def on_tick(self, counter: int) -> bool:
+        """Shut down once the drain is over."""
+        drained = self._stop_at_s is not None and time.monotonic() >= self._stop_at_s
+        if drained and not self.should_exit:
+            super().handle_exit(signal.SIGTERM, None)
+        return await super().on_tick(counter)
+
+
+class _Supervisor(Multiprocess):
+    """uvicorn's supervisor, which notices at once if a worker dies while it is asked to respond."""
+
+    def keep_subprocess_alive(self) -> None:
+        """Replace workers that ended or hang."""
+        for worker in self.processes:
+            # While this process holds the worker's end of their pipe too, it never reads its end.
+            worker.child_conn.close()
+        super().keep_subprocess_alive()
+
+
+def run_workers(
+    create_app: Callable[[], FastAPI],
+    *,
+    host: str,
+    port: int,
+    num_workers: int,
+    options: dict[str, Any],
+) -> None:
+    """Serve with several processes until SIGINT or SIGTERM.
+
+    uvicorn replaces workers that end or hang; on SIGHUP it replaces all, one after another, each
+    once its successor serves.
+
+    Args:
+        create_app: picklable; called in every worker.
+        host: address to listen on.
+        port: port to listen on; 0 for any free one.
+        num_workers: number of processes.
+        options: of uvicorn, for every worker.
+
+    Raises:
+        UnavailableError: a worker could not start.
+    """
+    config = uvicorn.Config(
+        partial(_in_worker, create_app),
+        factory=True,
+        host=host,
+        port=port,
+        workers=num_workers,
+        timeout_worker_healthcheck=WORKER_TIMEOUT_S,
+        **options,
+    )
+    with config.bind_socket() as listener:
+        # Connections inherit it; without it responses wait for up to 40 ms.
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        supervisor = _Supervisor(config, sockets=[listener])
+        supervisor.run()
+    if any(worker.exitcode == STARTUP_FAILURE for worker in supervisor.processes):
+        raise UnavailableError("a worker could not start; the log above says why")
+
+
+def _in_worker(create_app: Callable[[], FastAPI]) -> FastAPI:
+    try:
+        app = create_app()
+    except DexTouchError as error:
+        logger.error("worker_failed", error=error.message)  # noqa: TRY400 - the message says it all
+        # With this status the supervisor ends, rather than start the worker again and again.
+        sys.exit(STARTUP_FAILURE)
+    gc.collect()
+    gc.freeze()
+    return app

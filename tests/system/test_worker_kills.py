@@ -1,0 +1,145 @@
+"""Two workers share rollouts by Redis: kill -9 loses nothing; drain, restart and hot swap."""
+
+import os
+import random
+import shutil
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from dextouch.clients import RolloutClient
+from dextouch.errors import UnavailableError
+from tests.contracts.redis_server import running_redis
+from tests.system.scaled import ASKED, Load, Service, haproxy, is_ready, noise, wait_until
+from tests.unit.worlds.fakes import actions
+
+pytestmark = pytest.mark.system
+TAKEOVER_S = 10.0  # on any machine; what an idle one needs is in docs/scaling.md
+
+
+@pytest.fixture(scope="module")
+def redis_url(tmp_path_factory):
+    with running_redis(tmp_path_factory.mktemp("redis")) as url:
+        yield url
+
+
+@pytest.fixture
+def one_port(tmp_path, redis_url):
+    """Two workers of one parent on one port."""
+    service = Service(tmp_path, redis_url, ("--workers", 2))
+    wait_until(lambda: len(service.workers()) == 2, "two workers")
+    yield service
+    service.stop()
+
+
+@pytest.fixture
+def gateway(tmp_path, redis_url):
+    """Two processes behind HAProxy: its address, and the processes."""
+    if shutil.which("haproxy") is None:
+        pytest.skip("no haproxy on the PATH: apt-get install haproxy")
+    services = [Service(tmp_path, redis_url, ("--drain-s", 2)) for _ in range(2)]
+    for service in services:
+        wait_until(lambda service=service: is_ready(service.url), "service")
+    with haproxy(tmp_path, services) as url:
+        yield url, services
+    for service in services:
+        service.stop()
+
+
+def report(load, kills_s, what):
+    """What was measured around the kills; every rollout must be whole."""
+    assert load.mistakes == []
+    around_s = [
+        1e3 * (end - begin)
+        for begin, end in load.times_s
+        if any(begin <= kill_s <= end for kill_s in kills_s)
+    ]
+    print(  # noqa: T201 - figures for docs/scaling.md
+        f"\n{what}: {len(kills_s)} kills, {sum(load.num_chunks)} chunks of {len(load.num_chunks)} "
+        f"rollouts, 0 lost, wrong or doubled; {len(around_s)} chunks during a kill: p50 "
+        f"{np.percentile(around_s, 50):.0f} ms, p99 {np.percentile(around_s, 99):.0f} ms, max "
+        f"{max(around_s):.0f} ms; all chunks: p50 "
+        f"{1e3 * np.median([end - begin for begin, end in load.times_s]):.0f} ms; load "
+        f"{os.getloadavg()[0]:.1f}"
+    )
+    assert max(around_s) < 1e3 * TAKEOVER_S
+
+
+@pytest.mark.parametrize("num_kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+def test_kills_of_workers_on_one_port(one_port, num_kills):
+    rng, kills_s = random.Random(num_kills), []
+    with Load(one_port.url) as load:
+        for _ in range(num_kills):
+            wait_until(lambda: len(one_port.workers()) == 2, "a new worker")
+            load.advance()
+            kills_s.append(time.monotonic())
+            os.kill(rng.choice(one_port.workers()), signal.SIGKILL)
+            load.advance()
+    report(load, kills_s, "workers on one port")
+
+
+@pytest.mark.parametrize("num_kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+def test_kills_of_workers_behind_the_gateway(gateway, num_kills):
+    url, services = gateway
+    rng, kills_s = random.Random(num_kills), []
+    with Load(url) as load:
+        for _ in range(num_kills):
+            load.advance()
+            victim = rng.choice(services)
+            kills_s.append(time.monotonic())
+            victim.process.kill()
+            victim.process.wait()
+            load.advance()
+            victim.start()
+            wait_until(lambda victim=victim: is_ready(victim.url), "the service again")
+            time.sleep(1.0)  # the gateway looks twice a second
+    report(load, kills_s, "workers behind HAProxy")
+
+
+def test_a_drained_worker_finishes_and_begins_nothing(gateway):
+    url, (first, second) = gateway
+    with Load(url) as load, RolloutClient(first.url, patience_s=0.0) as direct:
+        before = direct.start(seed=1, **ASKED)
+        first.process.send_signal(signal.SIGTERM)
+        wait_until(lambda: not is_ready(first.url), "not ready")
+        assert before.step(actions(4)).first_step == 1
+        for refused in (lambda: direct.start(seed=1, **ASKED), before.fork):
+            with pytest.raises(UnavailableError, match="begins no rollouts") as caught:
+                refused()
+            assert caught.value.details["retry_after_s"] == 1
+        with RolloutClient(url, patience_s=0.0) as client:
+            after = client.start(seed=2, **ASKED)
+            assert first.process.wait(20) in {0, -signal.SIGTERM}
+            after.step(actions(4))
+        load.advance()
+    assert load.mistakes == []
+    assert is_ready(second.url)
+
+
+def test_a_new_checkpoint_by_a_restart_of_one_worker_after_another(one_port):
+    with Load(one_port.url) as load, RolloutClient(one_port.url) as client:
+        assert client.worlds()[0].digest == "d1"
+        old = one_port.workers()
+        one_port.digests.write_text("d2 d1")
+        one_port.process.send_signal(signal.SIGHUP)
+        wait_until(
+            lambda: len(one_port.workers()) == 2 and not set(old) & set(one_port.workers()),
+            "both workers anew",
+        )
+        load.advance()
+        with RolloutClient(one_port.url) as other, other.start(seed=3, **ASKED) as rollout:
+            assert rollout.info.world_digest == "d2"
+            total = 3 + noise(3, 0, "d2")
+            assert rollout.step(actions(4)).tactile_kpa[-1, 0, 0] == pytest.approx(total, abs=1e-4)
+    # Each response was checked against the noise of the digest that its rollout began with: d1.
+    assert load.mistakes == []
+
+
+def test_a_worker_that_cannot_start_ends_the_service(tmp_path, redis_url):
+    service = Service(tmp_path, redis_url, ("--workers", 2, "--step-s", -1))
+    assert service.process.wait(60) == 1
+    log = service.log_path.read_text()
+    assert "step_s: got -1.0" in log
+    assert "a worker could not start" in log
