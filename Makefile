@@ -5,13 +5,14 @@ BIN := $(VENV)/bin
 LEROBOT := tests/benchmarks/lerobot
 LEROBOT_VENV ?= .venv-lerobot
 OPENPI_VENV ?= .venv-openpi
+LEROBOT_POLICY_VENV ?= .venv-lerobot-policy
 STAGE ?= store loader acquisition clocks calibration retargeting alignment closure twin world-model evaluator agreement rollouts
 MADE := runs/reproduce
 DOCS_VENV ?= .venv-docs
 SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow kills vm fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-openpi wheel-test \
+.PHONY: demo test check slow kills vm fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi wheel-test \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -113,6 +114,14 @@ $(OPENPI_VENV)/.complete:
 
 check-openpi: $(VENV)/.dev $(OPENPI_VENV)/.complete   ## opt-in: check interoperability with openpi's own client and packing
 	$(BIN)/python tests/system/openpi/check.py $(OPENPI_VENV)/bin/python
+
+$(LEROBOT_POLICY_VENV)/.complete:
+	$(PYTHON) -m venv $(LEROBOT_POLICY_VENV)
+	$(LEROBOT_POLICY_VENV)/bin/pip install --quiet --disable-pip-version-check '.[lerobot]'
+	touch $@
+
+check-lerobot-policy: $(VENV)/.dev $(LEROBOT_POLICY_VENV)/.complete   ## opt-in: a policy of LeRobot acts as in its own loop (8 GB)
+	$(BIN)/python tests/system/lerobot/check.py $(LEROBOT_POLICY_VENV)/bin/python
 
 # The site reads the docstrings of dextouch and needs neither torch nor mujoco, so it has an environment of its own.
 $(DOCS_VENV)/.complete: pyproject.toml constraints.txt

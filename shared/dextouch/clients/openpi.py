@@ -60,8 +60,12 @@ class OpenPiPolicy:
         self._connected()
 
     def reset(self, start: PolicyStart) -> None:
-        """Remember the instruction; the server gets no message, as in openpi's own client."""
+        """Remember the instruction, and tell a server that `resets`, which openpi's do not."""
         self._prompt = start.instruction
+        if self.metadata.get("resets") is True:
+            connection = self._connected()
+            self._send(connection, {"reset": True})
+            self._receive(connection)
 
     def act(self, observation: Observation) -> np.ndarray:
         """Actions [K, 67] of the server for the newest step.
@@ -78,10 +82,7 @@ class OpenPiPolicy:
         request["observation/tactile"] = observation.tactile_kpa[-1]
         request["prompt"] = self._prompt
         connection = self._connected()
-        try:
-            connection.send(pack_openpi(request))
-        except (OSError, WebSocketException) as error:
-            raise self._gone(error) from error
+        self._send(connection, request)
         actions = self._receive(connection).get("actions")
         if not isinstance(actions, np.ndarray):
             raise InvalidInputError(
@@ -122,6 +123,12 @@ class OpenPiPolicy:
                 ) from error
             self.metadata = self._receive(self._connection)
         return self._connection
+
+    def _send(self, connection: ClientConnection, request: Mapping[str, Any]) -> None:
+        try:
+            connection.send(pack_openpi(request))
+        except (OSError, WebSocketException) as error:
+            raise self._gone(error) from error
 
     def _receive(self, connection: ClientConnection) -> dict[str, Any]:
         try:

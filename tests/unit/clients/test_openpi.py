@@ -20,11 +20,11 @@ START = PolicyStart("stand_bottle", "stand it up", 0, fakes.anchor(), np.eye(3))
 
 
 @contextmanager
-def policy_server(answer):
+def policy_server(answer, **metadata):
     """A server that answers each request by `answer(request)`: a map, text or bytes."""
 
     def handle(connection):
-        connection.send(msgpack.packb({"policy": "by hand"}))
+        connection.send(msgpack.packb({"policy": "by hand"} | metadata))
         for data in connection:
             reply = answer(msgpack.unpackb(data, object_hook=decoded))
             if isinstance(reply, dict):
@@ -71,6 +71,22 @@ def test_a_request_holds_the_newest_step_and_the_instruction():
     np.testing.assert_array_equal(request["observation/state"], seen.action_reached[-1])
     np.testing.assert_array_equal(request["observation/tactile"], seen.tactile_kpa[-1])
     np.testing.assert_array_equal(actions, np.arange(16 * 67).reshape(16, 67))
+
+
+def test_a_server_that_says_so_is_told_where_rollouts_begin():
+    asked = []
+
+    def answer(request):
+        asked.append(request)
+        return {"actions": np.zeros((4, 67))}
+
+    with policy_server(answer, resets=True) as url:
+        policy = OpenPiPolicy(url)
+        for _ in range(2):
+            policy.reset(START)
+            policy.act(observation())
+        policy.close()
+    assert ["reset" in request for request in asked] == [True, False, True, False]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,3 @@
+from typing import Any
+
+def get_safe_torch_device(try_device: str | None) -> Any: ...
