@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.observations import start_from as start_from
     from dextouch.schemas.observations import validate_fields as validate_fields
     from dextouch.schemas.problems import CLASS_OF_STATUS as CLASS_OF_STATUS
+    from dextouch.schemas.problems import MAX_NAMED as MAX_NAMED
     from dextouch.schemas.problems import PROBLEM_MEDIA_TYPE as PROBLEM_MEDIA_TYPE
     from dextouch.schemas.problems import Health as Health
     from dextouch.schemas.problems import Problem as Problem

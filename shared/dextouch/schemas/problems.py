@@ -24,6 +24,8 @@ from dextouch.frozen_model import FrozenModel
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:dextouch:error:"
 
+MAX_NAMED = 1000
+
 # Names of the error constructor's own parameters.
 RESERVED = frozenset({"self", "message"})
 # The first matching class decides; leaves of the tree precede their parents.
@@ -138,10 +140,13 @@ def error_from_problem(problem: Problem) -> DexTouchError:
 
 
 def first_problems(error: ValidationError, *, limit: int = 5) -> str:
-    """Summarize pydantic's errors in one line, without the input.
+    """Summarize pydantic's errors in one line, without the input; of very many only their number.
 
     Strips the prefix "Value error, " that pydantic adds to messages of validators.
     """
+    # Pydantic describes all of them, which takes longer than finding them.
+    if error.error_count() > MAX_NAMED:
+        return f"got {error.error_count()} mistakes, which are too many to name"
     items = error.errors(include_input=False, include_url=False)[:limit]
     return "; ".join(
         f"{'.'.join(str(part) for part in item['loc']) or 'fields'}: "

@@ -10,14 +10,13 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 
 from dextouch.errors import InvalidInputError
+from dextouch.schemas import MAX_NAMED, first_problems
 from dextouch.serving.guard import KIB
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 # Bodies above it are decoded in a thread, so that others need not wait.
 MAX_INLINE_BYTES = 64 * KIB
-# With more mistakes, describing them takes longer than finding them.
-MAX_MISTAKES = 1000
 
 
 @dataclass(frozen=True)
@@ -41,10 +40,8 @@ class JsonBody(Generic[ModelT]):
         try:
             return self.model.model_validate(from_json(body) if body else None)
         except ValidationError as error:
-            if error.error_count() > MAX_MISTAKES:
-                raise InvalidInputError(
-                    f"body: got {error.error_count()} mistakes, which are too many to name"
-                ) from None
+            if error.error_count() > MAX_NAMED:
+                raise InvalidInputError(f"body: {first_problems(error)}") from None
             mistakes = error.errors(include_url=False)
         except ValueError as error:
             mistakes = [{"type": "json_invalid", "loc": (), "msg": str(error), "input": {}}]

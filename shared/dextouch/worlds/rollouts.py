@@ -112,6 +112,9 @@ class RolloutService:
         # records, of which snapshot and payload are left out.
         self._live: OrderedDict[str, tuple[RolloutRecord, Any]] = OrderedDict()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        # Of those, the ones that no chunk has renewed since the last sweep.
+        self._unused: set[str] = set()
+        self._sweeper: asyncio.TimerHandle | None = None
 
     def worlds(self) -> list[WorldDescription]:
         """Descriptions of the available worlds."""
@@ -247,6 +250,8 @@ class RolloutService:
 
     def close(self) -> None:
         """End the worlds' threads; rollouts remain in the store."""
+        if self._sweeper is not None:
+            self._sweeper.cancel()
         for worker in (*self._workers.values(), *self._reopened.values()):
             worker.close()
 
@@ -307,8 +312,19 @@ class RolloutService:
     def _keep(self, record: RolloutRecord, state: object) -> None:
         self._live[record.info.id] = (record, state)
         self._live.move_to_end(record.info.id)
+        self._unused.discard(record.info.id)
         if len(self._live) > self.limits.max_rollouts:
             self._live.popitem(last=False)
+        if self._sweeper is None:
+            self._sweep()
+
+    def _sweep(self) -> None:
+        """Drop the states of abandoned rollouts, every `ttl_s` while there are any states."""
+        for rollout_id in self._unused:
+            self._live.pop(rollout_id, None)
+        self._unused = set(self._live)
+        loop = asyncio.get_running_loop()
+        self._sweeper = loop.call_later(self.limits.ttl_s, self._sweep) if self._live else None
 
     def _worker(self, world: str) -> WorldWorker[Any]:
         if world not in self._workers:

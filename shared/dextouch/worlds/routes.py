@@ -61,6 +61,8 @@ from dextouch.worlds.world import World
 MAX_BODY_BYTES = 2**28
 # Room for 1000 rows of float64, or some hundred rows as JSON.
 MAX_CHUNK_BYTES = 2**20
+# Of a chunk as JSON; more than any world takes at once.
+MAX_ROWS = 4096
 # Bodies above it are decoded in a thread, so that others need not wait.
 MAX_INLINE_BYTES = 64 * KIB
 
@@ -68,7 +70,10 @@ MAX_INLINE_BYTES = 64 * KIB
 class ActionsBody(FrozenModel):
     """A chunk as JSON: rows of 67 numbers."""
 
-    actions: Annotated[list[Annotated[list[float], Field(fail_fast=True)]], Field(fail_fast=True)]
+    actions: Annotated[
+        list[Annotated[list[float], Field(fail_fast=True)]],
+        Field(fail_fast=True, max_length=MAX_ROWS),
+    ]
 
 
 # Both routes that simulate answer with a packed observation, or as JSON if that is asked for.

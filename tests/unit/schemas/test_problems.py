@@ -1,7 +1,7 @@
 """Problems of pydantic as one line: what a validator of ours says stands there as it said it."""
 
 import pytest
-from pydantic import BaseModel, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from dextouch.schemas import first_problems
 
@@ -26,4 +26,21 @@ class Rate(BaseModel):
 def test_one_line_without_noise(rate_hz, line):
     with pytest.raises(ValidationError) as caught:
         Rate(rate_hz=rate_hz)
+    assert first_problems(caught.value) == line
+
+
+class Nothing(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+@pytest.mark.parametrize(
+    ("num_mistakes", "line"),
+    [
+        (1000, "; ".join(f"{n}: Extra inputs are not permitted" for n in range(5))),
+        (1001, "got 1001 mistakes, which are too many to name"),
+    ],
+)
+def test_very_many_mistakes_are_counted(num_mistakes, line):
+    with pytest.raises(ValidationError) as caught:
+        Nothing.model_validate({str(n): 0 for n in range(num_mistakes)})
     assert first_problems(caught.value) == line

@@ -145,3 +145,25 @@ async def test_memory_stays_flat_over_abandoned_rollouts():
     assert len(store._entries) <= 3
     assert len(made._locks) == 0
     made.close()
+
+
+async def test_the_states_of_abandoned_rollouts_are_dropped():
+    now_s = [0.0]
+    store = MemoryState(clock_s=lambda: now_s[0])
+    made = service(store, ttl_s=600.0)
+    kept, *_ = [await begin(made) for _ in range(3)]
+    made._sweep()
+    now_s[0] = 500.0
+    await made.step(kept, 0, actions(4), ALL)
+    made._sweep()
+    assert list(made._live) == [kept]
+    now_s[0] = 601.0
+    await store.ping()
+    assert len(store._entries) == 1
+    made._sweep()
+    made._sweep()
+    assert not made._live
+    assert made._sweeper is None
+    await begin(made)
+    assert made._sweeper is not None
+    made.close()
