@@ -88,7 +88,13 @@ def create_service_app(
         of their route (see `Shortcut`).
     """
     app = FastAPI(
-        title=name, version=__version__, docs_url=None, redoc_url=None, lifespan=_started(lifespan)
+        title=name,
+        version=__version__,
+        docs_url=None,
+        redoc_url=None,
+        lifespan=_started(lifespan),
+        # Services have metrics and logs of their own.
+        telemetry={"tracing": False, "metrics": False, "logs": False},
     )
     app.state.settings = settings
     app.state.access = AccessControl(settings.api_keys)
@@ -295,8 +301,11 @@ class RequestMiddleware:
                 self._count(scope, message["status"], duration_s)
             await send(message)
 
-        with structlog.contextvars.bound_contextvars(request_id=request_id):
+        tokens = structlog.contextvars.bind_contextvars(request_id=request_id)
+        try:
             await self._app(scope, receive, send_with_headers)
+        finally:
+            structlog.contextvars.reset_contextvars(**tokens)
 
     def _count(self, scope: Scope, status: int, duration_s: float) -> None:
         # The route template, not the path, to keep the number of labels bounded.
