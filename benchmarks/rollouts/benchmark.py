@@ -1,50 +1,57 @@
 """Entry point of the benchmark stage `rollouts`: what a chunk costs beside an echo."""
 
 import argparse
-import http.client
-import json
+import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Final
-from urllib.parse import urlsplit
-
-import numpy as np
-from websockets.sync.client import connect
+from typing import Any, Final
 
 from benchmarks.figures import Figure, Requirement
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
-from benchmarks.rollouts.server import MAX_STEPS, resting_actions
+from benchmarks.rollouts.crowd import Crowd, crowd
+from benchmarks.rollouts.ways import MAX_CHUNKS, Chunk, Way, compared, opened
+from benchmarks.rollouts.worlds import MAX_STEPS, StillWorld, resting_actions
 from benchmarks.rounds import interleaved
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ReturnSelector
 from dextouch.serving import ChildProcess
-from dextouch.streams import pack_openpi, unpack_openpi
 
-START: Final = {"world": "still", "task": "rest", "seed": 0, "instruction": ""}
-# What the chunk returns: the last image, or those of all 16 steps.
-ANSWERS: Final = {
-    "last image": ReturnSelector(steps="last"),
-    "16 raw images": ReturnSelector(steps="all"),
-}
-WAYS: Final = ("HTTP", "WebSocket")
+LAST: Final = ReturnSelector(steps="last")
+JPEG: Final = ReturnSelector(steps="last", images="jpeg")
+ALL: Final = ReturnSelector(steps="all")
 MAX_OVER_ECHO: Final = {"HTTP": 1.5, "WebSocket": 1.3}
-USUAL: Final = {"rounds": 15, "chunks": 200}
-QUICK: Final = {"rounds": 3, "chunks": 20}
-# Fewer than a rollout may have (RolloutLimits.max_chunks).
-MAX_CHUNKS: Final = 900
-
-Chunk = Callable[[], int]
+MAX_DURABLE_MS: Final = 1.0
+MIN_BATCHED: Final = 3.0
+MAX_TAIL: Final = 3.0
+# Those with a requirement, and others for comparison.
+WAYS: Final = (
+    Way("HTTP", "last image as JPEG", JPEG),
+    Way("HTTP", "16 raw images", ALL),
+    Way("WebSocket", "last image", LAST),
+    Way("WebSocket", "16 raw images", ALL),
+)
+OTHERS: Final = (
+    Way("HTTP", "last image", LAST),
+    Way("HTTP", "last image, world in a thread", LAST, world="still in a thread"),
+)
+DURABLE: Final = Way("HTTP", "last image, in Redis", LAST, server="durable")
+DEVICES: Final = ("device", "batch device")
+NUM_ROLLOUTS: Final = 32
+USUAL: Final = {"rounds": 15, "chunks": 200, "crowd_chunks": 60}
+QUICK: Final = {"rounds": 3, "chunks": 20, "crowd_chunks": 3}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
     parser.add_argument("--rounds", type=int, help="rounds (15; quick 3)")
     parser.add_argument("--chunks", type=int, help="chunks of each way in a round (200; quick 20)")
+    parser.add_argument(
+        "--crowd-chunks", type=int, help=f"chunks of each of {NUM_ROLLOUTS} rollouts (60; quick 3)"
+    )
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
@@ -56,74 +63,78 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     del folder
     plan = dict(QUICK if options.quick else USUAL)
     plan |= {name: value for name in plan if (value := getattr(options, name)) is not None}
-    if plan["rounds"] < 1 or not 1 <= plan["chunks"] <= MAX_CHUNKS:
+    if plan["rounds"] < 1 or not all(
+        1 <= plan[name] <= MAX_CHUNKS for name in ("chunks", "crowd_chunks")
+    ):
         raise InvalidInputError(
             f"got {plan['rounds']} rounds of {plan['chunks']} chunks, expected at least one round "
             f"and 1 … {MAX_CHUNKS} chunks"
         )
     child = ChildProcess("benchmarks.rollouts.server")
     try:
-        times_s, sizes = timed(child.receive(), plan, bar)
+        urls = child.receive()
+        ways = [*WAYS, *OTHERS, *([DURABLE] if DURABLE.server in urls else [])]
+        times_s, sizes = timed(urls, ways, plan, bar)
+        with bar("32 rollouts", len(DEVICES)) as step:
+            crowds = {world: _crowd(urls, world, plan, step) for world in DEVICES}
     finally:
         child.close()
-    over = {
-        (way, answer): times_s[f"{way}, {answer}, ours"].over(times_s[f"{way}, {answer}, echo"])
-        for way in WAYS
-        for answer in ANSWERS
-    }
+    bare_s = {selector: bare_step_s(selector) for selector in (LAST, JPEG, ALL)}
+    over = {way: _overhead(times_s, way, bare_s[way.selector]) for way in ways}
     return StageReport(
         stage="rollouts",
         machine=describe_machine(("numpy", "fastapi", "uvicorn", "websockets", "msgpack")),
         options=plan,
-        tables=[_table(times_s, over, sizes)],
+        tables=[_table(times_s, over, sizes), _crowd_table(crowds)],
         panels=[],
-        requirements=[
-            Requirement(
-                f"{way}, {answer}: a chunk over an echo of the same bytes, p50",
-                figure.median,
-                "at most",
-                MAX_OVER_ECHO[way],
-            )
-            for (way, answer), figure in over.items()
-        ],
+        requirements=_requirements(times_s, over, crowds),
         data={
             "seconds": {name: list(figure.values) for name, figure in times_s.items()},
-            "bytes": {f"{way}, {answer}": size for (way, answer), size in sizes.items()},
+            "bytes": {_name(way): size for way, size in sizes.items()},
+            "bare_step_seconds": {_name(way): bare_s[way.selector] for way in ways},
+            "crowds": {world: found._asdict() for world, found in crowds.items()},
         },
         notes=[
             "the world computes nothing; client and server are processes of their own; medians of "
-            "the chunks of a round, medians over the rounds, ratios round by round"
+            "the chunks of a round, medians over the rounds; ratios round by round, of a chunk "
+            "less the bare step of the world: over HTTP to a bare ASGI echo of the same bytes, "
+            "over the WebSocket to a minimal server that unpacks, steps the same world and packs"
         ],
     )
 
 
 def timed(
-    urls: Mapping[str, str], plan: Mapping[str, int], bar: Bar
-) -> tuple[dict[str, Figure], dict[tuple[str, str], int]]:
-    """Seconds of a chunk and of its echo, and bytes of the answers by way and kind."""
-    subjects = {
-        f"{way}, {answer}, {server}": (way, answer, server)
-        for way in WAYS
-        for answer in ANSWERS
-        for server in ("ours", "echo")
-    }
-    sizes: dict[tuple[str, str], int] = {}
+    urls: Mapping[str, str], ways: list[Way], plan: Mapping[str, int], bar: Bar
+) -> tuple[dict[str, Figure], dict[Way, int]]:
+    """Seconds of a chunk and of what it is compared with, and bytes of the answers."""
+    sizes: dict[Way, int] = {}
+    for way in ways:
+        with opened(urls, way) as chunk:
+            sizes[way] = chunk()
 
-    def once(way: str, answer: str, server: str, _: int = 0) -> float:
-        opened = _ours if server == "ours" else _echo
-        with opened(urls, way, answer, sizes) as chunk:
+    def ours(way: Way, _: int) -> float:
+        with opened(urls, way) as chunk:
             return _median_s(chunk, plan["chunks"])
 
-    for way in WAYS:
-        for answer in ANSWERS:
-            once(way, answer, "ours")
+    def other(way: Way, _: int) -> float:
+        with compared(urls, way, sizes[way]) as chunk:
+            return _median_s(chunk, plan["chunks"])
+
+    subjects = {_name(way): partial(ours, way) for way in ways}
+    subjects |= {f"{_name(way)}, compared": partial(other, way) for way in ways}
     with bar("rounds", plan["rounds"] * len(subjects)) as step:
-        found = interleaved(
-            {name: partial(once, *subject) for name, subject in subjects.items()},
-            plan["rounds"],
-            on_step=step,
-        )
+        found = interleaved(subjects, plan["rounds"], on_step=step)
     return {name: Figure.of(values) for name, values in found.items()}, sizes
+
+
+def bare_step_s(selector: ReturnSelector) -> float:
+    """Seconds of the world's own step, in this process."""
+    world, actions = StillWorld(), resting_actions(MAX_STEPS)
+
+    def step() -> int:
+        return world.step(0, actions, seed=0, selector=selector).state
+
+    return _median_s(step, 500)
 
 
 def _median_s(chunk: Chunk, count: int) -> float:
@@ -134,105 +145,90 @@ def _median_s(chunk: Chunk, count: int) -> float:
         started = time.perf_counter()
         chunk()
         seconds.append(time.perf_counter() - started)
-    return float(np.median(seconds))
+    return statistics.median(seconds)
 
 
-@contextmanager
-def _ours(
-    urls: Mapping[str, str], way: str, answer: str, sizes: dict[tuple[str, str], int]
-) -> Iterator[Chunk]:
-    """One rollout; every call advances it by a chunk and returns the bytes of the answer."""
-    actions, selector = resting_actions(MAX_STEPS), ANSWERS[answer]
-    if way == "WebSocket":
-        address = urls["ours"].replace("http", "ws") + "/v1/openpi"
-        with connect(address, compression=None, proxy=None) as socket:
-            socket.recv()
-            wanted = {"steps": selector.steps}
-            socket.send(pack_openpi({"start": START, "return": wanted}))
-            unpack_openpi(_bytes(socket.recv()), max_bytes=2**26)
-            message = pack_openpi({"actions": actions})
-
-            def send() -> int:
-                socket.send(message)
-                return len(_bytes(socket.recv()))
-
-            sizes[way, answer] = send()
-            yield send
-        return
-    with _connection(urls["ours"]) as post:
-        start = post("/v1/rollouts", pack_json(START), "application/json")
-        rollout_id = unpack_openpi(start, max_bytes=2**26)["fields"]["rollout"]["id"]
-        chunks = iter(range(MAX_CHUNKS + 10))
-        query = f"steps={selector.steps}"
-
-        def step() -> int:
-            path = f"/v1/rollouts/{rollout_id}/chunks/{next(chunks)}?{query}"
-            kind = "application/octet-stream; dtype=float64"
-            return len(post(path, actions.tobytes(), kind))
-
-        sizes[way, answer] = step()
-        yield step
+def _crowd(urls: Mapping[str, str], world: str, plan: Mapping[str, int], step: Any) -> Crowd:  # noqa: ANN401 - of the bar
+    step(world)
+    num_chunks = plan["crowd_chunks"]
+    return crowd(urls["ours"], world, num_rollouts=NUM_ROLLOUTS, num_chunks=num_chunks)
 
 
-@contextmanager
-def _echo(
-    urls: Mapping[str, str], way: str, answer: str, sizes: dict[tuple[str, str], int]
-) -> Iterator[Chunk]:
-    """Sends as many bytes as a chunk, and gets as many back."""
-    size, body = sizes[way, answer], resting_actions(MAX_STEPS).tobytes()
-    if way == "WebSocket":
-        with connect(urls["messages"], compression=None, proxy=None, max_size=2**26) as socket:
-            message = size.to_bytes(8, "little") + body
-
-            def send() -> int:
-                socket.send(message)
-                return len(_bytes(socket.recv()))
-
-            yield send
-        return
-    with _connection(urls["echo"]) as post:
-        yield lambda: len(post(f"/{size}", body, "application/octet-stream"))
+def _name(way: Way) -> str:
+    return f"{way.protocol}, {way.answer}"
 
 
-@contextmanager
-def _connection(url: str) -> Iterator[Callable[[str, bytes, str], bytes]]:
-    """POST requests over one connection, by the standard library's client."""
-    with ExitStack() as stack:
-        connection = http.client.HTTPConnection(urlsplit(url).netloc)
-        stack.callback(connection.close)
-
-        def post(path: str, body: bytes, kind: str) -> bytes:
-            connection.request("POST", path, body, {"content-type": kind})
-            return connection.getresponse().read()
-
-        yield post
+def _overhead(times_s: Mapping[str, Figure], way: Way, bare_s: float) -> Figure:
+    ours, other = times_s[_name(way)], times_s[f"{_name(way)}, compared"]
+    # The minimal WebSocket server takes the step, too.
+    taken_s = bare_s if way.protocol == "HTTP" else 0.0
+    return Figure.of([one - taken_s for one in ours.values]).over(other)
 
 
-def _bytes(message: str | bytes) -> bytes:
-    if isinstance(message, str):
-        raise InvalidInputError(f"server: {message}")
-    return message
-
-
-def pack_json(fields: Mapping[str, object]) -> bytes:
-    """Fields as a JSON body."""
-    return json.dumps(fields).encode()
+def _requirements(
+    times_s: Mapping[str, Figure], over: Mapping[Way, Figure], crowds: Mapping[str, Crowd]
+) -> list[Requirement]:
+    beside = {"HTTP": "an echo of the same bytes", "WebSocket": "a minimal WebSocket server"}
+    found = [
+        Requirement(
+            f"{_name(way)}: a chunk over {beside[way.protocol]}, p50",
+            over[way].median,
+            "at most",
+            MAX_OVER_ECHO[way.protocol],
+        )
+        for way in WAYS
+    ]
+    durable, memory = times_s.get(_name(DURABLE)), times_s[_name(OTHERS[0])]
+    durable_ms = None if durable is None else 1e3 * (durable.median - memory.median)
+    alone, batched = (crowds[world] for world in DEVICES)
+    return [
+        *found,
+        Requirement(
+            "kept in Redis: further time of a chunk, p50",
+            durable_ms,
+            "at most",
+            MAX_DURABLE_MS,
+            "ms",
+        ),
+        Requirement(
+            "32 rollouts on a device of 5 ms: chunks/s, batched over one by one",
+            batched.chunks_per_s / alone.chunks_per_s,
+            "at least",
+            MIN_BATCHED,
+        ),
+        Requirement(
+            "32 rollouts on a device of 5 ms, batched: p99 over p50",
+            batched.p99_s / batched.p50_s,
+            "at most",
+            MAX_TAIL,
+        ),
+    ]
 
 
 def _table(
-    times_s: Mapping[str, Figure],
-    over: Mapping[tuple[str, str], Figure],
-    sizes: Mapping[tuple[str, str], int],
+    times_s: Mapping[str, Figure], over: Mapping[Way, Figure], sizes: Mapping[Way, int]
 ) -> ResultTable:
     rows = [
         (
-            f"{way}, {answer}",
-            f"{sizes[way, answer] / 1e3:.0f}",
-            times_s[f"{way}, {answer}, ours"].scaled(1e3).text(),
-            times_s[f"{way}, {answer}, echo"].scaled(1e3).text(),
+            _name(way),
+            f"{sizes[way] / 1e3:.0f}",
+            times_s[_name(way)].scaled(1e3).text(),
+            times_s[f"{_name(way)}, compared"].scaled(1e3).text(),
             figure.text(),
         )
-        for (way, answer), figure in over.items()
+        for way, figure in over.items()
     ]
-    columns = ("chunk of 16 steps", "kB", "ours ms", "echo ms", "ratio")
+    columns = ("chunk of 16 steps", "kB", "ours ms", "beside ms", "ratio")
     return ResultTable("Time of a chunk", columns, rows)
+
+
+def _crowd_table(crowds: Mapping[str, Crowd]) -> ResultTable:
+    rows = [
+        (world, f"{one.chunks_per_s:.0f}", f"{one.p50_s * 1e3:.0f}", f"{one.p99_s * 1e3:.0f}")
+        for world, one in crowds.items()
+    ]
+    return ResultTable(
+        f"{NUM_ROLLOUTS} rollouts on a device of 5 ms",
+        ("world", "chunks/s", "p50 ms", "p99 ms"),
+        rows,
+    )

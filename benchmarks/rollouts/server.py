@@ -1,105 +1,30 @@
-"""Child process of the benchmark: rollouts of a world that computes nothing, and two echoes.
+"""Child process of the benchmark: rollouts of several worlds, and what they are compared with.
 
-Answers once with the three URLs, and ends when its parent does.
+Answers once with its URLs, and ends when its parent does. "durable" is among them where there is a
+redis-server.
 """
 
+import asyncio
+import shutil
+import subprocess
+import tempfile
 import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
 
+import msgpack
 import numpy as np
-from jaxtyping import Float64
+import uvicorn
 from starlette.types import Receive, Scope, Send
-from websockets.sync.server import ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, serve
 
-from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses, check_actions
-from dextouch.schemas import (
-    EVERYTHING,
-    Observation,
-    ReturnSelector,
-    RolloutStart,
-    WorldDescription,
-)
+from benchmarks.rollouts.worlds import BatchDevice, Device, StillWorld
+from dextouch.schemas import ReturnSelector
 from dextouch.serving import configure_logging, serve_parent
-from dextouch.worlds import (
-    StartedRollout,
-    SteppedRollout,
-    WorldServiceSettings,
-    create_world_app,
-)
-from services.cli.servers import served
-
-SIZE_PX = 64
-MAX_STEPS = 16
-CAMERA = "camera_head"
-
-
-def resting_actions(num_steps: int) -> Float64[np.ndarray, "steps 67"]:
-    """Actions that leave everything in its place."""
-    rows = np.zeros((num_steps, 67))
-    for part in POSE_SLICES:
-        rows[:, part] = IDENTITY_POSE_9D
-    return rows
-
-
-class StillWorld:
-    """Returns the same prepared observation for every chunk."""
-
-    is_quick = True
-
-    def __init__(self) -> None:
-        self.description = WorldDescription(
-            name="still",
-            kind="model",
-            digest="still",
-            tasks=("rest",),
-            cameras=(CAMERA,),
-            image_height_px=SIZE_PX,
-            image_width_px=SIZE_PX,
-            model_rate_hz=15.0,
-            action_kinds=("commanded",),
-            starts_from=("task_seed",),
-            max_chunk_steps=MAX_STEPS,
-        )
-        generator = np.random.default_rng(0)
-        shape = (MAX_STEPS, SIZE_PX, SIZE_PX, 3)
-        self._images = generator.integers(0, 255, shape, dtype=np.uint8)
-        self._touch = generator.random((MAX_STEPS, 2, 320), dtype=np.float32)
-
-    def reset(self, start: RolloutStart) -> StartedRollout[int]:
-        """See World."""
-        del start
-        anchor = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
-        return StartedRollout(0, self._seen(0, resting_actions(1)), anchor, np.eye(3))
-
-    def step(
-        self,
-        state: int,
-        actions: Float64[np.ndarray, "steps 67"],
-        *,
-        seed: int,
-        selector: ReturnSelector = EVERYTHING,
-    ) -> SteppedRollout[int]:
-        """See World."""
-        del seed
-        seen = self._seen(state + 1, check_actions(actions)).selected(selector)
-        return SteppedRollout(state + len(actions), seen)
-
-    def snapshot(self, state: int) -> bytes:
-        """See World."""
-        return str(state).encode()
-
-    def restore(self, data: bytes) -> int:
-        """See World."""
-        return int(data)
-
-    def _seen(self, first_step: int, actions: np.ndarray) -> Observation:
-        n = len(actions)
-        return Observation(
-            first_step=first_step,
-            images={CAMERA: self._images[:n]},
-            tactile_kpa=self._touch[:n],
-            action_reached=actions,
-            reached_is_measured=True,
-        )
+from dextouch.worlds import WorldServiceSettings, create_world_app
+from dextouch.worlds.rollouts import RolloutLimits
+from services.cli.servers import Server, bind, served
 
 
 async def echo(scope: Scope, receive: Receive, send: Send) -> None:
@@ -117,28 +42,101 @@ async def echo(scope: Scope, receive: Receive, send: Send) -> None:
     await send({"type": "http.response.body", "body": body})
 
 
-def echo_messages(connection: ServerConnection) -> None:
-    """Answer every message with as many bytes as its first eight say."""
-    for message in connection:
-        head = message[:8] if isinstance(message, bytes) else b""
-        connection.send(bytes(int.from_bytes(head, "little")))
+def _encoded(value: np.ndarray) -> dict[bytes, Any]:
+    shape, data = value.shape, value.tobytes()
+    return {b"__ndarray__": True, b"data": data, b"dtype": value.dtype.str, b"shape": shape}
+
+
+def _decoded(found: dict[Any, Any]) -> Any:  # noqa: ANN401 - an array, or the map itself
+    if b"__ndarray__" not in found:
+        return found
+    return np.frombuffer(found[b"data"], found[b"dtype"]).reshape(found[b"shape"])
+
+
+async def answer_messages(connection: ServerConnection) -> None:
+    """What a policy server of openpi does: unpack a message, take a step, pack what is seen."""
+    world, state = StillWorld(), 0
+    async for message in connection:
+        asked = msgpack.unpackb(message, object_hook=_decoded)
+        selector = ReturnSelector(steps=asked["steps"])
+        stepped = world.step(state, asked["actions"], seed=0, selector=selector)
+        state, seen = stepped.state, stepped.observation
+        shown = {
+            "first_step": seen.first_step,
+            "tactile_kpa": seen.tactile_kpa,
+            "action_reached": seen.action_reached,
+            **{f"image/{camera}": images for camera, images in seen.images.items()},
+        }
+        await connection.send(msgpack.packb(shown, default=_encoded))
+
+
+@contextmanager
+def bare_servers() -> Iterator[dict[str, str]]:
+    """The echo in a bare uvicorn, and the minimal WebSocket server, in a thread."""
+    place, started = bind("echo", host="127.0.0.1", port=0), threading.Event()
+    config = uvicorn.Config(echo, log_config=None, access_log=False, lifespan="off")
+    server, urls = Server(config), {"echo": place.url}
+
+    async def run() -> None:
+        async with serve(answer_messages, "127.0.0.1", 0, compression=None) as sockets:
+            port = next(iter(sockets.sockets)).getsockname()[1]
+            urls["messages"] = f"ws://127.0.0.1:{port}"
+            started.set()
+            await server.serve(sockets=[place.socket])
+
+    thread = threading.Thread(target=asyncio.run, args=[run()], daemon=True)
+    thread.start()
+    started.wait()
+    try:
+        yield urls
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+@contextmanager
+def redis_url() -> Iterator[str | None]:
+    """Address of an empty Redis server without persistence; None where none is installed."""
+    program = shutil.which("redis-server")
+    if program is None:
+        yield None
+        return
+    place = bind("redis", host="127.0.0.1", port=0)
+    port = place.url.rsplit(":", 1)[1]
+    place.socket.close()
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        command = [program, "--port", port, "--bind", "127.0.0.1", "--save", "", "--dir", folder]
+        process = stack.enter_context(
+            subprocess.Popen(command, stdout=subprocess.PIPE, text=True)  # noqa: S603 - by PATH
+        )
+        stack.callback(process.terminate)
+        assert process.stdout is not None  # noqa: S101 - it is a pipe
+        next(line for line in process.stdout if "Ready to accept" in line)
+        yield f"redis://127.0.0.1:{port}/0"
 
 
 def main() -> None:
     """Serve until standard input closes."""
     requests, answer = serve_parent(niceness=0)
     configure_logging(service="benchmark", log_format="auto", level="warning")
-    app = create_world_app({"still": StillWorld()}, WorldServiceSettings())
-    with (
-        serve(echo_messages, "127.0.0.1", 0, compression=None) as sockets,
-        served({"ours": app, "echo": echo}) as urls,  # type: ignore[dict-item]
-    ):
-        threading.Thread(target=sockets.serve_forever, daemon=True).start()
-        port = sockets.socket.getsockname()[1]
-        answer({**urls, "messages": f"ws://127.0.0.1:{port}"})
-        for _ in requests:
-            pass
-        sockets.shutdown()
+    worlds = {
+        "still": StillWorld(),
+        "still in a thread": StillWorld(is_quick=False),
+        "device": Device(),
+        "batch device": BatchDevice(),
+    }
+    with bare_servers() as bare, redis_url() as url:
+        # Each round begins new ones.
+        limits = RolloutLimits(max_rollouts=10_000)
+        apps = {"ours": create_world_app(worlds, WorldServiceSettings(limits=limits))}
+        if url is not None:
+            durable = WorldServiceSettings(state_url=url, limits=limits)
+            apps["durable"] = create_world_app({"still": StillWorld()}, durable)
+        with served(apps) as urls:
+            answer({**bare, **urls})
+            for _ in requests:
+                pass
 
 
 if __name__ == "__main__":

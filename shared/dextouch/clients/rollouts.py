@@ -222,7 +222,8 @@ def _query(selector: ReturnSelector) -> str:
         raise InvalidInputError("selector: an Observation holds touch; expected tactile=True")
     names = () if selector.cameras is None else selector.cameras or ("",)
     cameras = [("cameras", name) for name in names]
-    return urlencode([("steps", selector.steps), *cameras])
+    images = [("images", selector.images)] if selector.images != "raw" else []
+    return urlencode([("steps", selector.steps), *cameras, *images])
 
 
 def _parsed(model: type[ModelT], reply: Reply) -> ModelT:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.observations import RolloutAnswer as RolloutAnswer
     from dextouch.schemas.observations import RolloutOrigin as RolloutOrigin
     from dextouch.schemas.observations import RolloutStart as RolloutStart
+    from dextouch.schemas.observations import answer_parts as answer_parts
     from dextouch.schemas.observations import check_observation as check_observation
     from dextouch.schemas.observations import decode_answer as decode_answer
     from dextouch.schemas.observations import decode_observation as decode_observation

@@ -117,7 +117,7 @@ class _Session:
         if not isinstance(chunk, int) or isinstance(chunk, bool):
             raise InvalidInputError(f"chunk: got {chunk!r}, expected a whole number")
         answer = await self._service.step(
-            self._current(), chunk, actions.astype(np.float64), self._selector
+            self._current(), chunk, np.asarray(actions, np.float64), self._selector
         )
         return self._repacked(answer)
 
@@ -135,7 +135,8 @@ class _Session:
 
     def _repacked(self, answer: Answer) -> bytes:
         """A response of the rollout service in openpi's format; images and arrays by name."""
-        fields, arrays = unpack(answer.payload, max_bytes=len(answer.payload))
+        size = len(answer.payload)
+        fields, arrays = answer.parts or unpack(answer.payload, max_bytes=size)
         info = fields["rollout"]
         self._rollout_id, self._next_chunk = info["id"], info["next_chunk"]
         return pack_openpi({**fields, **arrays, "replayed": answer.replayed})

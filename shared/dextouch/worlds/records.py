@@ -6,15 +6,14 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
 
-import numpy as np
+import msgpack
 
 from dextouch.errors import LimitExceededError, NotFoundError, StorageError, UnavailableError
 from dextouch.schemas import RolloutInfo
 from dextouch.serving import StateStore, Versioned
-from dextouch.streams import pack, unpack
 
 KEY_PREFIX = "rollout:"
-MAX_RECORD_BYTES = 2**30
+RECORD_FORMAT = 2
 # Time that a start may wait for others and for its world; after a crash its slot is held that long.
 PLACE_TTL_S = 600.0
 # Of an id, the beginning that all rollouts of one API key share.
@@ -38,29 +37,31 @@ class RolloutRecord:
 
     def to_bytes(self) -> bytes:
         """Serialize the record, except the payload, which is stored as it is."""
-        fields = {
-            "info": self.info.model_dump(mode="json"),
-            "request_sha256": self.request_sha256,
-            "payload_bytes": len(self.payload),
-        }
-        return pack(fields, {"snapshot": np.frombuffer(self.snapshot, np.uint8)})
+        info = self.info.model_dump(mode="json")
+        fields = (RECORD_FORMAT, info, self.request_sha256, len(self.payload), self.snapshot)
+        return msgpack.packb(fields)
 
     @staticmethod
     def from_stored(stored: Versioned) -> "RolloutRecord":
         """The record that a store holds.
 
         Raises:
-            StorageError: not the whole payload, as one written by another version of DexTouch.
+            StorageError: not the whole record, or one of another version of DexTouch.
         """
-        fields, arrays = unpack(stored.value, max_bytes=MAX_RECORD_BYTES)
-        info = RolloutInfo.model_validate(fields["info"])
-        if fields.get("payload_bytes") != len(stored.tail):
+        fields = msgpack.unpackb(stored.value)
+        if not isinstance(fields, list) or fields[0] != RECORD_FORMAT:
             raise StorageError(
-                f"rollout {info.id}: got {len(stored.tail)} bytes of its newest response, expected "
-                f"{fields.get('payload_bytes')}; start a new one"
+                "rollout: it was stored by another version of DexTouch; start a new one"
             )
-        snapshot = arrays["snapshot"].tobytes()
-        return RolloutRecord(info, snapshot, fields["request_sha256"], stored.tail, stored.version)
+        info, sha256, num_bytes, snapshot = fields[1:]
+        if num_bytes != len(stored.tail):
+            raise StorageError(
+                f"rollout {info['id']}: got {len(stored.tail)} bytes of its newest response, "
+                f"expected {num_bytes}; start a new one"
+            )
+        return RolloutRecord(
+            RolloutInfo.model_validate(info), snapshot, sha256, stored.tail, stored.version
+        )
 
 
 def new_rollout_id(owner: str) -> str:
@@ -79,7 +80,8 @@ class RecordStore:
     async def read(self, rollout_id: str) -> RolloutRecord:
         """The newest record; raises NotFoundError where unknown, deleted or expired."""
         stored = await self._store.get(KEY_PREFIX + rollout_id)
-        if stored is None:
+        # Without a value while it is only placed.
+        if stored is None or not stored.value:
             raise _unknown(rollout_id)
         return RolloutRecord.from_stored(stored)
 
