@@ -10,14 +10,15 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from typing import Any
+from contextlib import ExitStack, contextmanager, suppress
+from typing import Any, Final, Literal
 
 import msgpack
 import numpy as np
 import uvicorn
 from starlette.types import Receive, Scope, Send
 from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
 
 from benchmarks.rollouts.worlds import BatchDevice, Device, StillWorld
 from dextouch.schemas import ReturnSelector
@@ -25,6 +26,8 @@ from dextouch.serving import configure_logging, serve_parent
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.rollouts import RolloutLimits
 from services.cli.servers import Server, bind, served
+
+STEPS: Final[tuple[Literal["last", "all"], ...]] = ("last", "all")
 
 
 async def echo(scope: Scope, receive: Receive, send: Send) -> None:
@@ -56,18 +59,21 @@ def _decoded(found: dict[Any, Any]) -> Any:  # noqa: ANN401 - an array, or the m
 async def answer_messages(connection: ServerConnection) -> None:
     """What a policy server of openpi does: unpack a message, take a step, pack what is seen."""
     world, state = StillWorld(), 0
-    async for message in connection:
-        asked = msgpack.unpackb(message, object_hook=_decoded)
-        selector = ReturnSelector(steps=asked["steps"])
-        stepped = world.step(state, asked["actions"], seed=0, selector=selector)
-        state, seen = stepped.state, stepped.observation
-        shown = {
-            "first_step": seen.first_step,
-            "tactile_kpa": seen.tactile_kpa,
-            "action_reached": seen.action_reached,
-            **{f"image/{camera}": images for camera, images in seen.images.items()},
-        }
-        await connection.send(msgpack.packb(shown, default=_encoded))
+    selectors = {steps: ReturnSelector(steps=steps) for steps in STEPS}
+    with suppress(ConnectionClosed):
+        while True:
+            message = await connection.recv(decode=False)
+            asked = msgpack.unpackb(message, object_hook=_decoded)
+            actions, selector = asked["actions"], selectors[asked["steps"]]
+            stepped = world.step(state, actions, seed=0, selector=selector)
+            state, seen = stepped.state, stepped.observation
+            shown = {
+                "first_step": seen.first_step,
+                "tactile_kpa": seen.tactile_kpa,
+                "action_reached": seen.action_reached,
+                **{f"image/{camera}": images for camera, images in seen.images.items()},
+            }
+            await connection.send(msgpack.packb(shown, default=_encoded))
 
 
 @contextmanager

@@ -11,7 +11,8 @@ from dextouch.errors import InvalidInputError
 def test_ours_and_the_echo_move_the_same_bytes(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("benchmarks.command.refuse_shape_checks", lambda: None)
     path = tmp_path / "report.json"
-    assert main(["rollouts", "--quick", "--rounds", "1", "--chunks", "5", "--json", str(path)]) == 0
+    short = ["--quick", "--rounds", "1", "--chunks", "5", "--crowd-chunks", "1"]
+    assert main(["rollouts", *short, "--json", str(path)]) == 0
     report = json.loads(path.read_text())
     sizes = report["bytes"]
     # 16 images of 64 x 64 px, 16 x 640 taxels in float32 and 16 x 67 numbers in float64.
@@ -19,7 +20,10 @@ def test_ours_and_the_echo_move_the_same_bytes(tmp_path, capsys, monkeypatch):
     for way in ("HTTP", "WebSocket"):
         assert 0 < sizes[f"{way}, 16 raw images"] - everything < 1500
         assert 0 < sizes[f"{way}, last image"] - everything / 16 < 1500
-    assert len(report["seconds"]) == 8
+    assert sizes["HTTP, last image as JPEG"] < sizes["HTTP, last image"] / 2
+    named = {requirement["what"].split(":")[0] for requirement in report["requirements"]}
+    assert {"HTTP, 16 raw images", "kept in Redis"} < named
+    assert report["crowds"]["batch device"]["p99_s"] > 0.005 * (0.8 + 0.2 * 2)
     assert "WebSocket, last image" in capsys.readouterr().out
 
 

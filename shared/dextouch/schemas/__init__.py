@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from dextouch.schemas.observations import decode_answer as decode_answer
     from dextouch.schemas.observations import decode_observation as decode_observation
     from dextouch.schemas.observations import decode_start as decode_start
-    from dextouch.schemas.observations import encode_answer as encode_answer
     from dextouch.schemas.observations import encode_observation as encode_observation
     from dextouch.schemas.observations import encode_start as encode_start
     from dextouch.schemas.observations import start_from as start_from

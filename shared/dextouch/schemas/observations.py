@@ -222,18 +222,6 @@ class RolloutAnswer:
     origin: RolloutOrigin | None
 
 
-def encode_answer(
-    rollout: RolloutInfo,
-    observation: Observation,
-    *,
-    selector: ReturnSelector = EVERYTHING,
-    info: dict[str, float] | None = None,
-    origin: RolloutOrigin | None = None,
-) -> bytes:
-    """Encode an observation with the rollout's progress, with touch and images as selected."""
-    return pack(*answer_parts(rollout, observation, selector=selector, info=info, origin=origin))
-
-
 def answer_parts(
     rollout: RolloutInfo,
     observation: Observation,
@@ -242,7 +230,10 @@ def answer_parts(
     info: dict[str, float] | None = None,
     origin: RolloutOrigin | None = None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Fields and arrays of `encode_answer`."""
+    """Fields and arrays of a response: the rollout's progress and its observation as selected.
+
+    `pack` encodes them, and `decode_answer` is the inverse of both if touch is selected.
+    """
     arrays = _observation_arrays(observation)
     if not selector.tactile:
         del arrays["tactile_kpa"]
@@ -260,7 +251,7 @@ def answer_parts(
 
 
 def decode_answer(data: bytes, *, max_bytes: int) -> RolloutAnswer:
-    """Decode the result of `encode_answer` with tactile.
+    """Decode a packed response that holds touch.
 
     Raises:
         InvalidInputError: not a valid response.

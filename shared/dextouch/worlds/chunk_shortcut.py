@@ -19,7 +19,8 @@ from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands.actions import ACTION_DIM
 from dextouch.schemas import ReturnSelector
 from dextouch.serving import JSON, MSGPACK, OCTETS, AccessControl
-from dextouch.worlds.rollouts import Answer, RolloutService
+from dextouch.worlds.answers import Answer
+from dextouch.worlds.rollouts import RolloutService
 
 SCOPE: Final = "rollout"
 REPLAYED_HEADER: Final = "dextouch-replayed"

@@ -30,7 +30,8 @@ from dextouch.schemas import (
 )
 from dextouch.serving import MAX_WEBSOCKET_BYTES
 from dextouch.streams import pack_openpi, unpack, unpack_openpi
-from dextouch.worlds.rollouts import Answer, RolloutService
+from dextouch.worlds.answers import Answer
+from dextouch.worlds.rollouts import RolloutService
 
 SCOPE: Final = "rollout"
 _REFUSED: Final = 1008

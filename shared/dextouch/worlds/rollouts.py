@@ -9,8 +9,7 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import AbstractAsyncContextManager
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from dataclasses import replace
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -30,16 +29,15 @@ from dextouch.errors import (
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
     MAX_SEED,
-    Observation,
     ReturnSelector,
     RolloutInfo,
     RolloutOrigin,
     RolloutStart,
     WorldDescription,
-    answer_parts,
 )
 from dextouch.serving import StateStore
 from dextouch.streams import pack
+from dextouch.worlds.answers import Answer, parts_of, selector_bytes
 from dextouch.worlds.batcher import StepJob, WorldWorker
 from dextouch.worlds.records import RecordStore, RolloutRecord, new_rollout_id
 from dextouch.worlds.warm_up import first_chunk_s
@@ -53,12 +51,6 @@ from dextouch.worlds.world import (
 )
 
 logger = structlog.get_logger(__name__)
-
-# More of them are encoded as JPEG beside the event loop, at 60 MB/s.
-MAX_INLINE_IMAGE_BYTES = 2**16
-
-
-AnswerParts = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
 class RolloutLimits(FrozenModel):
@@ -74,20 +66,6 @@ class RolloutLimits(FrozenModel):
         gt=0,
         description="seconds until an unused rollout is dropped; every chunk renews them",
     )
-
-
-@dataclass(frozen=True)
-class Answer:
-    """An encoded response; `replayed` if it was computed for an earlier, equal request.
-
-    `parts` are its fields and arrays; None where only the bytes are known.
-    """
-
-    payload: bytes
-    parts: AnswerParts | None = None
-    replayed: bool = False
-    queued_s: float = 0.0
-    device_s: float = 0.0
 
 
 # Opens the world of this name and digest, or returns None where it is not to be had.
@@ -185,7 +163,7 @@ class RolloutService:
         logger.info("rollout_started", rollout_id=info.id, world=world, task=info.task)
         origin = RolloutOrigin(started.anchor, started.K_head)
         shown = started.observation.selected(selector)
-        parts = await _parts(info, shown, selector, origin=origin)
+        parts = await parts_of(info, shown, selector, origin=origin)
         return Answer(pack(*parts), parts)
 
     async def get(self, rollout_id: str) -> RolloutInfo:
@@ -211,7 +189,7 @@ class RolloutService:
             description = worker.world.description
             check_selector(selector, description)
             checked = check_chunk(actions, description)
-            asked = hashlib.sha256(_selector_bytes(selector))
+            asked = hashlib.sha256(selector_bytes(selector))
             asked.update(np.ascontiguousarray(checked, dtype="<f8").data)
             sha256 = asked.hexdigest()
             replayed = _replay(record, chunk, sha256)
@@ -307,7 +285,7 @@ class RolloutService:
                 "last_step": before.last_step + num_steps,
             }
         )
-        parts = await _parts(info, seen, selector, info=outcome.stepped.info)
+        parts = await parts_of(info, seen, selector, info=outcome.stepped.info)
         payload = pack(*parts)
         record = RolloutRecord(info, outcome.snapshot, request_sha256, payload, stored.version)
         version = await self._records.write(record)
@@ -376,25 +354,6 @@ class RolloutService:
                 got=digest,
             )
         return self._reopened[began]
-
-
-async def _parts(
-    rollout: RolloutInfo,
-    seen: Observation,
-    selector: ReturnSelector,
-    **told: Any,  # noqa: ANN401 - see answer_parts
-) -> AnswerParts:
-    """Fields and arrays of a response, from a thread where encoding the images takes long."""
-    num_bytes = sum(images.nbytes for images in seen.images.values())
-    make = partial(answer_parts, rollout, seen, selector=selector, **told)
-    if selector.images == "raw" or num_bytes <= MAX_INLINE_IMAGE_BYTES:
-        return make()
-    return await asyncio.to_thread(make)
-
-
-@lru_cache(maxsize=64)
-def _selector_bytes(selector: ReturnSelector) -> bytes:
-    return selector.model_dump_json().encode()
 
 
 def chunk_seed(rollout_seed: int, chunk: int, world_digest: str) -> int:

@@ -46,6 +46,7 @@ from dextouch.serving import (
     timed,
 )
 from dextouch.streams import unpack
+from dextouch.worlds.answers import Answer
 from dextouch.worlds.chunk_shortcut import (
     REPLAYED_HEADER,
     SCOPE,
@@ -55,7 +56,7 @@ from dextouch.worlds.chunk_shortcut import (
     wants_json,
 )
 from dextouch.worlds.openpi import openpi_router
-from dextouch.worlds.rollouts import Answer, Reopen, RolloutLimits, RolloutService
+from dextouch.worlds.rollouts import Reopen, RolloutLimits, RolloutService
 from dextouch.worlds.world import World
 
 MAX_BODY_BYTES = 2**28

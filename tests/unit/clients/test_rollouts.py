@@ -239,3 +239,14 @@ def test_no_service_there(free_port):
 def test_an_address_must_be_one(url):
     with pytest.raises(InvalidInputError, match="address"):
         RolloutClient(url)
+
+
+def test_images_as_jpeg_are_decoded_by_the_client(client):
+    selector = ReturnSelector(steps="last", images="jpeg")
+    with client.start(world="sum", **ASKED) as exact, client.start(world="sum", **ASKED) as rollout:
+        raw = exact.step(actions(4), selector=ReturnSelector(steps="last"))
+        seen = rollout.step(actions(4), selector=selector)
+    assert seen.images.keys() == raw.images.keys()
+    for camera, images in raw.images.items():
+        assert seen.images[camera].shape == images.shape
+    np.testing.assert_array_equal(seen.tactile_kpa, raw.tactile_kpa)

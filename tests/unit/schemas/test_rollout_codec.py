@@ -18,10 +18,10 @@ from dextouch.schemas import (
     RolloutOrigin,
     RolloutStart,
     StartRequest,
+    answer_parts,
     decode_answer,
     decode_observation,
     decode_start,
-    encode_answer,
     encode_observation,
     encode_start,
 )
@@ -43,6 +43,11 @@ INFO = RolloutInfo(
     ttl_s=600.0,
 )
 REQUEST = StartRequest(world="twin", task="stand_bottle", seed=3, instruction="stand the bottle")
+
+
+def encode_answer(*args, **options) -> bytes:
+    """A response as services send it."""
+    return pack(*answer_parts(*args, **options))
 
 
 def golden_observation() -> Observation:
