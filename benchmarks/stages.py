@@ -87,11 +87,11 @@ STAGES = {
         "benchmarks.rollouts.benchmark",
         "time a chunk of a rollout beside an echo of the same bytes",
         "Serves rollouts of a world that computes nothing, a bare ASGI echo and a minimal "
-        "WebSocket server of openpi's kind in a process of their own, and times chunks of 16 steps over "
-        "HTTP and over the WebSocket, with the last image or all of them, in turns with what "
-        "they are compared with; one way keeps its rollouts in Redis. Then advances 32 rollouts "
-        "at once on a device that takes 5 ms for one, batched and one by one. Close other "
-        "programs first: timings on a busy machine say little.",
+        "WebSocket server of openpi's kind in a process of their own, and times chunks of 16 "
+        "steps over HTTP and over the WebSocket, with the last image or all of them, in turns "
+        "with what they are compared with; one way keeps its rollouts in Redis. Then advances 32 "
+        "rollouts at once on a device that takes 5 ms for one, batched and one by one. Close "
+        "other programs first: timings on a busy machine say little.",
     ),
     "agreement": StageEntry(
         "benchmarks.agreement",

@@ -24,7 +24,6 @@ from benchmarks.rollouts.worlds import BatchDevice, Device, StillWorld
 from dextouch.schemas import ReturnSelector
 from dextouch.serving import configure_logging, serve_parent
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from dextouch.worlds.rollouts import RolloutLimits
 from services.cli.servers import Server, bind, served
 
 STEPS: Final[tuple[Literal["last", "all"], ...]] = ("last", "all")
@@ -134,7 +133,7 @@ def main() -> None:
     }
     with bare_servers() as bare, redis_url() as url:
         # Each round begins new ones.
-        limits = RolloutLimits(max_rollouts=10_000)
+        limits = WorldServiceSettings().limits.model_copy(update={"max_rollouts": 10_000})
         apps = {"ours": create_world_app(worlds, WorldServiceSettings(limits=limits))}
         if url is not None:
             durable = WorldServiceSettings(state_url=url, limits=limits)
