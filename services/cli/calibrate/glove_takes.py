@@ -8,7 +8,6 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
@@ -48,7 +47,6 @@ _PRESS = re.compile(
 )
 
 Found = TypeVar("Found")
-Ask = Callable[[str], str]
 
 
 class PressRow(BaseModel):
@@ -139,90 +137,27 @@ def press_of(row: PressRow, options: argparse.Namespace) -> TaxelPress:
     return TaxelPress(row.pressure_kpa, row.sigma_kpa or 0.0, counts, pad_taxels(row.pads))
 
 
-@dataclass(frozen=True)
-class StationTakes:
-    """Records takes with a running station and locates them.
+class Guide:
+    """Leads an operator, who lays the glove down and presses it while a station records takes.
 
-    Attributes:
+    An invalid take is explained and repeated.
+
+    Args:
+        options: of the command.
         request: sends a request to the station, as `HttpLink.request`.
-        spool: the station's spool, if accessible from this machine.
-        has_store: whether takes may be read from the store that the station uploads to.
+        ask: puts a question to the operator.
         wait: sleeps.
     """
 
-    request: Callable[..., Reply]
-    spool: Path
-    has_store: bool
-    wait: Callable[[float], None] = time.sleep
-
-    def record(
-        self, name: str, words: str, seconds: float, check: Callable[[str], Found]
-    ) -> tuple[str, Found]:
-        """Record a valid take; interrupted and invalid ones are discarded.
-
-        Args:
-            name: id of the take.
-            words: description for the operator, also the take's instruction.
-            seconds: duration.
-            check: raises an error for an invalid take. If takes are only in the store, it runs
-                after the take is saved.
-
-        Returns:
-            The take's folder in the spool, or its id in the store; and the result of the check.
-
-        Raises:
-            ConflictError: the recorder is busy with another take; save or discard that.
-        """
-        self._act("arm", {"task": TASK, "instruction": words})
-        self._act("record", {"recording_id": name})
-        take, found = str((self.spool / name).resolve()), None
-        with ExitStack() as undo:
-            undo.callback(self._act, "discard", {"recording_id": name})
-            num_ticks = round(seconds / TICK_S)
-            for _ in progress(range(num_ticks), words, num_ticks):
-                self.wait(TICK_S)
-            self._act("stop", {"recording_id": name})
-            if Path(take).is_dir():
-                found = check(take)
-            undo.pop_all()
-        # Other devices may be absent; the presence of the glove shows in its readings.
-        self._act("save", {"recording_id": name, "accept_incomplete": True})
-        if found is None:
-            take = self._await_upload(name)
-            found = check(take)
-        return take, found
-
-    def _act(self, action: str, body: dict[str, object]) -> None:
-        self.request("POST", f"/v1/recorder/{action}", body=json.dumps(body).encode())
-
-    def _await_upload(self, name: str) -> str:
-        """Wait for the upload and return the take's id in the store."""
-        if not self.has_store:
-            raise NotFoundError(
-                f"take {name!r}: not in {self.spool.resolve()}; name the station's spool with "
-                "--spool, or on another machine its store with --store URL"
-            )
-        num_tries = round(UPLOAD_S)
-        for _ in progress(range(num_tries), "waiting for the upload", num_tries):
-            uploads = json.loads(self.request("GET", "/v1/uploads").body)
-            for take in uploads:
-                if take["recording_id"] == name and take["uploaded"]:
-                    return str(take.get("stored_as") or name)
-            self.wait(1.0)
-        raise NotFoundError(
-            f"take {name!r}: the station did not upload it within {UPLOAD_S:g} s; look at its "
-            "uploads, then calibrate with --rest and --presses"
-        )
-
-
-class Guide:
-    """Dialogue with an operator, who lays the glove down and presses it while takes are recorded.
-
-    An invalid take is explained and repeated.
-    """
-
-    def __init__(self, options: argparse.Namespace, takes: StationTakes, ask: Ask) -> None:
-        self._options, self._takes, self._ask = options, takes, ask
+    def __init__(
+        self,
+        options: argparse.Namespace,
+        request: Callable[..., Reply],
+        *,
+        ask: Callable[[str], str] = input,
+        wait: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._options, self._request, self._ask, self._wait = options, request, ask, wait
         started = f"calibration-glove-{options.side}-{datetime.now(UTC):%Y%m%d-%H%M%S}"
         self._names = (f"{started}-{number}" for number in count(1))
 
@@ -235,7 +170,7 @@ class Guide:
                 f"Enter records {REST_S:g} s: "
             )
             try:
-                return self._takes.record(
+                return self.record(
                     next(self._names),
                     f"{side} glove at rest, untouched",
                     REST_S,
@@ -277,7 +212,7 @@ class Guide:
             fit_gain(tare, [press], full_scale_counts=self._options.full_scale)
             return row, press
 
-        return self._takes.record(next(self._names), f"{target}, held still", PRESS_S, check)[1]
+        return self.record(next(self._names), f"{target}, held still", PRESS_S, check)[1]
 
     def _known_so_far(self, tare: TaxelTare, presses: list[TaxelPress]) -> str:
         try:
@@ -301,19 +236,75 @@ class Guide:
                 "--rest and --presses"
             ) from error
 
+    def record(
+        self, name: str, words: str, seconds: float, check: Callable[[str], Found]
+    ) -> tuple[str, Found]:
+        """Record a valid take; interrupted and invalid ones are discarded.
+
+        Args:
+            name: id of the take.
+            words: description for the operator, also the take's instruction.
+            seconds: duration.
+            check: raises an error for an invalid take. If takes are only in the store, it runs
+                after the take is saved.
+
+        Returns:
+            The take's folder in the spool, or its id in the store; and the result of the check.
+
+        Raises:
+            ConflictError: the recorder is busy with another take; save or discard that.
+        """
+        self._act("arm", {"task": TASK, "instruction": words})
+        self._act("record", {"recording_id": name})
+        take, found = str((self._options.spool / name).resolve()), None
+        with ExitStack() as undo:
+            undo.callback(self._act, "discard", {"recording_id": name})
+            num_ticks = round(seconds / TICK_S)
+            for _ in progress(range(num_ticks), words, num_ticks):
+                self._wait(TICK_S)
+            self._act("stop", {"recording_id": name})
+            if Path(take).is_dir():
+                found = check(take)
+            undo.pop_all()
+        # Other devices may be absent; the presence of the glove shows in its readings.
+        self._act("save", {"recording_id": name, "accept_incomplete": True})
+        if found is None:
+            take = self._await_upload(name)
+            found = check(take)
+        return take, found
+
+    def _act(self, action: str, body: dict[str, object]) -> None:
+        self._request("POST", f"/v1/recorder/{action}", body=json.dumps(body).encode())
+
+    def _await_upload(self, name: str) -> str:
+        """Wait for the upload and return the take's id in the store."""
+        if self._options.store is None:
+            raise NotFoundError(
+                f"take {name!r}: not in {self._options.spool.resolve()}; name the station's spool "
+                "with --spool, or on another machine its store with --store URL"
+            )
+        num_tries = round(UPLOAD_S)
+        for _ in progress(range(num_tries), "waiting for the upload", num_tries):
+            uploads = json.loads(self._request("GET", "/v1/uploads").body)
+            for take in uploads:
+                if take["recording_id"] == name and take["uploaded"]:
+                    return str(take.get("stored_as") or name)
+            self._wait(1.0)
+        raise NotFoundError(
+            f"take {name!r}: the station did not upload it within {UPLOAD_S:g} s; look at its "
+            "uploads, then calibrate with --rest and --presses"
+        )
+
 
 def record_takes(
-    options: argparse.Namespace, takes: StationTakes | None = None, *, ask: Ask = input
+    options: argparse.Namespace, guide: Guide | None = None
 ) -> tuple[str, list[PressRow]]:
     """Lead an operator through rest and presses; returns the rest take and valid presses.
 
     The list of presses is stored in the folder, so that the calibration can be repeated from the
     same takes.
     """
-    if takes is None:
-        link = HttpLink(options.url, api_key=options.key)
-        takes = StationTakes(link.request, options.spool, has_store=options.store is not None)
-    guide = Guide(options, takes, ask)
+    guide = guide or Guide(options, HttpLink(options.url, api_key=options.key).request)
     rest, tare = guide.rest()
     rows = guide.presses(tare)
     again = f"dextouch station calibrate glove --side {options.side} --rest {rest}"

@@ -120,11 +120,9 @@ def guide(bench, tmp_path, script, monkeypatch, **changed):
     """The whole command with a fake link and operator."""
     ask, asked = operator(bench, script)
     given = options(tmp_path, **changed)
-    takes = glove_takes.StationTakes(
-        bench.request, spool=given.spool, has_store=given.store is not None, wait=bench.wait
-    )
+    leads = glove_takes.Guide(given, bench.request, ask=ask, wait=bench.wait)
     record = glove_takes.record_takes
-    monkeypatch.setattr(glove, "record_takes", lambda o: record(o, takes, ask=ask))
+    monkeypatch.setattr(glove, "record_takes", lambda o: record(o, leads))
     return glove.calibrate(given), asked
 
 
@@ -189,10 +187,9 @@ def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsy
 def test_a_glove_that_was_touched_rests_once_more(bench, tmp_path, monkeypatch, capsys):
     bench.creeps = True
     ask, _ = operator(bench, [("", 20.0), ("", 0.0), ("", None)])
-    takes = glove_takes.StationTakes(
-        bench.request, spool=tmp_path / "spool", has_store=False, wait=bench.wait
-    )
-    rest, rows = glove_takes.record_takes(options(tmp_path), takes, ask=ask)
+    given = options(tmp_path)
+    leads = glove_takes.Guide(given, bench.request, ask=ask, wait=bench.wait)
+    rest, rows = glove_takes.record_takes(given, leads)
     assert rows == []
     assert rest.endswith("-2")
     assert "Once more: rest take" in capsys.readouterr().out
@@ -202,15 +199,14 @@ def test_a_glove_that_was_touched_rests_once_more(bench, tmp_path, monkeypatch, 
 
 def test_presses_that_do_not_hold_are_not_used(bench, tmp_path, capsys):
     ask, _ = operator(bench, [("", 0.0), ("20", None), ("", 20.0), ("", None)])
-    takes = glove_takes.StationTakes(
-        bench.request, spool=tmp_path / "spool", has_store=False, wait=bench.wait
-    )
 
     def creeping(question):
         bench.creeps = "Put" in question
         return ask(question)
 
-    _, rows = glove_takes.record_takes(options(tmp_path), takes, ask=creeping)
+    given = options(tmp_path)
+    leads = glove_takes.Guide(given, bench.request, ask=creeping, wait=bench.wait)
+    _, rows = glove_takes.record_takes(given, leads)
     assert rows == []
     assert "changed while it lay" in capsys.readouterr().out
 
@@ -219,9 +215,7 @@ def test_interrupted_takes_are_discarded(bench, tmp_path):
     def interrupted(_):
         raise KeyboardInterrupt
 
-    takes = glove_takes.StationTakes(
-        bench.request, spool=tmp_path / "spool", has_store=False, wait=interrupted
-    )
+    takes = glove_takes.Guide(options(tmp_path), bench.request, wait=interrupted)
     with pytest.raises(KeyboardInterrupt):
         takes.record("take-1", "rest", 1.0, str.upper)
     assert bench.recorder.status().state == "discarded"
@@ -231,34 +225,28 @@ def test_interrupted_takes_are_discarded(bench, tmp_path):
 def test_a_busy_recorder_is_left_alone(bench, tmp_path):
     bench.recorder.arm(TakePrompt(task="t", instruction="i"))
     bench.recorder.record("other")
-    takes = glove_takes.StationTakes(
-        bench.request, spool=tmp_path / "spool", has_store=False, wait=bench.wait
-    )
+    takes = glove_takes.Guide(options(tmp_path), bench.request, wait=bench.wait)
     with pytest.raises(ConflictError, match="while recording"):
         takes.record("take-1", "rest", 1.0, str.upper)
     assert bench.recorder.status().recording_id == "other"
 
 
 def test_takes_of_another_machine_come_from_the_store(bench, tmp_path):
-    takes = glove_takes.StationTakes(
-        bench.request, spool=tmp_path / "not-here", has_store=False, wait=bench.wait
-    )
+    elsewhere = options(tmp_path, spool=tmp_path / "not-here")
+    takes = glove_takes.Guide(elsewhere, bench.request, wait=bench.wait)
     with pytest.raises(NotFoundError, match=r"--spool.*--store"):
         takes.record("take-1", "rest", 1.0, str.upper)
     bench.uploaded = True
-    takes = glove_takes.StationTakes(
-        bench.request, spool=tmp_path / "not-here", has_store=True, wait=bench.wait
-    )
+    elsewhere.store = "http://store"
     assert takes.record("take-2", "rest", 1.0, str.upper) == ("take-2", "TAKE-2")
     assert bench.sent[-1] == "GET /v1/uploads"
 
 
 def test_nobody_there_and_contradicting_options_are_refused(bench, tmp_path):
-    takes = glove_takes.StationTakes(
-        bench.request, spool=tmp_path / "spool", has_store=False, wait=bench.wait
-    )
+    given, ask = options(tmp_path), operator(bench, [])[0]
+    leads = glove_takes.Guide(given, bench.request, ask=ask, wait=bench.wait)
     with pytest.raises(InvalidInputError, match="nobody answers"):
-        glove_takes.record_takes(options(tmp_path), takes, ask=operator(bench, [])[0])
+        glove_takes.record_takes(given, leads)
     with pytest.raises(InvalidInputError, match="one of the two"):
         glove.calibrate(options(tmp_path, rest="take"))
     with pytest.raises(InvalidInputError, match="--url of a running station"):
