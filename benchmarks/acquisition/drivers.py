@@ -29,9 +29,9 @@ from services.acquisition.devices.finger_tracker.mock import (
 from services.acquisition.devices.pose_tracker.driver import (
     BridgePoseTrackerDecoder,
     PoseTrackerDecoder,
+    pose_descriptor,
 )
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource, PoseTrackerSource
-from services.acquisition.devices.pose_tracker.poses import pose_descriptor
 from services.acquisition.devices.robot_state.driver import (
     STREAM_SIZES,
     RobotStateDecoder,

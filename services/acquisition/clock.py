@@ -74,7 +74,6 @@ class VirtualClock(StationClock):
 
     def __init__(self, start_ns: int = 1_000_000_000) -> None:
         self._now_ns = start_ns
-        self._suspended_ns = 0
         self.lock = threading.Lock()
         self.open_waiters: set[_VirtualWaiter] = set()
 
@@ -89,16 +88,9 @@ class VirtualClock(StationClock):
             self.open_waiters.add(waiter)
         return waiter
 
-    def suspend(self, duration_ns: int) -> None:
-        """Suspend the host: time passes without any thread running."""
-        with self.lock:
-            self._now_ns += duration_ns
-            self._suspended_ns += duration_ns
-            self.advance()
-
     def suspended_ns(self) -> int:
-        """How long the simulated host has slept."""
-        return self._suspended_ns
+        """A simulated host never sleeps."""
+        return 0
 
     def wall_offset_ns(self) -> int:
         """Nobody sets the wall clock of a simulated host."""

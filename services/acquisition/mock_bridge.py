@@ -1,24 +1,25 @@
 """`python -m services.acquisition.mock_bridge KIND PLACE`: a mock SDK process.
 
-It plays the made-up pattern of one hand or tracker over a bridge until it is ended, and writes one
-line of JSON with its port to the standard output once it listens.
+It plays the made-up pattern of one hand or tracker to every station that connects until it is
+ended, and writes one line of JSON with its port to the standard output once it listens.
 """
 
 import argparse
+import contextlib
 import itertools
 import json
+import socketserver
 import sys
+import time
 
 import numpy as np
 
 from dextouch.tactile.layout import Side
-from services.acquisition.clock import StationClock
 from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import ROUND_S, pattern_streams
-from services.acquisition.mocks.replay import MockDevice, MockPlace
-from services.acquisition.mocks.sdk_link import BridgeServer, BridgeSource, signs_of_life
+from services.acquisition.mocks.sdk_link import BridgeSource
 
 
 def pattern_source(kind: str, place: str, *, seed: int) -> BridgeSource:
@@ -29,6 +30,42 @@ def pattern_source(kind: str, place: str, *, seed: int) -> BridgeSource:
         side: Side = "left" if place == "left" else "right"
         return BridgeFingerTrackerSource(streams[f"keypoints_{side}"], side=side, rng=rng)
     return BridgePoseSource(streams[place], faults=DeviceFaults(), rng=rng)
+
+
+class BridgeServer(socketserver.ThreadingTCPServer):
+    """Says hello to every connection, and then the same samples at the same times to all of them.
+
+    Args:
+        source: what it says; it samples too fast for a bridge to need signs of life.
+        port: to listen on; any free one if 0.
+    """
+
+    allow_reuse_address = daemon_threads = True
+
+    def __init__(self, source: BridgeSource, port: int = 0) -> None:
+        super().__init__(("127.0.0.1", port), BridgeConnection)
+        self.source = source
+        self.start_ns = time.monotonic_ns()
+
+
+class BridgeConnection(socketserver.StreamRequestHandler):
+    """One station, until it goes."""
+
+    disable_nagle_algorithm = True
+    server: BridgeServer
+
+    def handle(self) -> None:
+        """Send hello and samples."""
+        source, start_ns = self.server.source, self.server.start_ns
+        with contextlib.suppress(OSError):  # the station has gone
+            self.wfile.write(source.hello)
+            for number in itertools.count():
+                lap, index = divmod(number, len(source.t_ns))
+                t_ns = round(lap * ROUND_S * 1e9) + int(source.t_ns[index])
+                ahead_ns = start_ns + t_ns - time.monotonic_ns()
+                if ahead_ns > 0:
+                    time.sleep(ahead_ns * 1e-9)
+                    self.wfile.write(b"".join(source.units(index, number, t_ns)))
 
 
 def main() -> None:
@@ -43,17 +80,10 @@ def main() -> None:
     if is_hand != (options.kind == "finger_tracker"):
         parser.error(f"a {options.kind} cannot sit at {options.place!r}")
     source = pattern_source(options.kind, options.place, seed=options.seed)
-    server, clock = BridgeServer(source.hello, port=options.port), StationClock()
-    place = MockPlace("bridge", pattern_streams()[0], DeviceFaults(), options.seed, clock)
-    device = MockDevice(place, source, server)
-    server.plug()
-    signs_of_life(device, source.magic, clock).start()
-    sys.stdout.write(json.dumps({"port": server.port}) + "\n")
-    sys.stdout.flush()
-    start_ns, waiter = clock.now_ns(), clock.waiter(drives_time=True)
-    for lap in itertools.count():
-        offset_ns = round(lap * ROUND_S * 1e9)
-        device.play(clock, waiter, start_host_ns=start_ns, offset_ns=offset_ns)
+    with BridgeServer(source, options.port) as server:
+        sys.stdout.write(json.dumps({"port": server.server_address[1]}) + "\n")
+        sys.stdout.flush()
+        server.serve_forever()
 
 
 if __name__ == "__main__":

@@ -265,7 +265,9 @@ class MockStation:
         self._play(start_ns)
         for thread, _ in self._players:
             thread.join()
-        self._drain()
+        for pair in self.pairs:
+            if pair.device.port.link.is_open:
+                pair.device.port.link.wait_consumed()
         if recorder.status().state == "recording":
             recorder.stop()
         check = recorder.status().check
@@ -320,8 +322,3 @@ class MockStation:
             except (DeviceError, InvalidInputError) as error:
                 self._failures.append(f"{device.name}: {error.message}")
                 logger.exception("stop_mock_device", device=device.name)
-
-    def _drain(self) -> None:
-        for pair in self.pairs:
-            if pair.device.port.link.is_open:
-                pair.device.port.link.wait_consumed()

@@ -28,6 +28,7 @@ from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
 from services.acquisition.mocks.sdk_link import BridgePort
+from tests.unit.acquisition.sleepy_clock import SleepyClock
 from tests.unit.acquisition.usb_bus import usb_trackers
 
 BOOT_NS = 4_000_000_000_000
@@ -126,7 +127,7 @@ class CameraSubject(Subject):
 
 
 def build(streams, links):
-    clock = VirtualClock()
+    clock = SleepyClock()
     pairs = build_mocks(streams, faults=FaultScript(), seed=1, clock=clock, links=links)
     return {pair.device.name: pair for pair in pairs}, clock
 

@@ -54,13 +54,9 @@ class ImageEncoder:
     ) -> None:
         self.encoding: ImageEncoding = encoding
         self._size_px, self._rate_hz = size_px, rate_hz
-        self._video: GopEncoder | None = None
         if encoding == "h264":
             check_video_size(*size_px)
-
-    def prepare(self) -> None:
-        """Load the encoder now, so that the first images need not wait for it."""
-        if self.encoding == "h264" and self._video is None:
+            # Now, since it takes longer than the first images would wait.
             self._video = self._new_video()
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"], *, begins: bool) -> np.ndarray:
@@ -74,7 +70,7 @@ class ImageEncoder:
             return image
         if self.encoding == "jpeg":
             return encoded_values([encode_jpeg(image)]).reshape(())
-        if self._video is None or begins:
+        if begins:
             # A new encoder begins a new group; it costs no more than encoding an image.
             self._video = self._new_video()
         return encoded_values([self._video.encode(image)]).reshape(())
@@ -100,11 +96,6 @@ class EncodingQueue:
         self._thread: concurrent.futures.ThreadPoolExecutor | None = None
         self._is_group_wanted = False
         self._lock = threading.Lock()
-
-    def prepare(self) -> None:
-        """Load the encoder; only while nothing is queued."""
-        if self._thread is None:
-            self._encoder.prepare()
 
     def begin_group(self) -> None:
         """The next image that is put begins a group."""

@@ -12,6 +12,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from dextouch.errors import DeviceError, StaleDataError
 from dextouch.frozen_model import FrozenModel
+from dextouch.schemas import first_problems
 from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings, StreamDecoder, check_packet
@@ -110,13 +111,9 @@ def parse_hello(line: bytes, *, device: str) -> BridgeHello:
     try:
         hello = BridgeHello.model_validate_json(line)
     except ValidationError as error:
-        found = "; ".join(
-            f"{'.'.join(map(str, part['loc'])) or 'hello'}: {part['msg']}"
-            for part in error.errors(include_url=False)[:3]
-        )
         raise DeviceError(
-            f"{device}: the bridge's first line is no {PROTOCOL!r} hello ({found}); is this the "
-            "address of a bridge?",
+            f"{device}: the bridge's first line is no {PROTOCOL!r} hello "
+            f"({first_problems(error)}); is this the address of a bridge?",
             device=device,
             event="wrong_hello",
         ) from error

@@ -29,9 +29,14 @@ from services.acquisition.health.evaluation import (
     raised_finding,
     worst,
 )
-from services.acquisition.health.link import LinkJudge, TrackingJudge
 from services.acquisition.health.station import CalibrationJudge, PathJudge
-from services.acquisition.health.values import CameraJudge, FiniteJudge, PoseJudge
+from services.acquisition.health.streams import (
+    CameraJudge,
+    FiniteJudge,
+    LinkJudge,
+    PoseJudge,
+    TrackingJudge,
+)
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
 

@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 
 from dextouch.errors import InvalidInputError
 from dextouch.frozen_model import FrozenModel
+from dextouch.tactile.layout import SIDES
 from services.acquisition.drivers.packets import (
     CRC,
     HEADER,
@@ -123,25 +124,21 @@ class FaultScript(FrozenModel):
     def first_light() -> "FaultScript":
         """What an ordinary station does to its data: the faults of the demo."""
         base = DeviceFaults(skew_ppm=50.0, jitter_ms=0.8, drop_probability=0.002)
-        glove = {"path_delay_ms": 2.0, "bit_error_rate": 1e-6}
         fingers = {"path_delay_ms": 4.0, "position_noise_m": 5e-4}
-        tracker = {**fingers, "rotation_noise_rad": float(np.deg2rad(0.05))}
-        camera = {"path_delay_ms": 30.0}
-        robot = {"path_delay_ms": 1.0}
-        changes = {
-            "glove_left": glove,
-            "glove_right": glove,
-            "finger_tracker_left": fingers,
-            "finger_tracker_right": fingers,
-            "pose_tracker_wrist_left": tracker,
-            "pose_tracker_wrist_right": tracker,
-            "pose_tracker_head": tracker,
-            "camera_head": camera,
-            "camera_wrist_left": camera,
-            "camera_wrist_right": camera,
-            "robot_state": robot,
+        changes: dict[str, dict[str, float]] = {
+            "glove": {"path_delay_ms": 2.0, "bit_error_rate": 1e-6},
+            "finger_tracker": fingers,
+            "pose_tracker_wrist": {**fingers, "rotation_noise_rad": float(np.deg2rad(0.05))},
+            "camera_wrist": {"path_delay_ms": 30.0},
         }
-        devices = {name: base.model_copy(update=change) for name, change in changes.items()}
+        devices = {
+            f"{kind}_{side}": base.model_copy(update=change)
+            for kind, change in changes.items()
+            for side in SIDES
+        }
+        devices["pose_tracker_head"] = devices["pose_tracker_wrist_left"]
+        devices["camera_head"] = devices["camera_wrist_left"]
+        devices["robot_state"] = base.model_copy(update={"path_delay_ms": 1.0})
         return FaultScript(devices=devices, others=base)
 
 

@@ -15,7 +15,6 @@ from typing import ClassVar
 from dextouch.errors import DeviceError
 from services.acquisition.transports.ports import (
     HandleTransport,
-    HidDevice,
     HidTransport,
     SerialTransport,
     SocketTransport,
@@ -304,7 +303,7 @@ class HidPort(ReportPort):
         transport = HidTransport(self.open, address=f"mock:{name}", serial_number=name)
         self.transport = WatchedTransport(transport, self.link)
 
-    def open(self) -> HidDevice:
+    def open(self) -> "HidPort":
         """What hidapi's open does: reports that came before are not seen."""
         self.check_plugged()
         self.flush()

@@ -1,8 +1,7 @@
-"""Simulated SDK processes behind a bridge: local sockets that say the same to every station."""
+"""Simulated SDK processes behind a bridge, on a socket pair with the driver of the station."""
 
-import contextlib
 import socket
-import threading
+from abc import abstractmethod
 
 from services.acquisition.clock import PeriodicCall, StationClock, VirtualClock
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
@@ -14,7 +13,7 @@ from services.acquisition.drivers.sdk_link import (
     BridgeHello,
     FrameConvention,
 )
-from services.acquisition.mocks.ports import SEND_TIMEOUT_S, MockPort, SocketPort
+from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import MockDevice, MockPair, MockPlace, PacketSource
 
 # A left-handed sender in centimetres, and OpenVR's own frame: y up, looking along −z.
@@ -29,11 +28,16 @@ class BridgeSource(PacketSource):
 
     Attributes:
         magic: of its packets.
-        hello: the first line of a connection.
+        frame: its coordinates.
     """
 
     magic: bytes
-    hello: bytes
+    frame: FrameConvention
+
+    @property
+    @abstractmethod
+    def hello(self) -> bytes:
+        """The first line of a connection."""
 
 
 def mock_hello(**says: object) -> bytes:
@@ -99,65 +103,3 @@ def bridged_pair(place: MockPlace, source: BridgeSource, decoder: BridgeDecoder)
         port.life = signs_of_life(device, source.magic, clock)
     driver = BridgeDriver(place.name, transport=port.transport, decoder=decoder, clock=clock)
     return MockPair(device, driver)
-
-
-class BridgeServer(MockPort):
-    """A bridge process's socket: says hello to every connection and sends all of them the same.
-
-    Args:
-        hello: the first line of a connection.
-        port: to listen on; any free one if 0.
-    """
-
-    def __init__(self, hello: bytes, *, port: int = 0) -> None:
-        super().__init__()
-        self._hello = hello
-        self._lock = threading.Lock()
-        self._connections: list[socket.socket] = []
-        self._listener = socket.create_server(("127.0.0.1", port))
-        self.port = int(self._listener.getsockname()[1])
-        self._accepting = threading.Thread(target=self._accept, name="bridge-accept", daemon=True)
-
-    def plug(self) -> None:
-        """Accept connections."""
-        # It sends to whoever hears it, and to nobody.
-        self.link.set_open(is_open=True)
-        self._accepting.start()
-
-    def unplug(self) -> None:
-        """End, as a process does: for good."""
-        with contextlib.suppress(OSError):
-            self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-        self._accepting.join()
-        self.disconnect()
-
-    def disconnect(self) -> None:
-        """Close all connections."""
-        with self._lock:
-            for connection in self._connections:
-                connection.close()
-            self._connections.clear()
-
-    def send(self, unit: bytes) -> bool:
-        """Send to every connection."""
-        with self._lock:
-            for connection in list(self._connections):
-                try:
-                    connection.sendall(unit)
-                except OSError:  # the station has gone
-                    connection.close()
-                    self._connections.remove(connection)
-        return True
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                connection, _ = self._listener.accept()
-            except OSError:  # stopped
-                return
-            connection.settimeout(SEND_TIMEOUT_S)
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            with self._lock, contextlib.suppress(OSError):
-                connection.sendall(self._hello)
-                self._connections.append(connection)

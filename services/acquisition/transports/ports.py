@@ -8,7 +8,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import structlog
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 logger = structlog.get_logger(__name__)
 
 Handle = TypeVar("Handle")
+# What we use of an opened hidapi device, which has no types: `read`, `write` and `close`.
+HidDevice = Any
 
 READ_TIMEOUT_S = 0.1
 MAX_REPORT_BYTES = 64
@@ -239,29 +241,12 @@ class SerialTransport(HandleTransport["serial.Serial"]):
             logger.warning("fail_to_close_port", address=self.info.address, error=str(error))
 
 
-@runtime_checkable
-class HidDevice(Protocol):
-    """What we use of an opened hidapi device."""
-
-    def read(self, max_length: int, timeout_ms: int = 0) -> list[int]:
-        """One report; [] when none has come yet; OSError when unplugged."""
-        ...
-
-    def write(self, buff: bytes) -> int:
-        """Send a report, its id first; the number of bytes, or -1."""
-        ...
-
-    def close(self) -> None:
-        """Close it."""
-        ...
-
-
 def hid_opener(
     *, vendor_id: int, product_id: int, serial_number: str | None = None
 ) -> Callable[[], HidDevice]:
     """What opens the real device of these ids (hidraw; the libusb backend detaches other users)."""
 
-    def open_device() -> HidDevice:
+    def open_device() -> object:
         import hidraw
 
         device = hidraw.device()

@@ -15,13 +15,13 @@ import numpy as np
 from dextouch.clients import HttpLink
 from dextouch.errors import InvalidInputError, NotFoundError, StaleDataError
 from services.alignment.calibration.intrinsics import CameraCalibration, calibrate_found
-from services.cli.calibrate.advice import Coverage, camera_coverage
 from services.cli.calibrate.boards import (
     SUFFIXES,
-    Board,
     BoardView,
+    Coverage,
     Lens,
     Photos,
+    camera_coverage,
     decode_photo,
     find_board,
     parse_board,
@@ -56,7 +56,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
     if options.watch and options.url is not None:
         raise InvalidInputError("got --watch and --url, expected one of the two")
     if options.watch or options.url is not None:
-        _collect(options, parse_board(options.board))
+        _collect(options)
     paths = photo_paths(options.photos)
     if not paths:
         raise NotFoundError(f"{options.photos}: holds no photo; expected {', '.join(SUFFIXES)}")
@@ -152,28 +152,73 @@ def read_lens(folder: Path, camera: str) -> tuple[Lens, tuple[int, int]]:
 
 
 class Session:
-    """Growing set of views of one camera, with its coverage picture in the calibration folder."""
+    """Growing set of views of one camera, with its coverage picture in the calibration folder.
 
-    def __init__(self, board: Board, folder: Path, camera_name: str) -> None:
+    Args:
+        options: of the command: board, calibration folder and camera.
+        live: folder in which images of a running station are kept, in new positions of a static
+            board; None for photos, which are kept already.
+    """
+
+    def __init__(self, options: argparse.Namespace, live: Path | None = None) -> None:
         self.views: list[BoardView] = []
         self.todo: tuple[str, ...] = ("hold the board in front of the camera",)
-        self.board, self._folder, self._camera = board, folder, camera_name
+        self._options, self._board, self._live = options, parse_board(options.board), live
+        self._before: BoardView | None = None
+        self._num_idle = 0
 
     @property
     def is_enough(self) -> bool:
         """Whether coverage is sufficient, or the maximum number of views is reached."""
         return not self.todo or len(self.views) >= MAX_VIEWS
 
-    def is_new(self, view: BoardView, photo: np.ndarray) -> bool:
-        """Whether the view differs enough from all kept ones."""
-        needed_px = MIN_NEWS * float(np.hypot(*photo.shape))
-        return all(motion_px(view, kept) > needed_px for kept in self.views)
+    def collect(self, arrivals: Arrivals) -> None:
+        """Process photos or live images as they come, until coverage is sufficient."""
+        first = 0
+        if self._live is not None:
+            self._live.mkdir(parents=True, exist_ok=True)
+            first = len(list(self._live.glob("live_*.jpg")))
+        for name, data in arrivals:
+            photo = decode_photo(data, where=name)
+            view = find_board(name, photo, self._board)
+            why, self._before = self._why_not(view, photo), view
+            if view is None or why:
+                self._tell(name, why)
+            else:
+                if self._live is not None:
+                    path = self._live / f"live_{first + len(self.views):04d}.jpg"
+                    path.write_bytes(data)
+                self._keep(view, photo)
+            if self.is_enough:
+                return
 
-    def keep(self, view: BoardView, photo: np.ndarray) -> None:
+    def _why_not(self, view: BoardView | None, photo: np.ndarray) -> str:
+        """Why a view is not kept; "" of one that is."""
+        if self._live is None:
+            return "no board" if view is None else "blurred, left out" * view.is_blurred
+        if view is None:
+            return "no board in the last image; does --board match this board?"
+        before = self._before
+        if before is None or motion_px(view, before) > MAX_MOTION_PX or view.is_blurred:
+            return "the board in the last image moves or is blurred; hold it still"
+        needed_px = MIN_NEWS * float(np.hypot(*photo.shape))
+        is_new = all(motion_px(view, kept) > needed_px for kept in self.views)
+        return "" if is_new else "the board is where it was; hold it elsewhere"
+
+    def _tell(self, name: str, why: str) -> None:
+        """Name a photo that is left out; of live images give a hint now and then."""
+        self._num_idle += 1
+        if self._live is None:
+            print(f"{name}: {why}")
+        elif self._num_idle % TELL_AFTER_IMAGES == 0:
+            print(why)
+
+    def _keep(self, view: BoardView, photo: np.ndarray) -> None:
         """Add a view, redraw the picture and print advice."""
         self.views.append(view)
-        size_px = (photo.shape[1], photo.shape[0])
-        coverage, path = write_coverage(self.views, size_px, self._folder, self._camera)
+        self._num_idle = 0
+        size_px, options = (photo.shape[1], photo.shape[0]), self._options
+        coverage, path = write_coverage(self.views, size_px, options.to, options.camera)
         if coverage.todo != self.todo or len(self.views) == 1:
             print(f"{len(self.views)} views ({path}); next: {'; '.join(coverage.todo) or 'done'}")
         self.todo = coverage.todo
@@ -185,49 +230,6 @@ def motion_px(a: BoardView, b: BoardView) -> float:
     pairs = zip(map(tuple, a.points_board.tolist()), a.pixels, strict=True)
     moved = [np.linalg.norm(pixel - pixels_b[at]) for at, pixel in pairs if at in pixels_b]
     return float(np.mean(moved)) if moved else float("inf")
-
-
-def follow_folder(session: Session, arrivals: Arrivals) -> None:
-    """Process photos as they appear in a folder, until coverage is sufficient."""
-    for name, data in arrivals:
-        photo = decode_photo(data, where=name)
-        view = find_board(name, photo, session.board)
-        if view is None or view.is_blurred:
-            print(f"{name}: {'no board' if view is None else 'blurred, left out'}")
-        else:
-            session.keep(view, photo)
-        if session.is_enough:
-            return
-
-
-def collect_live(session: Session, arrivals: Arrivals, photos: Path) -> int:
-    """Keep JPEG images of a static board in new positions in a folder; returns their number."""
-    photos.mkdir(parents=True, exist_ok=True)
-    before: BoardView | None = None
-    first = len(list(photos.glob("live_*.jpg")))
-    num_kept = num_idle = 0
-    for name, data in arrivals:
-        photo = decode_photo(data, where=name)
-        view = find_board(name, photo, session.board)
-        still = view is not None and before is not None and motion_px(view, before) <= MAX_MOTION_PX
-        if view is None:
-            why = "no board in the last image; does --board match this board?"
-        elif not still or view.is_blurred:
-            why = "the board in the last image moves or is blurred; hold it still"
-        elif not session.is_new(view, photo):
-            why = "the board is where it was; hold it elsewhere"
-        else:
-            why, num_idle = "", 0
-            (photos / f"live_{first + num_kept:04d}.jpg").write_bytes(data)
-            num_kept += 1
-            session.keep(view, photo)
-        before = view
-        if session.is_enough:
-            break
-        num_idle += bool(why)
-        if why and num_idle % TELL_AFTER_IMAGES == 0:
-            print(why)
-    return num_kept
 
 
 def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:
@@ -259,13 +261,13 @@ def station_arrivals(newest: Callable[[], bytes], *, wait: Wait = time.sleep) ->
         wait(LIVE_PERIOD_S)
 
 
-def _collect(options: argparse.Namespace, board: Board) -> None:
+def _collect(options: argparse.Namespace) -> None:
     """Collect until coverage is sufficient, or Ctrl-C."""
-    session = Session(board, options.to, options.camera)
+    session = Session(options, None if options.url is None else options.photos)
     print("Ctrl-C ends the collection and calibrates with the photos so far")
     try:
         if options.url is None:
-            follow_folder(session, folder_arrivals(options.photos))
+            session.collect(folder_arrivals(options.photos))
             return
         link = HttpLink(options.url, api_key=options.key)
         path = f"/v1/live/cameras/camera_{options.camera}"
@@ -273,6 +275,6 @@ def _collect(options: argparse.Namespace, board: Board) -> None:
         def newest() -> bytes:
             return link.request("GET", path, accept="image/jpeg").body
 
-        collect_live(session, station_arrivals(newest), options.photos)
+        session.collect(station_arrivals(newest))
     except KeyboardInterrupt:
         print(f"stopped with {len(session.views)} views")

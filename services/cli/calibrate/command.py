@@ -125,14 +125,14 @@ _COMMANDS = {
     "camera": ("photos of a board → K and distortion of a camera", _CAMERA, "camera:calibrate"),
     "hand-eye": ("photos and poses → camera on its tracker", _HAND_EYE, "mounts:calibrate_mount"),
     "glove": ("rest and known pressures → tare, gain, faults", _GLOVE, "glove:calibrate"),
-    "wrist": ("flat hand → wrist axes of a glove's keypoints", _WRIST, "hands:measure_wrist"),
-    "profile": ("moving hand → the person's bones and knuckles", _PROFILE, "hands:measure_person"),
+    "wrist": ("flat hand → wrist axes of a glove's keypoints", _WRIST, "takes:measure_wrist"),
+    "profile": ("moving hand → the person's bones and knuckles", _PROFILE, "takes:measure_person"),
     "robot-base": (
         "pairs of poses → the robot's base in the world",
         _ROBOT_BASE,
         "mounts:calibrate_base",
     ),
-    "latency": ("common motion or taps → path delay", _LATENCY, "latency:calibrate"),
+    "latency": ("common motion or taps → path delay", _LATENCY, "takes:measure_latency"),
     "show": ("contents, age and accuracy of a calibration", _SHOW, "show:show"),
 }
 

@@ -26,7 +26,7 @@ from services.alignment.calibration.tactile_gain import (
     pad_taxels,
 )
 from services.alignment.calibration.tactile_tare import TaxelTare, measure_tare
-from services.cli.calibrate.files import read_rows, read_stream
+from services.cli.calibrate.record import read_rows, read_stream
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 REST_S, PRESS_S, TICK_S = 10.0, 5.0, 0.1

@@ -9,12 +9,16 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import invert
 from services.alignment.calibration.hand_eye import BoardViews, solve_hand_eye, solve_robot_base
-from services.cli.calibrate.advice import turn_coverage
-from services.cli.calibrate.boards import board_pose, is_ambiguous, parse_board, read_photos
+from services.cli.calibrate.boards import (
+    board_pose,
+    is_ambiguous,
+    parse_board,
+    read_photos,
+    turn_coverage,
+)
 from services.cli.calibrate.camera import read_lens
-from services.cli.calibrate.files import poses_of_photos, read_pairs
 from services.cli.calibrate.pictures import turns_picture
-from services.cli.calibrate.record import write_picture, write_pose
+from services.cli.calibrate.record import poses_of_photos, read_pairs, write_picture, write_pose
 
 # Tracker of each camera, by the stream names of recordings.
 TRACKERS = {"head": "head", "wrist_left": "left", "wrist_right": "right"}

@@ -4,6 +4,7 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 import time
 from contextlib import contextmanager
 
@@ -13,11 +14,11 @@ import pytest
 from dextouch.errors import DeviceError, StaleDataError
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.mock_bridge import pattern_source
+from services.acquisition.mock_bridge import BridgeServer, pattern_source
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.replay import MockDevice, MockPlace
-from services.acquisition.mocks.sdk_link import BridgeServer, signs_of_life
+from services.acquisition.mocks.replay import MockPlace
+from services.acquisition.mocks.sdk_link import bridged_pair
 from services.acquisition.settings import AcquisitionSettings
 
 # The promises are tried by `make slow`; the default run must not need an idle machine.
@@ -61,69 +62,6 @@ def kind(request):
     return request.param
 
 
-class Bridge:
-    """A bridge process's server and device, played by hand."""
-
-    def __init__(self, kind):
-        self.source = pattern_source(kind, DEVICES[kind][0], seed=0)
-        self.server = BridgeServer(self.source.hello)
-        place = MockPlace("b", pattern_streams()[0], DeviceFaults(), 0, StationClock())
-        self.device = MockDevice(place, self.source, self.server)
-
-    def send_sample(self, index, t_device_ns):
-        self.device.send_aside(lambda n: b"".join(self.source.units(index, n, t_device_ns)))
-
-
-@pytest.fixture
-def bridge(kind):
-    made = Bridge(kind)
-    life = signs_of_life(made.device, made.source.magic, StationClock())
-    made.server.plug()
-    life.start()
-    yield made
-    life.stop()
-    made.server.unplug()
-
-
-@pytest.fixture
-def server(bridge):
-    return bridge.server
-
-
-def test_a_bridge_without_samples_still_lives(kind, server, monkeypatch):
-    # Longer than the real limit of 200 ms, so that a busy machine is not taken for a dead bridge.
-    monkeypatch.setattr("services.acquisition.drivers.sdk_link.SILENCE_NS", 10**9)
-    driver = driver_of(kind, server.port)
-    driver.open()
-    end_s = time.monotonic() + 1.2
-    while time.monotonic() < end_s:
-        assert driver.read() == {}
-    assert driver.statistics.packets >= 2
-    driver.close()
-
-
-def test_two_stations_hear_the_same(kind, bridge):
-    drivers = [driver_of(kind, bridge.server.port) for _ in range(2)]
-    for driver in drivers:
-        driver.open()
-    for index in range(5):
-        bridge.send_sample(index, 10**12 + index * 10**7)
-    values = [[s.values.tobytes() for s in read_samples(driver, 5)] for driver in drivers]
-    assert len(values[0]) == 5
-    assert values[0] == values[1]
-    for driver in drivers:
-        driver.close()
-
-
-def test_a_bridge_that_ends_is_lost(kind, server):
-    driver = driver_of(kind, server.port)
-    driver.open()
-    server.disconnect()
-    with pytest.raises(DeviceError, match="closed by the device"):
-        read_until_lost(driver)
-    driver.close()
-
-
 @contextmanager
 def bridge_process(kind, *options):
     command = [sys.executable, "-m", "services.acquisition.mock_bridge", kind]
@@ -134,6 +72,59 @@ def bridge_process(kind, *options):
             yield process, json.loads(process.stdout.readline())["port"]
         finally:
             process.kill()
+
+
+def test_a_bridge_without_samples_still_lives(kind, monkeypatch):
+    # Longer than the real limit of 200 ms, so that a busy machine is not taken for a dead bridge.
+    monkeypatch.setattr("services.acquisition.drivers.sdk_link.SILENCE_NS", 10**9)
+    source, clock = pattern_source(kind, DEVICES[kind][0], seed=0), StationClock()
+    place = MockPlace("bridge", pattern_streams()[0], DeviceFaults(), 0, clock)
+    pair = bridged_pair(place, source, driver_of(kind, 1).decoder)
+    pair.device.port.plug()
+    pair.driver.open()
+    end_s = time.monotonic() + 1.2
+    while time.monotonic() < end_s:
+        assert pair.driver.read() == {}
+    assert pair.driver.statistics.packets >= 2
+    pair.driver.close()
+    pair.device.port.unplug()
+
+
+@pytest.fixture
+def port(kind):
+    server = BridgeServer(pattern_source(kind, DEVICES[kind][0], seed=0))
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield server.server_address[1]
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_two_stations_hear_the_same(kind, port):
+    drivers = [driver_of(kind, port) for _ in range(2)]
+    for driver in drivers:
+        driver.open()
+    heard = [{s.sequence: s for s in read_samples(driver, 100)} for driver in drivers]
+    for driver in drivers:
+        driver.close()
+    both = heard[0].keys() & heard[1].keys()
+    assert both
+    for sequence in both:
+        first, second = (samples[sequence] for samples in heard)
+        assert first.t_device_ns == second.t_device_ns
+        assert first.values.tobytes() == second.values.tobytes()
+
+
+@pytest.mark.system
+def test_a_bridge_that_ends_is_lost(kind):
+    with bridge_process(kind) as (process, port):
+        driver = driver_of(kind, port)
+        driver.open()
+        process.terminate()
+        with pytest.raises(DeviceError, match="closed by the device"):
+            read_until_lost(driver)
+        driver.close()
 
 
 @pytest.mark.system

@@ -14,8 +14,8 @@ from pydantic import ValidationError
 
 from dextouch.errors import DeviceError
 from dextouch.streams import Sample, StreamDescriptor
+from services.acquisition.devices.pose_tracker.driver import pose_descriptor
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
-from services.acquisition.devices.pose_tracker.poses import pose_descriptor
 from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
 from services.acquisition.drivers.sdk_link import (
     MAX_HELLO_BYTES,

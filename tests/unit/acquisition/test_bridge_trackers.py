@@ -23,15 +23,13 @@ from services.acquisition.devices.finger_tracker.mock import BridgeFingerTracker
 from services.acquisition.devices.pose_tracker.driver import (
     POSE_PAYLOAD,
     BridgePoseTrackerDecoder,
+    SenderFrame,
     TrackingResult,
+    quaternion_of_one,
 )
 from services.acquisition.devices.pose_tracker.mock import (
     POSE_INDEX,
     BridgePoseSource,
-)
-from services.acquisition.devices.pose_tracker.poses import (
-    SenderFrame,
-    quaternion_of_one,
 )
 from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
 from services.acquisition.drivers.sdk_link import BridgeDriver, FrameConvention
@@ -51,7 +49,9 @@ STREAMS = {stream.descriptor.name: stream for stream in pattern_streams(2.0)}
 
 def fingers(side="left", seed=1, **settings):
     rng = np.random.default_rng(seed)
-    return BridgeFingerTrackerSource(STREAMS[f"keypoints_{side}"], side=side, rng=rng, **settings)
+    source = BridgeFingerTrackerSource(STREAMS[f"keypoints_{side}"], side=side, rng=rng)
+    vars(source).update(settings)
+    return source
 
 
 def hello_with(source, **changes):
@@ -61,7 +61,9 @@ def hello_with(source, **changes):
 
 def poses(stream="wrist_left", **settings):
     rng = np.random.default_rng(1)
-    return BridgePoseSource(STREAMS[stream], faults=DeviceFaults(), rng=rng, **settings)
+    source = BridgePoseSource(STREAMS[stream], faults=DeviceFaults(), rng=rng)
+    vars(source).update(settings)
+    return source
 
 
 def play(source, decoder, delay_ns=lambda index: 2 * MS):

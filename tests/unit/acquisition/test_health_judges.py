@@ -6,15 +6,13 @@ import pytest
 from dextouch.streams import Sample, StreamDescriptor
 from dextouch.tactile.layout import expand_taxels, raw_indices
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
-from services.acquisition.devices.pose_tracker.poses import pose_descriptor
+from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder, pose_descriptor
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.image_quality import ImageQuality
 from services.acquisition.glove_record import GloveRecord
 from services.acquisition.health.cells import TaxelJudge, count_taxels, neighbour_share
-from services.acquisition.health.link import TrackingJudge
 from services.acquisition.health.monitor import SampleQueue
-from services.acquisition.health.values import CameraJudge, FiniteJudge, PoseJudge
+from services.acquisition.health.streams import CameraJudge, FiniteJudge, PoseJudge, TrackingJudge
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.supervisor import StreamCounters
 from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes, judged

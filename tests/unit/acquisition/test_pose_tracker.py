@@ -8,12 +8,12 @@ import pytest
 
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from dextouch.streams import StreamDescriptor
-from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
-from services.acquisition.devices.pose_tracker.mock import PoseTrackerSource
-from services.acquisition.devices.pose_tracker.poses import (
+from services.acquisition.devices.pose_tracker.driver import (
     PoseGate,
+    PoseTrackerDecoder,
     TrackingState,
 )
+from services.acquisition.devices.pose_tracker.mock import PoseTrackerSource
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import ReplayStream
 

@@ -14,12 +14,13 @@ from dextouch.errors import InvalidInputError, StorageFullError
 from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition import take
-from services.acquisition.clock import StationClock, VirtualClock
+from services.acquisition.clock import StationClock
 from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.recorder import Recorder, TakeOptions
 from services.acquisition.take import SpoolSafety
+from tests.unit.acquisition.sleepy_clock import SleepyClock
 
 PROMPT = TakePrompt(task="stand_bottle", instruction="stand the bottle up")
 ANYWAY = SaveTake(accept_incomplete=True)
@@ -38,7 +39,7 @@ def file_size_limit(num_bytes):
 
 @pytest.fixture
 def clock():
-    return VirtualClock(10**9)
+    return SleepyClock(10**9)
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import json
 import re
+from argparse import Namespace
 from itertools import count
 
 import cv2
@@ -16,7 +17,7 @@ from dextouch.errors import (
 )
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.cli.calibrate import advice, boards, camera
+from services.cli.calibrate import boards, camera
 from services.cli.calibrate.command import main
 from tests.unit.cli.rendered_boards import (
     BOARD,
@@ -41,19 +42,19 @@ from tests.unit.cli.rendered_boards import (
 def test_advice_names_what_is_missing(views, words):
     board = boards.parse_board(BOARD)
     found = [boards.find_board(str(i), render(view), board) for i, view in enumerate(views)]
-    todo = "; ".join(advice.camera_coverage(found, SIZE).todo)
+    todo = "; ".join(boards.camera_coverage(found, SIZE).todo)
     assert re.search(words, todo)
 
 
 def test_advice_asks_for_the_edges_and_for_more_only_when_all_else_is_there():
     board = boards.parse_board(BOARD)
     views = [boards.find_board(str(i), render(T), board) for i, T in enumerate(good_views())]
-    assert advice.camera_coverage(views, SIZE).todo == ()
-    assert advice.camera_coverage(views[:24], SIZE).todo == (
+    assert boards.camera_coverage(views, SIZE).todo == ()
+    assert boards.camera_coverage(views[:24], SIZE).todo == (
         "take 1 more photos, each from another direction",
     )
     inner = [v for v in views if v.pixels[:, 0].max() < 0.84 * SIZE[0]]
-    todo = advice.camera_coverage(inner, SIZE).todo
+    todo = boards.camera_coverage(inner, SIZE).todo
     assert any("right" in words and "left," not in words for words in todo)
 
 
@@ -78,8 +79,8 @@ def test_tilts_are_told_apart(turn, nearer):
     depth = {name: (T[:3, :3] @ np.array(p) + T[:3, 3])[2] for name, p in edges.items()}
     really = min(depth, key=depth.get)
     view = boards.find_board("", render(T), boards.parse_board(BOARD))
-    tilt = advice.camera_coverage([view], SIZE).tilts_rad[0]
-    said = max(advice.TILTS, key=lambda words: float(tilt @ np.array(advice.TILTS[words])))
+    tilt = boards.camera_coverage([view], SIZE).tilts_rad[0]
+    said = max(boards.TILTS, key=lambda words: float(tilt @ np.array(boards.TILTS[words])))
     assert really in said
     assert really == nearer
     assert abs(np.linalg.norm(tilt) - 0.5) < 0.05
@@ -100,6 +101,10 @@ def test_a_chessboard_is_never_taken_for_its_half_turn(roll_rad):
     assert distance < 1e-3
 
 
+def new_session(tmp_path, live=None):
+    return camera.Session(Namespace(board=BOARD, to=tmp_path / "to", camera="head"), live)
+
+
 def jpeg(T):
     return cv2.imencode(".jpg", render(T), [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()
 
@@ -108,10 +113,9 @@ def test_live_views_are_kept_only_when_still_and_new(tmp_path):
     here, there = board_at([-0.1, 0, 0.5], [0, 0.4, 0]), board_at([0.1, 0, 0.5], [0, -0.4, 0])
     moving = board_at([0, 0, 0.5], [0, 0, 0])
     images = [jpeg(T) for T in (here, here, here, moving, there, there)]
-    session = camera.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
-    arrivals = ((f"live {index}", data) for index, data in enumerate(images))
-    num_kept = camera.collect_live(session, arrivals, tmp_path / "photos")
-    assert num_kept == 2
+    session = new_session(tmp_path, tmp_path / "photos")
+    session.collect((f"live {index}", data) for index, data in enumerate(images))
+    assert len(session.views) == 2
     kept = sorted((tmp_path / "photos").glob("*.jpg"))
     assert [path.read_bytes() for path in kept] == [images[1], images[5]]
     assert not session.is_enough
@@ -127,16 +131,16 @@ def test_live_views_are_kept_only_when_still_and_new(tmp_path):
 )
 def test_live_images_that_add_nothing_are_told_now_and_then(image, words, tmp_path, capsys):
     data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()
-    session = camera.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
+    session = new_session(tmp_path, tmp_path / "photos")
     num_images = 2 * camera.TELL_AFTER_IMAGES + 3
-    camera.collect_live(session, ((f"{i}", data) for i in range(num_images)), tmp_path / "photos")
+    session.collect((f"{i}", data) for i in range(num_images))
     assert capsys.readouterr().out.count(words) == 2
 
 
 def test_a_watched_folder_is_read_once_and_left_when_the_views_suffice(tmp_path):
     views = good_views()
     photos = write_photos(tmp_path / "photos", views[:10])
-    session = camera.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
+    session = new_session(tmp_path)
     waits, later = count(), iter(range(10, 25))
 
     def wait(_):
@@ -144,7 +148,7 @@ def test_a_watched_folder_is_read_once_and_left_when_the_views_suffice(tmp_path)
         index = next(later)
         cv2.imwrite(str(photos / f"photo_{index:02d}.png"), render(views[index]))
 
-    camera.follow_folder(session, camera.folder_arrivals(photos, wait=wait))
+    session.collect(camera.folder_arrivals(photos, wait=wait))
     assert session.is_enough
     assert [view.name for view in session.views] == [f"photo_{i:02d}.png" for i in range(25)]
     assert next(waits) == 15
@@ -154,13 +158,15 @@ def test_blurred_photos_are_named_and_do_not_count(tmp_path, capsys):
     photo = render(board_at([0, 0, 0.4], [0, 0, 0]))
     pair = [cv2.imencode(".png", image)[1].tobytes() for image in (photo, smeared(photo, (6, 0)))]
     named = list(zip(("sharp", "moved"), pair, strict=True))
-    session = camera.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
-    camera.follow_folder(session, iter(named))
+    session = new_session(tmp_path)
+    session.collect(iter(named))
     assert [view.name for view in session.views] == ["sharp"]
     assert "moved: blurred, left out" in capsys.readouterr().out
     # The board stands still, but the image is blurred all the same: out of focus, say.
     still = iter([("a", pair[1]), ("b", pair[1])])
-    assert camera.collect_live(session, still, tmp_path / "live") == 0
+    live = new_session(tmp_path, tmp_path / "live")
+    live.collect(still)
+    assert live.views == []
     photos = tmp_path / "photos"
     photos.mkdir()
     for name, data in named:

@@ -132,7 +132,6 @@ class FingerTrackerDecoder(ReportDecoder):
             DESCRIPTOR_MAGIC, min_payload=DESCRIPTOR_BYTES, max_payload=DESCRIPTOR_BYTES
         )
         self._order: Int64[np.ndarray, 25] | None = None
-        self.undescribed = 0
         self.unseen_nodes = 0
 
     @property
@@ -158,7 +157,6 @@ class FingerTrackerDecoder(ReportDecoder):
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
         check_packet(packet, device=self._device, source=self._side)
         if self._order is None:
-            self.undescribed += 1
             return None
         keypoints, num_unseen = unpack_keypoints(packet.payload, self._order)
         self.unseen_nodes += num_unseen

@@ -21,7 +21,6 @@ from services.acquisition.drivers.reports import (
     DESCRIPTOR_REPORT,
     split_into_reports,
 )
-from services.acquisition.drivers.sdk_link import FrameConvention
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.ports import HidPort
@@ -112,33 +111,18 @@ class FingerTrackerSource(TrackedFingers):
 
 
 class BridgeFingerTrackerSource(TrackedFingers, BridgeSource):
-    """A finger tracker's SDK: in its own frame and centimetres, nodes in its own order.
-
-    Args:
-        stream: [n, 25, 3] in m, wrist frame.
-        side: which hand.
-        rng: of the order of the nodes and of the noise.
-        frame: the SDK's coordinates.
-        faults: position noise, and when the thumb is not seen.
-    """
+    """A finger tracker's SDK: in its own frame and centimetres, nodes in its own order."""
 
     magic = MAGIC
+    frame = LEFT_HANDED
 
-    def __init__(
-        self,
-        stream: ReplayStream,
-        *,
-        side: Side,
-        rng: np.random.Generator,
-        frame: FrameConvention = LEFT_HANDED,
-        faults: DeviceFaults | None = None,
-    ) -> None:
-        super().__init__(stream, side=side, rng=rng, faults=faults)
-        self._ours_from_theirs = frame.ours_from_theirs()
-        self.hello = mock_hello(
+    @property
+    def hello(self) -> bytes:
+        """Who is there, and the order of the nodes."""
+        return mock_hello(
             kind="finger_tracker",
-            devices=({"index": 0, "serial_number": f"MF-{side}", "source": side},),
-            frame=frame,
+            devices=({"index": 0, "serial_number": f"MF-{self._side}", "source": self._side},),
+            frame=self.frame,
             length_unit="cm",
             nodes=tuple(NODES[node] for node in self._order),
         )
@@ -148,7 +132,7 @@ class BridgeFingerTrackerSource(TrackedFingers, BridgeSource):
         return [self.packet(index, sequence, t_device_ns)]
 
     def _sent(self, points_m: Float64[np.ndarray, "25 3"]) -> Float64[np.ndarray, "25 3"]:
-        return 100.0 * points_m @ self._ours_from_theirs
+        return 100.0 * points_m @ self.frame.ours_from_theirs()
 
 
 def mock_finger_tracker(place: MockPlace) -> MockPair:

@@ -18,12 +18,12 @@ from services.acquisition.devices.pose_tracker.driver import (
     BridgePoseTrackerDecoder,
     PoseTrackerDecoder,
     TrackingResult,
+    TrackingState,
+    source_of,
 )
-from services.acquisition.devices.pose_tracker.poses import TrackingState, source_of
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
-from services.acquisition.drivers.sdk_link import FrameConvention
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.ports import HidPort
@@ -135,32 +135,17 @@ def add_pose_noise(
 
 
 class BridgePoseSource(TrackedPoses, BridgeSource):
-    """An OpenVR-like source of one tracker: y up, matrices, and a flag that stays set when lost.
-
-    Args:
-        stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
-        faults: position and rotation noise, per axis; occlusions and jumps.
-        rng: of the noise.
-        frame: the source's coordinates.
-    """
+    """An OpenVR-like source of one tracker: y up, matrices, and a flag that stays set when lost."""
 
     magic = POSE_MAGIC
+    frame = Y_UP
 
-    def __init__(
-        self,
-        stream: ReplayStream,
-        *,
-        faults: DeviceFaults,
-        rng: np.random.Generator,
-        frame: FrameConvention = Y_UP,
-    ) -> None:
-        super().__init__(stream, faults=faults, rng=rng)
-        self._theirs_from_ours = frame.ours_from_theirs().T
+    @property
+    def hello(self) -> bytes:
+        """Who is there."""
         number = f"LHR-{self.source}"
         device = {"index": POSE_INDEX, "serial_number": number, "source": self.source}
-        self.hello = mock_hello(
-            kind="pose_tracker", devices=(device,), frame=frame, length_unit="m"
-        )
+        return mock_hello(kind="pose_tracker", devices=(device,), frame=self.frame, length_unit="m")
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet; its pose is flagged valid whatever the result says."""
@@ -172,7 +157,7 @@ class BridgePoseSource(TrackedPoses, BridgeSource):
 
     @cached_property
     def _matrices(self) -> Float64[np.ndarray, "n 3 4"]:
-        M = self._theirs_from_ours
+        M = self.frame.ours_from_theirs().T
         R = M @ rotation_from_quaternion(self.poses[:, 3:]) @ M.T
         return np.concatenate([R, (self.poses[:, :3] @ M.T)[:, :, None]], axis=2)
 

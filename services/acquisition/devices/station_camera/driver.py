@@ -75,7 +75,6 @@ class DriverStamps(Decoder):
             ),
         )
         self.usable: bool | None = None
-        self.least_delay_ns: int | None = None
         self._settings = settings
         self._last_ns: int | None = None
         self._number = 0
@@ -120,9 +119,6 @@ class DriverStamps(Decoder):
             self.statistics.lost += steps - 1
             self._number += steps
         self._last_ns = t_driver_ns
-        delay_ns = t_host_ns - t_driver_ns
-        if self.least_delay_ns is None or delay_ns < self.least_delay_ns:
-            self.least_delay_ns = delay_ns
         return t_driver_ns, self._number
 
     def _give_up(self) -> None:
@@ -183,11 +179,6 @@ class StationCamera(Driver):
         """What the images are like."""
         return replace(self._checker.quality, num_dropped=self._queue.num_dropped)
 
-    @property
-    def least_delay_ns(self) -> int | None:
-        """Shortest time from a driver's stamp to the arrival so far: what a latency is made of."""
-        return self._stamps.least_delay_ns
-
     def calibration(self) -> dict[str, Matrix]:
         """Latency with its sigma, if calibrated, and the exposure that the stamps assume."""
         record = {
@@ -212,8 +203,6 @@ class StationCamera(Driver):
         Raises:
             DeviceError: it is absent, in use, or cannot do what it is asked for.
         """
-        # Loading a video encoder takes longer than the first images would wait.
-        self._queue.prepare()
         super().open()
         exposure_ns = self._link.exposure_ns
         self._exposure_ns = self._settings.exposure_ns if exposure_ns is None else exposure_ns

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -112,8 +112,7 @@ def parse_identity(body: bytes, source: int) -> GloveIdentity:
     Raises:
         PacketError: another size, or a serial number that is no ASCII text.
     """
-    _check_size("identity", body, IDENTITY.size)
-    serial_bytes, *firmware = IDENTITY.unpack(body)
+    serial_bytes, *firmware = _unpacked("identity", IDENTITY, body)
     try:
         serial_number = serial_bytes.rstrip(b"\0").decode("ascii")
     except UnicodeDecodeError as error:
@@ -142,14 +141,14 @@ def parse_time(body: bytes) -> int:
     Raises:
         PacketError: another size.
     """
-    _check_size("time sync", body, TIME_SYNC.size)
-    (t_received_ns,) = TIME_SYNC.unpack(body)
+    (t_received_ns,) = _unpacked("time sync", TIME_SYNC, body)
     return int(t_received_ns)
 
 
-def _check_size(what: str, body: bytes, size: int) -> None:
-    if len(body) != size:
-        raise PacketError(f"glove {what}: got {len(body)} bytes, expected {size}")
+def _unpacked(what: str, layout: struct.Struct, body: bytes) -> tuple[Any, ...]:
+    if len(body) != layout.size:
+        raise PacketError(f"glove {what}: got {len(body)} bytes, expected {layout.size}")
+    return layout.unpack(body)
 
 
 def glove_descriptor(side: Side, label: str | None = None) -> StreamDescriptor:
