@@ -16,7 +16,6 @@ from services.acquisition.memory import keep_for_life
 from services.acquisition.routes import recorder_router, station_router
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import Station
-from services.acquisition.take import SpoolSafety
 from services.acquisition.uploader import Uploader, recover_spool
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ def _real_station(settings: AcquisitionSettings) -> Station:
         spool_root=settings.spool,
         clock=clock,
         calibration=load_calibration(settings.calibration),
-        safety=_spool_safety(settings),
+        safety=settings,
     )
 
 
@@ -59,12 +58,8 @@ def _mock_station(settings: AcquisitionSettings) -> "MockStation":
         name=settings.station,
         calibration={**known, **load_calibration(settings.calibration)},
         links=settings.mock_links,
-        safety=_spool_safety(settings),
+        safety=settings,
     )
-
-
-def _spool_safety(settings: AcquisitionSettings) -> SpoolSafety:
-    return SpoolSafety(settings.flush_period_s, settings.min_free_bytes)
 
 
 def _make_uploader(settings: AcquisitionSettings) -> Uploader:

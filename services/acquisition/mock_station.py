@@ -39,8 +39,8 @@ from services.acquisition.mocks.replay import (
     ReplayStream,
     device_rng,
 )
+from services.acquisition.settings import SpoolSafety
 from services.acquisition.station import Station
-from services.acquisition.take import SpoolSafety
 
 LATENCY_SIGMA_MS = 0.2
 WRISTS = ("wrist_left", "wrist_right")

@@ -30,7 +30,8 @@ from services.acquisition.drivers.base import Driver
 from services.acquisition.health import HealthMonitor
 from services.acquisition.memory import give_back_free_memory
 from services.acquisition.path_latency import add_latencies
-from services.acquisition.take import SpoolSafety, Take, check_free_space
+from services.acquisition.settings import SpoolSafety
+from services.acquisition.take import Take, check_free_space
 from services.acquisition.take_check import DeviceEvents, TakeWatch
 
 logger = structlog.get_logger(__name__)

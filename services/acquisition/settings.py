@@ -6,13 +6,29 @@ from typing import Literal
 from pydantic import Field, SecretStr, model_validator
 
 from dextouch.data_folder import default_spool
+from dextouch.frozen_model import FrozenModel
 from dextouch.serving import ServiceSettings, service_config
 from services.acquisition.devices.registry import ChosenDevice
 from services.acquisition.mock_links import MockLinks
-from services.acquisition.take import SpoolSafety
 
 
-class AcquisitionSettings(ServiceSettings):
+class SpoolSafety(FrozenModel):
+    """How much a power loss may cost, and how much space is kept for closing a take."""
+
+    flush_period_s: float = Field(
+        default=0.5,
+        gt=0,
+        le=3600,
+        description="seconds between two flushes to the disk, the most that a power loss can lose",
+    )
+    min_free_bytes: int = Field(
+        default=64 * 2**20,
+        ge=0,
+        description="a take ends, and none begins, when less is left on the spool's disk",
+    )
+
+
+class AcquisitionSettings(ServiceSettings, SpoolSafety):
     """Record the gloves, trackers, robots and cameras of a station, and serve them over HTTP.
 
     Real devices are named by --devices. With --mock they are simulated: they play an episode of a
@@ -31,17 +47,6 @@ class AcquisitionSettings(ServiceSettings):
         description="name of the station, as recordings carry it",
     )
     spool: Path = Field(default_factory=default_spool, description="folder of the takes")
-    flush_period_s: float = Field(
-        default=SpoolSafety.flush_period_s,
-        gt=0,
-        le=3600,
-        description="seconds between two flushes to the disk, the most that a power loss can lose",
-    )
-    min_free_bytes: int = Field(
-        default=SpoolSafety.min_free_bytes,
-        ge=0,
-        description="a take ends, and none begins, when less is left on the spool's disk",
-    )
     mock: bool = Field(default=False, description="simulate the devices")
     mock_store: str | None = Field(
         default=None, description="local store of the episode that mock devices play"

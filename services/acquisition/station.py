@@ -17,8 +17,8 @@ from services.acquisition.glove_record import NO_CELL, glove_record
 from services.acquisition.health import HealthMonitor
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.recorder import Recorder, TakeOptions
+from services.acquisition.settings import SpoolSafety
 from services.acquisition.supervisor import DeviceSupervisor
-from services.acquisition.take import SpoolSafety
 from services.acquisition.take_check import DeviceEvents
 
 CONNECT_TIMEOUT_S = 10.0

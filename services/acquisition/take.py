@@ -2,43 +2,24 @@
 
 import os
 import threading
-from dataclasses import dataclass
+from itertools import dropwhile
 from pathlib import Path
 
 import structlog
 
-from dextouch.episodes import disk_errors
+from dextouch.episodes import disk_errors, is_keyframe
 from dextouch.episodes.spool import LOG_FILE, SpoolWriter
-from dextouch.errors import InvalidInputError, StorageError, StorageFullError
+from dextouch.errors import StorageError, StorageFullError
 from dextouch.schemas import TakeCheck
 from dextouch.streams import H264_UNIT, EncodedBatch, Sample, SampleBatch
 from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.drivers.base import Readings
-from services.acquisition.drivers.image_encoding import GroupGate
+from services.acquisition.settings import SpoolSafety
 from services.acquisition.take_check import TakeWatch
 
 logger = structlog.get_logger(__name__)
 
 MEBIBYTE = 2**20
-
-
-@dataclass(frozen=True)
-class SpoolSafety:
-    """How much a power loss may cost, and how much space is kept for closing a take.
-
-    Raises:
-        InvalidInputError: a period that is no positive number of seconds, or negative bytes.
-    """
-
-    flush_period_s: float = 0.5
-    min_free_bytes: int = 64 * MEBIBYTE
-
-    def __post_init__(self) -> None:
-        if not 0 < self.flush_period_s <= 3600 or self.min_free_bytes < 0:
-            raise InvalidInputError(
-                f"spool safety: got a period of {self.flush_period_s} s and {self.min_free_bytes} "
-                "bytes to keep free, expected 0 … 3600 s and no negative number"
-            )
 
 
 def check_free_space(folder: Path, safety: SpoolSafety) -> None:
@@ -81,7 +62,9 @@ class Take:
         self.watch = watch
         self._failure: str | None = None
         self._lock = threading.RLock()
-        self._gates = {s.name: GroupGate() for s in spool.attributes.streams if s.unit == H264_UNIT}
+        # Of video only what can be looked at without what came before the take: these streams wait
+        # for the first image that begins a group.
+        self._waiting = {s.name for s in spool.attributes.streams if s.unit == H264_UNIT}
         self._safety = safety
         with disk_errors(f"open log of spool {spool.path.name!r}"):
             self._log = os.open(spool.path / LOG_FILE, os.O_RDONLY)
@@ -112,11 +95,11 @@ class Take:
                 self._end(error)
 
     def _encode(self, name: str, samples: list[Sample]) -> tuple[EncodedBatch | None, list[Sample]]:
-        if name in self._gates:
-            # Of video only what can be looked at without what came before the take.
-            samples = self._gates[name].admit(samples)
+        if name in self._waiting:
+            samples = list(dropwhile(lambda s: not is_keyframe(s.values.item()), samples))
         if not samples:
             return None, samples
+        self._waiting.discard(name)
         return self.spool.encode(name, SampleBatch.from_samples(samples)), samples
 
     def end(self) -> TakeCheck:

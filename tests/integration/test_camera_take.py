@@ -13,15 +13,17 @@ from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.images import decode_jpeg
 from dextouch.schemas import RecordingAttributes, SaveTake, TakePrompt
-from dextouch.streams import SampleBatch, StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.station_camera.mock import video_camera
-from services.acquisition.drivers.image_encoding import GroupGate
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import MockPlace, ReplayStream
+from services.acquisition.settings import SpoolSafety
 from services.acquisition.station import Station
+from services.acquisition.take import Take
+from services.acquisition.take_check import TakeWatch
 from services.acquisition.uploader import Uploader
 from services.alignment.synchronization.stream_clock import time_stream
 from services.episode_store.app import create_app
@@ -190,7 +192,7 @@ def test_lost_images_and_an_unplugged_camera_leave_gaps_and_whole_groups(tmp_pat
 
 
 def test_a_take_of_a_running_camera_begins_with_a_group(tmp_path):
-    """What a recorder does with `begin_take` and gates."""
+    """What a recorder does with `begin_take` and its takes."""
     clock = VirtualClock()
     stream = replay(45)
     place = MockPlace("camera_head", stream, DeviceFaults(), 3, clock)
@@ -206,8 +208,9 @@ def test_a_take_of_a_running_camera_begins_with_a_group(tmp_path):
         station="desk",
         streams=driver.descriptors,
     )
-    gate = GroupGate()
     with SpoolWriter(tmp_path / "spool" / "take", attributes, sync=False) as spool:
+        watch = TakeWatch({driver.name: driver}, clock)
+        take = Take(spool, watch, clock=clock, safety=SpoolSafety())
         for index in range(45):
             if index == 13:
                 assert driver.begin_take() == driver.calibration()
@@ -216,9 +219,8 @@ def test_a_take_of_a_running_camera_begins_with_a_group(tmp_path):
             samples = driver.read()["camera_head"]
             if index >= 11:
                 # The take began at 11, the camera heard of it at 13.
-                samples = gate.admit(samples)
-                if samples:
-                    spool.append("camera_head", SampleBatch.from_samples(samples))
+                take.accept({"camera_head": samples})
+        take.end()
     driver.close()
     batch = upload(tmp_path / "spool", tmp_path).read("camera_head")
     assert len(batch) == 32

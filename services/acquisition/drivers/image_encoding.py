@@ -8,9 +8,7 @@ on with its group over a gap and over a reopened device; and a take begins with 
 import concurrent.futures
 import threading
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
-from itertools import dropwhile
 from typing import Literal
 
 import numpy as np
@@ -145,20 +143,6 @@ class EncodingQueue:
 
     def _encode(self, image: Sample, begins: bool) -> Sample:  # noqa: FBT001 - submitted
         return replace(image, values=self._encoder.encode(image.values, begins=begins))
-
-
-class GroupGate:
-    """Lets the H.264 samples of one take pass from the first one that begins a group."""
-
-    def __init__(self) -> None:
-        self._is_open = False
-
-    def admit(self, samples: Sequence[Sample]) -> list[Sample]:
-        """Those of the samples that can be decoded within the take."""
-        if not self._is_open:
-            samples = list(dropwhile(lambda s: not is_keyframe(s.values.item()), samples))
-            self._is_open = bool(samples)
-        return list(samples)
 
 
 class GroupPreview:

@@ -11,7 +11,6 @@ from services.acquisition.devices.camera.driver import CameraDecoder
 from services.acquisition.drivers.image_encoding import (
     MAX_WAITING_IMAGES,
     EncodingQueue,
-    GroupGate,
     GroupPreview,
     ImageEncoder,
     WholeGroups,
@@ -134,14 +133,6 @@ def test_odd_sizes_are_refused_for_h264_only():
     with pytest.raises(InvalidInputError, match="even"):
         ImageEncoder("h264", (31, 48), rate_hz=30.0)
     assert ImageEncoder("jpeg", (31, 48), rate_hz=30.0).encoding == "jpeg"
-
-
-def test_the_gate_opens_at_a_group():
-    samples = encoded(20)
-    gate = GroupGate()
-    assert gate.admit(samples[3:6]) == []
-    assert gate.admit(samples[6:12]) == samples[8:12]
-    assert gate.admit(samples[12:]) == samples[12:]
 
 
 def test_the_newest_image_can_be_looked_at():

@@ -8,9 +8,10 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from dextouch.episodes.spool import SpoolReader
-from dextouch.errors import InvalidInputError, StorageFullError
+from dextouch.errors import StorageFullError
 from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition import take
@@ -19,7 +20,7 @@ from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.recorder import Recorder, TakeOptions
-from services.acquisition.take import SpoolSafety
+from services.acquisition.settings import SpoolSafety
 from tests.unit.acquisition.sleepy_clock import SleepyClock
 
 PROMPT = TakePrompt(task="stand_bottle", instruction="stand the bottle up")
@@ -251,5 +252,5 @@ def test_the_real_clock_tells_of_sleep_and_settings(monkeypatch):
 
 @pytest.mark.parametrize("wrong", [{"flush_period_s": 0.0}, {"min_free_bytes": -1}])
 def test_impossible_safety_is_refused(wrong):
-    with pytest.raises(InvalidInputError, match="spool safety"):
+    with pytest.raises(ValidationError, match=next(iter(wrong))):
         SpoolSafety(**wrong)

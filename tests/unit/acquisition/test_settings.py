@@ -9,8 +9,7 @@ from services.acquisition.app import create_app
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.mock_links import MockLinks
-from services.acquisition.settings import AcquisitionSettings
-from services.acquisition.take import SpoolSafety
+from services.acquisition.settings import AcquisitionSettings, SpoolSafety
 
 OPTIONS = {
     "station",
@@ -56,7 +55,8 @@ def test_environment_and_flags(monkeypatch):
 
 def test_the_spools_safety_and_the_mocks_links_are_options_too(monkeypatch):
     defaults = AcquisitionSettings()
-    assert SpoolSafety(defaults.flush_period_s, defaults.min_free_bytes) == SpoolSafety()
+    assert isinstance(defaults, SpoolSafety)
+    assert (defaults.flush_period_s, defaults.min_free_bytes) == (0.5, 64 * 2**20)
     monkeypatch.setenv("DEXTOUCH_ACQUISITION_FLUSH_PERIOD_S", "0.1")
     monkeypatch.setenv("DEXTOUCH_ACQUISITION_MOCK_LINKS__TRACKERS", "bridge")
     flags = ["--min-free-bytes", "1000", "--mock-links.images", "h264"]

@@ -4,6 +4,7 @@ import itertools
 import struct
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Literal, NamedTuple
@@ -203,6 +204,10 @@ class TactileGloveDecoder(StreamDecoder[Packet]):
         return Sample(t_host_ns, counts, packet.t_device_ns, packet.sequence)
 
 
+# A reply that is awaited, with its arrival.
+Reply = Future[tuple[Packet, int]]
+
+
 class Answer(NamedTuple):
     """The glove's answer to a request, and when the host asked and was answered."""
 
@@ -243,8 +248,7 @@ class TactileGlove(Driver):
         self._serial_number = serial_number
         self._numbers = itertools.count(1)
         # The requests under way, and the replies to them with their arrivals.
-        self._asked: dict[int, tuple[Packet, int] | None] = {}
-        self._answered = threading.Condition()
+        self._asked: dict[int, Reply] = {}
         self._writing = threading.Lock()
         self._held: Readings = {}
         self._reader: int | None = None
@@ -301,52 +305,42 @@ class TactileGlove(Driver):
     def _ask(self, command: Command) -> Answer:
         for _ in range(NUM_ATTEMPTS):
             number = next(self._numbers) % SEQUENCE_MODULUS
+            reply = self._asked[number] = Future()
             try:
                 with self._writing:
-                    self._asked[number] = None
                     t_asked_ns = self._clock.now_ns()
                     self.transport.write(encode_request(command, request=number))
-                reply = self._await(number)
+                packet, t_answered_ns = self._await(reply)
+            except TimeoutError:
+                continue
             finally:
                 # Also replies that arrive too late: a station sends requests for months.
-                with self._answered:
-                    del self._asked[number]
-            if reply is not None:
-                packet, t_answered_ns = reply
-                return Answer(self._body(command, packet), packet, t_asked_ns, t_answered_ns)
+                del self._asked[number]
+            return Answer(self._body(command, packet), packet, t_asked_ns, t_answered_ns)
         raise DeviceError(
             f"{self.name}: no answer to {command.name.lower()} from {self.info} in "
             f"{NUM_ATTEMPTS} attempts; is it a glove of this protocol?",
             device=self.name,
         )
 
-    def _await(self, number: int) -> tuple[Packet, int] | None:
+    def _await(self, reply: Reply) -> tuple[Packet, int]:
         """The reply; read here if this is the reading thread, else that one brings it."""
-        if self._reader in (None, threading.get_ident()):
-            self._read_until(number)
-        else:
-            with self._answered:
-                self._answered.wait_for(lambda: self._asked[number], ANSWER_TIMEOUT_NS * 1e-9)
-        return self._asked[number]
-
-    def _read_until(self, number: int) -> None:
-        end_ns = self._clock.now_ns() + ANSWER_TIMEOUT_NS
-        num_silent = 0
-        while self._asked[number] is None:
-            if num_silent >= MAX_SILENT_READS or self._clock.now_ns() > end_ns:
-                return
+        if self._reader not in {None, threading.get_ident()}:
+            return reply.result(ANSWER_TIMEOUT_NS * 1e-9)
+        end_ns, num_silent = self._clock.now_ns() + ANSWER_TIMEOUT_NS, 0
+        while not reply.done() and num_silent < MAX_SILENT_READS and self._clock.now_ns() <= end_ns:
             data = self.transport.read()
             num_silent = 0 if data else num_silent + 1
             if data:
                 for name, samples in self.decoder.decode(data, self._clock.now_ns()).items():
                     self._held.setdefault(name, []).extend(samples)
+        return reply.result(0)
 
     def _accept(self, packet: Packet, t_host_ns: int) -> None:
         """A reply came (called by the decoder); unexpected replies are ignored."""
-        with self._answered:
-            if packet.sequence in self._asked:
-                self._asked[packet.sequence] = (packet, t_host_ns)
-                self._answered.notify_all()
+        reply = self._asked.get(packet.sequence)
+        if reply is not None and not reply.done():
+            reply.set_result((packet, t_host_ns))
 
     def _body(self, command: Command, packet: Packet) -> bytes:
         answered, status, body = parse_reply(packet)
