@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import Field, field_validator
 
 from dextouch.frozen_model import FrozenModel
-from services.acquisition.devices.registry import kind_names
+from services.acquisition.devices.kinds import kind_names
 
 
 class MockLinks(FrozenModel):

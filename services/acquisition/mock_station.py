@@ -16,13 +16,13 @@ from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.devices.camera.driver import CameraDecoder
 from services.acquisition.devices.camera.mock import CameraSource
 from services.acquisition.devices.finger_tracker.mock import mock_finger_tracker
-from services.acquisition.devices.pose_tracker.mock import mock_pose_tracker
-from services.acquisition.devices.registry import (
+from services.acquisition.devices.kinds import (
     ENTRY_POINT_GROUP,
     IMPORT_FAILURES,
     device_kind,
     kind_names,
 )
+from services.acquisition.devices.pose_tracker.mock import mock_pose_tracker
 from services.acquisition.devices.robot_state.driver import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.devices.robot_state.mock import RobotStateSource
 from services.acquisition.devices.station_camera.mock import video_camera

@@ -8,7 +8,7 @@ from pydantic import Field, SecretStr, model_validator
 from dextouch.data_folder import default_spool
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import ServiceSettings, service_config
-from services.acquisition.devices.registry import ChosenDevice
+from services.acquisition.devices.kinds import ChosenDevice
 from services.acquisition.mock_links import MockLinks
 
 

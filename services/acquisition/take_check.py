@@ -11,9 +11,10 @@ from typing import Literal
 
 from dextouch.schemas import LedgerEntry, StreamTake, TakeCheck, TakeProblem
 from dextouch.streams import StreamDescriptor
-from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS
+from dextouch.tactile.layout import NUM_TAXELS
 from services.acquisition.clock import HostWatch, StationClock
 from services.acquisition.drivers.base import Driver
+from services.acquisition.glove_record import is_ours
 from services.acquisition.health import CODES, HealthMonitor, count_taxels
 from services.acquisition.supervisor import StreamCounters
 
@@ -38,7 +39,6 @@ IN_THE_CHECK: dict[str, tuple[str, ...]] = {
     "taxels_saturated": ("saturated_taxels",),
 }
 DeviceEvents = Mapping[str, Mapping[str, int]]
-Problem = tuple[str, Literal["WARN", "ERROR"], str]
 
 
 @dataclass(frozen=True)
@@ -83,42 +83,39 @@ class StreamFacts:
 
         Cells of other gloves are checked by health monitoring, whose findings the check includes.
         """
-        descriptor, low, high = (
-            self.descriptor,
-            self.counters.low_counts,
-            self.counters.high_counts,
-        )
-        is_ours = descriptor.kind == "tactile" and descriptor.shape == (NUM_RAW_TAXELS,)
-        if descriptor.side is None or low is None or high is None or not is_ours:
+        side, low, high = self.descriptor.side, self.counters.low_counts, self.counters.high_counts
+        if side is None or low is None or high is None or not is_ours(self.descriptor):
             return {}
-        return count_taxels(low, high, side=descriptor.side)
+        return count_taxels(low, high, side=side)
 
-    def problems(self) -> Iterator[Problem]:
-        """What is wrong with the stream's samples: code, level and words."""
+    def problems(self) -> Iterator[TakeProblem]:
+        """What is wrong with the stream's samples."""
+        name = self.descriptor.name
         if self.counters.num_samples == 0:
-            yield "missing_stream", "ERROR", "no sample arrived; is it connected?"
+            text = "no sample arrived; is it connected?"
+            yield _problem(name, "missing_stream", "ERROR", text)
             return
         max_gap_s = MAX_GAP_S.get(self.descriptor.kind, MAX_GAP_OTHERS_S)
         if self.largest_gap_s > max_gap_s:
             text = f"{self.largest_gap_s:.2f} s without a sample, expected at most {max_gap_s} s"
-            yield "gap", "ERROR", text
+            yield _problem(name, "gap", "ERROR", text)
         if self.span_ns[1] - self.span_ns[0] < MIN_JUDGED_S * 1e9:
             return
         rate_hz, nominal_hz = self.rate_hz or 0.0, self.descriptor.nominal_rate_hz
         off = abs(rate_hz / nominal_hz - 1.0)
         if off > CODES["rate"].warn:
             text = f"{rate_hz:.1f} Hz, expected {nominal_hz:g} Hz"
-            yield "rate", "ERROR" if off > CODES["rate"].error else "WARN", text
+            yield _problem(name, "rate", "ERROR" if off > CODES["rate"].error else "WARN", text)
         loss = self.loss_ratio
         if loss > CODES["loss"].warn:
             lost, damaged = self.events["lost"], self.events["crc_errors"]
             text = f"{lost} packets lost ({loss:.1%}), {damaged} corrupt"
-            yield "loss", "ERROR" if loss > LOSS_ERROR else "WARN", text
+            yield _problem(name, "loss", "ERROR" if loss > LOSS_ERROR else "WARN", text)
         for event, count in self.taxels().items():
             if count:
                 text = f"{count} {event.replace('_', ' ')} during the whole take"
                 is_error = count >= CODES["taxels_dead"].error * NUM_TAXELS
-                yield event, "ERROR" if is_error else "WARN", text
+                yield _problem(name, event, "ERROR" if is_error else "WARN", text)
 
 
 class TakeFindings:
@@ -199,7 +196,7 @@ class TakeFindings:
                 continue
             times = "once" if entry.count == 1 else f"{entry.count} times"
             text = f"{entry.event} found {times}. {CODES[entry.event].advice}"
-            found.append(_problem(entry.stream, (entry.event, "WARN", text)))
+            found.append(_problem(entry.stream, entry.event, "WARN", text))
         return found
 
 
@@ -278,7 +275,7 @@ class TakeWatch:
 
     def check(self) -> TakeCheck:
         """Judge the ended take: complete means no problem of level ERROR."""
-        own = [_problem(fact.descriptor.name, p) for fact in self._facts for p in fact.problems()]
+        own = [problem for fact in self._facts for problem in fact.problems()]
         streams = tuple(
             StreamTake(
                 stream=fact.descriptor.name,
@@ -331,6 +328,5 @@ class TakeWatch:
         return quality
 
 
-def _problem(stream: str, problem: Problem) -> TakeProblem:
-    code, level, text = problem
+def _problem(stream: str, code: str, level: Literal["WARN", "ERROR"], text: str) -> TakeProblem:
     return TakeProblem(stream=stream, code=code, level=level, message=f"{stream}: {text}")

@@ -163,7 +163,7 @@ def told(station, minutes):
         "streams": {s.stream: s.level for s in report.streams},
         "samples": {s.stream: s.num_samples for s in report.streams},
         "skew_ppm": {s.stream: s.skew_ppm for s in report.streams},
-        "unjudged": monitor.num_unjudged,
+        "unjudged": monitor.report().figures["unjudged_samples"],
     }
 
 

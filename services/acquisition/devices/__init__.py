@@ -6,19 +6,17 @@ docs/tutorials/add_a_device.md builds one.
 
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.kind import (
+from services.acquisition.devices.kinds import (
+    ENTRY_POINT_GROUP,
     DeviceKind,
     DeviceSettings,
     GloveSettings,
     SerialLineSettings,
-    serial_transport,
-)
-from services.acquisition.devices.registry import (
-    ENTRY_POINT_GROUP,
     build_drivers,
     device_kind,
     kind_names,
     load_calibration,
+    serial_transport,
 )
 from services.acquisition.drivers.base import (
     CellLayout,

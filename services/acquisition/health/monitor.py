@@ -300,13 +300,10 @@ class HealthMonitor:
         """How often each (stream, code) was raised since the station's start."""
         return self._log.raised()
 
-    @property
-    def num_unjudged(self) -> int:
-        """Number of samples that were not evaluated because the evaluation did not keep up."""
-        return sum(stream.queue.num_dropped for stream in self._streams.values())
-
     def _judge_itself(self, evaluation: Evaluation) -> None:
-        evaluation.figures["unjudged_samples"] = float(self.num_unjudged)
+        """How many samples were not evaluated because the evaluation did not keep up."""
+        num_unjudged = sum(stream.queue.num_dropped for stream in self._streams.values())
+        evaluation.figures["unjudged_samples"] = float(num_unjudged)
 
     def _evaluate(self, watched: _Watched, now_ns: int, *, confirming: bool) -> None:
         evaluation = watched.evaluate(now_ns)

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from usb.backend import IBackend
     from usb.core import Device, Interface
 
+# The number of the interface that sends the reports.
+INTERFACE = 0
 READ_TIMEOUT_MS = 100
 WRITE_TIMEOUT_MS = 500
 REPORT_BYTES = 64
@@ -35,7 +37,6 @@ class UsbAddress:
 @dataclass(frozen=True)
 class _Opened:
     device: "Device"
-    interface: int
     endpoint_in: int
     endpoint_out: int | None
     read_bytes: int
@@ -50,17 +51,13 @@ class UsbTransport(HandleTransport[_Opened]):
 
     Args:
         address: of the device.
-        interface: the number of the interface that sends the reports.
         backend: of pyusb; a new context of libusb at every opening if None, since an older one
             learns of what is plugged in only by udev, which does not speak inside containers.
     """
 
-    def __init__(
-        self, address: UsbAddress, *, interface: int = 0, backend: "IBackend | None" = None
-    ) -> None:
+    def __init__(self, address: UsbAddress, *, backend: "IBackend | None" = None) -> None:
         super().__init__(TransportInfo("usb", str(address), address.serial_number))
         self._address = address
-        self._interface = interface
         self._backend = backend
         # Outlives the devices found in it: libusb wants them given back before its context ends.
         self._context: IBackend | None = None
@@ -100,7 +97,7 @@ class UsbTransport(HandleTransport[_Opened]):
                 SET_REPORT_TYPE,
                 SET_REPORT_REQUEST,
                 OUTPUT_REPORT | data[0],
-                handle.interface,
+                INTERFACE,
                 data,
                 WRITE_TIMEOUT_MS,
             )
@@ -118,7 +115,7 @@ class UsbTransport(HandleTransport[_Opened]):
         with contextlib.suppress(OSError):  # it may be gone
             usb.util.dispose_resources(device)
             if detached:
-                device.attach_kernel_driver(self._interface)
+                device.attach_kernel_driver(INTERFACE)
                 usb.util.dispose_resources(device)
 
     def _find(self) -> "Device":
@@ -163,28 +160,28 @@ class UsbTransport(HandleTransport[_Opened]):
         import usb.util
 
         with contextlib.suppress(NotImplementedError):  # a system without kernel drivers in the way
-            if device.is_kernel_driver_active(self._interface):
-                device.detach_kernel_driver(self._interface)
+            if device.is_kernel_driver_active(INTERFACE):
+                device.detach_kernel_driver(INTERFACE)
                 self._detached = True
         try:
             configuration = device.get_active_configuration()
         except usb.core.USBError:
             device.set_configuration()
             configuration = device.get_active_configuration()
-        found = [i for i in configuration if i.bInterfaceNumber == self._interface]
+        found = [i for i in configuration if i.bInterfaceNumber == INTERFACE]
         ins = [end for i in found[:1] for end in _interrupt_endpoints(i, usb.util.ENDPOINT_IN)]
         outs = [end for i in found[:1] for end in _interrupt_endpoints(i, usb.util.ENDPOINT_OUT)]
         if not ins:
             raise DeviceError(
-                f"{self.info}: interface {self._interface} has no interrupt endpoint to read; "
+                f"{self.info}: interface {INTERFACE} has no interrupt endpoint to read; "
                 "another device or firmware?"
             )
-        usb.util.claim_interface(device, self._interface)
+        usb.util.claim_interface(device, INTERFACE)
         endpoint_in, packet_bytes = ins[0]
         # Less room than one transfer fills is an overflow error, so never ask for less.
         read_bytes = max(REPORT_BYTES, packet_bytes)
         endpoint_out = outs[0][0] if outs else None
-        return _Opened(device, self._interface, endpoint_in, endpoint_out, read_bytes)
+        return _Opened(device, endpoint_in, endpoint_out, read_bytes)
 
 
 def _new_context() -> "IBackend | None":

@@ -68,9 +68,9 @@ def read_samples(driver, count):
 
 def test_opening_asks_who_it_is(glove):
     glove.driver.open()
-    assert glove.driver.identity.serial_number == "glove_left"
-    assert glove.driver.identity.firmware == "1.0.0"
-    assert glove.driver.identity.side == "left"
+    identity = glove.driver.identify()
+    assert (identity.serial_number, identity.firmware) == ("glove_left", "1.0.0")
+    assert identity.side == "left"
 
 
 def test_a_driver_that_was_started_anew_is_answered_too(glove):
@@ -79,7 +79,7 @@ def test_a_driver_that_was_started_anew_is_answered_too(glove):
     for _ in range(2):
         driver = TactileGlove("left", transport=transport, clock=host)
         driver.open()
-        assert driver.identity.serial_number == "glove_left"
+        assert driver.identify().serial_number == "glove_left"
         driver.close()
 
 

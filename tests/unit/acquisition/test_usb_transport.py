@@ -25,9 +25,9 @@ def model(serial_number="A1", **settings):
     return device
 
 
-def transport(*devices, serial_number="A1", interface=0):
+def transport(*devices, serial_number="A1"):
     backend = OddUsbBus(*devices)
-    return UsbTransport(UsbAddress(*IDS, serial_number), interface=interface, backend=backend)
+    return UsbTransport(UsbAddress(*IDS, serial_number), backend=backend)
 
 
 @pytest.fixture
@@ -176,10 +176,11 @@ def test_unconfigured_device_is_configured():
 
 
 @pytest.mark.parametrize(("settings", "interface"), [({"endpoints": ()}, 0), ({}, 1)])
-def test_device_without_the_endpoint_is_refused_and_released(settings, interface):
+def test_device_without_the_endpoint_is_refused_and_released(settings, interface, monkeypatch):
+    monkeypatch.setattr("services.acquisition.transports.usb.INTERFACE", interface)
     device = model(**settings)
     with pytest.raises(DeviceError, match="no interrupt endpoint"):
-        transport(device, interface=interface).open()
+        transport(device).open()
     assert device.num_open == 0
     assert device.kernel_driver
 

@@ -17,7 +17,7 @@ from dextouch.streams import (
     encoded_values,
 )
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.kind import CameraStream, DeviceKind, TcpSettings
+from services.acquisition.devices.kinds import CameraStream, DeviceKind, TcpSettings
 from services.acquisition.drivers.base import Driver, StreamDecoder, check_packet
 from services.acquisition.drivers.image_encoding import ImageEncoding, WholeGroups
 from services.acquisition.drivers.image_quality import ImageChecker, ImageQuality

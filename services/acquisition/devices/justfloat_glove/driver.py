@@ -16,7 +16,7 @@ from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.streams import ClockCapabilities, Sample
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.kind import DeviceKind, GloveSettings, serial_transport
+from services.acquisition.devices.kinds import DeviceKind, GloveSettings, serial_transport
 from services.acquisition.drivers.base import CellLayout, Driver, StreamDecoder, glove_stream
 from services.acquisition.drivers.packets import PortionedSearch
 

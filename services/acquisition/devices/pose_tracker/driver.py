@@ -18,7 +18,7 @@ from dextouch.errors import PacketError
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import SIDES
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.kind import (
+from services.acquisition.devices.kinds import (
     DeviceKind,
     StreamName,
     TrackerSettings,

@@ -68,7 +68,12 @@ class TrackedPoses(PacketSource):
     ) -> None:
         self.t_ns = stream.t_ns
         self.source = source_of(stream.descriptor.name)
-        self.poses = add_pose_noise(stream.values, faults, rng)
+        self.poses = np.array(stream.values, dtype=np.float64)
+        shape = (len(self.poses), 3)
+        self.poses[:, :3] += faults.position_noise_m * rng.standard_normal(shape)
+        turns_rad = faults.rotation_noise_rad * rng.standard_normal(shape)
+        R = rotation_from_quaternion(self.poses[:, 3:]) @ rotation_from_vector(turns_rad)
+        self.poses[:, 3:] = quaternion_from_rotation(R)
         self.states = np.full(len(self.t_ns), int(TrackingState.RUNNING_OK))
         # The ledger of this source: the fault of each sample, "" if it has none.
         self.labels = np.full(len(self.t_ns), "", dtype="<U8")
@@ -120,18 +125,6 @@ class PoseTrackerSource(TrackedPoses):
         payload = PAYLOAD.pack(self.states[index], *self.poses[index])
         packet = Packet(VERSION, SOURCES[self.source], sequence, t_device_ns, payload)
         return split_into_reports(DATA_REPORT, sequence, encode_packet(MAGIC, packet))
-
-
-def add_pose_noise(
-    poses: np.ndarray, faults: DeviceFaults, rng: np.random.Generator
-) -> Float64[np.ndarray, "n 7"]:
-    """Poses with Gaussian noise on each axis of position and of the tracked body's rotation."""
-    noisy = np.array(poses, dtype=np.float64)
-    noisy[:, :3] += faults.position_noise_m * rng.standard_normal((len(noisy), 3))
-    turns_rad = faults.rotation_noise_rad * rng.standard_normal((len(noisy), 3))
-    R = rotation_from_quaternion(noisy[:, 3:]) @ rotation_from_vector(turns_rad)
-    noisy[:, 3:] = quaternion_from_rotation(R)
-    return noisy
 
 
 class BridgePoseSource(TrackedPoses, BridgeSource):

@@ -8,9 +8,10 @@ import numpy as np
 from pydantic import Field
 
 from dextouch.errors import InvalidInputError
-from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor, StreamKind
+from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
+from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.kind import DeviceKind, TcpSettings
+from services.acquisition.devices.kinds import DeviceKind, TcpSettings
 from services.acquisition.drivers.base import Decoder, Driver, Readings, check_packet
 from services.acquisition.drivers.packets import PacketDecoder
 from services.acquisition.transports.ports import tcp_transport
@@ -38,19 +39,16 @@ _NUMBER = np.dtype("<f8")
 def robot_descriptor(stream: str) -> StreamDescriptor:
     """One of the six streams: joints in rad (left 20, then right 20), poses in the world frame."""
     is_pose = stream.startswith("wrist")
-    kind: StreamKind = "pose" if is_pose else "robot_state"
-    side: Literal["left", "right"] | None = None
-    if is_pose:
-        side = "left" if "left" in stream else "right"
+    side: Side = "left" if "left" in stream else "right"
     return StreamDescriptor(
         name=stream,
-        kind=kind,
+        kind="pose" if is_pose else "robot_state",
         shape=(STREAM_SIZES[stream],),
         dtype="float64",
         unit="pose_m_wxyz" if is_pose else "rad",
         nominal_rate_hz=NOMINAL_RATE_HZ,
         frame="world" if is_pose else None,
-        side=side,
+        side=side if is_pose else None,
         device=DEVICE,
         capabilities=ClockCapabilities(crc=True, sequence=True, device_time=True),
     )

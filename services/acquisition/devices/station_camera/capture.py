@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from pydantic import Field, model_validator
 
 from dextouch.errors import DeviceError
-from services.acquisition.devices.kind import CameraStream, DeviceSettings
+from services.acquisition.devices.kinds import CameraStream, DeviceSettings
 from services.acquisition.transports.ports import Handle, HandleTransport, TransportInfo
 
 if TYPE_CHECKING:

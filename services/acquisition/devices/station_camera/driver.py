@@ -19,7 +19,7 @@ from dextouch.streams import (
     StreamDescriptor,
 )
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.kind import DeviceKind
+from services.acquisition.devices.kinds import DeviceKind
 from services.acquisition.devices.station_camera.capture import (
     NS_PER_MS,
     CapturedImage,
@@ -107,11 +107,11 @@ class DriverStamps(Decoder):
         if t_driver_ns is None or not _is_plausible(t_driver_ns, t_host_ns, MAX_AGE_NS):
             self._refuse()
             return None
-        if self._last_ns is not None and t_driver_ns == self._last_ns:
-            self.statistics.repeated += 1
-            return None
-        if self._last_ns is not None and t_driver_ns < self._last_ns:
-            self._refuse()
+        if self._last_ns is not None and t_driver_ns <= self._last_ns:
+            if t_driver_ns == self._last_ns:
+                self.statistics.repeated += 1
+            else:
+                self._refuse()
             return None
         self._num_bad = 0
         if self._last_ns is not None:

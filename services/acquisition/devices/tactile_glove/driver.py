@@ -16,7 +16,7 @@ from dextouch.errors import DeviceError, InvalidInputError, PacketError
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import NUM_RAW_TAXELS, Side
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.kind import DeviceKind, GloveSettings, serial_transport
+from services.acquisition.devices.kinds import DeviceKind, GloveSettings, serial_transport
 from services.acquisition.drivers.base import (
     Driver,
     Readings,
@@ -243,7 +243,6 @@ class TactileGlove(Driver):
         decoder = TactileGloveDecoder(side, on_reply=self._accept, label=label)
         name = f"glove_{hand_name(side, label)}"
         super().__init__(name, transport=transport, decoder=decoder, clock=clock)
-        self.identity: GloveIdentity | None = None
         self._side: Side = side
         self._serial_number = serial_number
         self._numbers = itertools.count(1)
@@ -261,11 +260,8 @@ class TactileGlove(Driver):
         """
         self._reader = threading.get_ident()
         self._held = {}
-        self.identity = None
         super().open()
-        identity = self.identify()
-        self._check(identity)
-        self.identity = identity
+        self._check(self.identify())
 
     def read(self) -> Readings:
         """New samples by stream; those that came during a request of this thread go first."""
