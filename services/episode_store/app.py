@@ -12,9 +12,9 @@ from dextouch.errors import StorageError
 from dextouch.serving import create_service_app, serve
 from services.episode_store.catalog import Catalog
 from services.episode_store.ingest import Ingest
-from services.episode_store.intake import Intake, StorageLimits
-from services.episode_store.reading import StoreReader
-from services.episode_store.routes import catalog_router, content_router, uploads_router
+from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
+from services.episode_store.reading import content_router
+from services.episode_store.routes import catalog_router, uploads_router
 from services.episode_store.settings import EpisodeStoreSettings
 
 logger = structlog.get_logger(__name__)
@@ -23,10 +23,13 @@ logger = structlog.get_logger(__name__)
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     """Create the application of one store; recovers data of crashed writers at startup."""
     store = EpisodeStore(settings.store_url)
-    catalog, reader = Catalog(store), StoreReader(store, settings)
+    catalog = Catalog(store)
     ingest = Ingest(store, settings)
     limits = StorageLimits(ingest.folder, settings, recordings=catalog.bytes_by_station)
-    intake = Intake(ingest, limits, settings)
+    admission = Admission(
+        max_requests=settings.max_batches_in_flight, max_bytes=settings.max_bytes_in_flight
+    )
+    metrics = UploadMetrics()
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -42,13 +45,13 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         name="episode_store",
         settings=settings,
         routers=[
-            uploads_router(intake),
+            uploads_router(ingest, limits, admission, metrics),
             catalog_router(catalog, max_page=settings.max_page),
-            content_router(reader),
+            content_router(store, settings),
         ],
         lifespan=lifespan,
     )
-    intake.register(app.state.registry)
+    metrics.register(app.state.registry, limits)
     return app
 
 

@@ -1,32 +1,22 @@
-"""Intake of uploads: limits of batches in flight, disk and stations before the ingest; metrics."""
+"""Limits of uploads: batches in flight, the disk, and what each station may use; and metrics."""
 
 import os
 import threading
 import time
-from collections.abc import Awaitable, Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import anyio
-import anyio.to_thread
 import structlog
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
 from dextouch.episodes import disk_errors, folder_bytes
 from dextouch.episodes.spool import read_attributes
 from dextouch.errors import LimitExceededError, NotFoundError, StorageError, StorageFullError
-from dextouch.schemas import (
-    BatchReceipt,
-    ExpireUploads,
-    FinishRecording,
-    RecordingAttributes,
-    RecordingStatus,
-    UploadList,
-    UploadSummary,
-)
-from dextouch.streams import MAX_BATCH_BYTES
-from services.episode_store.ingest import Ingest, idle_seconds
+from dextouch.schemas import RecordingAttributes, UploadList, UploadSummary
+from services.episode_store.ingest import idle_seconds
 from services.episode_store.settings import EpisodeStoreSettings
 
 logger = structlog.get_logger(__name__)
@@ -50,6 +40,8 @@ class Admission:
     """
 
     def __init__(self, *, max_requests: int, max_bytes: int) -> None:
+        # Batches are written by threads of their own; reads and commits use others.
+        self.threads = anyio.CapacityLimiter(max_requests)
         self._max_requests, self._max_bytes = max_requests, max_bytes
         self._num_requests = self._num_bytes = 0
         self._guard = threading.Lock()
@@ -233,137 +225,55 @@ class StorageLimits:
         return found
 
 
-class Intake:
-    """Passes every upload through the limits to the ingest, and updates metrics.
+class UploadMetrics:
+    """Prometheus metrics of uploads."""
 
-    Batches are written by threads of their own; reads and commits use others.
-    """
-
-    def __init__(
-        self, ingest: Ingest, limits: StorageLimits, settings: EpisodeStoreSettings
-    ) -> None:
-        self._ingest, self._limits = ingest, limits
-        max_batches = settings.max_batches_in_flight
-        self._admission = Admission(
-            max_requests=max_batches, max_bytes=settings.max_bytes_in_flight
-        )
-        self._threads = anyio.CapacityLimiter(max_batches)
-        self._batches = Counter(
+    def __init__(self) -> None:
+        self.batches = Counter(
             "dextouch_store_batches",
             "Acknowledged batches; replayed ones were stored before.",
             ("replayed",),
             registry=None,
         )
-        self._bytes = Counter(
+        self.bytes = Counter(
             "dextouch_store_batch_bytes", "Bytes of acknowledged new batches.", registry=None
         )
-        self._ack_seconds = Histogram(
+        self.ack_seconds = Histogram(
             "dextouch_store_ack_seconds",
             "Time from admission of a batch to its acknowledgement.",
             buckets=SECONDS,
             registry=None,
         )
-        self._finish_seconds = Histogram(
+        self.finish_seconds = Histogram(
             "dextouch_store_finish_seconds",
             "Time from the request to finish an upload to the committed recording.",
             buckets=SECONDS,
             registry=None,
         )
-        self._refused = Counter(
+        self.refused = Counter(
             "dextouch_store_refused",
             "Refused upload requests by the exhausted resource.",
             ("reason",),
             registry=None,
         )
 
-    def register(self, registry: CollectorRegistry) -> None:
-        """Add the metrics to a registry."""
-        counts = (self._batches, self._bytes, self._refused)
-        for metric in (*counts, self._ack_seconds, self._finish_seconds):
+    def register(self, registry: CollectorRegistry, limits: StorageLimits) -> None:
+        """Add the metrics to a registry, with what the limits measure."""
+        counts = (self.batches, self.bytes, self.refused)
+        for metric in (*counts, self.ack_seconds, self.finish_seconds):
             registry.register(metric)
         uploads = Gauge("dextouch_store_open_uploads", "Unfinished uploads.", registry=registry)
-        uploads.set_function(lambda: self._limits.num_open)
+        uploads.set_function(lambda: limits.num_open)
         free = Gauge(
             "dextouch_store_free_bytes", "Free bytes on the store's disk.", registry=registry
         )
-        free.set_function(self._limits.free_bytes)
-
-    def create(self, attributes: RecordingAttributes) -> RecordingStatus:
-        """Begin an upload or return its status; raises as `Ingest.create` and when full."""
-        with self._counting_refusals():
-            self._limits.check_new(attributes.station)
-        status = self._ingest.create(attributes)
-        if status.state == "open":
-            self._limits.begin(attributes)
-        return status
-
-    def status(self, recording_id: str) -> RecordingStatus:
-        """Status of an upload."""
-        return self._ingest.status(recording_id)
-
-    async def put_batch(
-        self,
-        recording_id: str,
-        stream: str,
-        number: int,
-        *,
-        announced: str | None,
-        read: Callable[[], Awaitable[bytes]],
-    ) -> BatchReceipt:
-        """Store a batch of an unfinished upload.
-
-        `announced` is the Content-Length of the request, whose body `read` reads.
-
-        Raises:
-            LimitExceededError: too many batches in flight; the body was not read.
-            StorageFullError: the disk or the station's quota is full; the body was not read.
-            DexTouchError: as `Ingest.put_batch`.
-        """
-        # A body of unknown length may be as large as the largest batch.
-        num_bytes = int(announced) if announced and announced.isdecimal() else MAX_BATCH_BYTES
-        with ExitStack() as admission:
-            with self._counting_refusals():
-                admission.enter_context(self._admission.admitted(num_bytes))
-                self._limits.check_batch(recording_id, num_bytes)
-            started = time.perf_counter()
-            data = await read()
-            receipt = await anyio.to_thread.run_sync(
-                self._ingest.put_batch, recording_id, stream, number, data, limiter=self._threads
-            )
-        self._ack_seconds.observe(time.perf_counter() - started)
-        self._batches.labels(str(receipt.replayed).lower()).inc()
-        if not receipt.replayed:
-            self._bytes.inc(len(data))
-            self._limits.add(recording_id, len(data))
-        return receipt
-
-    def finish(self, recording_id: str, body: FinishRecording) -> RecordingStatus:
-        """Commit a complete upload; raises as `Ingest.finish` and when full."""
-        started = time.perf_counter()
-        with self._counting_refusals():
-            self._limits.check_finish(recording_id)
-        status = self._ingest.finish(recording_id, body)
-        self._limits.end(recording_id)
-        self._finish_seconds.observe(time.perf_counter() - started)
-        return status
-
-    def idle(self, *, idle_s: float) -> UploadList:
-        """Unfinished uploads that have been idle for `idle_s`."""
-        return self._limits.idle(idle_s=idle_s)
-
-    def expire(self, wanted: ExpireUploads) -> UploadList:
-        """Drop unfinished uploads that have been idle for `idle_s` and return them."""
-        gone = []
-        for upload in self._limits.idle(idle_s=wanted.idle_s).uploads:
-            if self._ingest.expire(upload.recording_id, idle_s=wanted.idle_s):
-                self._limits.end(upload.recording_id)
-                gone.append(upload)
-        return UploadList(uploads=tuple(gone))
+        free.set_function(limits.free_bytes)
 
     @contextmanager
-    def _counting_refusals(self) -> Iterator[None]:
+    def counting_refusals(self) -> Iterator[None]:
+        """Count uploads that are refused inside, by the exhausted resource."""
         try:
             yield
         except (LimitExceededError, StorageFullError) as error:
-            self._refused.labels(str(error.details.get("reason", "other"))).inc()
+            self.refused.labels(str(error.details.get("reason", "other"))).inc()
             raise

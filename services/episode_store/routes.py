@@ -1,13 +1,16 @@
-"""HTTP routes of the store: uploads by stations, and reading of recordings and episodes."""
+"""HTTP routes of the store: uploads by stations, and lists of recordings and episodes."""
 
-from typing import Annotated, Any
+import time
+from contextlib import ExitStack
+from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+import anyio
+import anyio.to_thread
+from fastapi import APIRouter, Depends, Path, Query, Request
 
 from dextouch.schemas import (
     BatchReceipt,
     CatalogHours,
-    EpisodeDetail,
     EpisodeList,
     ExpireUploads,
     FinishRecording,
@@ -16,28 +19,23 @@ from dextouch.schemas import (
     RecordingStatus,
     UploadList,
 )
-from dextouch.serving import AS_SET, JSON, KIB, MSGPACK, OCTETS, JsonBody, RequireScope, takes
+from dextouch.serving import AS_SET, JSON, KIB, OCTETS, JsonBody, RequireScope, takes
+from dextouch.streams import MAX_BATCH_BYTES
 from services.episode_store.catalog import Catalog, EpisodeFilter, EpisodeQuery, RecordingQuery
-from services.episode_store.intake import Intake
-from services.episode_store.reading import Answer, SpanQuery, StoreReader, WindowQuery
+from services.episode_store.ingest import Ingest
+from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
 
 Attributes = Annotated[RecordingAttributes, Depends(JsonBody(RecordingAttributes))]
 Finish = Annotated[FinishRecording, Depends(JsonBody(FinishRecording))]
-Responses = dict[int | str, dict[str, Any]]
 MAY_READ = Depends(RequireScope("store_read"))
 MAY_WRITE = Depends(RequireScope("store_write"))
 # Room for the calibration and descriptors of a station, or the ledger of a take.
 MAX_ATTRIBUTES_BYTES = 256 * KIB
-WINDOW_MSGPACK = "application/vnd.dextouch.window+msgpack"
-# Committed content is immutable but may be deleted: clients must revalidate.
-CACHE_CONTROL = "private, no-cache"
-# Responses of these routes besides the problems that all routes can give.
-SAMPLES: Responses = {200: {"content": {MSGPACK: {}}}, 304: {}}
-WINDOW: Responses = {200: {"content": {WINDOW_MSGPACK: {}}}, 304: {}}
-IfNoneMatch = Annotated[str | None, Header(alias="if-none-match")]
 
 
-def uploads_router(intake: Intake) -> APIRouter:
+def uploads_router(
+    ingest: Ingest, limits: StorageLimits, admission: Admission, metrics: UploadMetrics
+) -> APIRouter:
     """Create the routes of uploads: /v1/recordings while they come, and /v1/uploads."""
     router = APIRouter(prefix="/v1")
 
@@ -45,7 +43,12 @@ def uploads_router(intake: Intake) -> APIRouter:
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
     def create(attributes: Attributes) -> RecordingStatus:
         """Begin an upload, or return the status of an existing one."""
-        return intake.create(attributes)
+        with metrics.counting_refusals():
+            limits.check_new(attributes.station)
+        status = ingest.create(attributes)
+        if status.state == "open":
+            limits.begin(attributes)
+        return status
 
     @router.post(
         "/recordings/{recording_id}/streams/{stream}/batches/{number}",
@@ -57,33 +60,63 @@ def uploads_router(intake: Intake) -> APIRouter:
         recording_id: str, stream: str, number: Annotated[int, Path(ge=0)], request: Request
     ) -> BatchReceipt:
         """Store batch n of a stream (wire format v2 or v1), exactly once even if repeated."""
-        announced = request.headers.get("content-length")
-        return await intake.put_batch(
-            recording_id, stream, number, announced=announced, read=request.body
-        )
+        announced = request.headers.get("content-length", "")
+        # A body of unknown length may be as large as the largest batch.
+        num_bytes = int(announced) if announced.isdecimal() else MAX_BATCH_BYTES
+        with ExitStack() as admitted:
+            # A refused body is not read.
+            with metrics.counting_refusals():
+                admitted.enter_context(admission.admitted(num_bytes))
+                limits.check_batch(recording_id, num_bytes)
+            started = time.perf_counter()
+            data = await request.body()
+            receipt = await anyio.to_thread.run_sync(
+                ingest.put_batch, recording_id, stream, number, data, limiter=admission.threads
+            )
+        metrics.ack_seconds.observe(time.perf_counter() - started)
+        metrics.batches.labels(str(receipt.replayed).lower()).inc()
+        if not receipt.replayed:
+            metrics.bytes.inc(len(data))
+            limits.add(recording_id, len(data))
+        return receipt
 
     @router.post("/recordings/{recording_id}/finish", tags=["recordings"], dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
     def finish(recording_id: str, body: Finish) -> RecordingStatus:
         """Commit a complete upload."""
-        return intake.finish(recording_id, body)
+        started = time.perf_counter()
+        with metrics.counting_refusals():
+            limits.check_finish(recording_id)
+        status = ingest.finish(recording_id, body)
+        limits.end(recording_id)
+        metrics.finish_seconds.observe(time.perf_counter() - started)
+        return status
 
     @router.get("/recordings/{recording_id}", tags=["recordings"], dependencies=[MAY_READ])
     def status(recording_id: str) -> RecordingStatus:
         """Status of an upload."""
-        return intake.status(recording_id)
+        return ingest.status(recording_id)
 
     @router.get("/uploads", tags=["uploads"], dependencies=[MAY_READ])
     def listing(idle_s: Annotated[float, Query(ge=0)] = 0.0) -> UploadList:
         """List unfinished uploads that have been idle for `idle_s`."""
-        return intake.idle(idle_s=idle_s)
+        return limits.idle(idle_s=idle_s)
 
     @router.post("/uploads/expire", tags=["uploads"], dependencies=[MAY_WRITE])
     def expire(wanted: ExpireUploads) -> UploadList:
         """Drop such uploads with their data; the response lists them."""
-        return intake.expire(wanted)
+        return _expire(ingest, limits, wanted.idle_s)
 
     return router
+
+
+def _expire(ingest: Ingest, limits: StorageLimits, idle_s: float) -> UploadList:
+    gone = []
+    for upload in limits.idle(idle_s=idle_s).uploads:
+        if ingest.expire(upload.recording_id, idle_s=idle_s):
+            limits.end(upload.recording_id)
+            gone.append(upload)
+    return UploadList(uploads=tuple(gone))
 
 
 def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
@@ -108,74 +141,3 @@ def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
         return catalog.hours(wanted)
 
     return router
-
-
-def content_router(reader: StoreReader) -> APIRouter:
-    """Create the routes of single recordings and episodes."""
-    router = APIRouter(prefix="/v1", dependencies=[MAY_READ])
-
-    @router.get("/recordings/{recording_id}/attributes", tags=["recordings"])
-    def attributes(recording_id: str) -> RecordingAttributes:
-        """Attributes of a finished recording."""
-        return reader.recording_attributes(recording_id)
-
-    @router.get(
-        "/recordings/{recording_id}/streams/{stream}",
-        tags=["recordings"],
-        response_class=Response,
-        responses=SAMPLES,
-    )
-    def recording_samples(
-        recording_id: str,
-        stream: str,
-        span: Annotated[SpanQuery, Query()],
-        if_none_match: IfNoneMatch = None,
-    ) -> Response:
-        """Samples of a finished recording with start_ns ≤ t_host_ns < stop_ns, as msgpack."""
-        answer = reader.samples("recording", recording_id, stream, span, known=if_none_match)
-        return _response(answer, MSGPACK)
-
-    @router.get("/episodes/{episode_id}", tags=["episodes"])
-    def episode(episode_id: str) -> EpisodeDetail:
-        """Attributes of an episode."""
-        return reader.episode(episode_id)
-
-    @router.get(
-        "/episodes/{episode_id}/windows",
-        tags=["episodes"],
-        response_class=Response,
-        responses=WINDOW,
-    )
-    def window(
-        episode_id: str,
-        query: Annotated[WindowQuery, Query()],
-        if_none_match: IfNoneMatch = None,
-    ) -> Response:
-        """Window of the model grid as msgpack (`dextouch.episodes.decode_window`)."""
-        return _response(reader.window(episode_id, query, known=if_none_match), WINDOW_MSGPACK)
-
-    @router.get(
-        "/episodes/{episode_id}/streams/{stream}",
-        tags=["episodes"],
-        response_class=Response,
-        responses=SAMPLES,
-    )
-    def episode_samples(
-        episode_id: str,
-        stream: str,
-        span: Annotated[SpanQuery, Query()],
-        if_none_match: IfNoneMatch = None,
-    ) -> Response:
-        """Samples with start_ns ≤ t_ref_ns < stop_ns as msgpack."""
-        answer = reader.samples("episode", episode_id, stream, span, known=if_none_match)
-        return _response(answer, MSGPACK)
-
-    return router
-
-
-def _response(answer: Answer, media_type: str) -> Response:
-    """Response with ETag; 304 without a body if the client has it already."""
-    headers = {"etag": answer.etag, "cache-control": CACHE_CONTROL}
-    if answer.data is None:
-        return Response(status_code=304, headers=headers)
-    return Response(answer.data, media_type=media_type, headers=headers)
