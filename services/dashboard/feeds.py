@@ -5,11 +5,13 @@ A new panel is a topic here with the function that fetches it, a section in
 """
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from typing import Any, Literal, TypeVar
 
+import numpy as np
 import structlog
 from pydantic import ValidationError
+from pydantic_core import to_json
 
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.frozen_model import FrozenModel
@@ -31,7 +33,8 @@ from dextouch.schemas import (
     first_problems,
 )
 from dextouch.streams import unpack
-from dextouch.tactile.layout import SIDES
+from dextouch.tactile import CONTACT_THRESHOLD_KPA, colour, hand_canvas
+from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import (
     RecorderView,
@@ -40,8 +43,6 @@ from services.dashboard.station_view import (
     station_view,
     unreachable_station,
 )
-from services.dashboard.topics import Message, Topic, topic_message
-from services.dashboard.touch import taxel_message
 from services.dashboard.upstream import Upstream
 
 logger = structlog.get_logger(__name__)
@@ -58,7 +59,13 @@ ACTIONS: Mapping[str, type[FrozenModel]] = {
     "discard": TakeName,
     "rerecord": TakeName,
 }
+# Of the taxel maps.
+FULL_SCALE_KPA = 40.0
+RAMP_STEPS = 128
+TAXEL_MESSAGE = 1
 Page = TypeVar("Page", EpisodeList, RecordingList)
+# A WebSocket message: text (JSON) or bytes.
+Message = str | bytes
 
 
 class ServiceView(FrozenModel):
@@ -89,6 +96,60 @@ class TakesView(FrozenModel):
     refused: tuple[UploadStatus, ...] = ()
     takes: tuple[TakeView, ...] = ()
     note: str = ""
+
+
+class Topic:
+    """A topic: its newest messages, fetched at most once a period whatever the number of viewers.
+
+    Args:
+        name: of the topic.
+        period_s: between two fetches.
+        fetch: asks the services.
+    """
+
+    def __init__(
+        self, name: str, period_s: float, fetch: Callable[[], Awaitable[list[Message]]]
+    ) -> None:
+        self.name = name
+        self.period_s = period_s
+        self._fetch = fetch
+        self._messages: list[Message] = []
+        self._due_s = float("-inf")
+        self._fetching = asyncio.Lock()
+
+    @classmethod
+    def of_json(cls, name: str, period_s: float, read: Callable[[], Awaitable[object]]) -> "Topic":
+        """A topic with one message, the JSON of what `read` returns."""
+
+        async def fetch() -> list[Message]:
+            return [topic_message(name, await read())]
+
+        return cls(name, period_s, fetch)
+
+    async def newest(self) -> list[Message]:
+        """Messages that are at most a period old; the same list while nothing changes."""
+        now_s = asyncio.get_running_loop().time
+        async with self._fetching:
+            if (started_s := now_s()) >= self._due_s:
+                try:
+                    messages = await self._fetch()
+                    if messages != self._messages:
+                        self._messages = messages
+                except Exception:
+                    # Supervisor of a feed: a bad response must not end the page's updates.
+                    logger.exception("topic_failed", topic=self.name)
+                self._due_s = started_s + self.period_s
+            return self._messages
+
+    async def updates(self) -> AsyncIterator[list[Message]]:
+        """Messages at first and whenever they change; a slow viewer skips to the newest ones."""
+        seen: list[Message] = []
+        while True:
+            messages = await self.newest()
+            if messages and messages is not seen:
+                seen = messages
+                yield messages
+            await asyncio.sleep(max(0.0, self._due_s - asyncio.get_running_loop().time()))
 
 
 class Feeds:
@@ -265,3 +326,31 @@ async def _clock_words(store: Upstream, episode_id: str) -> str:
         f"skew to {max(skews_ppm):.0f} ppm, residual to {max(residuals_ms):.2f} ms, "
         f"{lost} samples lost{f'; unreliable times: {doubted}' if doubted else ''}"
     )
+
+
+def topic_message(topic: str, data: object) -> str:
+    """Encode a message of a topic as JSON; `data` may hold pydantic models."""
+    return to_json({"topic": topic, "data": data}, inf_nan_mode="null").decode()
+
+
+def heatmap_layout() -> dict[str, object]:
+    """Positions of the 320 taxels and the colour map, from `dextouch.tactile`."""
+    taxels = np.arange(NUM_TAXELS, dtype=np.float32)
+    canvases = {side: hand_canvas(taxels, side=side) for side in SIDES}
+    rows, columns = canvases["right"].shape
+    pressures_kpa = np.linspace(0.0, FULL_SCALE_KPA, RAMP_STEPS)
+    return {
+        "rows": rows,
+        "columns": columns,
+        # NaN sorts last: the first 320 are the cells of the taxels in their order.
+        "cells": {s: np.argsort(c.ravel())[:NUM_TAXELS].tolist() for s, c in canvases.items()},
+        "ramp": colour(pressures_kpa, full_scale_kpa=FULL_SCALE_KPA).tolist(),
+        "full_scale_kpa": FULL_SCALE_KPA,
+        "contact_kpa": CONTACT_THRESHOLD_KPA,
+    }
+
+
+def taxel_message(side: Side, pressures_kpa: np.ndarray) -> bytes:
+    """Encode pressures: uint8 kind, uint8 side, uint16 count, then float32 kPa, little endian."""
+    header = bytes([TAXEL_MESSAGE, SIDES.index(side)]) + len(pressures_kpa).to_bytes(2, "little")
+    return header + np.ascontiguousarray(pressures_kpa, dtype="<f4").tobytes()

@@ -14,12 +14,10 @@ from starlette.websockets import WebSocketState
 
 from dextouch.errors import AccessDeniedError
 from dextouch.frozen_model import FrozenModel
-from services.dashboard.feeds import Feeds
+from services.dashboard.feeds import Feeds, Topic, heatmap_layout
 from services.dashboard.sessions import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView
-from services.dashboard.topics import Topic
-from services.dashboard.touch import heatmap_layout
 
 WEBSOCKET_REFUSED = 1008
 # Interval at which a WebSocket checks that its session is still valid.

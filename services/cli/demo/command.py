@@ -24,8 +24,9 @@ from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, create_
 from services.alignment.app import create_app as create_alignment
 from services.alignment.settings import AlignmentSettings
 from services.cli.demo import recording, scoring
-from services.cli.demo.settings import DemoPlan, parse
+from services.cli.demo.settings import TASKS, DemoPlan, parse
 from services.cli.servers import served
+from services.cli.study.parts import refuse_trained
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.command_line import print_scores
@@ -112,7 +113,8 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
             takes[original.attributes.domain] = taken
         with stages.stage("predict", "predicting held-out scenes with the world model"):
             scenes = [read_scene(truths.open(episode_id)) for episode_id in demonstrations]
-            scoring.refuse_trained(models.training_seeds, (scene.start.seed for scene in scenes))
+            seeds = [scene.start.seed for scene in scenes]
+            refuse_trained(scoring.MODEL, models.checkpoint, TASKS, seeds)
             prediction = measure_prediction(models.world_model, scenes)
         with stages.stage("judge", "scoring policies in the twin and in the world model"):
             policies = {**scoring.ladder(plan), "behaviour cloning": models.policy}

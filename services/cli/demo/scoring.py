@@ -1,16 +1,16 @@
 """Networks of the demo, shipped or freshly trained, and the scoring of policies by them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dextouch.clients import Policy, RolloutClient
-from dextouch.errors import ConflictError, DexTouchError
+from dextouch.errors import DexTouchError
 from dextouch.worlds import BatchWorld
 from services.cli.demo.settings import TASKS, DemoPlan
 from services.cli.main import run_command
-from services.cli.study.parts import demonstrator
+from services.cli.study.parts import demonstrator, refuse_trained
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
@@ -19,7 +19,6 @@ from services.evaluation.success_probe import SuccessProbe
 from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name
 from services.twin.tasks import get_task
 from services.world_model.checkpoints import default_checkpoint
-from services.world_model.state_checkpoints import read_state_checkpoint
 from services.world_model.world import open_world
 
 MODEL = "world_model"
@@ -42,28 +41,12 @@ SMALL_STATE_MODEL = (
 
 @dataclass(frozen=True)
 class Models:
-    """State model with the range of its training seeds by task, closed-loop policy and probe."""
+    """State model and its checkpoint, closed-loop policy and probe."""
 
     world_model: BatchWorld[Any]
-    training_seeds: Mapping[str, tuple[int, int]]
+    checkpoint: Path
     policy: BehaviourCloningPolicy
     probe: SuccessProbe
-
-
-def refuse_trained(training_seeds: Mapping[str, tuple[int, int]], seeds: Iterable[int]) -> None:
-    """Refuse to evaluate on seeds used in training.
-
-    Raises:
-        ConflictError: the world model was trained on some of these seeds.
-    """
-    wanted = list(seeds)
-    for task, (low, high) in training_seeds.items():
-        trained = [seed for seed in wanted if low <= seed <= high]
-        if trained:
-            raise ConflictError(
-                f"world model: trained on {task!r} with seeds {low} … {high}, and the demo "
-                f"evaluates on seed {trained[0]}; train it on seeds below 20000"
-            )
 
 
 def committed_models() -> Models:
@@ -108,7 +91,7 @@ def _stores(*stores: str, to: Path | None = None) -> list[str]:
 def _load(world_model: Path, policy: Path, probe: Path) -> Models:
     return Models(
         open_world(world_model),
-        read_state_checkpoint(world_model).metadata.training_seeds,
+        world_model,
         BehaviourCloningPolicy.load(policy),
         SuccessProbe.load(probe),
     )
@@ -133,7 +116,7 @@ def judge(
     Returns:
         `policies`, `agreement` and other entries of `report.json`.
     """
-    refuse_trained(models.training_seeds, plan.seeds)
+    refuse_trained(MODEL, models.checkpoint, TASKS, plan.seeds)
     twin, imagined = RolloutClient(urls["twin"]), RolloutClient(urls["imagined"])
     tasks = EvaluationPlan(
         instructions={task: get_task(task).instruction for task in TASKS},

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 from dextouch.clients import RolloutClient
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
@@ -88,8 +89,6 @@ def connect(addresses: Mapping[str, Address], connections: ExitStack) -> StudyWo
 def refuse_training_seeds(definition: StudyDefinition) -> None:
     """Refuse starts whose task and seed a world model was trained on.
 
-    Content digests miss them where image size or simulator changed since.
-
     Raises:
         ConflictError: a start was trained on.
         NotFoundError: a checkpoint is missing.
@@ -102,17 +101,28 @@ def refuse_training_seeds(definition: StudyDefinition) -> None:
             raise NotFoundError(
                 f"world {name!r}: no checkpoint {path}; train it, or check the path"
             )
-        if not is_state_checkpoint(path):
-            continue
-        metadata = read_state_checkpoint(path).metadata
-        for task in definition.tasks:
-            trained = [seed for seed in definition.seeds if metadata.may_have_seen(task, seed)]
-            if trained:
-                low, high = metadata.training_seeds[task]
-                raise ConflictError(
-                    f"world {name!r}: trained on task {task!r} with seeds {low} … {high}, and the "
-                    f"study starts from seed {trained[0]}; choose another first_seed"
-                )
+        if is_state_checkpoint(path):
+            refuse_trained(name, path, definition.tasks, definition.seeds)
+
+
+def refuse_trained(name: str, checkpoint: Path, tasks: Sequence[str], seeds: Sequence[int]) -> None:
+    """Refuse starts whose task and seed a state model was trained on.
+
+    Content digests miss them where image size or simulator changed since.
+
+    Raises:
+        ConflictError: a start was trained on.
+    """
+    metadata = read_state_checkpoint(checkpoint).metadata
+    for task in tasks:
+        trained = [seed for seed in seeds if metadata.may_have_seen(task, seed)]
+        if trained:
+            low, high = metadata.training_seeds[task]
+            raise ConflictError(
+                f"world {name!r}: trained on task {task!r} with seeds {low} … {high}, and seed "
+                f"{trained[0]} is among those to start from; choose another first_seed, or train "
+                "on others"
+            )
 
 
 def demonstrator(tasks: Sequence[str], seeds: Sequence[int], script: str) -> ReplayPolicy:

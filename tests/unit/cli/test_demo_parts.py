@@ -15,9 +15,12 @@ from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas import LineageEntry
 from services.cli.demo.command import Stages, show, worst_errors
 from services.cli.demo.recording import align, forget_take
-from services.cli.demo.scoring import ladder, refuse_trained
+from services.cli.demo.scoring import ladder
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, parse
 from services.cli.servers import bind, served
+from services.cli.study.parts import refuse_trained
+from services.world_model.state_checkpoints import write_state_checkpoint
+from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.bridges.takes import write_episode, write_recording
 from tests.unit.worlds.fakes import anchor, observation
 
@@ -189,8 +192,12 @@ def test_policies_that_do_not_look_are_good_and_bad_ones():
     assert chunks["retreat"][-1, 11] != chunks["retreat"][0, 11]
 
 
-def test_seeds_of_training_are_refused():
-    trained = {"press": (0, 219)}
-    refuse_trained(trained, range(220, 230))
+def test_seeds_of_training_are_refused(tmp_path):
+    loaded, path = untrained_state_checkpoint(), tmp_path / "state.safetensors"
+    trained = {"training_seeds": {"press": (0, 219)}, "training_splits": ("A", "B", "C")}
+    metadata = loaded.metadata.model_copy(update=trained)
+    write_state_checkpoint(path, loaded.dynamics, loaded.renderer, metadata)
+    refuse_trained("model", path, ["press"], range(220, 230))
+    refuse_trained("model", path, ["pour"], range(219, 222))
     with pytest.raises(ConflictError, match=r"'press' with seeds 0 … 219.*seed 219"):
-        refuse_trained(trained, range(219, 222))
+        refuse_trained("model", path, ["press"], range(219, 222))

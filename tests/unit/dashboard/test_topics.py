@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from services.dashboard.topics import Topic
+from services.dashboard.feeds import Topic
 
 
 class Source:
