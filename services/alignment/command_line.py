@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -243,21 +242,20 @@ def align_batch(
     `num_workers` are aligned at the same time, each in its own process; `on_progress` is called
     from several threads.
     """
-    workers: list[AlignmentWorker] = []
-    mine = threading.local()
-
-    def start() -> None:
-        mine.worker = AlignmentWorker(store_url)
-        workers.append(mine.worker)
+    workers = [AlignmentWorker(store_url) for _ in range(num_workers)]
+    idle = workers.copy()
 
     def align(recording_id: str) -> Outcome:
+        worker = idle.pop()
         try:
             tell = partial(on_progress, recording_id)
-            return recording_id, mine.worker.run(recording_id, options, tell)
+            return recording_id, worker.run(recording_id, options, tell)
         except DexTouchError as error:
             return recording_id, error
+        finally:
+            idle.append(worker)
 
-    threads = ThreadPoolExecutor(num_workers, thread_name_prefix="align", initializer=start)
+    threads = ThreadPoolExecutor(num_workers, thread_name_prefix="align")
     try:
         for ready in as_completed([threads.submit(align, one) for one in recording_ids]):
             yield ready.result()

@@ -25,9 +25,8 @@ from services.alignment.synchronization.resampling import (
 )
 
 NS_PER_MS = 1e6
-# How far apart a sample and its true one may be: around a known origin, and without one.
+# How far apart a sample and its true one may be.
 NEAR_NS = 60_000_000
-FAR_NS = 1_500_000_000
 MAX_COMPARED_SAMPLES = 400
 # Another sample than the nearest is believed only if its values fit this much better: a hand at
 # rest looks the same at every moment, up to noise.
@@ -54,22 +53,21 @@ class Match:
 
 
 def compare_with_truth(
-    episode: EpisodeReader, truth: EpisodeReader, *, origin_in_truth_ns: int | None = None
+    episode: EpisodeReader, truth: EpisodeReader, *, origin_in_truth_ns: int
 ) -> dict[str, Any]:
     """Errors of an episode against the truth episode that its mock devices replayed.
 
     Args:
         episode: made by alignment from the recording of the replay.
         truth: the replayed episode.
-        origin_in_truth_ns: true time of the episode's time 0. With it `latency_error_ms` is
-            absolute; without it the median stream is taken as exact.
+        origin_in_truth_ns: true time of the episode's time 0.
 
     Returns:
         `clock_rms_ms` {stream: ms} without each stream's constant delay; `latency_ms` {stream:
         the delay, calibrated plus found}; `latency_error_ms` {stream: what calibration left};
         `num_dropped` {stream}; `taxel_iou` and `taxel_mae_kpa` over samples that arrived (None
         without gloves); `fingertip_error_mm`, `wrist_error_mm`, `wrist_error_deg`, means over
-        the model grid; `origin_ms`.
+        the model grid.
 
     Raises:
         InvalidInputError: the two share no stream.
@@ -84,18 +82,17 @@ def compare_with_truth(
             f"truth: the episode has {sorted(episode.streams)}, the truth "
             f"{sorted(truth.streams)}; expected common streams"
         )
-
-    def match(name: str, origin_ns: int, reach_ns: int) -> Match:
-        period_ns = truth.streams[name].period_ns()
-        return match_samples(
-            episode.read(name), truth.read(name), origin_ns, reach_ns, period_ns=period_ns
-        )
-
     origin_ns = origin_in_truth_ns
-    if origin_ns is None:
-        found = [match(name, 0, FAR_NS).mean_offset_ns for name in shared]
-        origin_ns = -round(float(np.median(found)))
-    matches = {name: match(name, origin_ns, NEAR_NS) for name in shared}
+    matches = {
+        name: match_samples(
+            episode.read(name),
+            truth.read(name),
+            origin_ns,
+            NEAR_NS,
+            period_ns=truth.streams[name].period_ns(),
+        )
+        for name in shared
+    }
     left = {name: (m.mean_offset_ns + origin_ns) / NS_PER_MS for name, m in matches.items()}
     known = {report.stream: report.latency_ms or 0.0 for report in episode.attributes.clocks}
     gloves = (
@@ -111,7 +108,6 @@ def compare_with_truth(
         "latency_ms": {name: known.get(name, 0.0) + error for name, error in left.items()},
         "latency_error_ms": left,
         "num_dropped": {name: m.num_dropped for name, m in matches.items()},
-        "origin_ms": origin_ns / NS_PER_MS,
         **_taxel_errors(gloves),
         **_pose_errors(episode, truth, origin_ns),
     }

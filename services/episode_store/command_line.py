@@ -79,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     does = "permanently delete items in the trash"
     purge = _command(commands, shared, "purge", does, "--older-than 30d")
     purge.add_argument(
-        "--older-than", type=_age, default=0.0, metavar="AGE", help="such as 30d or 12h"
+        "--older-than", type=seconds_of, default=0.0, metavar="AGE", help="such as 30d or 12h"
     )
     return parser
 
@@ -99,13 +99,6 @@ def _command(
         description=f"{does[0].upper()}{does[1:]}.",
         epilog=f"example:\n  dextouch store {name} {usual}".rstrip(),
     )
-
-
-def _age(text: str) -> float:
-    try:
-        return seconds_of(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _add_ids(command: argparse.ArgumentParser) -> None:

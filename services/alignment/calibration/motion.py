@@ -9,14 +9,13 @@ A twist is [..., 6]: rotation vector in rad, then translation in m. T · move(tw
 own frame about its own origin and shifts it along its own axes.
 """
 
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from dextouch.geometry import invert, transform
+from dextouch.geometry import invert, rigid_error, transform
 from dextouch.geometry.rotations import (
     SERIES_ANGLE_RAD,
     rotation_angle,
@@ -102,9 +101,7 @@ def checked_poses(task: str, **series: np.ndarray) -> list[Float64[np.ndarray, "
                 "views out of all series",
                 views=bad.tolist(),
             )
-        R = poses[:, :3, :3]
-        orthogonal = np.allclose(R @ np.swapaxes(R, 1, 2), np.eye(3), atol=1e-3)
-        if not orthogonal or (np.linalg.det(R) < 0).any():
+        if rigid_error(poses) > 1e-3:
             raise InvalidInputError(f"{task}: {name} holds matrices that are no rigid transforms")
     if shapes[0][0] < MIN_VIEWS:
         raise InvalidInputError(
@@ -115,7 +112,7 @@ def checked_poses(task: str, **series: np.ndarray) -> list[Float64[np.ndarray, "
 
 def view_pairs(num_views: int) -> np.ndarray:
     """Pairs of views [p, 2]: all of them, or every n-th of very many."""
-    pairs = np.array(list(combinations(range(num_views), 2)))
+    pairs = np.column_stack(np.triu_indices(num_views, 1))
     return pairs[:: max(1, len(pairs) // MAX_PAIRS)]
 
 

@@ -262,25 +262,23 @@ class _Points:
 
 def _points(tare: TaxelTare, presses: Sequence[TaxelPress], full_scale_counts: float) -> _Points:
     limit = SATURATED_RATIO * full_scale_counts
-    counts, sigmas, used, full = [], [], [], []
+    rows = []
+
+    def of_taxels(level: Level) -> list[np.ndarray]:
+        rows = level.mean_counts, level.sigma_counts
+        return [select_taxels(row, side=tare.side) for row in rows]
+
     for index, press in enumerate(presses):
         raw = checked_counts(press.counts, what=f"press {index} ({press.pressure_kpa:g} kPa)")
         level = steady_level(raw)
         _check_steady(raw, level, press, tare)
-        counts.append(select_taxels(level.mean_counts, side=tare.side))
-        sigmas.append(select_taxels(level.sigma_counts, side=tare.side))
         at_stop = select_taxels((raw >= limit).mean(axis=0), side=tare.side)
-        full.append(press.taxels & (at_stop > MAX_SATURATED_READINGS))
-        used.append(press.taxels & ~full[-1])
-    known = np.array([*((press.pressure_kpa, press.sigma_kpa) for press in presses), (0.0, 0.0)])
-    return _Points(
-        known[:, :1],
-        known[:, 1:],
-        np.stack([*counts, select_taxels(tare.level.mean_counts, side=tare.side)]),
-        np.stack([*sigmas, select_taxels(tare.level.sigma_counts, side=tare.side)]),
-        np.stack([*used, np.ones(NUM_TAXELS, dtype=np.bool_)]),
-        np.stack([*full, np.zeros(NUM_TAXELS, dtype=np.bool_)]),
-    )
+        is_full = press.taxels & (at_stop > MAX_SATURATED_READINGS)
+        used = press.taxels & ~is_full
+        rows.append(([press.pressure_kpa], [press.sigma_kpa], *of_taxels(level), used, is_full))
+    everywhere = np.ones(NUM_TAXELS, dtype=np.bool_)
+    rows.append(([0.0], [0.0], *of_taxels(tare.level), everywhere, ~everywhere))
+    return _Points(*map(np.array, zip(*rows, strict=True)))
 
 
 def _check_steady(raw: np.ndarray, level: Level, press: TaxelPress, tare: TaxelTare) -> None:

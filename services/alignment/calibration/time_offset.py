@@ -21,6 +21,7 @@ from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from services.alignment.calibration.motion import DegenerateMotionError
 
 CUTOFF_HZ = 8.0
+MAX_OFFSET_S = 1.0
 MIN_OVERLAP_S = 2.0
 MIN_CORRELATION = 0.5
 # Another offset that correlates nearly as well makes a periodic motion useless.
@@ -35,7 +36,7 @@ SEARCH_STEP_S = 0.001
 MIN_FALL_M_PER_S = 0.05
 MIN_REST_S = 0.5
 TOUCH_KPA = 2.0
-MAX_OFFSET_S = 0.2
+MAX_TAP_OFFSET_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,6 @@ def estimate_time_offset(
     signal_a: np.ndarray,
     t_b_ns: np.ndarray,
     signal_b: np.ndarray,
-    *,
-    max_offset_s: float = 1.0,
 ) -> TimeOffset:
     """Estimate the offset between two streams that measured the same motion.
 
@@ -61,7 +60,6 @@ def estimate_time_offset(
         signal_a: [n] or [n, k]: angular speed, or k components in common axes (better).
         t_b_ns: stamps [m] of stream b.
         signal_b: [m] or [m, k]; may have another unit and zero than a.
-        max_offset_s: largest offset to search.
 
     Raises:
         DegenerateMotionError: no motion, too slow, too periodic, or not the same one.
@@ -82,7 +80,7 @@ def estimate_time_offset(
     grid_a, smooth_a = _low_passed(t_a, a, step_s)
     grid_b, smooth_b = _low_passed(t_b, b, step_s)
     spline_b = CubicSpline(grid_b, smooth_b)
-    coarse_s = _coarse(grid_a, smooth_a, (grid_b, smooth_b), step_s, max_offset_s)
+    coarse_s = _coarse(grid_a, smooth_a, (grid_b, smooth_b), step_s)
     offset_s, sigma_s = _refined(grid_a, smooth_a, spline_b, coarse_s)
     if abs(offset_s - coarse_s) > 0.1 or sigma_s > MAX_SIGMA_S:
         raise DegenerateMotionError(
@@ -177,18 +175,17 @@ def _coarse(
     a: np.ndarray,
     stream_b: tuple[np.ndarray, np.ndarray],
     step_s: float,
-    max_offset_s: float,
 ) -> float:
     """The offset of highest correlation on the grid, if it is the only high one."""
     grid_b, b = stream_b
-    num = round(max_offset_s / step_s)
+    num = round(MAX_OFFSET_S / step_s)
     offsets = step_s * np.arange(-num, num + 1)
     scores = np.array([_correlation(grid_a, a, grid_b + offset, b) for offset in offsets])
     best = int(np.argmax(scores))
     if not scores[best] >= MIN_CORRELATION:
         raise DegenerateMotionError(
             f"time offset: the streams correlate by {scores[best]:.2f} at best, expected "
-            f"{MIN_CORRELATION}; both must see the same brisk motion within {max_offset_s:g} s"
+            f"{MIN_CORRELATION}; both must see the same brisk motion within {MAX_OFFSET_S:g} s"
         )
     inner = scores[1:-1]
     peaks = 1 + np.flatnonzero((inner > scores[:-2]) & (inner >= scores[2:]))
@@ -261,7 +258,7 @@ def _onsets(t_s: np.ndarray, pressure_kpa: np.ndarray) -> tuple[list[float], flo
 
 def _bend_s(t_s: np.ndarray, height: np.ndarray, onset_s: float) -> float | None:
     """Time at which a fall near a touch stops; None without a fall."""
-    bends = np.arange(onset_s - MAX_OFFSET_S, onset_s + MAX_OFFSET_S, SEARCH_STEP_S)
+    bends = np.arange(onset_s - MAX_TAP_OFFSET_S, onset_s + MAX_TAP_OFFSET_S, SEARCH_STEP_S)
     best, found = np.inf, None
     for bend in bends.tolist():
         near = (t_s >= bend - BEFORE_S) & (t_s <= bend + AFTER_S)

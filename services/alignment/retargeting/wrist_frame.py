@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from dextouch.geometry import apply, invert, transform
+from dextouch.geometry import apply, invert, rigid_error, transform
 from dextouch.geometry.rotations import rotation_angle, vector_from_rotation
 from dextouch.hands import FINGER_CHAINS, PALM_NODES, WRIST_NODE, chain_indices, mean_hand_m
 from dextouch.schemas import Matrix, matrix_rows
@@ -188,13 +188,11 @@ def calibrated_transform(
         raise ShapeError(f"{what}: got shape {T.shape}, expected (4, 4)")
     if not np.isfinite(T).all():
         raise NonFiniteError(f"{what}: holds NaN or infinity; calibrate again")
-    R = T[:3, :3]
-    off, determinant = np.abs(R @ R.T - np.eye(3)).max(), np.linalg.det(R)
-    if off > RIGID_TOLERANCE or determinant < 0 or T[3].tolist() != [0, 0, 0, 1]:
+    off = rigid_error(T)
+    if off > RIGID_TOLERANCE:
         raise InvalidInputError(
-            f"{what}: no rigid transform (R Rᵀ is off by {off:.1e}, expected at most "
-            f"{RIGID_TOLERANCE:.0e}; det {determinant:+.2f}; last row {T[3].tolist()}); calibrate "
-            "again"
+            f"{what}: no rigid transform (RᵀR or the last row is off by {off:.1e}, expected at "
+            f"most {RIGID_TOLERANCE:.0e}; det {np.linalg.det(T[:3, :3]):+.2f}); calibrate again"
         )
     return T
 

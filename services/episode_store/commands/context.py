@@ -89,14 +89,11 @@ class Context:
 
 
 def seconds_of(text: str) -> float:
-    """Parse a duration such as `30d`, `12h`, `90m` or `10s` to seconds.
-
-    Raises:
-        ValueError: anything else.
-    """
+    """Parse a duration such as `30d`, `12h`, `90m` or `10s` to seconds, for argparse."""
     factor = _UNITS.get(text[-1:])
     if factor is None or not text[:-1].isdecimal():
-        raise ValueError(f"got {text!r}, expected a number and one of s m h d, such as 30d")
+        told = f"got {text!r}, expected a number and one of s m h d, such as 30d"
+        raise argparse.ArgumentTypeError(told)
     return int(text[:-1]) * factor
 
 

@@ -1,5 +1,6 @@
 """`dextouch store`: what each word says, writes and answers."""
 
+import argparse
 import io
 import json
 import os
@@ -319,7 +320,7 @@ def test_deletions_that_are_not_clear_are_refused(store, word, words):
 def test_ages_and_sizes():
     assert [seconds_of(text) for text in ("30d", "12h", "5m", "7s")] == [2_592_000, 43_200, 300, 7]
     for bad in ("", "d", "30", "-1d", "1.5d", "1w"):
-        with pytest.raises(ValueError, match="30d"):
+        with pytest.raises(argparse.ArgumentTypeError, match="30d"):
             seconds_of(bad)
     sizes = [readable_size(n) for n in (0, 999, 1000, 999_600, 12_345_678)]
     assert sizes == ["0 bytes", "999 bytes", "1 kB", "1 MB", "12.3 MB"]
