@@ -3,12 +3,11 @@
 import asyncio
 import signal
 import socket
-import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import partial
 
 import uvicorn
 from fastapi import FastAPI
@@ -19,6 +18,7 @@ from dextouch.serving import ServiceSettings, server_options
 BACKLOG = 128
 START_TIMEOUT_S = 60.0
 START_CHECK_S = 0.01
+GRACE_S = 10
 
 
 class Server(uvicorn.Server):
@@ -35,6 +35,12 @@ class Server(uvicorn.Server):
     def capture_signals(self) -> Iterator[None]:
         """Leave the process's signal handlers alone."""
         yield
+
+
+def _server(app: FastAPI, grace_s: int) -> Server:
+    settings: ServiceSettings = getattr(app.state, "settings", None) or ServiceSettings()
+    options = server_options(settings, grace_s=grace_s)
+    return Server(uvicorn.Config(app, backlog=BACKLOG, **options))
 
 
 @dataclass(frozen=True)
@@ -79,18 +85,14 @@ async def serve_all(
     *,
     stop: asyncio.Event,
     on_ready: Callable[[], None],
-    grace_s: int = 10,
+    grace_s: int = GRACE_S,
 ) -> None:
     """Serve until `stop` is set; `on_ready` is called once all services respond.
 
     Raises:
         UnavailableError: a service terminated unexpectedly; the others were shut down.
     """
-    servers = {}
-    for place, app in placed:
-        settings: ServiceSettings = getattr(app.state, "settings", None) or ServiceSettings()
-        options = server_options(settings, grace_s=grace_s)
-        servers[place.name] = Server(uvicorn.Config(app, backlog=BACKLOG, **options))
+    servers = {place.name: _server(app, grace_s) for place, app in placed}
     tasks = {
         place.name: asyncio.create_task(servers[place.name].serve(sockets=[place.socket]))
         for place, _ in placed
@@ -134,36 +136,32 @@ async def _announce(servers: Sequence[Server], on_ready: Callable[[], None]) -> 
 
 @contextmanager
 def served(apps: Mapping[str, FastAPI]) -> Iterator[dict[str, str]]:
-    """Context manager that serves applications in a thread on loopback; yields URLs by name.
+    """Context manager that serves applications in threads on loopback; yields URLs by name.
 
     Raises:
         UnavailableError: they did not start, or one terminated unexpectedly.
     """
-    placed = [(bind(name, host="127.0.0.1", port=0), app) for name, app in apps.items()]
-    answering = threading.Event()
-    stopper: Future[Callable[[], object]] = Future()
-
-    async def serve() -> None:
-        stop = asyncio.Event()
-        stopper.set_result(partial(asyncio.get_running_loop().call_soon_threadsafe, stop.set))
-        await serve_all(placed, stop=stop, on_ready=answering.set)
-
-    with ThreadPoolExecutor(1, "services") as pool:
-        serving = pool.submit(asyncio.run, serve())
-        serving.add_done_callback(lambda _: answering.set())
-        has_begun = answering.wait(START_TIMEOUT_S) and not serving.done()
-        try:
-            if has_begun:
-                yield {place.name: place.url for place, _ in placed}
-        finally:
-            # The loop is closed where they ended by themselves.
-            with suppress(RuntimeError):
-                stopper.result()()
-            failure = serving.exception()
-            if has_begun and failure is not None:
-                raise UnavailableError("a service ended by itself") from failure
-    if not has_begun:
-        raise UnavailableError(
-            f"services {', '.join(apps)} did not start within {START_TIMEOUT_S:.0f} s; the log "
-            "above says why"
-        ) from failure
+    placed = {name: bind(name, host="127.0.0.1", port=0) for name in apps}
+    servers = [_server(app, GRACE_S) for app in apps.values()]
+    with ExitStack() as stack:
+        for place in placed.values():
+            stack.callback(place.socket.close)
+        pool = stack.enter_context(ThreadPoolExecutor(len(apps), "services"))
+        running = [
+            pool.submit(server.run, [place.socket])
+            for server, place in zip(servers, placed.values(), strict=True)
+        ]
+        for server in servers:
+            stack.callback(setattr, server, "should_exit", True)  # noqa: FBT003 - a value
+        give_up_s = time.monotonic() + START_TIMEOUT_S
+        while not all(server.started for server in servers):
+            ended = [one for one in running if one.done()]
+            if ended or time.monotonic() > give_up_s:
+                raise UnavailableError(
+                    f"services {', '.join(apps)} did not start within {START_TIMEOUT_S:.0f} s; the "
+                    "log above says why"
+                ) from (ended[0].exception() if ended else None)
+            time.sleep(START_CHECK_S)
+        yield {name: place.url for name, place in placed.items()}
+        if any(one.done() for one in running):
+            raise UnavailableError("a service ended by itself; the log above says why")

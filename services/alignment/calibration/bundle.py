@@ -11,7 +11,7 @@ estimate with another sensor in the second series.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -50,16 +50,13 @@ Measurement = Callable[[np.ndarray], Linearised]
 class TrackerNoise:
     """Expected noise of a tracker, one sigma for each axis; refined from the views."""
 
-    task: ClassVar[str]
     tracker_rotation_rad: float = 8.7e-4
     tracker_translation_m: float = 5e-4
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not (np.isfinite(value) and value > 0):
-                raise InvalidInputError(
-                    f"{self.task}: noise {name} is {value}, expected above zero"
-                )
+                raise InvalidInputError(f"expected noise {name}: got {value}, expected above zero")
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,8 @@ from services.alignment.calibration.motion import (
 TASK = "hand-eye"
 BASE_TASK = "robot base"
 MIN_CORNERS = 4
+# Expected of a robot that reports its pose: rotation (rad) and translation (m), an axis.
+ROBOT_SIGMA = (3e-4, 2e-4)
 # Where the tracker's place is given, the effector must at least move so far in two directions.
 MIN_SECOND_SPREAD_M = 0.05
 # Poses of a board come from a solver; few steps bring them to the minimum of the pixels.
@@ -57,7 +59,6 @@ class HandEyeNoise(TrackerNoise):
     given.
     """
 
-    task = TASK
     pixel_px: float = 0.3
     board_tilt_rad: float = 1.5e-3
     board_roll_rad: float = 5e-4
@@ -258,15 +259,6 @@ def polish(measurement: Measurement, Ts_camera_board: np.ndarray) -> Float64[np.
 
 
 @dataclass(frozen=True)
-class RobotBaseNoise(TrackerNoise):
-    """Expected noise, one sigma for each axis; refined from the pairs."""
-
-    task = BASE_TASK
-    robot_rotation_rad: float = 3e-4
-    robot_translation_m: float = 2e-4
-
-
-@dataclass(frozen=True)
 class RobotBaseResult(PoseEstimate):
     """Pose of the robot's base in the tracked world, and how well it is known.
 
@@ -285,16 +277,16 @@ def solve_robot_base(
     Ts_base_effector: np.ndarray,
     *,
     T_effector_tracker: np.ndarray | None = None,
-    noise: RobotBaseNoise | None = None,
 ) -> RobotBaseResult:
     """Estimate the robot's base in the tracked world from simultaneous pairs of poses.
+
+    The noise of tracker and robot is estimated from the pairs too.
 
     Args:
         Ts_world_tracker: [n ≥ 4, 4, 4] poses of a tracker that the effector carries.
         Ts_base_effector: [n, 4, 4] poses of the effector, from the robot's own joints.
         T_effector_tracker: where the tracker sits; the identity where both series are of the same
             frame; None to find it.
-        noise: what to expect; default `RobotBaseNoise()`.
 
     Raises:
         DegenerateMotionError: the effector was turned too little or about one axis only (or,
@@ -309,7 +301,7 @@ def solve_robot_base(
     )
     names = ("Ts_world_tracker", "Ts_base_effector")
     series = Series(BASE_TASK, "effector", tracker, invert(effector), names)
-    noise, mount = noise or RobotBaseNoise(), None
+    mount = None
     if T_effector_tracker is not None:
         _check_places(effector)
         repeated = np.broadcast_to(T_effector_tracker, (MIN_VIEWS, *np.shape(T_effector_tracker)))
@@ -317,12 +309,8 @@ def solve_robot_base(
         mount = invert(given[0])
     agreed = agreeing_views(series, mount)
     # The robot errs in the effector's axes.
-    own = sensor_components(
-        "robot",
-        adjoint(invert(agreed.predicted)),
-        (noise.robot_rotation_rad, noise.robot_translation_m),
-    )
-    bundle, sigmas = weighted_bundle(agreed, noise, own)
+    own = sensor_components("robot", adjoint(invert(agreed.predicted)), ROBOT_SIGMA)
+    bundle, sigmas = weighted_bundle(agreed, TrackerNoise(), own)
     _, errors = view_errors(agreed.series, bundle.X)
     rotation_rms_rad, translation_rms_m = np.sqrt(np.square(errors).mean(axis=0)).tolist()
     result = RobotBaseResult(

@@ -150,7 +150,7 @@ def _find_stretch(
     refused = refused_edges(first_ns, last_ns, start_ns)
     refused += refused_stretches(grid_ns + origin_ns, valid, (first, stop), start_ns)
     return _Stretch(
-        gridded.part(first, stop),
+        place_streams(moved, grid_ns[first:stop], max_gap_ns=options.max_gap_ns),
         origin_ns + int(grid_ns[first]),
         num_steps - (stop - first),
         refused_matrices(refused),

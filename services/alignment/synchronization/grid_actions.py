@@ -45,14 +45,6 @@ class GriddedStreams:
         """Steps at which every stream can be read without reaching across a gap."""
         return np.logical_and.reduce([placement.valid for placement in self.at.values()])
 
-    def part(self, first: int, stop: int) -> "GriddedStreams":
-        """Steps first … stop - 1."""
-        at = {
-            name: GridPlacement(p.left[first:stop], p.weight[first:stop], p.valid[first:stop])
-            for name, p in self.at.items()
-        }
-        return GriddedStreams(self.grid_ns[first:stop], self.streams, at)
-
     def poses(self, name: str) -> Float64[np.ndarray, "n 4 4"]:
         """Transforms of a pose stream at the steps."""
         return poses_on_grid(self.streams[name].values, self.at[name])

@@ -35,10 +35,8 @@ from dextouch.episodes.care import (
 from dextouch.errors import InvalidInputError, NotFoundError, StorageError
 from dextouch.schemas import (
     EpisodeAttributes,
-    EpisodeList,
     EpisodeSummary,
     RecordingAttributes,
-    RecordingList,
     RecordingSummary,
     json_ready,
 )
@@ -87,24 +85,17 @@ def _list_kind(context: Context, catalog: Catalog, kind: Kind) -> tuple[dict[str
     """List matching items of a kind; returns them and the number of all."""
     options = context.options
     wanted = EpisodeFilter(task=options.task, domain=options.domain, origin=options.origin)
-    found: EpisodeList | RecordingList
     if kind == "episode":
-        found = catalog.episodes(wanted, limit=sys.maxsize)
-        total = catalog.episodes(EpisodeFilter(), limit=1).num_matching
-        for episode in found.episodes:
-            context.say(
-                f"{episode.episode_id}  episode  {episode.task}  {episode.domain}  "
-                f"{episode.origin}  {episode.num_steps} steps  {_outcome(episode)}"
-            )
-    else:
-        found = catalog.recordings(wanted, limit=sys.maxsize)
-        total = catalog.recordings(limit=1).num_matching
-        for recording in found.recordings:
-            context.say(
-                f"{recording.recording_id}  recording  {recording.task}  {recording.domain}  "
-                f"{sum(recording.num_samples.values())} samples  {_outcome(recording)}"
-            )
-    return json_ready(found), total
+        episodes = catalog.episodes(wanted, limit=sys.maxsize)
+        for row in episodes.episodes:
+            told = f"{row.origin}  {row.num_steps} steps  {_outcome(row)}"
+            context.say(f"{row.episode_id}  episode  {row.task}  {row.domain}  {told}")
+        return json_ready(episodes), catalog.episodes(EpisodeFilter(), limit=1).num_matching
+    recordings = catalog.recordings(wanted, limit=sys.maxsize)
+    for each in recordings.recordings:
+        told = f"{sum(each.num_samples.values())} samples  {_outcome(each)}"
+        context.say(f"{each.recording_id}  recording  {each.task}  {each.domain}  {told}")
+    return json_ready(recordings), catalog.recordings(limit=1).num_matching
 
 
 def _outcome(

@@ -47,10 +47,8 @@ def read_sample(hand, work, keypoints):
             x, y, z = keypoints[node, 0], keypoints[node, 1], keypoints[node, 2]
             seen = node >= 0 and np.isfinite(x) and np.isfinite(y) and np.isfinite(z)
             work.usable[finger, index] = seen
-            point = work.measured[finger, index]
-            point[0] = x if seen else 0.0
-            point[1] = y if seen else 0.0
-            point[2] = z if seen else 0.0
+            for k in range(3):
+                work.measured[finger, index, k] = keypoints[node, k] if seen else 0.0
 
 
 @compiled
@@ -165,12 +163,10 @@ def set_box(hand, work, finger, before_rad, reach):
     """Bounds of a finger's joints in this sample: limits, and the reach since the last one."""
     for joint in range(hand.num_joints[finger]):
         before = before_rad[finger, joint]
-        lower, upper = hand.lower_rad[finger, joint], hand.upper_rad[finger, joint]
-        if np.isfinite(reach):
-            lower, upper = max(lower, before - reach), min(upper, before + reach)
-        work.lower[finger, joint] = lower
-        work.upper[finger, joint] = upper
         work.before[finger, joint] = before
+        # An infinite reach is none.
+        work.lower[finger, joint] = max(hand.lower_rad[finger, joint], before - reach)
+        work.upper[finger, joint] = min(hand.upper_rad[finger, joint], before + reach)
 
 
 @compiled
@@ -290,10 +286,8 @@ def mark_reacquired(hand, person, work, memory, output):
         for joint in range(hand.num_joints[finger]):
             angle = memory.joints_rad[finger, joint]
             lower, upper = work.lower[finger, joint], work.upper[finger, joint]
-            if angle <= lower and lower > hand.lower_rad[finger, joint]:
-                is_held = True
-            if angle >= upper and upper < hand.upper_rad[finger, joint]:
-                is_held = True
+            is_held |= angle <= lower and lower > hand.lower_rad[finger, joint]
+            is_held |= angle >= upper and upper < hand.upper_rad[finger, joint]
         if not is_held:
             memory.is_behind[finger] = 0
             continue
