@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
+from rich.progress import TaskID
 
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, disk_errors
@@ -156,16 +156,9 @@ def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
 @contextmanager
 def _bars(console: Console, num_recordings: int) -> Iterator[OnRecordingProgress]:
     """A bar for each recording at work and one for all; nothing without a terminal."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
     shown: dict[str, TaskID] = {}
     shares: dict[str, float] = {}
-    with Bars(*columns, console=console, disable=not console.is_terminal, transient=True) as bars:
+    with Bars(console=console, disable=not console.is_terminal, transient=True) as bars:
         whole = bars.add_task(f"{num_recordings} recordings", total=max(num_recordings, 1))
 
         def on_progress(recording_id: str, progress: Progress) -> None:

@@ -3,6 +3,7 @@
 As data, as one line of text, and as tables for a terminal.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -15,7 +16,6 @@ from rich.text import Text
 from dextouch.episodes import EpisodeReader
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import ClockReport, Domain, Matrix
-from dextouch.tactile.layout import SIDES
 from services.alignment.calibration.tactile_baseline import REASONS
 from services.alignment.synchronization.refused_parts import RefusedPart, refused_parts
 
@@ -88,10 +88,8 @@ def _retargeting_figures(quality: Mapping[str, float]) -> dict[str, dict[str, fl
     """By side; empty where nothing was retargeted."""
     found: dict[str, dict[str, float]] = {}
     for name, value in quality.items():
-        for side in SIDES:
-            figure = name.removeprefix(f"retargeting_{side}_")
-            if figure != name:
-                found.setdefault(side, {})[figure] = value
+        if match := re.fullmatch(r"retargeting_(left|right)_(.+)", name):
+            found.setdefault(match[1], {})[match[2]] = value
     return found
 
 

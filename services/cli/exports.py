@@ -40,35 +40,30 @@ What each format keeps and loses: docs/bridges.md
 """
 
 
-def _export_mcap(reader: Reader, path: Path, options: argparse.Namespace) -> int:
+# Formats with one file per episode or recording, and those with all episodes together.
+_SINGLE, _JOINT = ("mcap", "rrd"), ("umi", "lerobot")
+
+
+def _export_one(reader: Reader, path: Path, options: argparse.Namespace) -> int:
+    if options.format == "rrd":
+        from dextouch.bridges.rerun import export_rrd
+
+        return export_rrd(reader, path, overwrite=options.force)
     from dextouch.bridges.mcap import export_mcap
 
     return export_mcap(reader, path, overwrite=options.force, jpeg_quality=options.jpeg_quality)
 
 
-def _export_rrd(reader: Reader, path: Path, options: argparse.Namespace) -> int:
-    from dextouch.bridges.rerun import export_rrd
+def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> int:
+    if options.format == "umi":
+        from dextouch.bridges.umi import export_umi
 
-    return export_rrd(reader, path, overwrite=options.force)
-
-
-def _export_umi(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> int:
-    from dextouch.bridges.umi import export_umi
-
-    return export_umi(readers, options.to, overwrite=options.force)
-
-
-def _export_lerobot(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> int:
+        return export_umi(readers, options.to, overwrite=options.force)
     from dextouch.bridges.lerobot import ExportOptions, export_lerobot
 
     with _replaced(options.to, force=options.force):
         chosen = ExportOptions(fps=options.fps)
         return export_lerobot(readers, options.to, repo_id=options.repo_id, options=chosen)
-
-
-# Formats with one file per episode or recording, and those with all episodes together.
-_SINGLE = {"mcap": _export_mcap, "rrd": _export_rrd}
-_JOINT = {"umi": _export_umi, "lerobot": _export_lerobot}
 
 
 @contextmanager
@@ -127,7 +122,7 @@ def _export(options: argparse.Namespace) -> Report:
     report: Report = {"format": form, "kind": options.kind, "ids": ids}
     shown = progress(ids, f"export {form}", len(ids))
     if form in _JOINT:
-        num_steps = _JOINT[form]((store.open(item_id) for item_id in shown), options)
+        num_steps = _export_all((store.open(item_id) for item_id in shown), options)
         print(f"{to}  {len(ids)} episodes  {num_steps} steps")
         return report | {"path": str(to), "num_steps": num_steps}
     # One file for one id, a folder of files otherwise.
@@ -142,7 +137,7 @@ def _export(options: argparse.Namespace) -> Report:
     files: list[dict[str, object]] = []
     for item_id in shown:
         path = paths[item_id]
-        count = _SINGLE[form](_open(store, options.kind, item_id), path, options)
+        count = _export_one(_open(store, options.kind, item_id), path, options)
         files.append({"id": item_id, "path": str(path), "num_messages": count})
         print(f"{path}  {count} messages")
     return report | {"files": files}

@@ -77,11 +77,6 @@ def quality_bound(text: str) -> tuple[str, float]:
     return name, least
 
 
-def _checked(text: str) -> str:
-    quality_bound(text)
-    return text
-
-
 class CatalogFilter(FrozenModel):
     """Filter of episodes or recordings; omitted fields match anything.
 
@@ -95,7 +90,9 @@ class CatalogFilter(FrozenModel):
     domain: Domain | None = None
     success: bool | None = None
     recovered: bool | None = None
-    min_quality: tuple[Annotated[str, AfterValidator(_checked)], ...] = ()
+    min_quality: tuple[
+        Annotated[str, AfterValidator(lambda text: quality_bound(text) and text)], ...
+    ] = ()
     created_after: AwareDatetime | None = None
     created_before: AwareDatetime | None = None
 

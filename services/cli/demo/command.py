@@ -26,7 +26,7 @@ from services.alignment.settings import AlignmentSettings
 from services.cli.demo import recording, scoring
 from services.cli.demo.settings import TASKS, DemoPlan, parse
 from services.cli.servers import served
-from services.cli.study.parts import refuse_trained
+from services.cli.study.command import refuse_trained
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.command_line import print_scores

@@ -10,7 +10,7 @@ from dextouch.errors import DexTouchError
 from dextouch.worlds import BatchWorld
 from services.cli.demo.settings import TASKS, DemoPlan
 from services.cli.main import run_command
-from services.cli.study.parts import demonstrator, refuse_trained
+from services.cli.study.command import demonstrator, refuse_trained
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE

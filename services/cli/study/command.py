@@ -1,33 +1,42 @@
-"""The commands `dextouch study run` and `dextouch study report`."""
+"""The commands `dextouch study run` and `dextouch study report`, and worlds of a study."""
 
 import argparse
-from contextlib import ExitStack
-from functools import partial
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+from dextouch.clients import RolloutClient
 from dextouch.command_line import CommandParser, add_json
 from dextouch.episodes import EpisodeStore
-from services.cli.study.parts import (
-    connect,
-    demonstrator,
-    refuse_training_seeds,
-    served_worlds,
-)
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.serving import ChildProcess
 from services.evaluation.command_line import (
     EXIT_FAILED,
     instructions_for,
     print_failures,
     print_scores,
 )
+from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.scores import REAL
 from services.evaluation.settings import DEFAULT_PROBE
-from services.evaluation.studies.definition import read_definition
+from services.evaluation.studies.definition import StudyDefinition, WorldChoice, read_definition
 from services.evaluation.studies.engine import StudyParts, cells_of, run_study
 from services.evaluation.studies.policies import PolicyFactory, file_digest
 from services.evaluation.studies.reports import REPORT_FILE, write_reports
 from services.evaluation.studies.results import StudyHeader, StudyResults
+from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_probe import SuccessProbe
+from services.twin.scripted_actions import scripted_actions
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+from services.world_model.checkpoints import default_checkpoint
+from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 
+_CHILD = "services.cli.study.world_process"
 _RUN_EPILOG = """\
 example:
   dextouch study run study.toml
@@ -148,3 +157,126 @@ def _finish(results: StudyResults, json_path: Path | None) -> int:
     print_failures(figures, results.path)
     print(f"\nreport: {results.path.with_name(REPORT_FILE)}")
     return EXIT_FAILED if figures["failures"] else 0
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a world is served."""
+
+    url: str
+    world: str
+    api_key: str | None = None
+
+
+@contextmanager
+def served_worlds(definition: StudyDefinition) -> Iterator[dict[str, Address]]:
+    """Addresses of all worlds by name; those without a URL are served until the block ends.
+
+    Raises:
+        UnavailableError: a process could not serve its world; its messages are above.
+        InvalidInputError: a checkpoint that cannot be served, or a key's variable is not set.
+    """
+    choices = {REAL: definition.real, **definition.imagined}
+    with ExitStack() as children:
+        started: dict[str, ChildProcess] = {}
+        for name, choice in choices.items():
+            if choice.url is None:
+                kind = "builtin" if choice.builtin else "checkpoint"
+                value = choice.builtin or str(choice.checkpoint)
+                started[name] = ChildProcess(
+                    _CHILD,
+                    kind,
+                    value,
+                    str(definition.in_flight),
+                    environment={"OMP_NUM_THREADS": "1"},
+                )
+                children.callback(started[name].close)
+        served = {name: child.receive() for name, child in started.items()}
+        for name, answer in served.items():
+            if "refused" in answer:
+                raise InvalidInputError(f"world {name!r}: {answer['refused']}")
+        yield {
+            name: Address(**served[name]) if name in served else _address(name, choice)
+            for name, choice in choices.items()
+        }
+
+
+def _address(name: str, choice: WorldChoice) -> Address:
+    key, variable = None, choice.api_key_variable
+    if variable is not None and (key := os.environ.get(variable)) is None:
+        raise InvalidInputError(
+            f"world {name!r}: its API key is expected in the variable {variable}, which is not set"
+        )
+    return Address(str(choice.url), str(choice.world), key)
+
+
+def connect(addresses: Mapping[str, Address], connections: ExitStack) -> StudyWorlds:
+    """Open connections to all worlds and ask what they are."""
+    opened = {
+        name: WorldAddress(
+            connections.enter_context(RolloutClient(one.url, one.api_key)), one.world
+        )
+        for name, one in addresses.items()
+    }
+    real = opened.pop(REAL)
+    return StudyWorlds.ask(real, opened)
+
+
+def refuse_training_seeds(definition: StudyDefinition) -> None:
+    """Refuse starts whose task and seed a world model was trained on.
+
+    Raises:
+        ConflictError: a start was trained on.
+        NotFoundError: a checkpoint is missing.
+    """
+    for name, choice in definition.imagined.items():
+        path = default_checkpoint() if choice.builtin == "world-model" else choice.checkpoint
+        if path is None:
+            continue
+        if not path.is_file():
+            raise NotFoundError(
+                f"world {name!r}: no checkpoint {path}; train it, or check the path"
+            )
+        if is_state_checkpoint(path):
+            refuse_trained(name, path, definition.tasks, definition.seeds)
+
+
+def refuse_trained(name: str, checkpoint: Path, tasks: Sequence[str], seeds: Sequence[int]) -> None:
+    """Refuse starts whose task and seed a state model was trained on.
+
+    Content digests miss them where image size or simulator changed since.
+
+    Raises:
+        ConflictError: a start was trained on.
+    """
+    metadata = read_state_checkpoint(checkpoint).metadata
+    for task in tasks:
+        trained = [seed for seed in seeds if metadata.may_have_seen(task, seed)]
+        if trained:
+            low, high = metadata.training_seeds[task]
+            raise ConflictError(
+                f"world {name!r}: trained on task {task!r} with seeds {low} … {high}, and seed "
+                f"{trained[0]} is among those to start from; choose another first_seed, or train "
+                "on others"
+            )
+
+
+def demonstrator(tasks: Sequence[str], seeds: Sequence[int], script: str) -> ReplayPolicy:
+    """The twin's demonstrator, planned for all starts without simulation.
+
+    Raises:
+        UnknownNameError: no such script or task.
+    """
+    stages = {task: _robot_stage(task) for task in tasks}
+    return ReplayPolicy(
+        {
+            (task, seed): scripted_actions(stage, seed, script)
+            for task, stage in stages.items()
+            for seed in seeds
+        }
+    )
+
+
+@lru_cache(maxsize=4)
+def _robot_stage(task: str) -> Stage:
+    return Stage(task, "robot", TwinSettings())

@@ -19,26 +19,20 @@ from dextouch.worlds import (
 from services.cli.servers import served
 
 
-def open_builtin(name: str) -> World[Any]:
-    """The twin, or the world model shipped with the package."""
-    if name == "twin":
+def open_named(kind: str, value: str) -> World[Any]:
+    """The twin, or the world model of a checkpoint or shipped with the package, on one thread."""
+    if (kind, value) == ("builtin", "twin"):
         from services.twin.settings import TwinSettings
         from services.twin.world import TwinWorld
 
         return TwinWorld(TwinSettings())
-    from services.world_model.checkpoints import default_checkpoint
-
-    return open_checkpoint(default_checkpoint())
-
-
-def open_checkpoint(path: Path) -> World[Any]:
-    """A world model of either kind, on one thread."""
     import torch
 
+    from services.world_model.checkpoints import default_checkpoint
     from services.world_model.world import open_world
 
     torch.set_num_threads(1)
-    return open_world(path)
+    return open_world(default_checkpoint() if kind == "builtin" else Path(value))
 
 
 def main() -> None:
@@ -51,7 +45,7 @@ def main() -> None:
     kind, value, batch_size = sys.argv[1:]
     configure_logging(service=f"world {value}", log_format="auto", level="warning")
     try:
-        world = open_builtin(value) if kind == "builtin" else open_checkpoint(Path(value))
+        world = open_named(kind, value)
     except DexTouchError as error:
         answer({"refused": error.message})
         return

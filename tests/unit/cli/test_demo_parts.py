@@ -18,7 +18,7 @@ from services.cli.demo.recording import align, forget_take
 from services.cli.demo.scoring import ladder
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, parse
 from services.cli.servers import bind, served
-from services.cli.study.parts import refuse_trained
+from services.cli.study.command import refuse_trained
 from services.world_model.state_checkpoints import write_state_checkpoint
 from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.bridges.takes import write_episode, write_recording
