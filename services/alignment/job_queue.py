@@ -22,6 +22,7 @@ from dextouch.errors import (
     NotFoundError,
     StorageError,
     StorageFullError,
+    UnavailableError,
 )
 from services.alignment.schemas import ENDED, AlignmentJob, AlignmentList, JobState
 from services.alignment.synchronization.progress import Progress
@@ -56,26 +57,32 @@ class JobQueue:
     leaves them as they were. Belongs to one event loop.
 
     Args:
-        database: which keeps them; loaded here.
         max_open: jobs that may wait or run.
         max_kept: jobs that are remembered; the oldest ended ones are forgotten first.
-
-    Raises:
-        CorruptDataError: the jobs on disk are damaged.
     """
 
-    def __init__(self, database: "JobDatabase", *, max_open: int, max_kept: int) -> None:
+    def __init__(self, *, max_open: int, max_kept: int) -> None:
         self.lock = asyncio.Lock()
         self._max_open, self._max_kept = max_open, max_kept
-        self._database, self._jobs = database, database.load()
+        self._jobs: dict[str, AlignmentJob] = {}
+        self._database: JobDatabase | None = None
 
-    def running(self) -> list[AlignmentJob]:
-        """Jobs at which somebody works, or did when the database was left."""
+    async def open(self, folder: Path) -> list[AlignmentJob]:
+        """Load the jobs kept in a folder; returns those that were running when it was left.
+
+        Raises:
+            ConflictError: another service uses the folder.
+            CorruptDataError: the jobs on disk are damaged.
+        """
+        self._database = await asyncio.to_thread(JobDatabase, folder)
+        self._jobs = await asyncio.to_thread(self._database.load)
         return [job for job in self._jobs.values() if job.state == "running"]
 
     def close(self) -> None:
-        """Release the database."""
-        self._database.close()
+        """Release the folder."""
+        if self._database is not None:
+            self._database.close()
+            self._database = None
 
     def get(self, alignment_id: str) -> AlignmentJob:
         """The current state of a job.
@@ -165,6 +172,8 @@ class JobQueue:
             self._jobs[job.alignment_id] = self._jobs[job.alignment_id].with_progress(progress)
 
     async def _commit(self, removed: Sequence[str], saved: Sequence[AlignmentJob]) -> None:
+        if self._database is None:
+            raise UnavailableError("alignments: the service has not started or is stopping")
         await asyncio.to_thread(self._database.commit, removed, saved)
 
 

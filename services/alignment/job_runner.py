@@ -14,7 +14,7 @@ from dextouch.errors import (
     StorageError,
     UnavailableError,
 )
-from services.alignment.job_queue import RETRY_AFTER_S, JobDatabase, JobQueue
+from services.alignment.job_queue import RETRY_AFTER_S, JobQueue
 from services.alignment.jobs import AlignmentWorker, check_recordings, episode_id_of
 from services.alignment.schemas import ENDED, AlignmentJob, AlignmentRequest
 from services.alignment.settings import AlignmentSettings
@@ -34,9 +34,9 @@ class JobRunner:
 
     def __init__(self, store: EpisodeStore, settings: AlignmentSettings) -> None:
         self._store, self._settings = store, settings
-        # Both by `start`.
-        self.queue: JobQueue
-        self._changed: asyncio.Condition
+        max_open = settings.num_workers + settings.max_waiting
+        self.queue = JobQueue(max_open=max_open, max_kept=settings.max_kept)
+        self._changed = asyncio.Condition(self.queue.lock)
         self._workers = [
             AlignmentWorker(settings.store_url, settings.log_level)
             for _ in range(settings.num_workers)
@@ -53,17 +53,11 @@ class JobRunner:
             ConflictError: another service uses them.
             CorruptDataError: they are damaged.
         """
-        settings = self._settings
-        folder = settings.jobs_folder or Path(self._store.root) / JOBS_FOLDER
-        self.queue = JobQueue(
-            await asyncio.to_thread(JobDatabase, folder),
-            max_open=settings.num_workers + settings.max_waiting,
-            max_kept=settings.max_kept,
-        )
-        self._changed = asyncio.Condition(self.queue.lock)
+        folder = self._settings.jobs_folder or Path(self._store.root) / JOBS_FOLDER
         async with self.queue.lock:
-            for job in self.queue.running():
-                await self.queue.save_if_possible(job.crashed(max_attempts=settings.max_attempts))
+            for job in await self.queue.open(folder):
+                resumed = job.crashed(max_attempts=self._settings.max_attempts)
+                await self.queue.save_if_possible(resumed)
         await asyncio.to_thread(self._store.sweep)
         work = [self._warm_up(), *(self._work(worker) for worker in self._workers)]
         self._tasks = [asyncio.create_task(one) for one in work]

@@ -40,8 +40,9 @@ async def opened(folder):
     async def open_queue(**limits):
         for queue in queues:
             queue.close()
-        queue = JobQueue(JobDatabase(folder), **{"max_open": 100, "max_kept": 100} | limits)
+        queue = JobQueue(**{"max_open": 100, "max_kept": 100} | limits)
         queues.append(queue)
+        await queue.open(folder)
         return queue
 
     yield open_queue
