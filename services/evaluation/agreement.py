@@ -37,7 +37,7 @@ FIGURES: Final[Mapping[str, Callable[..., float]]] = {
     "mean_absolute_error": policy.mean_absolute_error,
 }
 CORRELATIONS: Final = ("pearson", "spearman", "kendall")
-# Assignments of policies that are all tried; of more, this many are drawn.
+# Up to this many assignments of policies are enumerated; otherwise this many are drawn.
 MAX_PERMUTATIONS: Final = 50_000
 
 
@@ -47,7 +47,7 @@ class Figure:
 
     `value` is NaN and `interval` None where it is undefined, as a correlation where all scores of a
     world are equal; `undefined_share` is the share of hierarchical bootstrap draws in which it is.
-    The interval is that of the true scores: noise pulls an observed correlation towards zero, so
+    The interval is that of the true scores: noise biases an observed correlation towards zero, so
     the interval may lie above it.
     """
 
@@ -80,7 +80,7 @@ class Agreement:
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean score of one policy less that of another over the same starts of one world.
+    """Mean score of one policy minus that of another over the same starts of one world.
 
     `p` is the exact or sampled p value of the sign-flip test, two-sided.
     """
@@ -95,7 +95,7 @@ class Difference:
 def task_agreement(
     policies: Sequence[str], scores: MatchedScores, generator: np.random.Generator
 ) -> tuple[Agreement, Draws]:
-    """Agreement of one task, and the draws it rests on.
+    """Agreement of one task, and the draws that its intervals are computed from.
 
     Args:
         policies: names, in the order of the scores.
@@ -125,9 +125,9 @@ def pooled_agreement(
 ) -> Agreement:
     """Agreement over all policies of all tasks at once, each pair one point.
 
-    A pooled correlation also rewards telling easy tasks from hard ones; read it beside those of the
-    tasks. Permutations assign policies within each task only, and `without` leaves a policy out of
-    every task.
+    A pooled correlation also rewards separating easy from hard tasks; read it together with those
+    of the tasks. Permutations assign policies within each task only, and `without` omits a policy
+    in every task.
 
     Args:
         policies: names, the same in every task.

@@ -1,4 +1,4 @@
-"""Baseline image: an earlier image, moved over the table by the camera's known motion."""
+"""Baseline image: an earlier image, warped by the camera's known motion over the table."""
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -12,9 +12,9 @@ def warp_over_table(
     T_world_then: np.ndarray,
     T_world_now: np.ndarray,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """What a camera sees now if all that it saw then lies on the table, the plane z = 0.
+    """Image of a camera now if everything in its earlier image lies on the table plane z = 0.
 
-    Bilinear; beyond the image its edge is repeated. Rays that miss the table are taken as
+    Bilinear; pixels outside the image repeat its edge. Rays that miss the table count as
     infinitely far.
     """
     height, width = image.shape[:2]

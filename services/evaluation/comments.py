@@ -24,7 +24,7 @@ def task_comments(
     """
     both = f"both worlds (real and {world})"
     if agreement["num_starts"] == 0:
-        return [f"No start ended in {both} for every policy: nothing to compare."]
+        return [f"No start was completed in {both} by every policy: nothing to compare."]
     undefined = []
     if agreement["pearson"] == UNDEFINED:
         undefined = [_why_undefined(list(agreement["rates"].values()), world)]
@@ -39,12 +39,12 @@ def task_comments(
 
 
 def _correlation(agreement: Mapping[str, Any]) -> list[str]:
-    """What the correlation can tell: its interval, chance, and the policy that it hangs on."""
+    """Interval and chance level of the correlation, and the policy that influences it most."""
     interval, chance = agreement.get("pearson_interval"), agreement.get("pearson_chance")
     if not isinstance(interval, list) or not isinstance(chance, float):
         return []
     low, high = interval
-    vague = "; these data do not tell a faithful world from a poor one" if low < VAGUE_R else ""
+    vague = "; too wide to tell a faithful world from a poor one" if low < VAGUE_R else ""
     sentences = [
         f"Between the policies' true success rates Pearson's r is {low:.2f} to {high:.2f} (95 %)"
         f"{vague}. {_chance(chance)}"
@@ -59,18 +59,18 @@ def _correlation(agreement: Mapping[str, Any]) -> list[str]:
 
 def _chance(chance: float) -> str:
     share = f"{chance:.2g}" if chance >= 0.001 else "fewer than one in a thousand"
-    return f"Of all ways to pair the policies' rates, {share} correlate as well."
+    return f"Share of all pairings of the policies' rates that correlate at least as well: {share}."
 
 
 def _compared_starts(
     rows: Sequence[Mapping[str, Any]], agreement: Mapping[str, Any], both: str
 ) -> str:
     left_out = [repr(row["policy"]) for row in rows if row["policy"] not in agreement["rates"]]
-    unless = f" except {', '.join(left_out)}, none of whose starts did" if left_out else ""
+    unless = f" except {', '.join(left_out)}, which completed none" if left_out else ""
     num_starts = rows[0]["real_rollouts"] + rows[0]["real_failed"]
     return (
-        f"Agreement rests on {agreement['num_starts']} of {num_starts} starts, those that ended "
-        f"in {both} for every policy{unless}."
+        f"Agreement is computed over {agreement['num_starts']} of {num_starts} starts, those "
+        f"completed in {both} by every policy{unless}."
     )
 
 
@@ -84,7 +84,7 @@ def _size_of_a_step(rows: Sequence[Mapping[str, Any]]) -> str:
     if len(steps) == 1:
         n = next(iter(policies))
         steps = [f"{1 / n:.2f} (N = {n} for each policy)"]
-    return f"One rollout moves a real success rate by {' or '.join(steps)}."
+    return f"One rollout changes a real success rate by {' or '.join(steps)}."
 
 
 def _mean_error(bias: float, world: str) -> str:
@@ -115,8 +115,8 @@ def _widest_gaps(rows: Sequence[Mapping[str, Any]], world: str) -> list[str]:
         if apart:
             row = max(apart, key=lambda r: abs(r["imagined"] - r["real"]))
             sentences.append(
-                f"Counting every rollout that ended, {world} {verb} {len(apart)} of {len(rows)} "
-                "policies beyond chance (95 % intervals apart); farthest off is "
+                f"Over all completed rollouts, {world} {verb} {len(apart)} of {len(rows)} policies "
+                "beyond chance (95 % intervals do not overlap), most of all "
                 f"{row['policy']!r}: {row['real']:.2f} real, {row['imagined']:.2f} imagined."
             )
     return sentences
@@ -124,7 +124,7 @@ def _widest_gaps(rows: Sequence[Mapping[str, Any]], world: str) -> list[str]:
 
 def _why_undefined(rates: Sequence[Mapping[str, float]], world: str) -> str:
     if len(rates) < 2:
-        return "Pearson is undefined: it takes at least two policies."
+        return "Pearson is undefined: it needs at least two policies."
     same_real = len({rate["real"] for rate in rates}) == 1
     side, place = ("real", "the real world") if same_real else ("imagined", world)
     return (

@@ -1,7 +1,7 @@
 """Direct judge: predicts success from the first observation and the commands alone.
 
-It is the baseline for world models, since it imagines nothing. The benefit of a world model is what
-its imagined endings tell beyond this judge, trained on the same episodes for as much CPU time.
+It imagines nothing, so it is the baseline for world models: imagination is useful if imagined
+endings predict success better than this judge, trained on the same episodes for as much CPU time.
 """
 
 from collections.abc import Sequence

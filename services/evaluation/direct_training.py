@@ -129,8 +129,8 @@ def train_direct_judge(
     training, apart = split_by_seed(items, held_out_share=share, salt="direct judge ")
     if len({item.success for item in training}) < 2:
         raise InvalidInputError(
-            f"direct judge: all {len(training)} training episodes ended alike; record with more "
-            "noise levels"
+            f"direct judge: all {len(training)} training episodes have the same outcome, expected "
+            "both; record with more noise levels"
         )
     tasks = tuple(sorted({item.task for item in training}))
     apart = [item for item in apart if item.task in tasks]

@@ -60,7 +60,7 @@ class Ending:
         if len(observation) < NUM_SEEN_STEPS:
             raise InvalidInputError(
                 f"ending: got {len(observation)} steps, expected at least {NUM_SEEN_STEPS}; send "
-                "longer chunks and ask for all steps of the last one"
+                "longer chunks and request all steps of the last one"
             )
         images = observation.images.get(CAMERA)
         poses, doubt = observation.object_poses, observation.doubt

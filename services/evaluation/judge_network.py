@@ -177,7 +177,7 @@ def _check(ending: Ending, shape: ProbeShape) -> None:
     if ending.images is None and ending.object_poses is None:
         raise InvalidInputError(
             f"success probe: an ending of {ending.task!r} has neither images nor object poses; "
-            "ask the world for the images of its last chunk"
+            "request the images of the last chunk"
         )
     if ending.images is not None and ending.images.shape != size:
         raise InvalidInputError(f"success probe: got images {ending.images.shape}, expected {size}")

@@ -1,7 +1,7 @@
-"""Prediction errors of a world on held-out episodes, beside simple baselines.
+"""Prediction errors of a world on held-out episodes, compared with simple baselines.
 
-Only the `World` interface is used, so that all kinds of world models are measured alike: over whole
-open-loop rollouts, from the first observed step to the last.
+Only the `World` interface is used, so that all kinds of world models are measured in the same way:
+over whole open-loop rollouts, from the first observed step to the last.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ _LAST_STEP = ReturnSelector(cameras=(CAMERA,), steps="last")
 
 @dataclass(frozen=True)
 class PredictionResult:
-    """Figures for `report.json`, and one rollout per task as a picture."""
+    """Figures for `report.json`, and the images of one rollout per task."""
 
     figures: dict[str, Any]
     pictures: tuple[PredictionPicture, ...]

@@ -1,10 +1,10 @@
 """Draws of policies' true scores given a few rollouts: posterior, and hierarchical bootstrap.
 
-Ten starts say little about a policy, and a bootstrap of a correlation says it wrongly: noise in the
-scores of both worlds pulls every correlation towards zero, resampling adds the same noise again,
-and nothing in the draws takes it away. `posterior_scores` estimates that noise and takes it out;
-use it for intervals. `bootstrap_scores` is its rival, and tells how often a figure is undefined.
-`python -m benchmarks agreement` measures how often the intervals of both hold the truth.
+Ten starts give little information about a policy, and a bootstrap of a correlation is biased: noise
+in the scores of both worlds shrinks every correlation towards zero, and resampling adds the same
+noise again. `posterior_scores` models that noise; use it for intervals. `bootstrap_scores` is the
+baseline, and shows how often a figure is undefined. `python -m benchmarks agreement` measures how
+often the intervals of both contain the true value.
 """
 
 from dataclasses import dataclass
@@ -165,9 +165,9 @@ def noise_covariance(
 ) -> Float64[np.ndarray, "series series"]:
     """Covariance of the mean scores of several series of rollouts over the same starts.
 
-    Variances count two further rollouts, one of score 0 and one of score 1 (the rule of Agresti and
-    Coull 1998 for binomial rates), so that ten successes of ten are not taken as certain.
-    Correlations are shrunk towards zero, by all of them for four starts and fewer.
+    Variances include two additional rollouts, one of score 0 and one of score 1 (the rule of
+    Agresti and Coull 1998 for binomial rates), so that ten of ten successes are not certainty.
+    Correlations are shrunk towards zero; with four starts or fewer they are zero.
     """
     num_series, num_starts = rollouts.shape
     mean = (rollouts.sum(axis=1) + 1) / (num_starts + 2)
@@ -179,7 +179,7 @@ def noise_covariance(
     unit = np.where(varies[:, None], centred / np.where(varies, size, 1.0)[:, None], 0.0)
     correlation = max(0.0, 1 - _SHRINK_STARTS / num_starts) * (unit @ unit.T)
     correlation[np.arange(num_series), np.arange(num_series)] = 1.0
-    # Rows of equal series are as large as the diagonal; a little more keeps the matrix invertible.
+    # Identical series make the matrix singular; a small diagonal term keeps it invertible.
     correlation += 1e-6 * np.eye(num_series)
     return np.asarray(correlation * np.outer(deviation, deviation))
 
@@ -226,7 +226,7 @@ class _Grid:
     def prior_draws(
         self, index: int, num_draws: int, generator: np.random.Generator
     ) -> Float64[np.ndarray, "draws series"]:
-        """True scores drawn without regard to what each policy was observed to do."""
+        """Draws of the true scores from the prior, not conditioned on the observed scores."""
         mean = (
             self.mean[index] + generator.standard_normal((num_draws, 2)) @ self.mean_factor[index].T
         )

@@ -12,7 +12,7 @@ from services.evaluation.scores import RolloutFailure, RolloutScore
 class ResultLog:
     """Appends rollouts one by one, so that an interrupted study keeps its results.
 
-    Rows of earlier studies are kept; `study`, the start time of this one, tells them apart.
+    Rows of earlier studies are kept and distinguished by `study`, the start time of the study.
 
     Args:
         path: file to append to; it and its folder are created with the first row.

@@ -30,9 +30,7 @@ def robot_episodes(
     for place, store in enumerate(stores, 1):
         names = sorted(store.list(kind="episode"))
         if not names:
-            raise NotFoundError(
-                f"store {place} of the {len(stores)} given holds no episode; check its path"
-            )
+            raise NotFoundError(f"store {place} of {len(stores)}: has no episode; check its path")
         for episode_id in names:
             reader = store.open(episode_id)
             about = reader.attributes
@@ -41,7 +39,7 @@ def robot_episodes(
             if wanted is not None and not wanted(about):
                 continue
             if episode_id in found:
-                raise ConflictError(f"episode {episode_id!r}: in two stores; give it only once")
+                raise ConflictError(f"episode {episode_id!r}: in two stores; pass only one of them")
             found.add(episode_id)
             yield reader
     if not found:

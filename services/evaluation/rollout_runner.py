@@ -55,7 +55,7 @@ class RolloutRunner:
         probe: classifier of imagined success.
         num_steps: steps of a rollout on the model grid.
         shows_all: whether the head camera's images of all steps are requested. Otherwise worlds
-            render only what the policy looks at, and the ending.
+            render only the images that the policy uses, and the ending.
     """
 
     worlds: StudyWorlds
@@ -154,7 +154,7 @@ class RolloutRunner:
             success = rollout.observation.success if world == REAL else None
         if len(seen[-1]) < NUM_SEEN_STEPS:
             raise InvalidInputError(
-                f"{where}: the last chunk shows {len(seen[-1])} steps, expected at least "
+                f"{where}: the last chunk has {len(seen[-1])} steps, expected at least "
                 f"{NUM_SEEN_STEPS}; send longer chunks"
             )
         return PlayedRollout(seen, np.concatenate(commanded), success)

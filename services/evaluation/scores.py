@@ -27,7 +27,7 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class _Compared:
-    """What the agreement over all tasks needs of one of them."""
+    """Data of one task for the agreement over all tasks."""
 
     policies: tuple[str, ...]
     scores: MatchedScores
@@ -111,7 +111,8 @@ class ClosedLoopReport:
         digests = {(s.seed, s.start_digest) for found in scores.values() for s in found}
         if set(scores) | failed != expected or len(digests) != len(dict(digests)):
             raise InvalidInputError(
-                f"scores of {world!r} in {task!r}: the policies began from different starts"
+                f"scores of {world!r} in {task!r}: got policies with different starts, expected "
+                "the same starts for all"
             )
         success = {key: _success_share(found) for key, found in scores.items()}
         rows = [[success.get((p, seed), math.nan) for seed in seeds] for p in self.policies]

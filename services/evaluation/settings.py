@@ -40,14 +40,14 @@ class TrainPolicySettings(BaseSettings):
     tasks: Tasks = ()
     splits: Splits = ()
     imagined: tuple[str, ...] = Field(
-        default=(), description="stores of imagined episodes to train on, too, of all splits"
+        default=(), description="additional stores of imagined episodes; --splits does not apply"
     )
     early_at: float | None = Field(
         default=None,
         gt=0,
         lt=1,
-        description="fraction of training after which an early policy is saved, too, "
-        "beside the output as …_early.safetensors",
+        description="fraction of training after which an early policy is also saved, "
+        "next to the output as …_early.safetensors",
     )
     training: CloningSettings = Field(default=CloningSettings(), description="training settings")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
@@ -124,10 +124,10 @@ class RunSettings(BaseSettings):
     real: ServedWorld = Field(description="world that reports success, such as the twin")
     imagined: dict[str, ServedWorld] = Field(
         default={},
-        description="worlds to compare with it, by their names in the report; optional",
+        description="worlds to compare with the real one, by name in the report; optional",
     )
     seeds: str = Field(description="FIRST:LAST+1, such as 10000:10010")
-    tasks: tuple[str, ...] = Field(default=(), description="tasks; default: all of the probe")
+    tasks: tuple[str, ...] = Field(default=(), description="default: all tasks of the probe")
     policy: tuple[str, ...] = Field(
         default=(), description="custom policy, [NAME=]MODULE:FACTORY; repeatable"
     )
@@ -141,12 +141,14 @@ class RunSettings(BaseSettings):
         default=("behaviour-cloning", "hold"),
         description="bundled policies; [] for none",
     )
-    cloned_policy: Path = Field(default=DEFAULT_POLICY, description="checkpoint of train-policy")
-    probe: Path = Field(default=DEFAULT_PROBE, description="checkpoint of train-probe")
+    cloned_policy: Path = Field(
+        default=DEFAULT_POLICY, description="checkpoint of `dextouch train policy`"
+    )
+    probe: Path = Field(default=DEFAULT_PROBE, description="checkpoint of `dextouch train probe`")
     num_steps: int = Field(default=80, ge=4, description="steps of a rollout, at 15 per second")
     results: Path | None = Field(
         default=None,
-        description="JSON Lines file to which rollouts are appended as they end; default: beside "
+        description="JSON Lines file to which rollouts are appended as they end; default: next to "
         "the report, as .jsonl; not the file of --json or --html",
     )
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
@@ -162,14 +164,13 @@ class RunSettings(BaseSettings):
 
     @model_validator(mode="after")
     def _writes_each_file_once(self) -> "RunSettings":
-        results = "--results" if self.results else "--results (by default beside the report)"
+        results = "--results" if self.results else "--results (by default next to the report)"
         taken: dict[Path, str] = {}
         files = ((results, self.results_path()), ("--json", self.json_path), ("--html", self.html))
         for flag, path in files:
             if path and (other := taken.setdefault(path.resolve(), flag)) != flag:
                 raise ValueError(
-                    f"{other} and {flag} are the same file, {path}; one would overwrite the other: "
-                    "give each its own"
+                    f"{other} and {flag} are the same file, {path}; choose different files"
                 )
         return self
 

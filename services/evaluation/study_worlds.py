@@ -35,7 +35,9 @@ class StudyWorlds:
             InvalidInputError: an imagined world has the name of the real one.
         """
         if REAL in imagined:
-            raise InvalidInputError(f"imagined world {REAL!r}: that is the real one; rename it")
+            raise InvalidInputError(
+                f"imagined world {REAL!r}: this names the real world; choose another name"
+            )
         addresses = {REAL: real, **imagined}
         described = {name: _description(address) for name, address in addresses.items()}
         return cls(addresses, described)
@@ -68,7 +70,7 @@ class StudyWorlds:
         real = self.descriptions[REAL]
         if not real.knows_success or "task_seed" not in real.starts_from:
             raise InvalidInputError(
-                f"real world {real.name!r}: it does not judge success or does not begin from a "
+                f"real world {real.name!r}: does not report success or does not start from a "
                 "task and seed; expected a world that does both, such as the twin"
             )
         if CAMERA not in real.cameras:
@@ -95,15 +97,15 @@ class StudyWorlds:
 def _check_imagined(name: str, world: WorldDescription, real: WorldDescription) -> None:
     if "observation" not in world.starts_from:
         raise InvalidInputError(
-            f"imagined world {name!r}: it begins from {', '.join(world.starts_from)}; expected one "
-            "that begins from an observation of the real world"
+            f"imagined world {name!r}: starts from {', '.join(world.starts_from)}; expected one "
+            "that starts from an observation of the real world"
         )
     missing = [camera for camera in world.cameras if camera not in real.cameras]
     if missing or CAMERA not in world.cameras:
         raise InvalidInputError(
             f"imagined world {name!r}: got cameras {', '.join(world.cameras)}, expected "
-            f"{CAMERA} and only cameras of the real world ({', '.join(real.cameras)}), which its "
-            "first images come from"
+            f"{CAMERA} and only cameras of the real world ({', '.join(real.cameras)}), which "
+            "provides its first images"
         )
     if world.model_rate_hz != real.model_rate_hz:
         raise InvalidInputError(

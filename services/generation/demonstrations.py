@@ -27,9 +27,9 @@ def imagine_episode(
     """Replay an episode's commanded actions in an imagined world and store the result.
 
     The imagined episode starts from the source's first observation. Its `success` is that of the
-    *source*: the true outcome of the actions, which is the label for a success probe on imagined
-    endings. Its lineage names the source and the world's digest. Object poses, if the world
-    provides them, are the stream `object_poses`, from step 1 on.
+    *source*: the real outcome of the actions, and the label for training a success probe on
+    imagined endings. Its lineage names the source and the world's digest. Object poses, if the
+    world provides them, are the stream `object_poses`, from step 1 on.
 
     Args:
         source: a robot episode with head camera, touch and commanded actions.
@@ -54,7 +54,7 @@ def imagine_episode(
         return name
     if "action_commanded" not in source.streams:
         raise InvalidInputError(
-            f"episode {attributes.episode_id!r}: has no commanded actions to play in {world!r}"
+            f"episode {attributes.episode_id!r}: has no commanded actions to replay in {world!r}"
         )
     commanded = source.read("action_commanded").values
     seen = _played(source, commanded, client, world, image_steps)

@@ -128,8 +128,8 @@ class OptimizerLoop:
                 raise NonFiniteError(
                     f"training: gradients of step {self.budget.step} of "
                     f"{type(self._network).__name__} are NaN or infinite ({values}), expected "
-                    "finite ones; no weight was moved: look for NaN in the episodes, or lower the "
-                    "learning rate"
+                    "finite ones; no weight was changed: look for NaN in the episodes, or lower "
+                    "the learning rate"
                 )
         self.optimizer.step()
 

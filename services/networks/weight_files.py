@@ -108,19 +108,19 @@ def read_tensors(path: Path, where: str) -> tuple[dict[str, Tensor], dict[str, s
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             return tensors, file.metadata() or {}
     except SafetensorError as error:
-        raise CorruptDataError(f"{where}: no safetensors file ({error})") from error
+        raise CorruptDataError(f"{where}: not a safetensors file ({error})") from error
 
 
 def _history(text: str | None, history: type[History], key: str, where: str) -> History:
     if text is None:
-        raise CorruptDataError(f"{where}: has no {key!r} metadata; it is no such model of ours")
+        raise CorruptDataError(f"{where}: has no {key!r} metadata, so it is another kind of file")
     expected = history.model_fields["format_version"].default
     try:
         version = json.loads(text).get("format_version", expected)
         if version != expected:
             raise InvalidInputError(
                 f"{where}: format version {version}, expected {expected}; "
-                "train it anew with this version"
+                "train it again with this version"
             )
         return history.model_validate_json(text)
     except (ValidationError, json.JSONDecodeError, AttributeError) as error:
@@ -165,7 +165,7 @@ def load_strictly(
     if missing or foreign:
         raise InvalidInputError(
             f"{where}: {len(missing)} tensors missing {missing[:3]}, {len(foreign)} "
-            f"foreign {foreign[:3]}; expected exactly those of its own network settings"
+            f"unexpected {foreign[:3]}; expected exactly those of its own network settings"
         )
     for name, tensor in found.items():
         wanted = expected[name]

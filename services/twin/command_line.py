@@ -1,4 +1,4 @@
-"""Command line `dextouch twin`: record true episodes of the physics twin to a store."""
+"""Command line `dextouch twin`: record ground-truth episodes of the physics twin to a store."""
 
 import argparse
 import multiprocessing
@@ -72,11 +72,11 @@ def _seed_range(text: str) -> range:
 def _parser() -> argparse.ArgumentParser:
     parser = CommandParser(
         prog="dextouch twin",
-        description="Record true episodes in the physics twin, or serve it as a world.",
+        description="Record ground-truth episodes in the physics twin, or serve it as a world.",
         epilog="example:\n  dextouch twin serve --port 8084",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="{record,serve}")
-    does = "record episodes of a scripted demonstrator with true values"
+    does = "record ground-truth episodes of a scripted demonstrator"
     make = commands.add_parser("record", help=does, description=does.capitalize(), epilog=EXAMPLE)
     make.add_argument("--task", required=True, choices=TASK_NAMES, help="task to demonstrate")
     make.add_argument(
@@ -95,14 +95,18 @@ def _parser() -> argparse.ArgumentParser:
         default=0.0,
         type=float,
         metavar="SHARE",
-        help="share of takes that miss (%(default)s)",
+        help="share of takes whose objects are elsewhere (%(default)s)",
     )
     make.add_argument(
         "--freeze-from", type=int, metavar="STEP", help="freeze commands from a step on (0 … 80)"
     )
     make.add_argument("--motion", choices=MOTION_KINDS, help="replace the script by this motion")
     make.add_argument(
-        "--motion-from", type=int, default=0, metavar="STEP", help="its first step (%(default)s)"
+        "--motion-from",
+        type=int,
+        default=0,
+        metavar="STEP",
+        help="first step of --motion (%(default)s)",
     )
     make.add_argument(
         "--actions-of", type=int, metavar="SEED", help="play the actions of another seed instead"

@@ -35,7 +35,7 @@ class Mix:
     """Shares of the kinds of takes in a data set; they sum to 1.
 
     Scripts: `exact`, with noise of up to 12 (`fine`), 25 (`medium`) or 40 mm (`coarse`) standard
-    deviation, or with the levels `LADDER_M` in turn of the seeds (`ladder`). The other kinds have
+    deviation, or with the levels `LADDER_M` cycled over the seeds (`ladder`). The other kinds have
     the noise of a script: `miss` has displaced objects; `frozen` stops midway and `hold` never
     starts; `retreat`, `push`, `slip` and `wander` are motions of `services.twin.motions`;
     `other_scene` plays the actions of another seed.

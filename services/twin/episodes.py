@@ -1,4 +1,4 @@
-"""Recording of true episodes: all streams of one take, scripted or played, and its success."""
+"""Recording of ground-truth episodes: all streams of one take, scripted or played, and success."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -36,7 +36,7 @@ _MOTION: Final = 101
 
 @dataclass(frozen=True)
 class TruthEpisode:
-    """True values of one take.
+    """Ground truth of one take.
 
     `pad_forces_n` is the true contact force at the tactile rate: normal force on thumb … little tip
     and palm, left then right; pressures times taxel areas sum to it.

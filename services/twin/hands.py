@@ -60,7 +60,7 @@ class HumanHand(HandModel):
 
     Args:
         side: "left" or "right".
-        fingers: of a person, thumb first; default: of average size.
+        fingers: finger tables of a person, thumb first; default: average size.
 
     Raises:
         UnknownNameError: any other side.

@@ -55,7 +55,7 @@ class ObjectBodies:
         """A body and its ancestors up to the child of the world."""
         if body < 0:
             raise InvalidInputError(
-                f"twin scene: got objects {self._names}, expected the name of a body each"
+                f"twin scene: got objects {self._names}, expected names of bodies"
             )
         chain = [body]
         while self._model.body_parentid[chain[-1]] != 0:

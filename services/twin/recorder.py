@@ -1,4 +1,4 @@
-"""Recorder of a simulation's true streams, each sampled at its own rate."""
+"""Recorder of a simulation's ground-truth streams, each sampled at its own rate."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ TACTILE_RATE_HZ: Final = 60
 POSE_RATE_HZ: Final = 100
 KEYPOINT_RATE_HZ: Final = 120
 IMAGE_RATE_HZ: Final = 30
-# Number of final grid steps that always have images, since success is judged on them.
+# Number of final grid steps that always have images, since the success probe needs them.
 NUM_LAST_SHOWN_STEPS: Final = 3
 _NS_PER_S: Final = 1_000_000_000
 
@@ -63,7 +63,7 @@ def _flat(source: Callable[[], np.ndarray]) -> np.ndarray:
 
 
 class Recorder:
-    """Records the true values of one take; call `sample` at every physics step from step 0."""
+    """Records the ground truth of one take; call `sample` at every physics step from step 0."""
 
     def __init__(self, stage: Stage, options: TakeOptions) -> None:
         self._stage = stage

@@ -29,12 +29,12 @@ Actions = Float64[np.ndarray, "80 67"]
 
 
 def script_name(level_mm: float) -> str:
-    """The name of the script that reads places wrongly by so much."""
+    """Name of the script whose object positions are wrong by this much."""
     return f"script {level_mm:g} mm"
 
 
 def scripted_actions(stage: Stage, seed: int, policy: str) -> Actions:
-    """Commands of a policy that does not look, steps 1 … 80, relative to the start's poses.
+    """Open-loop commands of a policy, steps 1 … 80, relative to the start's poses.
 
     Raises:
         UnknownNameError: no such policy.

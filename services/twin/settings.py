@@ -6,7 +6,7 @@ from dextouch.frozen_model import FrozenModel
 
 
 class TwinSettings(FrozenModel):
-    """Cameras of the world, their image size, and the settling time of objects before a take.
+    """Cameras of the twin, their image size, and the settling time of objects before a take.
 
     Rendering a camera takes half as long as the physics, so omit unused ones.
     """

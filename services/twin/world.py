@@ -97,7 +97,7 @@ class TwinWorld:
         """See `World`; the seed determines the poses of hands and objects."""
         if start.observation is not None:
             raise InvalidInputError(
-                "world twin: got a start with an observation; it begins from task and seed only"
+                "world twin: got a start with an observation, expected only a task and seed"
             )
         stage = self.stage(start.task)
         anchor = stage.start(stage.plan(start.seed))
@@ -156,7 +156,7 @@ class TwinWorld:
         if set(fields) != {"world", "task", "seed", "step"} or set(arrays) != {"physics", "anchor"}:
             raise InvalidInputError(
                 f"world twin: got a snapshot with {sorted(fields)} and {sorted(arrays)}, "
-                "expected one that this world made"
+                "expected a snapshot made by this world"
             )
         if fields["world"] != self._description.digest:
             raise InvalidInputError(

@@ -340,7 +340,7 @@ def test_a_batch_answers_as_single_steps_do(candidate, world, started):
 
 def test_a_start_from_an_observation_begins_with_it(candidate, world):
     if "observation" not in world.description.starts_from:
-        pytest.skip("begins from task and seed only")
+        pytest.skip("expected only a task and seed")
     start = from_observation(world)
     if candidate.start is not from_observation:
         with_seed = world.reset(candidate.start(world))

@@ -34,7 +34,7 @@ Token = Annotated[str, Path(pattern=r"^[0-9a-f]{20}$")]
 
 
 class ShownCriterion(FrozenModel):
-    """A criterion as the page asks for it."""
+    """A criterion as the page shows it."""
 
     name: str
     description: str
@@ -166,7 +166,7 @@ def rating_router(
 
 
 def _rater(request: Request, name: str, key: str) -> str:
-    """The rater: with keys the name of the key, so that nobody marks for another.
+    """Name of the rater; with API keys that of the key, so that nobody can mark for another.
 
     Raises:
         ConflictError: another rater than the key's.

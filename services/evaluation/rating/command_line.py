@@ -34,10 +34,8 @@ def report_main(argv: Sequence[str]) -> int:
         )
         print(f"  {found['comment']}")
         if found["less_state_score"] != UNDEFINED:
-            print(f"  people's scores less the twin's own: {found['less_state_score']:+.2f}")
+            print(f"  people's scores minus the twin's own: {found['less_state_score']:+.2f}")
         for row in found["raters"]:
             low, high = row["bias_interval"]
-            print(
-                f"  {row['rater']}: {row['bias']:+.2f} ({low:+.2f} … {high:+.2f}) from the others"
-            )
+            print(f"  {row['rater']}: bias {row['bias']:+.2f} ({low:+.2f} … {high:+.2f})")
     return 0

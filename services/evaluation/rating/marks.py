@@ -1,4 +1,4 @@
-"""Marks that raters gave to rollouts, kept in an SQLite file that only grows."""
+"""Marks that raters gave to rollouts, kept in an append-only SQLite file."""
 
 import json
 import sqlite3
@@ -15,7 +15,7 @@ from dextouch.errors import StorageError
 from dextouch.frozen_model import FrozenModel
 
 RaterName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
-# A rater sees a rollout once, and a few of them a second time.
+# A rater sees every rollout once, and a few rollouts a second time.
 FIRST: Final = 1
 REPEAT: Final = 2
 _SCHEMA: Final = """
@@ -32,12 +32,12 @@ BEGIN SELECT RAISE(ABORT, 'marks are never deleted'); END;
 
 
 class Judgement(FrozenModel):
-    """What a rater says of a rollout.
+    """A rater's judgement of a rollout.
 
-    `holds` has every criterion of the task's rubric, and nothing if the rater `cannot_judge`.
-    `is_inconsistent` says that something physically impossible is seen. `presentation` is 2 when
-    the rater is shown the rollout again, to measure how consistent they are. Programs that judge
-    rollouts are raters of the kind "auto".
+    `holds` has an entry for every criterion of the task's rubric, or none if the rater
+    `cannot_judge`. `is_inconsistent` is true if anything physically impossible is seen.
+    `presentation` is 2 when the rater is shown the rollout again, to measure their consistency.
+    Programs that judge rollouts are raters of the kind "auto".
     """
 
     rater: RaterName
@@ -51,9 +51,7 @@ class Judgement(FrozenModel):
     @model_validator(mode="after")
     def _judges_or_not(self) -> "Judgement":
         if self.cannot_judge == bool(self.holds):
-            raise ValueError(
-                "expected marks for every criterion, or cannot_judge without any of them"
-            )
+            raise ValueError("expected a mark for every criterion, or cannot_judge and no marks")
         return self
 
 
@@ -65,7 +63,7 @@ class Mark(Judgement):
 
 @dataclass(frozen=True)
 class StoredMark:
-    """A mark with its number, which grows, and its time."""
+    """A mark with its increasing number and its time."""
 
     number: int
     rated_at: datetime
@@ -82,7 +80,7 @@ class MarkLog:
         path: SQLite file, created with its folder.
 
     Raises:
-        StorageError: the file cannot be opened, or is no such file.
+        StorageError: the file cannot be opened, or is not a file of marks.
     """
 
     def __init__(self, path: Path) -> None:

@@ -26,7 +26,7 @@ def rated_rollouts(store: EpisodeStore, tasks: Collection[str]) -> list[RatedRol
 
     Args:
         store: of episodes.
-        tasks: tasks with a rubric; episodes of others are left out.
+        tasks: tasks with a rubric; episodes of others are skipped.
 
     Raises:
         InvalidInputError: nothing to rate.
@@ -48,8 +48,8 @@ def rated_rollouts(store: EpisodeStore, tasks: Collection[str]) -> list[RatedRol
             )
     if not found:
         raise InvalidInputError(
-            f"store {store.root}: holds no episode with the stream {CAMERA} of "
-            f"{', '.join(sorted(tasks))}"
+            f"store {store.root}: has no episode of {', '.join(sorted(tasks))} with the stream "
+            f"{CAMERA}, expected at least one"
         )
     return found
 
@@ -57,10 +57,10 @@ def rated_rollouts(store: EpisodeStore, tasks: Collection[str]) -> list[RatedRol
 def state_scores(
     store: EpisodeStore, rollouts: Iterable[RatedRollout], rubrics: Mapping[str, Rubric]
 ) -> dict[str, float]:
-    """Scores of the twin's rollouts by its milestones, by episode id: the truth for raters.
+    """Ground-truth scores of the twin's rollouts, from their milestones, by episode id.
 
-    Rollouts of other worlds, rubrics that the twin cannot judge, and takes whose milestones were
-    not noted have none.
+    Rollouts of other worlds, rubrics that the twin cannot judge, and takes without recorded
+    milestones have none.
     """
     found = {}
     for rollout in rollouts:
@@ -76,7 +76,7 @@ class RolloutPictures:
     """JPEG pictures of single steps: the head image beside taxel maps of both hands."""
 
     def __init__(self, store: EpisodeStore) -> None:
-        # A rater's page asks for the steps of one rollout after the other. Only readers are kept:
+        # The page requests the steps of one rollout after another. Only readers are cached:
         # decoded images of a long rollout would take hundreds of megabytes.
         self._opened = lru_cache(maxsize=16)(store.open)
 

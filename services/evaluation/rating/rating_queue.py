@@ -1,4 +1,4 @@
-"""Queue of rollouts to rate: blinded, balanced, in another order for each rater."""
+"""Queue of rollouts to rate: blinded, balanced, in a different order for each rater."""
 
 import hashlib
 from collections import Counter
@@ -11,7 +11,7 @@ from services.evaluation.rating.marks import FIRST, REPEAT, MarkLog, StoredMark
 
 @dataclass(frozen=True)
 class RatedRollout:
-    """A rollout as raters may know it: nothing says which policy acted in which world.
+    """A rollout as shown to raters, without the policy and the world.
 
     `token` stands for its episode in addresses, since ids of imagined episodes name their world.
     """
@@ -35,21 +35,21 @@ class Assignment:
 
 
 def token_of(episode_id: str) -> str:
-    """Address of an episode that does not tell its id."""
+    """Opaque token that stands for an episode's id in addresses."""
     return hashlib.sha256(f"rated rollout {episode_id}".encode()).hexdigest()[:20]
 
 
 class RatingQueue:
     """Assigns rollouts to raters.
 
-    Rollouts with the fewest raters come first, and ties in an order of each rater's own. After
-    every `1 / repeat_share` rollouts a rater sees one again that lies at least `repeat_gap` marks
-    back. Asking again without rating gives the same rollout.
+    Rollouts with the fewest raters come first; ties are broken by an order specific to the rater.
+    After every `1 / repeat_share` rollouts a rater is shown one again that they rated at least
+    `repeat_gap` marks ago. A repeated request without a mark returns the same rollout.
 
     Args:
         rollouts: to be rated.
         marks: those given so far.
-        raters_per_rollout: people who rate each rollout.
+        raters_per_rollout: number of people who rate each rollout.
         repeat_share: share of rollouts that a rater sees twice.
         repeat_gap: marks between the two.
     """
@@ -73,10 +73,10 @@ class RatingQueue:
         """The rollout behind an address.
 
         Raises:
-            NotFoundError: none of this queue.
+            NotFoundError: no rollout of this queue has the token.
         """
         if token not in self._rollouts:
-            raise NotFoundError(f"rollout {token!r}: is not among those to rate")
+            raise NotFoundError(f"rollout {token!r}: not found among those to rate")
         return self._rollouts[token]
 
     def next(self, rater: str) -> Assignment | None:

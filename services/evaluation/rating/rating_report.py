@@ -1,4 +1,4 @@
-"""Scores of rated rollouts, and how far raters agree."""
+"""Scores of rated rollouts, and the agreement of raters."""
 
 import math
 from collections import defaultdict
@@ -28,11 +28,11 @@ def rating_report(
 ) -> dict[str, Any]:
     """Report entries: scores by rollout, and by task alpha, ICC(2,k), biases and consistency.
 
-    Marks of automatic judges are not scores of people: they are listed by themselves.
+    Marks of programs are listed separately from those of people.
 
     Args:
         marks: those that count (`MarkLog.latest`).
-        task_of: task of each episode id; marks of others are left out and counted.
+        task_of: task of each episode id; marks of others are skipped and counted.
         rubrics: by task.
         state_scores: true scores by episode id, where they are known.
     """
@@ -74,7 +74,7 @@ def _rollouts(
 
 
 def _less_state(rollouts: list[dict[str, Any]]) -> float | str:
-    """Mean of people's scores less true ones, over the rollouts that have both."""
+    """Mean of people's scores minus the ground truth, over the rollouts that have both."""
     both = [row for row in rollouts if UNDEFINED not in {row["score"], row["state_score"]}]
     if not both:
         return UNDEFINED

@@ -17,9 +17,9 @@ _NAME: Final = r"^[a-z][a-z0-9_]{0,63}$"
 class Criterion(FrozenModel):
     """One statement about a rollout that holds or does not.
 
-    `requires` names criteria without which it gives no points. A `latched` criterion holds once it
-    was reached at any time; another one only if it holds at the end. `milestone` is the event of
-    the twin that shows it.
+    `requires` names criteria without which it gives no points. A `latched` criterion holds if it
+    was ever reached, any other only if it holds at the end. `milestone` is the corresponding
+    milestone of the twin.
     """
 
     name: str = Field(pattern=_NAME)
@@ -47,8 +47,8 @@ class Rubric(FrozenModel):
                 raise ValueError(f"criterion {criterion.name!r} is given twice")
             if missing := [name for name in criterion.requires if name not in known]:
                 raise ValueError(
-                    f"criterion {criterion.name!r} requires {missing[0]!r}, which is not among "
-                    f"those before it ({', '.join(known) or 'none'})"
+                    f"criterion {criterion.name!r} requires {missing[0]!r}, expected one of the "
+                    f"criteria before it ({', '.join(known) or 'none'})"
                 )
             known.append(criterion.name)
         return self
@@ -94,7 +94,7 @@ class Rubric(FrozenModel):
     def holds_in_twin(self, event_times_s: Mapping[str, float]) -> dict[str, bool]:
         """Whether each criterion holds in a rollout of the twin, by the times of its milestones.
 
-        The twin notes when a milestone was first reached, so every criterion counts as latched.
+        The twin records when a milestone was first reached, so every criterion counts as latched.
 
         Raises:
             InvalidInputError: a criterion without a milestone, which only people can mark.

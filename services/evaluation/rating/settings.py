@@ -10,15 +10,16 @@ from dextouch.data_folder import default_store
 from dextouch.serving import ServiceSettings, service_config
 
 DEFAULT_MARKS = Path("runs/ratings.sqlite")
-_MARKS = "SQLite file of the marks, which only grows"
+_MARKS = "append-only SQLite file of the marks"
 _RUBRICS = "TOML file of rubrics by task; default: the package's"
 
 
 class RatingSettings(ServiceSettings):
     """Serve a page on which people rate the rollouts of a store, without knowing their origin.
 
-    Every rater sees the rollouts in an order of their own, without policy, world or the marks of
-    others; some they see twice. With API keys, a rater is the name of a key with the scope `rate`.
+    Every rater sees the rollouts in a different order, without policy, world or the marks of
+    others, and some of them twice. With API keys, a rater is the name of a key with the scope
+    `rate`.
 
     Example:
       dextouch rate serve --store-url runs/rollouts --marks runs/ratings.sqlite --port 8087
@@ -35,7 +36,7 @@ class RatingSettings(ServiceSettings):
         default=(), description="tasks to rate; default: all that have a rubric"
     )
     raters_per_rollout: int = Field(
-        default=5, ge=1, le=100, description="people who rate each rollout"
+        default=5, ge=1, le=100, description="number of people who rate each rollout"
     )
     repeat_share: float = Field(
         default=0.08, ge=0, le=0.5, description="share of rollouts that a rater sees twice"
@@ -43,7 +44,7 @@ class RatingSettings(ServiceSettings):
 
 
 class RatingReportSettings(BaseSettings):
-    """Print scores of the rated rollouts of a store, and how far raters agree.
+    """Print the scores of the rated rollouts of a store, and the agreement of raters.
 
     Example:
       dextouch rate report --store-url runs/rollouts --marks runs/ratings.sqlite --json ratings.json

@@ -44,7 +44,7 @@ class PolicyPanel:
 
 @dataclass(frozen=True)
 class Strip:
-    """Images in rows over time: an episode, or truth above prediction."""
+    """Images in rows over time: an episode, or ground truth above prediction."""
 
     title: str
     kind: str
@@ -141,7 +141,7 @@ def _interval(entry: Mapping[str, Any], world: str) -> tuple[float, float]:
 
 
 def strips(pictures: ReportPictures) -> list[Strip]:
-    """Episodes as one row of images, predictions as truth above prediction."""
+    """Episodes as one row of images, predictions below their ground truth."""
     found = [
         Strip(e.title, "episode", [("", moments(e.times_s, e.images, e.tactile_kpa))])
         for e in pictures.episodes

@@ -37,7 +37,7 @@ COMPARISONS: tuple[tuple[str, str, str, tuple[tuple[str, str], ...]], ...] = (
         (
             ("psnr", "world model"),
             ("psnr_copy", "copy the first image"),
-            ("psnr_warp", "first image, moved as the camera"),
+            ("psnr_warp", "first image, warped by the camera motion"),
             ("psnr_hands_still", "model, only the head moves"),
             ("psnr_hold", "model, nothing moves"),
             ("psnr_other_take", "model, another scene's actions"),
@@ -219,7 +219,8 @@ def tiles(report: Mapping[str, Any]) -> list[Tile]:
     if clocks:
         found.append(Tile("worst clock", f"{figure(max(clocks))} ms", "RMS, delay removed"))
     if is_number(errors.get("taxel_iou")):
-        found.append(Tile("touch recorded", figure(errors["taxel_iou"]), "contact IoU with truth"))
+        note = "contact IoU with the ground truth"
+        found.append(Tile("touch recorded", figure(errors["taxel_iou"]), note))
     rivals = [model[k] for k in IMAGE_RIVALS if is_number(model.get(k))]
     if is_number(model.get("psnr")) and rivals:
         gain = model["psnr"] - max(rivals)

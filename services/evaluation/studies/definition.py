@@ -51,7 +51,7 @@ class PolicyChoice(FrozenModel):
 
     `factory` is MODULE:FACTORY with `arguments`; `builtin` a bundled policy; `replay` an episode
     store whose commanded actions are sent; `script` one of the twin's own demonstrators: `script 10
-    mm` reads places wrongly by 10 mm, `retreat` and `another scene's actions` should fail.
+    mm` has object positions wrong by 10 mm, `retreat` and `another scene's actions` should fail.
     """
 
     factory: str | None = None
@@ -99,9 +99,9 @@ class StudyDefinition(FrozenModel):
     @model_validator(mode="after")
     def _is_possible(self) -> "StudyDefinition":
         if len(set(self.tasks)) != len(self.tasks):
-            raise ValueError(f"tasks: expected different ones, got {', '.join(self.tasks)}")
+            raise ValueError(f"tasks: got {', '.join(self.tasks)}, expected no task twice")
         if REAL in self.imagined:
-            raise ValueError(f"imagined: {REAL!r} is the real world; rename it")
+            raise ValueError(f"imagined: {REAL!r} names the real world; choose another name")
         if len(self.tasks) * self.num_starts > MAX_STARTS:
             raise ValueError(
                 f"got {len(self.tasks) * self.num_starts} starts, expected at most {MAX_STARTS}"
@@ -124,7 +124,7 @@ class StudyDefinition(FrozenModel):
     @property
     def digest(self) -> str:
         """SHA-256 of everything that can change a result, if only by rounding."""
-        # Policies that do not look get their last chunk in two parts unless rollouts are kept.
+        # Policies without images get their last chunk in two parts unless rollouts are kept.
         text = self.model_dump_json(exclude={"name"})
         return hashlib.sha256(text.encode()).hexdigest()
 

@@ -191,7 +191,7 @@ class _Workers:
             start, policies[cell.policy], cell.policy, cell.world, cell.repeat
         )
         if isinstance(outcome, RolloutFailure) and outcome.error == UnavailableError.__name__:
-            # A world that is gone would fail all the others, too.
+            # An unavailable world would fail all further rollouts too.
             runner.worlds.addresses[cell.world].client.worlds()
         store = self._parts.store
         if store is not None and played is not None and isinstance(start, MatchedStart):

@@ -41,7 +41,7 @@ def keep_rollout(
 ) -> None:
     """Store a rollout, unless a killed run of the study has done so already.
 
-    `success` is what the world itself reports; a judge's opinion on an imagined rollout is none.
+    `success` is the one reported by the world itself, never the probe's estimate.
     """
     episode_id = rollout_episode_id(header, cell)
     if store.exists(episode_id):

@@ -1,4 +1,4 @@
-"""Results of a study: a file that only grows, one JSON line per rollout, and can be resumed."""
+"""Results of a study: an append-only file of one JSON line per rollout that can be resumed."""
 
 import fcntl
 import json
@@ -160,6 +160,6 @@ def _refuse_others(path: Path, old: Mapping[str, str], new: Mapping[str, str]) -
     changed = [name for name in {**old, **new} if old.get(name) != new.get(name)]
     if changed:
         raise ConflictError(
-            f"results {path}: they are of another study ({', '.join(changed)} changed since); "
+            f"results {path}: belong to another study ({', '.join(changed)} changed); "
             "choose another --folder, or delete this one"
         )

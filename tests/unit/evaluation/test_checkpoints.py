@@ -64,7 +64,7 @@ def test_wrong_files_are_refused(policy_checkpoint, tmp_path):
     whole = path.read_bytes()
     for broken in (b"", b"\x80\x04", whole[:-40]):
         path.write_bytes(broken)
-        with pytest.raises(CorruptDataError, match="no safetensors"):
+        with pytest.raises(CorruptDataError, match="not a safetensors"):
             load_checkpoint(path, kind=KIND)
     path.write_bytes(bytes(3 * MAX_CHECKPOINT_BYTES))
     with pytest.raises(LimitExceededError, match="at most"):

@@ -239,8 +239,8 @@ def test_a_real_world_that_does_not_repeat_itself_has_no_scores(client, probe):
 @pytest.mark.parametrize(
     ("real", "imagined", "num_steps", "message"),
     [
-        ("dream", "dream", 16, "does not judge success"),
-        ("judge", "judge", 16, "begins from task_seed"),
+        ("dream", "dream", 16, "does not report success"),
+        ("judge", "judge", 16, "starts from task_seed"),
         ("judge", "wide", 16, "camera_wrist_left"),
         ("judge", "dream", 18, "multiple of 4"),
     ],

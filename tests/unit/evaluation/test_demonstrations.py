@@ -74,7 +74,7 @@ def test_stores_add_up_but_no_episode_counts_twice(url, tmp_path):
     assert len(ids(EpisodeStore(url), more)) == 25
     with pytest.raises(ConflictError, match="in two stores"):
         ids(EpisodeStore(url), more, EpisodeStore(url))
-    with pytest.raises(NotFoundError, match="store 2 of the 2 given"):
+    with pytest.raises(NotFoundError, match="store 2 of 2"):
         ids(EpisodeStore(url), EpisodeStore(str(tmp_path / "typo")))
 
 

@@ -119,5 +119,5 @@ def test_a_trained_judge_tells_near_from_far(tmp_path):
 def test_episodes_that_all_end_alike_are_refused():
     items = [_labelled(seed) for seed in range(60)]
     failed = [item for item in items if not item.success]
-    with pytest.raises(InvalidInputError, match="ended alike"):
+    with pytest.raises(InvalidInputError, match="same outcome"):
         train_direct_judge(failed, DirectSettings(), command="test")

@@ -195,5 +195,5 @@ async def test_a_foreign_page_cannot_mark(settings):
 def test_nothing_to_rate_is_an_error(settings):
     with pytest.raises(UnknownNameError, match="juggle"):
         create_rating_app(RatingSettings(**settings, tasks=("juggle",)))
-    with pytest.raises(InvalidInputError, match="holds no episode"):
+    with pytest.raises(InvalidInputError, match="has no episode"):
         create_rating_app(RatingSettings(**settings | {"rubrics": None}))

@@ -45,7 +45,7 @@ def test_a_study_without_a_single_imagined_ending_is_reported(
     assert status == 1
     assert "2 of 4 rollouts failed" in shown.err
     assert "hold in dream, 2 x: stuck: this world imagines nothing" in shown.err
-    comment = "No start ended in both worlds (real and dream) for every policy"
+    comment = "No start was completed in both worlds (real and dream) by every policy"
     assert "Pearson undefined, MMRV undefined" in shown.out
     assert comment in shown.out
     report = json.loads((tmp_path / "report.json").read_text())
@@ -82,8 +82,8 @@ def test_a_report_is_written_before_anything_is_printed(
 @pytest.mark.parametrize(
     ("flags", "named"),
     [
-        (["--json", "out.jsonl"], ["--results (by default beside the report)", "--json"]),
-        (["--html", "out.jsonl"], ["--results (by default beside the report)", "--html"]),
+        (["--json", "out.jsonl"], ["--results (by default next to the report)", "--json"]),
+        (["--html", "out.jsonl"], ["--results (by default next to the report)", "--html"]),
         (["--results", "out.json", "--json", "out.json"], ["--results", "--json"]),
         (["--results", "page", "--html", "./page"], ["--results", "--html"]),
         (["--json", "page", "--html", "elsewhere/../page"], ["--json", "--html"]),

@@ -86,10 +86,10 @@ def test_a_world_that_calls_everything_a_success_is_not_perfect():
     assert found["mmrv_interval"][1] > 0.3
     size, step, optimistic, overrated, undefined = whole["comments"]["stand"]
     assert size == (
-        "Agreement rests on 6 of 6 starts, those that ended in both worlds (real and dream) for "
-        "every policy."
+        "Agreement is computed over 6 of 6 starts, those completed in both worlds (real and dream) "
+        "by every policy."
     )
-    assert step == "One rollout moves a real success rate by 0.17 (N = 6 for each policy)."
+    assert step == "One rollout changes a real success rate by 0.17 (N = 6 for each policy)."
     # By hand: (0 + 5/6 + 1) / 3 = 0.61.
     assert optimistic == (
         "On these starts dream is too optimistic: its success rates are 0.61 above the real ones "
@@ -113,7 +113,7 @@ def test_comments_on_strict_and_fair_worlds():
     equal, correlation = fair["comments"]["stand"][2:]
     assert equal.endswith("success rates of dream are +0.00 from the real ones on average.")
     # Three policies: one of six assignments.
-    assert correlation.endswith("Of all ways to pair the policies' rates, 0.17 correlate as well.")
+    assert correlation.endswith("rates that correlate at least as well: 0.17.")
 
 
 def test_a_correlation_that_hangs_on_one_policy_is_named():
@@ -131,7 +131,7 @@ def test_chance_below_its_resolution_is_said_in_words():
     # Eight policies in the same order: 1 of 8! = 40,320 pairings correlates as well.
     marks = {name: "1" * k + "0" * (8 - k) for k, name in enumerate("abcdefgh")}
     sentences = report({"real": marks, "dream": marks}).to_report()["comments"]["stand"]
-    assert any("policies' rates, fewer than one in a thousand correlate" in s for s in sentences)
+    assert any("at least as well: fewer than one in a thousand" in s for s in sentences)
 
 
 def test_agreement_of_all_tasks_correlates_all_policies_of_all_tasks():
@@ -219,12 +219,12 @@ def test_one_policy_that_fails_narrows_the_agreement_and_the_comments_say_so():
     found = lost(whole, *(("real", "c", seed) for seed in range(1, 20)))
     size, step, mean, gap, undefined = found["comments"]["stand"]
     # Only start 0 is left, from which every policy succeeds in both worlds.
-    assert size.startswith("Agreement rests on 1 of 20 starts, those that ended in both worlds")
+    assert size.startswith("Agreement is computed over 1 of 20 starts, those completed in both")
     assert step == (
-        "One rollout moves a real success rate by 0.05 (N = 20: 'a', 'b') or 1.00 (N = 1: 'c')."
+        "One rollout changes a real success rate by 0.05 (N = 20: 'a', 'b') or 1.00 (N = 1: 'c')."
     )
     assert mean.startswith("On these starts the success rates of dream are +0.00 from the real")
-    assert gap.startswith("Counting every rollout that ended, dream overrates 1 of 3 policies")
+    assert gap.startswith("Over all completed rollouts, dream overrates 1 of 3 policies")
     assert "'b': 0.25 real, 1.00 imagined" in gap
     assert "on these starts every policy has the same success rate (1.00) in the real" in undefined
     assert found["agreement"]["stand"]["rates"] == {
@@ -236,8 +236,8 @@ def test_a_policy_without_a_start_that_ended_twice_is_named_as_left_out():
     gone = [("model", "c", seed) for seed in range(4)]
     found = lost(report(GOOD), *gone)
     assert found["comments"]["stand"][0] == (
-        "Agreement rests on 4 of 4 starts, those that ended in both worlds (real and model) for "
-        "every policy except 'c', none of whose starts did."
+        "Agreement is computed over 4 of 4 starts, those completed in both worlds (real and model) "
+        "by every policy except 'c', which completed none."
     )
     assert list(found["agreement"]["stand"]["rates"]) == ["a", "b"]
 
@@ -246,7 +246,8 @@ def test_policies_that_ended_from_different_starts_are_not_compared():
     pair = report({"real": {"a": "10", "b": "01"}, "dream": {"a": "10", "b": "01"}})
     found = lost(pair, ("dream", "a", 0), ("dream", "b", 1))
     assert found["comments"]["stand"] == [
-        "No start ended in both worlds (real and dream) for every policy: nothing to compare."
+        "No start was completed in both worlds (real and dream) by every policy: "
+        "nothing to compare."
     ]
 
 

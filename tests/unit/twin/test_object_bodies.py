@@ -126,7 +126,7 @@ def test_parts_that_cannot_both_be_there_are_refused(furnished):
     [
         ('<body name="thing"><geom size="0.01"/></body>', "'thing'"),
         ('<body name="thing"><joint type="ball"/><geom size="0.01"/></body>', "'thing'"),
-        ('<body name="other"/>', "name of a body"),
+        ('<body name="other"/>', "names of bodies"),
     ],
 )
 def test_bodies_that_cannot_be_placed_are_refused(objects, message):
