@@ -1,1 +1,1 @@
-"""Benchmarks of a checkout: time and error of each stage beside other implementations."""
+"""Benchmarks of a checkout: time and error of each stage, compared with other implementations."""

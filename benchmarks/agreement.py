@@ -1,4 +1,4 @@
-"""Entry point of the benchmark stage `agreement`: how often intervals hold the truth."""
+"""Entry point of the benchmark stage `agreement`: coverage of the intervals of an evaluation."""
 
 import argparse
 import math
@@ -37,7 +37,7 @@ DISAGREEMENTS: Final = (0.0, 0.05, 0.2, 0.5)
 NUM_POLICIES: Final = (3, 6, 10)
 NUM_STARTS: Final = 10
 # Correlation, on the scale of a normal variable, of the outcomes of different policies from the
-# same start: objects that lie badly are bad for all.
+# same start: unfavourable object poses are unfavourable for all.
 SHARED: Final = 0.5
 # The paper's largest table: 4 tasks of 3 policies, 10 starts and 5 raters.
 PAPER: Final = (3, 10, 5)
@@ -60,7 +60,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Tally:
-    """How often a method's intervals held the truth, and how wide they were."""
+    """Coverage and median width of a method's intervals."""
 
     held: float
     width: float
@@ -73,7 +73,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Simulate studies of known truth, and time both methods on a study of the paper's size.
+    """Simulate studies with known true rates, and time both methods on one of the paper's size.
 
     Raises:
         InvalidInputError: no study.
@@ -119,7 +119,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 def simulated_study(
     num_policies: int, disagreement: float, generator: np.random.Generator
 ) -> tuple[Truth, MatchedScores]:
-    """A study of policies of random skill from ten starts, with the rates behind it."""
+    """A study of policies of random skill from ten starts, with their true rates."""
     real = generator.uniform(0.05, 0.95, num_policies)
     imagined = np.clip(real + generator.normal(0, disagreement, num_policies), 0.02, 0.98)
     luck = generator.standard_normal(NUM_STARTS)
@@ -150,10 +150,10 @@ def coverage(
                 defined = draws[name][np.isfinite(draws[name])]
                 if 2 * len(defined) < plan["draws"]:
                     continue
-                # A bootstrap is read by its quantiles, as is usual.
+                # A bootstrap interval consists of quantiles, as is usual.
                 shortest = method == OURS and name in CORRELATIONS
                 interval = (shortest_interval if shortest else central_interval)(defined)
-                # A truth at the edge of what is possible (r = 1) is met within a thousandth.
+                # A true value at its limit (r = 1) counts as covered within a thousandth.
                 hit = interval.low - 1e-3 <= truth.figure(name) <= interval.high + 1e-3
                 held[method, name].append((hit, interval.high - interval.low))
     return {
@@ -185,7 +185,7 @@ def timed(num_rounds: int) -> dict[str, Figure]:
 def coverage_table(
     name: str, found: Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]]
 ) -> ResultTable:
-    """How often the 95 % interval of a figure holds the truth, and its median width."""
+    """Coverage and median width of the 95 % intervals of a figure."""
     rows = []
     for (num_policies, disagreement), tallies in found.items():
         row = [f"{num_policies} policies, {disagreement:g} apart"]
@@ -206,7 +206,7 @@ def time_table(times_s: Mapping[str, Figure]) -> ResultTable:
 def mean_held(
     found: Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]], method: str, name: str
 ) -> float:
-    """Share of all simulated studies whose interval holds the truth."""
+    """Share of all simulated studies whose interval contains the true value."""
     held = [tallies[method, name].held for tallies in found.values()]
     return float(np.nanmean(held))
 
@@ -215,7 +215,7 @@ def panel(
     found: Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]],
     times_s: Mapping[str, Figure],
 ) -> Panel:
-    """Time of a study against how far the intervals of Pearson's r are from holding 95 %."""
+    """Time of a study against the distance of the coverage for Pearson's r from 95 %."""
     points = [
         Point(
             label=name,
@@ -235,7 +235,7 @@ def requirements(
     found: Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]],
     times_s: Mapping[str, Figure],
 ) -> list[Requirement]:
-    """What the evaluation promises of its intervals."""
+    """Requirements on the intervals of an evaluation."""
     return [
         *(
             Requirement(

@@ -21,9 +21,9 @@ EXIT_MISSED = 1
 # Columns of the tables without a terminal.
 WIDTH = 200
 DESCRIPTION = (
-    "Time a stage of the platform against its error, beside its rivals. All designs are measured "
-    "in turns in one run, so that a busy machine is busy for all of them; figures are medians "
-    "over the rounds with their spread."
+    "Measure time and error of a stage of the platform, compared with other implementations. All "
+    "are measured alternately in one run, so that other load affects them equally; figures are "
+    "medians over the rounds with their spread."
 )
 
 
@@ -62,7 +62,7 @@ def usage() -> str:
             "",
             *rows,
             "",
-            "`python -m benchmarks STAGE --help` says what a stage measures and takes.",
+            "`python -m benchmarks STAGE --help` describes a stage and its options.",
             "",
             "example:",
             "  python -m benchmarks store --quick",

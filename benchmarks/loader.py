@@ -30,13 +30,13 @@ LEARNING = "training, windows in memory"
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
-    parser.add_argument("--store", help="read this store instead of making twin episodes")
+    parser.add_argument("--store", help="read this store instead of recording twin episodes")
     parser.add_argument(
-        "--episodes", type=int, help=f"twin episodes to make ({_USUAL['episodes']}; quick 4)"
+        "--episodes", type=int, help=f"twin episodes to record ({_USUAL['episodes']}; quick 4)"
     )
     parser.add_argument("--rounds", type=int, help=f"rounds ({_USUAL['rounds']}; quick 1)")
     parser.add_argument(
-        "--batches", type=int, help=f"batches a round ({_USUAL['batches']}; quick 2)"
+        "--batches", type=int, help=f"batches per round ({_USUAL['batches']}; quick 2)"
     )
     parser.add_argument(
         "--workers", default="0,1,2", metavar="A,B", help="worker processes (%(default)s)"
@@ -44,7 +44,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Time the loader and the training step in turns.
+    """Time the loader and the training step alternately.
 
     Raises:
         InvalidInputError: no episode, round or batch, or invalid numbers of workers.
@@ -67,7 +67,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         panels=[],
         requirements=[requirement(rates)],
         data={"windows_per_s": {name: list(figure.values) for name, figure in rates.items()}},
-        notes=["the episodes lie in the memory of the operating system: no disk is waited for"],
+        notes=["the episodes are in the page cache, so disk latency is not included"],
     )
 
 
@@ -88,7 +88,7 @@ def rate_table(rates: Mapping[str, Figure], num_episodes: int) -> ResultTable:
 
 
 def requirement(rates: Mapping[str, Figure]) -> Requirement:
-    """Requirement on the loader; unmeasured if its usual worker was not run."""
+    """Requirement on the loader; unmeasured if the default number of workers was not run."""
     loader = rates.get(loading(USUAL_WORKERS))
     figure = None if loader is None else loader.over(rates[LEARNING]).median
     what = f"{loading(USUAL_WORKERS)}, times what training consumes"

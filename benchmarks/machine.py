@@ -59,8 +59,8 @@ def refuse_shape_checks() -> None:
     """
     if any(type(finder).__module__.startswith("jaxtyping") for finder in sys.meta_path):
         raise ConflictError(
-            "bench: this process checks array shapes at every call, which would be timed too; "
-            "start `python -m benchmarks` in a process of its own"
+            "bench: this process checks array shapes at every call, which would distort timings; "
+            "run `python -m benchmarks` in a separate process"
         )
 
 

@@ -1,7 +1,7 @@
 """Trace of the files and functions that data passes through: packet, image, upload, chunk, window.
 
-`python -m benchmarks.walks` prints one row a walk. A walk is long where one concept lives in many
-places; counted are functions of `services` and `dextouch` that are entered on the way.
+`python -m benchmarks.walks` prints one row per trace (*walk*): the number of files and functions of
+`services` and `dextouch` that are entered. A long walk indicates a concept spread over many places.
 """
 
 import argparse
@@ -49,10 +49,10 @@ _PREFIXES = tuple(f"{root}/" for root in _ROOTS)
 
 @dataclass
 class Walk:
-    """What a piece of data passed through.
+    """Files and functions that a piece of data passed through.
 
     Attributes:
-        calls: how often each function of ours was entered, by (file, function).
+        calls: number of calls by (file, function).
         per_thread: the same by thread.
     """
 
@@ -71,7 +71,7 @@ class Walk:
         return len(self.calls)
 
     def num_calls(self, function: str, *, threads: str = "") -> int:
-        """How often a function was entered, in threads whose names begin so."""
+        """Number of calls of a function, in threads whose names begin with `threads`."""
         return sum(
             count
             for (thread, _, name), count in self.per_thread.items()
@@ -80,7 +80,7 @@ class Walk:
 
 
 class Tracer:
-    """Profile function that notes entries of our functions, in threads whose names begin so."""
+    """Profile function that counts calls, in threads whose names begin with `threads`."""
 
     def __init__(self, name: str, threads: str = "") -> None:
         self.walk = Walk(name)
@@ -108,7 +108,7 @@ class Tracer:
 
     @contextmanager
     def installed(self) -> Iterator["Tracer"]:
-        """Trace this thread and those that start meanwhile, while `is_on`."""
+        """Trace this thread and those started in the context, while `is_on`."""
         threading.setprofile(self)
         sys.setprofile(self)
         try:
@@ -120,7 +120,7 @@ class Tracer:
 
     @contextmanager
     def on(self) -> Iterator[None]:
-        """Count what happens meanwhile."""
+        """Count calls in the context."""
         self.is_on = True
         try:
             yield
@@ -129,10 +129,10 @@ class Tracer:
 
 
 def _place(code: CodeType) -> tuple[str, str] | None:
-    """File and function of one of our functions; mock devices are not on the way."""
+    """File and function of one of our functions, except those of mock devices."""
     prefix = next((p for p in _PREFIXES if code.co_filename.startswith(p)), None)
-    # Comprehensions belong to the function around them. Modules and class bodies are entered when
-    # they are imported, which is no part of a walk.
+    # Comprehensions belong to the enclosing function. Module and class bodies run on import, which
+    # does not count.
     is_function = code.co_flags & inspect.CO_NEWLOCALS and not code.co_name.startswith("<")
     if prefix is None or not is_function or code.co_filename.startswith(_MOCKS):
         return None
@@ -156,7 +156,7 @@ def packet_to_spool(stream: str, *, links: MockLinks | None = None) -> Walk:
             streams, FaultScript(), 0, VirtualClock(), spool_root=Path(folder), links=links
         ) as station,
     ):
-        # The connection was made; what follows is the take alone.
+        # Connected; from here on only the take is traced.
         tracer.is_on = True
         station.run_take(TakePrompt(task=TASK, instruction=TASK))
         tracer.is_on = False
@@ -187,10 +187,10 @@ def upload() -> Walk:
 
 
 def action_chunk_walk(world: World[Any] | None = None) -> Walk:
-    """From a policy's answer to the observation of its chunk, on both sides of HTTP.
+    """From a policy's chunk to its observation, on both sides of HTTP.
 
     Args:
-        world: served; by default the baseline, which has no inside.
+        world: world to serve; default: the baseline, which computes nothing.
     """
     shown = world or CopyFirstWorld(tasks=(TASK,))
     tracer = Tracer(f"action chunk, {shown.description.name}")
@@ -252,7 +252,7 @@ def window_into_training(store_url: str) -> Walk:
 
 
 def clock_stamp() -> Walk:
-    """From a stamp and an arrival to the estimated time of a sample, as they come in."""
+    """From timestamp and arrival to the estimated time of a sample, online."""
     clock = OnlineClock()
     tracer = Tracer("clock stamp")
     with tracer.installed(), tracer.on():

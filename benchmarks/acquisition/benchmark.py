@@ -29,14 +29,14 @@ _BLOCKS = 500
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
     parser.add_argument(
-        "--packets", type=int, help=f"a family over the bad line ({_USUAL['packets']}; quick 2000)"
+        "--packets", type=int, help=f"packets per family ({_USUAL['packets']}; quick 2000)"
     )
-    parser.add_argument("--rounds", type=int, help=f"of timing ({_USUAL['rounds']}; quick 1)")
+    parser.add_argument("--rounds", type=int, help=f"timing rounds ({_USUAL['rounds']}; quick 1)")
     parser.add_argument(
-        "--seconds", type=float, help=f"of eight gloves, thrice ({_USUAL['seconds']:g}; quick 1)"
+        "--seconds", type=float, help=f"length of three runs ({_USUAL['seconds']:g}; quick 1)"
     )
-    parser.add_argument("--splits", type=int, help=f"of a stream ({_USUAL['splits']}; quick 5)")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random (%(default)s)")
+    parser.add_argument("--splits", type=int, help=f"random splits ({_USUAL['splits']}; quick 5)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed (%(default)s)")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
@@ -101,9 +101,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "eight_gloves": runs,
         },
         notes=[
-            "justfloat has no checksum: errors that leave a possible reading are delivered by any "
-            "decoder; its stream says so in its capabilities",
-            "cameras: raw images are checked and JPEG images looked at too, one of 10 decoded",
+            "justfloat has no checksum: no decoder can detect errors that leave a plausible "
+            "reading; the stream's capabilities declare this",
+            "camera times include the quality checks; one in 10 JPEG images is decoded",
         ],
     )
 

@@ -1,4 +1,4 @@
-"""Packet families of gloves: packet generators, our decoders and rival decoders."""
+"""Packet families of gloves: packet generators, our decoders and baseline decoders."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ NO_CELL_SHARE = 0.3
 
 @runtime_checkable
 class Feed(Protocol):
-    """Decoder that maps bytes to the samples (rivals: payloads) of completed packets."""
+    """Decoder that maps bytes to the samples (baselines: payloads) of completed packets."""
 
     def __call__(self, data: bytes, /) -> Sequence[bytes] | Sequence[Sample]:
         """Decode the next bytes."""
@@ -62,12 +62,12 @@ class Family:
 
     @property
     def ways(self) -> dict[str, Callable[[], Feed]]:
-        """Our decoder beside its rivals."""
+        """Our decoder and the baselines, by name."""
         return {"ours": lambda: self.decoder().feed, **self.rivals}
 
 
 class FixedLength:
-    """Rival: whatever follows a mark is a packet of the usual length; nothing is checked."""
+    """Baseline: whatever follows a mark is a packet of the usual length; nothing is checked."""
 
     def __init__(self, mark: bytes, size: int, payload: slice) -> None:
         self._mark, self._size, self._payload = mark, size, payload
@@ -91,7 +91,7 @@ class FixedLength:
 
 
 class MarkAlone:
-    """Rival: a packet is what lies between two marks."""
+    """Baseline: a packet is what lies between two marks."""
 
     def __init__(self, mark: bytes, payload: slice) -> None:
         self._mark, self._payload = mark, payload
@@ -111,7 +111,7 @@ class MarkAlone:
 
 
 class TailAlone:
-    """Rival for packets that end with a mark: whatever stands before it, if the length fits."""
+    """Baseline for packets that end with a mark: the bytes before it, if their length fits."""
 
     def __init__(self, mark: bytes) -> None:
         self._mark = mark

@@ -1,4 +1,4 @@
-"""Decoding of packets from a noisy serial line, by our decoder and its rivals."""
+"""Decoding of packets from a noisy serial line, by our decoder and the baselines."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,1 +1,1 @@
-"""Benchmark of alignment, from a recorded take to an episode, against the true motion."""
+"""Benchmark of alignment, from a recorded take to an episode, against ground truth."""

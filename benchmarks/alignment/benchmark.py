@@ -30,11 +30,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rounds", type=int, help=f"rounds a take ({USUAL_ROUNDS}; quick {QUICK_ROUNDS})"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of motions and faults (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed (%(default)s)")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Record takes, then align each with every method in turns.
+    """Record takes, then align each alternately with every method.
 
     Raises:
         InvalidInputError: a take that is too short, or no round.
@@ -58,11 +58,10 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         requirements=requirements(longest),
         data={"takes": [{name: asdict(one) for name, one in found.items()} for found in results]},
         notes=[
-            "processor time of all threads, so times of real time are those of one core; the clock "
-            "fits are timed apart, right after the alignment, and taken off the calibration; "
-            "arrivals need none",
-            "gloves are calibrated by a take under known pressures and by their answers, other "
-            "path delays are wrong by 0.2 ms (sigma); the transfer over HTTP is not in these times",
+            "processor time of all threads, so multiples of real time refer to one core; clock "
+            "fits are timed separately after the alignment and subtracted from the calibration",
+            "gloves are calibrated with a take under known pressures and by time requests, other "
+            "path delays have errors of 0.2 ms (sigma); the transfer over HTTP is not included",
         ],
     )
 

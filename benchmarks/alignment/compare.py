@@ -1,4 +1,4 @@
-"""Alignment of recorded takes by the product and by arrival stamps, timed by steps."""
+"""Alignment of recorded takes as in the service and by arrival times, timed by steps."""
 
 import shutil
 import time
@@ -44,7 +44,7 @@ METHODS = (OURS, LINEAR, NEAREST)
 STORING, FITS, CALIBRATION = "storing the upload", "clock fits", "calibration"
 STEPS = (STORING, FITS, CALIBRATION, "resampling", "retargeting", "writing")
 OPTIONS = AlignmentOptions()
-# Arrival stamps are interpolated across every gap.
+# Arrival times are interpolated across every gap.
 ANY_GAP_NS = 10**12
 
 OnStage = Callable[[str], None]
@@ -52,7 +52,7 @@ OnStage = Callable[[str], None]
 
 @dataclass(frozen=True)
 class MethodResult:
-    """One method on one take: processor seconds by step, wall time, errors against the truth.
+    """One method on one take: processor seconds by step, wall time, errors against ground truth.
 
     `alignment_s` is all but the storing; `wall_s` is the wall time of the same.
     """
@@ -81,7 +81,7 @@ class _Run:
 def compare(
     take: RecordedTake, num_rounds: int, folder: Path, *, bar: Bar
 ) -> dict[str, MethodResult]:
-    """Align a take with every method in turns, each time in a new store.
+    """Align a take alternately with every method, each time in a new store.
 
     Args:
         take: in the spool.
@@ -133,7 +133,7 @@ def _run(recorded: RecordedTake, method: str, folder: Path, round_index: int) ->
 
 
 def _clock_fits_s(recording: RecordingReader) -> float:
-    """Processor time of reading the stamps of all streams and fitting their clocks."""
+    """Processor time of reading the timestamps of all streams and fitting their clocks."""
     begin_s = time.process_time()
     for name, descriptor in recording.streams.items():
         time_stream(recording.stamps(name), descriptor)
@@ -145,8 +145,8 @@ def align_by_arrivals(
 ) -> str:
     """Align a recording as if every sample had been taken when it arrived.
 
-    There is no clock model, no path delay and no gap: values are converted and hands retargeted as
-    in the product. Returns the episode's id.
+    There is no clock model, no path delay and no gap; values are converted and hands retargeted as
+    in the service. Returns the episode's id.
 
     Args:
         store: of recording and episode.
@@ -155,7 +155,7 @@ def align_by_arrivals(
         nearest: steps take the nearest sample instead of interpolating.
     """
     recording = store.recording(recording_id)
-    # The clock fits inside are timed apart and taken off again.
+    # The clock fits inside are timed separately and subtracted.
     streams = {name: _by_arrival(date_stream(recording, name)) for name in recording.streams}
     on_stage("placing")
     start_ns, gridded = _on_grid(streams, nearest=nearest)
@@ -193,7 +193,7 @@ def align_by_arrivals(
 
 
 def _by_arrival(stream: DatedStream) -> DatedStream:
-    """The stream with arrival stamps as times."""
+    """The stream with arrival times as sample times."""
     arrival_ns = stream.recording.stamps(stream.name).t_host_ns
     kept = first_arrivals(arrival_ns)
     report = ClockReport(stream=stream.name, method="arrival", num_samples=len(kept))

@@ -1,4 +1,4 @@
-"""Simulated takes of any length whose truth is known, recorded through a mock station."""
+"""Simulated takes with ground truth, recorded through a mock station."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ Truth = tuple[StreamDescriptor, Int64[np.ndarray, " n"], np.ndarray]
 
 @dataclass(frozen=True)
 class RecordedTake:
-    """A take in a station's spool, with the truth that the mock devices played."""
+    """A take in a station's spool, with the ground truth that the mock devices replayed."""
 
     seconds: float
     take: MockTake
@@ -41,8 +41,8 @@ def record(seconds: float, seed: int, folder: Path) -> RecordedTake:
     """Record a take of a two-handed station: gloves, keypoints, poses and a camera.
 
     The devices have the clock drift, jitter, delays, noise and losses of `FaultScript.first_light`,
-    and the gloves are calibrated by a take of their own. The hands are those of the robot, so that
-    the true joint angles are known; only the truth holds them, as `joints_measured`.
+    and the gloves are calibrated with a separate take. The hands are those of the robot, so that
+    the true joint angles are known; only the ground truth contains them, as `joints_measured`.
 
     Args:
         seconds: length of the take.
@@ -99,13 +99,13 @@ def _times_ns(seconds: float, rate_hz: float) -> Int64[np.ndarray, " n"]:
 
 
 def _waves(t_ns: np.ndarray, num: int, rng: np.random.Generator) -> Float64[np.ndarray, "n k"]:
-    """Sines of 0.2 to 0.7 Hz, the pace of hands at work."""
+    """Sines of 0.2 to 0.7 Hz, typical frequencies of manipulation."""
     turns = rng.uniform(0.2, 0.7, num) * (t_ns[:, None] * 1e-9) + rng.random(num)
     return np.sin(2 * np.pi * turns)
 
 
 def _pressures_kpa(t_ns: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A patch of contact that wanders over the taxels and comes and goes."""
+    """A contact patch that moves over the taxels, appears and disappears."""
     centre, strength = np.split(_waves(t_ns, 2, rng), 2, axis=1)
     across = (np.arange(NUM_TAXELS) - 160 - 150 * centre) / 12
     return (30 * np.maximum(strength, 0) * np.exp(-(across**2))).astype(np.float32)

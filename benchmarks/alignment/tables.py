@@ -76,7 +76,7 @@ def _point(result: MethodResult, what: str) -> Point:
 
 
 def requirements(results: Results) -> list[Requirement]:
-    """Speed and errors of the product on one take."""
+    """Requirements on speed and errors of the alignment service, on one take."""
     ours = results[OURS]
     speed = Requirement(
         "stored and aligned, times real time of one core", ours.speed.median, "at least", MIN_SPEED

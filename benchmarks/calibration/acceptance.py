@@ -59,9 +59,9 @@ def notes(results: Results) -> list[str]:
     for name in (OURS, OURS_POSES):
         rotation, translation = not_worse_share(results[name], results[PARK], tolerance_sigmas=0.0)
         told.append(
-            f"{name}: without any tolerance its error is at most Park's in {rotation:.0%} of the "
-            f"seeds (rotation) and {translation:.0%} (translation). Both see the same noise: even "
-            "the smaller of two typical errors is not the smaller one in nearly every seed."
+            f"{name}: without tolerance its error is at most Park's in {rotation:.0%} of the seeds "
+            f"(rotation) and {translation:.0%} (translation). Both use the same noisy data, so "
+            "even the better estimator does not have the smaller error in every seed."
         )
     return told
 

@@ -27,7 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seeds", type=int, help=f"hand-eye scenes ({USUAL['seeds']}; quick {QUICK['seeds']})"
     )
-    parser.add_argument("--views", type=int, default=20, help="of a hand-eye scene (%(default)s)")
+    parser.add_argument("--views", type=int, default=20, help="views per scene (%(default)s)")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:

@@ -116,7 +116,7 @@ def not_worse_share(
         InvalidInputError: ours has no sigma.
     """
     if ours.sigma_deg is None or ours.sigma_mm is None:
-        raise InvalidInputError(f"{ours.name}: has no sigma to compare within")
+        raise InvalidInputError(f"{ours.name}: has no sigma to define the tolerance")
 
     def share(errors: Figure, others: Figure, sigmas: Figure) -> float:
         limits = np.array(others.values) + tolerance_sigmas * np.array(sigmas.values)

@@ -27,7 +27,7 @@ class SceneResult:
         num_refused: number of refusals by ours.
         num_named: number of refusals that name axes to add.
         cause: message of the first refusal.
-        rivals: rival → median error, or that it refuses or returns NaN.
+        rivals: other method → median error, or that it refuses or returns NaN.
     """
 
     name: str

@@ -137,5 +137,5 @@ def _quiet_opencv() -> ModuleType:
 def _finite(name: str, R: object, t: object) -> Float64[np.ndarray, "4 4"]:
     T = transform(np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64).ravel())
     if not np.isfinite(T).all():
-        raise DegenerateRotationError(f"{name}: OpenCV gives NaN and says nothing")
+        raise DegenerateRotationError(f"{name}: OpenCV returns NaN without an error")
     return T

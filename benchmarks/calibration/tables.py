@@ -55,7 +55,7 @@ def tables(
             ],
         ),
         ResultTable(
-            "Scenes that show no mount (rivals: median error of what they answer)",
+            "Degenerate scenes (other methods: median error of their results)",
             ("scene", "ours refuses", "axes named", *RIVALS),
             [
                 (

@@ -1,1 +1,1 @@
-"""Benchmark of device clocks against simulated truth, beside rival methods."""
+"""Benchmark of device clocks against simulated ground truth, compared with other methods."""

@@ -24,10 +24,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seconds", type=float, help=f"length of a take ({_USUAL['seconds']:g}; quick 60)"
     )
-    parser.add_argument("--rounds", type=int, help=f"takes a scene ({_USUAL['rounds']}; quick 1)")
-    parser.add_argument("--seed", type=int, default=0, help="of the first round (%(default)s)")
+    parser.add_argument("--rounds", type=int, help=f"takes per scene ({_USUAL['rounds']}; quick 1)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first round (%(default)s)")
     names = ", ".join([*SCENES, *MORE_SCENES, *STOP_SCENES]).replace("%", "%%")
-    parser.add_argument("--scenes", metavar="A,B", help=f"only these, by comma (all: {names})")
+    parser.add_argument("--scenes", metavar="A,B", help=f"comma-separated scenes (all: {names})")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
@@ -54,14 +54,14 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         requirements=requirements(results, stampless),
         data={"results": [result.to_data() for result in (*results, *stampless)]},
         notes=[
-            f"online errors count after {WARM_UP_S:g} s and, in scenes with a step, not within "
-            "1.2 s of it; a round is a take with a seed of its own"
+            f"online errors exclude the first {WARM_UP_S:g} s and, in scenes with a step, 1.2 s "
+            "after it; each round is a take with a different seed"
         ],
     )
 
 
 def _plan(options: argparse.Namespace) -> dict[str, Any]:
-    """What the options say, else the usual or the quick numbers."""
+    """Values of the options, otherwise the usual or the quick defaults."""
     defaults: Mapping[str, float] = _QUICK if options.quick else _USUAL
     given = {name: getattr(options, name) for name in defaults}
     plan = {name: given[name] if given[name] is not None else defaults[name] for name in defaults}

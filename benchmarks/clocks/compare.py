@@ -58,7 +58,7 @@ class Result:
 def compare(
     scenes: Mapping[str, Scene], *, seconds: float, num_rounds: int, seed: int, bar: Bar
 ) -> list[Result]:
-    """Run ours and all rivals in every scene, in turns."""
+    """Run all methods alternately in every scene."""
     ways: list[tuple[str, Way, bool]] = [(name, way, True) for name, way in ONLINE.items()]
     ways += [(name, way, False) for name, way in OFFLINE.items()]
     return _compare(scenes, ways, (seconds, num_rounds, seed), bar)
@@ -99,7 +99,7 @@ def _measure(way: Way, takes: list[Take], is_online: bool, index: int) -> tuple[
     began_ns = time.thread_time_ns()
     estimate_ns = way(take)
     spent_ns = time.thread_time_ns() - began_ns
-    # Copying arrivals costs less than the clock can tell.
+    # Copying arrivals takes less time than the clock can resolve.
     return score(estimate_ns, take, is_online=is_online), max(spent_ns, 1) / 1e3 / len(take)
 
 

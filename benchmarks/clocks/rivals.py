@@ -1,4 +1,4 @@
-"""Methods that estimate sample times: ours, and rivals such as regression and block minima."""
+"""Methods that estimate sample times: ours, and others such as regression and block minima."""
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -91,7 +91,7 @@ def block_minima(take: Take) -> Int64[np.ndarray, " n"]:
     stop_s, least = x_s[0] + BLOCK_S, (x_s[0], y_ns[0])
     offsets = []
     for x, y in zip(x_s.tolist(), y_ns.tolist(), strict=True):
-        # A clock that went back ends a block too.
+        # A clock that decreases also ends a block.
         if not stop_s - BLOCK_S <= x < stop_s:
             minima = [*minima[1 - LINE_BLOCKS :], least]
             slope, level = _robust_line(np.array(minima))
@@ -119,7 +119,7 @@ def _points(take: Take) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, 
 
 
 def half_tick_ns(scene: Scene) -> int:
-    """Half a tick, the mean truncation of stamps, which fits to the earliest arrivals must add."""
+    """Half a tick, the mean truncation of timestamps, which fits to minimum delays must add."""
     return scene.tick_ns // 2
 
 

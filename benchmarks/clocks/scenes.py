@@ -1,8 +1,7 @@
-"""Simulated takes of device clocks with known truth, by scene and seed.
+"""Simulated takes of device clocks with ground truth, by scene and seed.
 
 A device samples at its own rate by its own clock; its packets are delayed by queues and bus
-polling, keep their order, and some are lost. The truth is known, so that every method can be
-scored.
+polling, keep their order, and some are lost. The true sample times are known.
 """
 
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from jaxtyping import Int64
 
 from dextouch.errors import InvalidInputError, UnknownNameError
 
-# The constant path delay, unobservable from one-way stamps, is subtracted before scoring.
+# The constant path delay, unobservable from one-way timestamps, is subtracted before scoring.
 BASE_DELAY_NS = 2_000_000
 # Crystals drift with the room temperature over minutes.
 WANDER_PERIOD_S = 120.0
@@ -39,8 +38,8 @@ class Scene:
         num_stops: number of stops, evenly spread.
         late_path_ms: additional path delay from the middle on, for a quarter of the take, a minute
             at most.
-        wrong_stamps: share of stamps that are wrong by +20 ms.
-        tick_ns: resolution of the device's stamps.
+        wrong_stamps: share of timestamps that are wrong by +20 ms.
+        tick_ns: resolution of the device's timestamps.
     """
 
     rate_hz: float = 60.0
@@ -61,11 +60,11 @@ class Scene:
 
 @dataclass(frozen=True)
 class Take:
-    """A simulated take: recorded data and truth.
+    """A simulated take: recorded data and ground truth.
 
     Attributes:
         sequence: numbers of the samples that arrived, counted by the device.
-        t_device_ns: the device's stamps.
+        t_device_ns: the device's timestamps.
         t_host_ns: arrivals on the host's clock.
         true_ns: true sampling times, on the host's clock.
         step_true_ns: time of the clock step; None if there is none.
@@ -91,14 +90,14 @@ SCENES = {
     "step -30 ms": Scene(step_ms=-30.0),
     "wander 5 ppm": Scene(wander_ppm=5.0),
 }
-# Beyond the seven: coarse stamps, and steps that hide among delays.
+# Not among the seven: coarse timestamps, and steps that are smaller than the delays.
 MORE_SCENES = {
     "stamps of 1 ms": Scene(tick_ns=1_000_000),
     "step -9 ms": Scene(step_ms=-9.0),
     "step -3 ms": Scene(step_ms=-3.0),
     "restart -5 s": Scene(step_ms=-5000.0),
 }
-# What breaks the rule that delays only add and clocks run on.
+# Violations of the assumptions that delays only add and clocks never stop.
 STOP_SCENES = {
     "stop 50 ms": Scene(stop_ms=50.0),
     "stop 500 ms": Scene(stop_ms=500.0),
@@ -107,7 +106,7 @@ STOP_SCENES = {
     "path +20 ms for a minute": Scene(late_path_ms=20.0),
     "0.2 % of stamps +20 ms": Scene(wrong_stamps=0.002),
 }
-# For streams without stamps: only how many samples got lost makes them hard.
+# For streams without timestamps, whose only difficulty is the number of lost samples.
 STAMPLESS_SCENES = {
     "0 % lost": Scene(drops=0.0),
     "0.2 % lost": Scene(drops=0.002),
@@ -171,5 +170,5 @@ def _arrivals(scene: Scene, true_s: np.ndarray, rng: np.random.Generator) -> np.
     num_late = min(num // 4, round(LATE_PATH_S * scene.rate_hz))
     delay_s[num // 2 : num // 2 + num_late] += scene.late_path_ms * 1e-3
     grid_s = scene.grid_ms * 1e-3
-    # Nothing overtakes: a late packet holds up those behind it.
+    # Packets keep their order: a late packet delays those behind it.
     return np.asarray(np.maximum.accumulate(np.ceil((true_s + delay_s) / grid_s) * grid_s))

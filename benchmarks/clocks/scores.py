@@ -31,7 +31,7 @@ class Score:
 
 
 def score(estimate_ns: np.ndarray, take: Take, *, is_online: bool) -> Score:
-    """Compare with the truth; online fits are not scored in the warm-up and right after a step."""
+    """Compare with the true times; online fits are not scored in the warm-up and after a step."""
     error_ms = (estimate_ns - take.true_ns - BASE_DELAY_NS) * 1e-6
     age_s = (take.true_ns - take.true_ns[0]) * 1e-9
     counts = np.ones(len(take), dtype=bool)

@@ -18,7 +18,7 @@ _TINY_US = 1e-3
 
 
 def tables(results: Sequence[Result], stampless: Sequence[Result]) -> list[ResultTable]:
-    """Errors of all methods in all scenes, streams without stamps, steps, and costs."""
+    """Errors of all methods in all scenes, streams without timestamps, steps, and costs."""
     found = [
         _error_table("RMS error in ms, constant path delay removed", results, "rms_ms"),
         _error_table("99th percentile of the error in ms", results, "p99_ms"),

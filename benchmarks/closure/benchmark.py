@@ -1,4 +1,4 @@
-"""The benchmark stage `closure`: human takes of the twin, played again by its robot hand."""
+"""The benchmark stage `closure`: human takes of the twin, replayed by its robot hand."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -27,10 +27,10 @@ Played = Mapping[tuple[str, Method], Sequence[ClosureTake]]
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of this stage."""
     parser.add_argument(
-        "--takes", type=int, metavar="N", help=f"human takes a task ({NUM_TAKES}; quick 1)"
+        "--takes", type=int, metavar="N", help=f"human takes per task ({NUM_TAKES}; quick 1)"
     )
     parser.add_argument(
-        "--tasks", default=",".join(TASKS), metavar="A,B", help="of the twin (%(default)s)"
+        "--tasks", default=",".join(TASKS), metavar="A,B", help="tasks of the twin (%(default)s)"
     )
 
 

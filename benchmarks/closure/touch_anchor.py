@@ -1,10 +1,9 @@
-"""Correction of retargeted joint angles that puts touching fingertips where the human's were.
+"""Correction of retargeted joint angles that moves fingertips in contact to the human positions.
 
-Bone directions make the robot's hand look like the human's, but larger: around an object its
-fingertips miss the places that the human's touched. Pinches are closed by the solver; with an
-object in between, only touch shows which fingertips matter. Those are led to the human's places,
-each finger by its own four joints, staying near the retargeted angles. Fingers that touch nothing
-keep them.
+Retargeting by bone directions gives the same posture, but on a larger hand: around an object its
+fingertips miss the human contact points. The solver closes pinches; with an object in between, only
+touch shows which fingertips matter. Those are moved to the human positions, each finger by its own
+four joints, near the retargeted angles. Fingers without contact are unchanged.
 """
 
 from dataclasses import dataclass
@@ -17,21 +16,21 @@ from benchmarks.closure.wrist_transfer import MatchedPoints
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
 
-# Half a grasp converges to micrometres in a handful of steps; unreachable places take a few more.
+# A few steps converge to micrometres; unreachable positions take more.
 _ITERATIONS: Final = 15
-# A share of the way below this moves a fingertip by micrometres: those fingers are left alone.
+# Smaller shares would move a fingertip by micrometres only: these fingers are unchanged.
 _NO_SHARE: Final = 1e-3
 
 
 @dataclass(frozen=True)
 class TouchAnchorOptions:
-    """How touch takes hold of fingertips.
+    """Influence of touch on fingertips.
 
     Args:
-        reach_s: a touch counts exp(-|Δt| / reach) at other times, so that fingers come and go
-            smoothly.
-        half_force_n: with this force (times that factor) a fingertip goes half of the way.
-        stay_m2_rad2: pull towards the retargeted angles beside the place of the fingertip.
+        reach_s: time constant: a contact has the weight exp(-|Δt| / reach) at other times, so that
+            the correction is smooth.
+        half_force_n: force (times that weight) at which a fingertip is moved half of the distance.
+        stay_m2_rad2: weight of the deviation from the retargeted angles.
     """
 
     reach_s: float = 0.3
@@ -52,15 +51,15 @@ def anchored_joints(
     shares: np.ndarray,
     options: TouchAnchorOptions | None = None,
 ) -> Float64[np.ndarray, "time 20"]:
-    """Joint angles, inside the limits, that lead touching fingertips to the human's places.
+    """Joint angles, inside the limits, that move fingertips in contact to the human positions.
 
     Args:
-        hand: the robot's.
-        joints_rad: [T, 20] as retargeted, inside the limits.
-        points: of both hands at these angles (`matched_points`).
-        offset_m: [T, 3] of the robot's wrist in the human's (`touch_offsets_m`).
-        shares: [T, 5] how much of the way each fingertip goes (`touch_shares`).
-        options: None takes the defaults.
+        hand: robot hand.
+        joints_rad: [T, 20], retargeted angles inside the limits.
+        points: points of both hands at these angles (`matched_points`).
+        offset_m: [T, 3], offset of the robot's wrist in the human wrist frame (`touch_offsets_m`).
+        shares: [T, 5], share of the distance that each fingertip is moved (`touch_shares`).
+        options: default: `TouchAnchorOptions()`.
 
     Raises:
         ShapeError: lengths that differ.
@@ -89,16 +88,18 @@ def anchored_joints(
 def touch_shares(
     pad_forces_n: np.ndarray, t_s: np.ndarray, options: TouchAnchorOptions | None = None
 ) -> Float64[np.ndarray, "time 5"]:
-    """How much of the way to the human's place each fingertip goes: 0 free, near 1 in touch.
+    """Share of the distance to the human position that each fingertip is moved.
+
+    It is 0 without contact and near 1 with contact.
 
     Args:
         pad_forces_n: [T, 6], thumb … little fingertip and palm, 0 or more.
-        t_s: [T] rising times.
-        options: None takes the defaults.
+        t_s: [T] increasing times.
+        options: default: `TouchAnchorOptions()`.
 
     Raises:
         ShapeError: lengths that differ.
-        InvalidInputError: times that do not rise, or forces that are negative or not finite.
+        InvalidInputError: times that do not increase, or forces that are negative or not finite.
     """
     options = options or TouchAnchorOptions()
     forces, times = np.asarray(pad_forces_n, dtype=np.float64), np.asarray(t_s, dtype=np.float64)
@@ -109,7 +110,7 @@ def touch_shares(
         )
     if not ((np.diff(times) > 0).all() and (forces >= 0).all() and np.isfinite(forces).all()):
         raise InvalidInputError(
-            "touch anchor: times must rise, forces be finite and 0 or more; sort and calibrate them"
+            "touch anchor: expected increasing times and finite forces ≥ 0; sort and calibrate them"
         )
     near = forces[:, :NUM_FINGERS].copy()
     keep = np.exp(-np.diff(times) / options.reach_s)
@@ -123,7 +124,7 @@ def touch_shares(
 def fingertip_jacobians(
     hand: RobotHand, joints_rad: np.ndarray
 ) -> tuple[Float64[np.ndarray, "time 5 3"], Float64[np.ndarray, "time 5 3 4"]]:
-    """Fingertips (m, wrist) and how each moves with its finger's joints (m/rad): axis × arm."""
+    """Fingertips (m, wrist frame) and their Jacobians for the finger's joints (m/rad)."""
     frames, tips = hand.joint_frames(joints_rad), hand.fingertips_m(joints_rad)
     axes = np.array([[row.axis for row in finger.joints] for finger in hand.fingers])
     axes_wrist = (frames[..., :3, :3] @ axes[..., None])[..., 0]

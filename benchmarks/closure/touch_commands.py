@@ -1,17 +1,17 @@
-"""Commands that make a position-controlled hand press as hard as the human did.
+"""Commands with which a position-controlled hand reproduces the forces of a human take.
 
-What a person does is recorded as it was reached: joint angles and wrists stop at the object,
-however hard they press. A servo that is commanded to go exactly there presses with nothing and
-drops it. It presses with stiffness × (commanded - reached); so the command must lead what was
-reached by the force that the glove felt, over the stiffness:
+A human recording contains reached poses: joint angles and wrists stop at the object, however hard
+they press. A servo that is commanded to a reached pose exerts no force and drops the object. It
+exerts stiffness × (commanded - reached), so the command must lead the reached pose by the force
+that the glove measured, divided by the stiffness:
 
     q_commanded = q + Jᵀ f / k,   wrist_commanded = wrist + (F / k_F, M / k_M)
 
-f is the force with which each place (fingertips, palm) presses; F and M are their sum and moment.
-Taxels measure how hard, not in which direction: pads are round. What a hand holds is pressed from
-several sides that balance each other, but for weight. So forces along the pads' normals are
-changed as little as balance asks. If little is left of them then, nothing in the hand balances
-them (a palm against the other hand, a finger on a button) and they stay along the normals.
+f is the force of each pad (fingertips, palm); F and M are their sum and moment. Taxels measure the
+magnitude of a force, not its direction. The forces on a held object balance, except for its weight,
+so the balanced forces nearest to the pads' normals are used. If these are nearly zero, nothing in
+the hand opposes them (a palm against the other hand, a finger on a button), and the forces along
+the normals are used.
 """
 
 from dataclasses import dataclass
@@ -27,23 +27,23 @@ from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
 
-# Turning is weighed against pushing with a lever of about half a grasp.
+# Lever that converts moments to forces, about half the size of a grasp.
 _LEVER_M: Final = 0.05
-# Forces that are out of balance by less are left so.
+# Imbalances below this are tolerated.
 _SLACK_N: Final = 1e-3
-# A hand holds something if balance leaves at least this share of what was felt.
+# A hand holds an object if the balanced forces are at least this share of the measured ones.
 _HOLDING_SHARE: Final = 0.4
 _PALM_SIGN: Final = {"left": -1.0, "right": 1.0}
 
 
 @dataclass(frozen=True)
 class HandServos:
-    """How stiff a position-controlled hand and its arm are, measured or from the maker.
+    """Stiffness of a position-controlled hand and its arm, measured or from the manufacturer.
 
     Args:
-        finger_nm_rad: of every finger joint.
-        wrist_n_m: of the wrist against being pushed; a stiffer arm leads less.
-        wrist_nm_rad: of the wrist against being turned.
+        finger_nm_rad: stiffness of every finger joint.
+        wrist_n_m: translational stiffness of the wrist.
+        wrist_nm_rad: rotational stiffness of the wrist.
     """
 
     finger_nm_rad: float
@@ -71,14 +71,14 @@ def commands_from_touch(
     pad_forces_n: np.ndarray,
     servos: HandServos,
 ) -> HandCommands:
-    """Commands of one hand; where nothing touches, exactly what is to be reached.
+    """Commands of one hand; without contact, exactly the poses to be reached.
 
     Args:
         hand: kinematics.
-        Ts_world_wrist: [T, 4, 4] poses that the robot's wrist is to reach.
-        joints_rad: [T, 20] angles that it is to reach, inside the limits.
-        pad_forces_n: [T, 6] N, how hard thumb … little fingertip and palm are to press.
-        servos: stiffness of the hand that will be commanded.
+        Ts_world_wrist: [T, 4, 4], target poses of the robot's wrist.
+        joints_rad: [T, 20], target angles, inside the limits.
+        pad_forces_n: [T, 6], target forces of thumb … little fingertip and palm.
+        servos: stiffness of the commanded hand.
 
     Raises:
         ShapeError: lengths that differ.
@@ -107,10 +107,10 @@ def commands_from_touch(
 def pressing_forces_n(
     hand: RobotHand, joints_rad: np.ndarray, pad_forces_n: np.ndarray
 ) -> Float64[np.ndarray, "time 6 3"]:
-    """The force (N, wrist axes) with which fingertips and palm press, and never more than felt.
+    """Force (N, wrist axes) of each fingertip and the palm, never larger than measured.
 
-    Minimises Σ |f_i - F_i n_i|² / F_i, F_i felt along the normal n_i of place i, plus the square of
-    what is out of balance (forces, and torques about the middle of touch) over a slack.
+    Minimises Σ |f_i - F_i n_i|² / F_i, with the measured F_i along the normal n_i of pad i, plus
+    the squared imbalance (of forces, and of moments about the centre of contact) over a slack.
 
     Raises:
         ShapeError: lengths that differ.
@@ -123,7 +123,7 @@ def pressing_forces_n(
             f"touch commands: got forces {felt_n.shape}, expected [{len(joints_rad)}, {NUM_PADS}]"
         )
     if not np.isfinite(felt_n).all():
-        raise NonFiniteError("touch commands: forces hold NaN or infinity; mask those samples")
+        raise NonFiniteError("touch commands: forces contain NaN or infinity; mask those samples")
     if (felt_n < 0).any():
         raise InvalidInputError(
             f"touch commands: got {felt_n.min()} N, expected 0 or more; tare the glove"
@@ -141,7 +141,7 @@ def pressing_forces_n(
 
 
 def _normals(hand: RobotHand, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 6 3"]:
-    """Where each place presses: off the last phalanx on its palm side, and off the palm."""
+    """Normal of each pad: on the palmar side of the last phalanx, and of the palm."""
     tips = hand.joint_frames(joints_rad)[:, :, -1, :3, 1]
     palm = np.broadcast_to(np.array([0.0, 1.0, 0.0]), (len(tips), 1, 3))
     return np.concatenate([tips, palm], axis=1) * _PALM_SIGN[hand.side]
@@ -150,7 +150,7 @@ def _normals(hand: RobotHand, joints_rad: np.ndarray) -> Float64[np.ndarray, "ti
 def _balanced(
     places_m: np.ndarray, along_n: np.ndarray, felt_n: np.ndarray
 ) -> Float64[np.ndarray, "time 6 3"]:
-    """Closed form of the balance: f - W Aᵀ (A W Aᵀ + slack)⁻¹ A f, W the felt forces."""
+    """Closed form of the balance: f - W Aᵀ (A W Aᵀ + slack)⁻¹ A f, with W the measured forces."""
     share = (felt_n / felt_n.sum(axis=1, keepdims=True))[..., None]
     arms = places_m - (share * places_m).sum(axis=1, keepdims=True)
     A = np.zeros((*felt_n.shape, 6, 3))

@@ -1,14 +1,13 @@
-"""Placement of the robot's wrist such that its hand touches where the human's did.
+"""Offset of the robot's wrist that puts its contact points where the human's were.
 
-A robot hand is larger than the human's and its knuckles lie elsewhere. With the human's wrist pose
-copied, its fingertips and palm are centimetres beside those of the human, and so is its grasp.
-What matters are the places that touch, so the robot's wrist is shifted, in the axes of the wrist,
-until the points that touch lie where the human's were:
+A robot hand is larger than a human one and has different proportions. With a copied wrist pose its
+fingertips and palm are centimetres away from those of the human, and so is its grasp. The wrist is
+therefore shifted, in wrist axes, until the points in contact match the human's:
 
     T_world_robot = T_world_human @ T_human_robot,  T_human_robot = (identity rotation, offset)
 
-The orientation stays the human's: `docs/twin_closure.md` measures what turning it as well does.
-No task and no object is known here, only both hands and, if there is a glove, its touch.
+The orientation is unchanged. Neither task nor object is used, only both hands and, with a glove,
+its touch.
 """
 
 from dataclasses import dataclass
@@ -27,12 +26,12 @@ NUM_PADS = 6
 
 @dataclass(frozen=True)
 class MatchedPoints:
-    """The places of thumb … little fingertip and palm of both hands, each in its own wrist.
+    """Positions of thumb … little fingertip and palm of both hands, each in its own wrist frame.
 
     Attributes:
-        human_m: of the person; zero where not seen.
+        human_m: of the person; zero where not tracked.
         robot_m: of the robot at the retargeted joint angles.
-        seen: whether the person's nodes of that place were tracked.
+        seen: whether the person's nodes of that point were tracked.
     """
 
     human_m: Float64[np.ndarray, "time 6 3"]
@@ -41,19 +40,19 @@ class MatchedPoints:
 
     @property
     def offset_m(self) -> Float64[np.ndarray, "time 6 3"]:
-        """How far the robot's wrist must be shifted for each place to meet; zero where not seen."""
+        """Wrist offset that makes each point match; zero where not tracked."""
         return np.where(self.seen[..., None], self.human_m - self.robot_m, 0.0)
 
 
 @dataclass(frozen=True)
 class WristTransferOptions:
-    """How touch decides about the offset.
+    """Influence of touch on the offset.
 
     Args:
-        reach_s: a touch counts exp(-|Δt| / reach) at other times: the approach is made with the
-            offset of the grasp that follows.
-        anchor_n_s: what the constant offset counts beside touch (force × time). Far from every
-            touch, and without any, the constant offset is all there is.
+        reach_s: time constant: a contact has the weight exp(-|Δt| / reach) at other times, so an
+            approach uses the offset of the grasp that follows.
+        anchor_n_s: weight of the constant offset relative to touch (force × time). Far from any
+            contact, and without contact, only the constant offset counts.
     """
 
     reach_s: float = 0.3
@@ -74,8 +73,8 @@ def matched_points(
 
     Args:
         keypoints_m: [T, 25, 3], metres, wrist axes; NaN marks a missing node.
-        joints_rad: [T, 20], what retargeting made of them.
-        hand: the robot's, of the same side.
+        joints_rad: [T, 20], retargeted angles.
+        hand: robot hand of the same side.
 
     Raises:
         ShapeError: other shapes.
@@ -98,7 +97,7 @@ def matched_points(
 
 
 def robot_places_m(joints_rad: np.ndarray, hand: RobotHand) -> Float64[np.ndarray, "time 6 3"]:
-    """Thumb … little fingertip and palm of the robot in its wrist, metres, for joints [T, 20]."""
+    """Thumb … little fingertip and palm (m) of the robot in its wrist frame, for joints [T, 20]."""
     chains = hand.chain_points_m(joints_rad)
     return np.concatenate([chains[:, :, 3], _palm_m(np.zeros(3), chains[:, 1:, 0])], axis=1)
 
@@ -108,15 +107,14 @@ def _palm_m(wrist_m: np.ndarray, knuckles_m: np.ndarray) -> np.ndarray:
 
 
 def constant_offset_m(points: MatchedPoints) -> Float64[np.ndarray, "3"]:
-    """The one offset that matches all places of all samples best (least squares: their mean).
+    """Constant offset that matches all points of all samples best (least squares: their mean).
 
     Raises:
-        InvalidInputError: no place was ever seen.
+        InvalidInputError: no point was ever tracked.
     """
     if not points.seen.any():
         raise InvalidInputError(
-            "wrist transfer: got no sample with a fingertip or the palm, expected at least one; "
-            "the tracker lost the hand all the time"
+            "wrist transfer: got no sample with a tracked fingertip or palm, expected at least one"
         )
     return np.asarray(points.offset_m[points.seen].mean(axis=0))
 
@@ -127,28 +125,28 @@ def touch_offsets_m(
     t_s: np.ndarray,
     options: WristTransferOptions | None = None,
 ) -> Float64[np.ndarray, "time 3"]:
-    """An offset for every sample: that of the places which touch, weighted by force and nearness.
+    """Offset for every sample: mean over points in contact, weighted by force and time difference.
 
     offset(t) = (Σ k(t, s) F_i(s) dt offset_i(s) + A c) / (Σ k(t, s) F_i(s) dt + A), over samples s
-    and places i, with k = exp(-|t - s| / reach), the constant offset c and its weight A. During a
-    grasp it stands nearly still, so that nothing slips; it depends on the future, so it is for
-    recordings.
+    and points i, with k = exp(-|t - s| / reach), the constant offset c and its weight A. During a
+    grasp it is nearly constant, so that nothing slips. It depends on future samples, so it can
+    only be used for recordings.
 
     Args:
         points: of T samples.
         pad_forces_n: [T, 6] forces on thumb … little fingertip and palm, 0 or more
             (`dextouch.tactile.pad_forces_n`).
-        t_s: [T] rising times, relative to any moment.
-        options: None takes the defaults.
+        t_s: [T] increasing times with any origin.
+        options: default: `WristTransferOptions()`.
 
     Raises:
         ShapeError: shapes that do not fit.
         NonFiniteError: forces or times that are not finite.
-        InvalidInputError: times that do not rise, or a negative force.
+        InvalidInputError: times that do not increase, or a negative force.
     """
     options = options or WristTransferOptions()
     forces, times = _checked(len(points.seen), pad_forces_n, t_s)
-    # Each sample stands for the time around it, so that the rate of the samples does not matter.
+    # Samples are weighted by their duration, so that the result does not depend on the rate.
     lasts_s = np.gradient(times) if len(times) > 1 else np.ones(1)
     weight = np.where(points.seen, forces, 0.0) * lasts_s[:, None]
     moments = np.concatenate(
@@ -170,10 +168,10 @@ def _checked(
             f"[{num_samples}, {NUM_PADS}] and [{num_samples}]"
         )
     if not (np.isfinite(forces).all() and np.isfinite(times).all()):
-        raise NonFiniteError("wrist transfer: forces or times hold NaN or infinity; mask them")
+        raise NonFiniteError("wrist transfer: forces or times contain NaN or infinity; mask them")
     if (np.diff(times) <= 0).any() or (forces < 0).any():
         raise InvalidInputError(
-            "wrist transfer: times must rise and forces be 0 or more; sort and calibrate them"
+            "wrist transfer: expected increasing times and forces ≥ 0; sort and calibrate them"
         )
     return forces, times
 
@@ -181,7 +179,7 @@ def _checked(
 def _decaying_sums(
     values: Float64[np.ndarray, "time 4"], t_s: np.ndarray, reach_s: float
 ) -> Float64[np.ndarray, "time 4"]:
-    """Σ_s exp(-|t - s| / reach) values(s) at every t, in time proportional to the samples."""
+    """Σ_s exp(-|t - s| / reach) values(s) at every t, in linear time."""
     keep = np.exp(-np.diff(t_s) / reach_s)
     before, after = values.copy(), values.copy()
     for index, factor in enumerate(keep, start=1):

@@ -1,1 +1,1 @@
-"""Stage `evaluator`: whether success that a world model imagines can be believed."""
+"""Stage `evaluator`: reliability of the success that a world model imagines."""

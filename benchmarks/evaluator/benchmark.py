@@ -1,4 +1,4 @@
-"""The stage `evaluator`: policies in the twin and in imagination, and how far the two agree."""
+"""The stage `evaluator`: policies in the twin and in imagination, and the agreement of both."""
 
 import argparse
 import json
@@ -43,7 +43,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--world",
         action="append",
         type=Path,
-        help="checkpoint of the world model (committed one); repeated for other training seeds",
+        help="checkpoint of the world model (committed one); may be repeated for training seeds",
     )
     parser.add_argument(
         "--probe",
@@ -55,19 +55,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--direct",
         action="append",
         type=Path,
-        help="checkpoint of the direct judge, which imagines nothing, as a rival (none); once for "
+        help="checkpoint of the direct judge, a baseline that imagines nothing (none); once for "
         "all worlds, or once for each",
     )
     parser.add_argument(
         "--without-touch",
         action="append",
         type=Path,
-        help="checkpoint of a world model that learned nothing of touch, as a rival (none); once "
+        help="checkpoint of a world model trained without touch, as a baseline (none); once "
         "for all worlds, or once for each",
     )
     parser.add_argument("--tasks", nargs="+", default=list(TASK_NAMES), help="(all of the twin)")
     parser.add_argument(
-        "--starts", type=int, help=f"starts a task ({_USUAL_STARTS}; quick {_QUICK_STARTS})"
+        "--starts", type=int, help=f"starts per task ({_USUAL_STARTS}; quick {_QUICK_STARTS})"
     )
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED, help="%(default)s")
     parser.add_argument(
@@ -86,19 +86,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--keep",
         type=Path,
         default=Path("runs/evaluator"),
-        help="folder of results; what is there is not computed again (%(default)s)",
+        help="folder of results; existing results are not computed again (%(default)s)",
     )
     parser.add_argument(
         "--repeats",
         type=Path,
         metavar="FILE",
-        help="evaluator.json of an earlier run: also say which figures are apart from it",
+        help="evaluator.json of an earlier run: also report which figures differ from it",
     )
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="%(default)s")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Roll out what is not kept yet, and make the table of everything.
+    """Compute missing results, and create the tables.
 
     Raises:
         InvalidInputError: options that do not fit.
@@ -158,7 +158,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 
 
 def figures_of_tasks(study: Study, kept: KeptRows) -> tuple[list[TaskFigures], int]:
-    """Figures of every task from what is kept, and how many rollouts failed or are missing."""
+    """Figures of every task from the kept rows, and the number of failed or missing rollouts."""
     figures: list[TaskFigures] = []
     failed = 0
     for task in study.tasks:

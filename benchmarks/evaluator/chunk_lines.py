@@ -1,4 +1,4 @@
-"""Lines of chained touch and images chunk by chunk, of scripts: elsewhere little moves."""
+"""Lines of chained touch and images by chunk, for scripts only: other policies move little."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -29,7 +29,7 @@ def chunk_figures_drawn(sampling: Sampling, scripts: Sequence[Rolled]) -> list[D
 
 
 def _contact(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
-    """F1 of moving chunks; of a chunk index all rollouts are counted together."""
+    """F1 of moving chunks; contacts of all rollouts are pooled by chunk index."""
     names = (f"{_COPY}, {_WHERE}", f"{_CONTEXT}, {_WHERE}")
     bounds = (0.0, 0.85)
     mine = [one for one in scripts if "true context" in one.rows]
@@ -74,7 +74,7 @@ def contact_counts_of(scripts: Sequence[Rolled]) -> list[np.ndarray]:
 
 
 def _images(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
-    """PSNR of whole images in the worst chunk, and beside the warped start where objects are."""
+    """PSNR of whole images in the worst chunk, and relative to the warped start around objects."""
     what = "chained image, worst chunk"
     around = "chained image less warped start where objects are or were, worst of chunks 2 to 5"
     found = []
@@ -116,7 +116,7 @@ def _sharpness(sampling: Sampling, scripts: Sequence[Rolled]) -> Drawn:
 
 
 def chunk_rows(task: str, scripts: Sequence[Rolled]) -> list[dict[str, Any]]:
-    """Contact F1, PSNR and sharpness of every chunk, each beside its rivals."""
+    """Contact F1, PSNR and sharpness of every chunk, each with its baselines."""
     if not scripts:
         return []
     rows: list[dict[str, Any]] = [

@@ -24,7 +24,7 @@ Bound = tuple[Sense, float]
 
 @dataclass(frozen=True)
 class Line:
-    """One line of the table; `value` is None where it is not defined, or nothing was rolled out.
+    """One line of the table; `value` is None if it is undefined, or nothing was rolled out.
 
     `value` is the mean over the training seeds, `by_seed` the figure of each; `interval` is the
     95 % bootstrap interval of the mean over the starts.
@@ -41,7 +41,7 @@ class Line:
     by_seed: tuple[float | None, ...] = ()
 
     def requirement(self) -> Requirement:
-        """The line as a promise that is kept or not."""
+        """The line as a requirement."""
         what = f"{self.task}: {self.what}"
         return Requirement(what, self.value, self.sense, self.bound, self.unit)
 
@@ -72,7 +72,7 @@ class Drawn:
     worst: float | None = None
 
     def less(self, other: "Drawn", what: str, bound: float) -> "Drawn":
-        """How much greater it is than another figure, in the same draws."""
+        """Difference to another figure, in the same draws."""
         return Drawn(
             what, self.value - other.value, self.draws - other.draws, self.num, ("at least", bound)
         )
@@ -154,7 +154,7 @@ class Sampling:
 
 
 def undefined(what: str, bound: Bound) -> Drawn:
-    """A figure that nothing was rolled out for."""
+    """A figure without rollouts."""
     return Drawn(what, math.nan, np.array([math.nan]), 0, bound)
 
 

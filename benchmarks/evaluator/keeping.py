@@ -1,8 +1,8 @@
-"""Results of the stage `evaluator` as lines of JSON, so that no rollout is made twice.
+"""Results of the stage `evaluator` as lines of JSON, so that no rollout is computed twice.
 
-A row is known by what it is about: the digests of twin, world and judge, the task, the seed and
-the policy. Arrays that other rows need (endings, images at the ends of chunks) lie beside the
-file. A line that a killed run left unfinished is skipped.
+A row is identified by the digests of twin, world and judge, the task, the seed and the policy.
+Arrays that other rows need (endings, images at the ends of chunks) are stored next to the file. A
+line that a killed run left incomplete is skipped.
 """
 
 import json
@@ -14,7 +14,7 @@ import numpy as np
 
 from dextouch.errors import CorruptDataError, StorageError
 
-# What tells rows apart; fields that a kind of row does not have are left out.
+# Fields that identify a row; a kind of row may lack some of them.
 KEY_FIELDS = (
     "kind", "twin", "world", "judge", "direct judge", "world without touch",
     "task", "seed", "policy",
@@ -23,15 +23,15 @@ Row = dict[str, Any]
 
 
 def row_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What a row is about."""
+    """Identity of a row."""
     return tuple(row.get(field) for field in KEY_FIELDS)
 
 
 class KeptRows:
-    """All rows of a file; rows that are added are written at once.
+    """All rows of a file; added rows are written immediately.
 
     Args:
-        path: of the file; it and its folder are created with the first row.
+        path: file; it and its folder are created with the first row.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,7 +46,7 @@ class KeptRows:
         return len(self._rows)
 
     def get(self, **about: object) -> Row | None:
-        """The row about something, None where there is none."""
+        """The row with this identity, or None."""
         return self._rows.get(row_key(about))
 
     def add(self, rows: Iterable[Row]) -> None:
@@ -60,7 +60,7 @@ class KeptRows:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("a", encoding="utf-8") as file:
-                # A line of a killed run may have no end yet.
+                # A killed run may have left a line without a line break.
                 file.write(("\n" if file.tell() and not self._ends_well() else "") + text)
         except OSError as error:
             raise StorageError(
@@ -83,7 +83,7 @@ def _parsed(line: str) -> Row | None:
 
 
 def array_path(keep: Path, *, digests: Sequence[str], **about: object) -> Path:
-    """Where the arrays of a rollout lie; `digests` are of every world that they come from."""
+    """Path of a rollout's arrays; `digests` are those of all worlds that they depend on."""
     digest = "-".join(one[:12] for one in digests)
     policy = str(about["policy"]).replace(" ", "_").replace("'", "")
     name = f"{about['task']}-{about['seed']}-{policy}.npz"
@@ -91,7 +91,7 @@ def array_path(keep: Path, *, digests: Sequence[str], **about: object) -> Path:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays, whole or not at all."""
+    """Write arrays atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     with partial.open("wb") as file:
@@ -100,7 +100,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Arrays of `write_arrays`.
+    """Read arrays written by `write_arrays`.
 
     Raises:
         CorruptDataError: a file that is not one of ours.

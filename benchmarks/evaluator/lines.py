@@ -30,7 +30,7 @@ class TaskFigures:
 
     Args:
         task: its name.
-        by_seed: for every training seed the rollouts that ended in both worlds, the same ones in
+        by_seed: for every training seed the rollouts completed in both worlds, the same ones in
             the same order.
         scripts: names of the scripted policies.
     """
@@ -63,7 +63,7 @@ class TaskFigures:
         ]
 
     def policy_rows(self) -> list[dict[str, Any]]:
-        """Success rates of every policy, and how many of its rollouts the judge cannot tell."""
+        """Success rates of every policy, and the number of its undecided rollouts."""
         rows = []
         for policy in dict.fromkeys(one.policy for one in self._by_seed[0]):
             mine = [[one for one in seed if one.policy == policy] for seed in self._by_seed]
@@ -117,7 +117,7 @@ def _rollout_figures(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Draw
 
 
 def _decision_figures(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
-    """Wrong answers among the decided ones; the judge's undecided band allows one in twenty."""
+    """Share of wrong decisions; the judge's undecided band is chosen for one in twenty."""
     found = []
     for name, kind in (("true", TRUE), ("imagined", IMAGINED)):
         mine = [one for one in scripts if one.rows[kind]["decision"] != "cannot tell"]
@@ -164,7 +164,7 @@ def _policy_figures(
 
 
 def _idle_figures(sampling: Sampling, everything: Sequence[Rolled]) -> list[Drawn]:
-    """Imagined success of what failed in reality: chance may let other actions succeed."""
+    """Imagined success of rollouts that failed in the twin; wrong actions may succeed by chance."""
     found = []
     for policy in IDLE:
         mine = [one for one in everything if one.policy == policy and not one.success]
@@ -175,7 +175,7 @@ def _idle_figures(sampling: Sampling, everything: Sequence[Rolled]) -> list[Draw
 
 
 def _wrong_action_figures(sampling: Sampling, everything: Sequence[Rolled]) -> list[Drawn]:
-    """What another episode's commands cost: an error that stays says they are not used."""
+    """Effect of another episode's commands: if the error is the same, commands are not used."""
     touch = "touch error with another episode's actions over that with their own"
     image = "chained image with their own actions less that with another episode's"
     mine = [one for one in everything if "wrong actions" in one.rows]
@@ -193,7 +193,7 @@ def _wrong_action_figures(sampling: Sampling, everything: Sequence[Rolled]) -> l
 
 
 def _still_figures(sampling: Sampling, everything: Sequence[Rolled]) -> list[Drawn]:
-    """The worst of the starts that were held still, so without an interval over starts."""
+    """Worst of the starts that were held still; there is no interval over starts."""
     touch, image = "still hands over 1000 steps, greatest pressure", "the same, image less copy"
     mine = [one.rows["held still"] for one in everything if "held still" in one.rows]
     if not mine:

@@ -1,4 +1,4 @@
-"""How near an imagined rollout is to the true one: contact of taxels and images, chunk by chunk."""
+"""Errors of an imagined rollout relative to the true one: taxel contact and images, by chunk."""
 
 from typing import Final
 
@@ -14,7 +14,7 @@ from dextouch.metrics.tactile import mse
 from dextouch.tactile import in_contact
 from services.evaluation.camera_warp import warp_over_table
 
-# Pixels about an object's box that belong to its region too.
+# Margin in pixels around an object's box that belongs to its region.
 _MARGIN_PX: Final = 1
 Row = dict[str, list[list[float]]]
 
@@ -27,12 +27,12 @@ def chunk_figures(
     first_image: np.ndarray,
     boxes_m: np.ndarray,
 ) -> Row:
-    """Per chunk: contact counts of the imagined touch and of the copied one, and PSNR at its end.
+    """Contact counts of imagined and copied touch, and PSNR at the end of every chunk.
 
     Counts are taxels in contact [in both, imagined, true]. The copy is the true touch at the
-    chunk's start, so it looks at the truth where the world has to remember. PSNR is
-    [imagined, warped] of the whole image and of the region where objects are or were; warped is
-    the rollout's first image, moved by the known motion of the camera over the table.
+    chunk's start, which the world model does not get. PSNR is [imagined, warped] for the whole
+    image and for the region where objects are or were; warped is the rollout's first image,
+    warped by the known motion of the camera over the table.
     """
     cameras = poses_from_actions(real.actions, anchor).Ts_world_camera_head
     found: Row = {"contact": [], "contact_of_copy": [], "psnr": [], "psnr_of_objects": []}
@@ -78,7 +78,7 @@ def object_region(
     T_world_camera: np.ndarray,
     shape_px: tuple[int, int],
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels within the rectangle about each object's box, [objects, 7] and [objects, 6]."""
+    """Pixels in the rectangles around boxes [objects, 6] of objects at poses [objects, 7]."""
     region = np.zeros(shape_px, dtype=bool)
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
     for pose, box in zip(object_poses, boxes_m, strict=True):
@@ -96,7 +96,7 @@ def object_region(
 def wrong_action_figures(
     real: TrueRollout, own: ImaginedRollout, wrong: ImaginedRollout
 ) -> dict[str, list[float] | list[list[float]]]:
-    """Errors [own, wrong] of what is imagined for a rollout's own actions and for another's.
+    """Errors [own, wrong] of predictions for a rollout's own actions and for another's.
 
     Squared error of touch in kPa², mean over all steps, and PSNR at the end of every chunk.
     """

@@ -17,10 +17,10 @@ from services.world_model.world import open_world
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """A world model, its judge, and its rivals where there are any.
+    """A world model, its judge, and its baselines if there are any.
 
-    `direct` judges without imagining; `untouched` is a world that learned nothing of touch.
-    `about` are the digests that results are known by.
+    `direct` judges without imagining; `untouched` is a world model trained without touch.
+    `about` holds the digests that identify results.
     """
 
     about: dict[str, str]
@@ -31,12 +31,12 @@ class Member:
 
     @property
     def tasks(self) -> set[str]:
-        """The tasks that all its networks know."""
+        """Tasks that all its networks were trained on."""
         return set(self.world.description.tasks) & set(self.probe.metadata.tasks)
 
     @property
     def judges(self) -> list[SuccessProbe | DirectJudge]:
-        """All that were trained on starts of their own."""
+        """All judges, each of which has training starts."""
         return [self.probe, *([] if self.direct is None else [self.direct])]
 
 
@@ -63,7 +63,7 @@ def file_digest(path: Path) -> str:
 
 
 def refuse_unequal_rivals(members: Sequence[Member]) -> None:
-    """Refuse rivals of the training seeds that do not know the same tasks.
+    """Refuse baselines of the training seeds that were not trained on the same tasks.
 
     Raises:
         InvalidInputError: direct judges, or worlds without touch, of different tasks.
@@ -74,7 +74,7 @@ def refuse_unequal_rivals(members: Sequence[Member]) -> None:
 
 
 def refuse_unequal_tasks(flag: str, known: Sequence[Collection[str]]) -> None:
-    """Refuse networks that are compared over training seeds and know different tasks.
+    """Refuse networks of several training seeds that were trained on different tasks.
 
     Raises:
         InvalidInputError: different tasks.
@@ -82,5 +82,5 @@ def refuse_unequal_tasks(flag: str, known: Sequence[Collection[str]]) -> None:
     if any(set(tasks) != set(known[0]) for tasks in known):
         raise InvalidInputError(
             f"evaluator: {flag}: got networks of {[sorted(tasks) for tasks in known]}, "
-            "expected the same tasks of all; train them on the same ones"
+            "expected the same tasks for all; train them on the same tasks"
         )

@@ -1,4 +1,4 @@
-"""The evaluator's table as an HTML page that stands alone."""
+"""The evaluator's table as a self-contained HTML page."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -23,7 +23,7 @@ def write_page(
     rows: Sequence[Sequence[Mapping[str, Any]]],
     notes: Sequence[str],
 ) -> None:
-    """Write one table a task, what it is about, and the tables of other rows."""
+    """Write the digests, one table per task, and the tables of other rows."""
     tables = "".join(
         _table(task, [line for line in lines if line.task == task])
         for task in dict.fromkeys(line.task for line in lines)
@@ -37,7 +37,7 @@ def write_page(
     path.write_text(
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         f"<title>Evaluator</title><style>{_STYLE}</style></head><body>"
-        "<h1>Can imagined success be believed?</h1>"
+        "<h1>How reliable is imagined success?</h1>"
         f"<ul>{digests}{remarks}</ul>{tables}{''.join(_plain_table(each) for each in rows)}"
         "<p>Intervals are 95 % bootstrap intervals over the starts.</p></body></html>\n",
         encoding="utf-8",

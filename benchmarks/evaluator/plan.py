@@ -15,18 +15,18 @@ CAMERA: Final = "camera_head"
 # 5 1/3 s at 15 steps a second, in chunks as policies send them.
 NUM_STEPS: Final = 80
 CHUNK_STEPS: Final = 16
-# A still hand is watched for 63 chunks, 1008 steps, and looked at after every 9th.
+# Still hands are rolled out for 63 chunks, 1008 steps, with images after every 9th.
 STILL_CHUNKS: Final = 63
 STILL_SHOWN_EVERY: Final = 9
 FIRST_SEED: Final = 30_000
 LEVELS_MM: Final = (0.0, 2.5, 5.0, 7.5, 10.0, 15.0, 20.0, 30.0)
-# What cannot succeed, and what a judge that looks at motion would call a success.
+# Policies that cannot succeed, but might fool a judge that relies on motion.
 IDLE: Final = (HOLD, RETREAT, ELSEWHERE)
 
 
 @dataclass(frozen=True)
 class ClonedPolicy:
-    """A checkpoint of a cloned policy, known by its name and its content."""
+    """A checkpoint of a cloned policy, identified by its name and content."""
 
     name: str
     path: Path
@@ -45,13 +45,13 @@ class ClonedPolicy:
 
     @property
     def key(self) -> str:
-        """Its name in results; another checkpoint of the same name has another one."""
+        """Name in results, with a digest of the checkpoint."""
         return f"{self.name}@{hashlib.sha256(self.path.read_bytes()).hexdigest()[:8]}"
 
 
 @dataclass(frozen=True)
 class OutsidePolicy:
-    """A policy of somebody's own, known by its name and the content of its module's file."""
+    """A custom policy, identified by its name and the content of its module's file."""
 
     source: PolicySource
     digest: str
@@ -71,7 +71,7 @@ class OutsidePolicy:
 
     @property
     def key(self) -> str:
-        """Its name in results; another file of the same name has another one."""
+        """Name in results, with a digest of the module's file."""
         return f"{self.source.name}@{self.digest}"
 
 
@@ -80,10 +80,10 @@ class Trained:
     """The checkpoints of one training seed.
 
     Args:
-        world: of the world model; None is the one that comes with the package.
-        probe: of the judge of imagined endings.
-        direct: of the direct judge, its rival without a world model; None for none.
-        untouched: of a world model that learned nothing of touch; None for none.
+        world: world model; None: the one included in the package.
+        probe: judge of imagined endings.
+        direct: direct judge, the baseline without a world model; None for none.
+        untouched: world model trained without touch; None for none.
     """
 
     world: Path | None
@@ -98,7 +98,7 @@ def trained_seeds(
     directs: Sequence[Path] = (),
     untouched: Sequence[Path] = (),
 ) -> tuple[Trained, ...]:
-    """One entry for each world, with the others of the same place or the only ones there are.
+    """One entry for each world, with the other networks at the same index or the only ones.
 
     Raises:
         InvalidInputError: several judges, but not one for each world; or no world or judge.
@@ -122,7 +122,7 @@ def _one_each(paths: Sequence[Path], count: int) -> list[Path | None]:
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """Everything that one run of the stage is about.
+    """Everything that defines one run of the stage.
 
     `trained` are the checkpoints of every training seed; `keep` is the folder of results and
     arrays; the first `num_still_starts` starts of a task are also held still for 1000 steps.
@@ -146,7 +146,7 @@ class StudyPlan:
 
     @property
     def scripts(self) -> tuple[str, ...]:
-        """Names of the scripted policies, from exact to far off."""
+        """Names of the scripted policies, by increasing error."""
         return tuple(script_name(level_mm) for level_mm in self.levels_mm)
 
     @property

@@ -21,7 +21,7 @@ _LAST_IMAGE = ReturnSelector(steps="last")
 
 @dataclass(frozen=True)
 class TrueRollout:
-    """What the twin made of a policy.
+    """Rollout of a policy in the twin.
 
     Chunk ends are steps 16, 32 … 80. `actions` are what was sent, relative to step 0;
     `object_poses` T_world_object at step 0 and the chunk ends.
@@ -37,7 +37,7 @@ class TrueRollout:
 
 @dataclass(frozen=True)
 class ImaginedRollout:
-    """What a world imagined of the same policy; `doubted` is why it does not trust itself."""
+    """Imagined rollout of the same policy; `doubted` is the reason of the world's doubt."""
 
     tactile_kpa: Float32[np.ndarray, "81 2 320"]
     images_of_chunks: UInt8[np.ndarray, "chunks h w 3"]
@@ -62,7 +62,7 @@ def play_in_twin(
         chunk = _chunk(policy, seen, first, twin)
         shows_end = looks == "last" or first + CHUNK_STEPS == NUM_STEPS
         head = CHUNK_STEPS - 4 if shows_end else CHUNK_STEPS
-        # Images are slow, so only those that somebody looks at are made.
+        # Images are slow, so only those that are used are rendered.
         selector = ReturnSelector() if looks == "all" else _NO_IMAGES
         step = twin.step(state, chunk[:head], seed=start.seed, selector=selector)
         parts = [step]
@@ -84,7 +84,7 @@ def play_in_twin(
 
 
 def stage_poses(twin: TwinWorld, state: TwinState) -> Float64[np.ndarray, "objects 7"]:
-    """Where the objects of a state are."""
+    """Object poses of a state."""
     simulation = twin.stage(state.task).simulation
     simulation.set_state(state.physics, step_index=0)
     return simulation.object_poses()
@@ -93,7 +93,7 @@ def stage_poses(twin: TwinWorld, state: TwinState) -> Float64[np.ndarray, "objec
 def play_in_imagination(
     world: World[State], first: RolloutStart, policy: Policy | Actions, start: PolicyStart
 ) -> ImaginedRollout:
-    """Let a policy act in an imagined world; a policy that looks sees what is imagined."""
+    """Let a policy act in an imagined world; if it uses images, it observes imagined ones."""
     started = world.reset(first)
     state, seen = started.state, started.observation
     touch, images = [seen.tactile_kpa], []
@@ -104,7 +104,7 @@ def play_in_imagination(
         if looks == "all" or at + CHUNK_STEPS == NUM_STEPS:
             step = last = world.step(state, chunk, seed=start.seed + at)
         else:
-            # A world is a function: asking twice gives touch of all steps and the last image.
+            # A world is functional: two calls give touch of all steps and only the last image.
             step = world.step(state, chunk, seed=start.seed + at, selector=_NO_IMAGES)
             last = world.step(state, chunk, seed=start.seed + at, selector=_LAST_IMAGE)
         images.append(last.observation.images[CAMERA][-1])
@@ -123,7 +123,7 @@ def play_in_imagination(
 
 
 def _begin(policy: Policy | Actions, start: PolicyStart) -> Literal["no", "last", "all"]:
-    """Tell a policy that looks where it begins; which steps of a chunk it looks at."""
+    """Reset a closed-loop policy, and return which steps of a chunk it needs images of."""
     if isinstance(policy, np.ndarray):
         return "no"
     ask(policy.reset, start, where="policy: reset")
@@ -144,7 +144,7 @@ def _chunk(
 def start_in_twin(
     twin: TwinWorld, task: str, seed: int, instruction: str
 ) -> tuple[StartedRollout[TwinState], RolloutStart, PolicyStart]:
-    """How the twin begins, and the same start for an imagined world and for a policy."""
+    """Start of a rollout in the twin, and the same start for an imagined world and a policy."""
     asked = RolloutStart(task=task, seed=seed, instruction=instruction)
     started = twin.reset(asked)
     imagined = replace(

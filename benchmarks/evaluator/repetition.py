@@ -11,8 +11,8 @@ from benchmarks.evaluator.drawn import Line
 from benchmarks.figures import Requirement
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 
-# Of areas under the curve, correlations, success rates and the like, and of decibels. Figures in
-# other units scatter too much to be compared.
+# Tolerances by unit: of areas under the curve, correlations, rates and the like, and of decibels.
+# Figures in other units scatter too much to be compared.
 TOLERANCES: Final = {"": 0.08, "dB": 1.0}
 
 
@@ -35,7 +35,7 @@ Earlier = Mapping[tuple[str, str], _EarlierLine]
 
 
 def read_lines(path: Path) -> Earlier:
-    """The lines of the `evaluator.json` of an earlier run, by task and what they are about.
+    """Lines of the `evaluator.json` of an earlier run, by task and name.
 
     Raises:
         NotFoundError: no such file.
@@ -47,20 +47,20 @@ def read_lines(path: Path) -> Earlier:
         run = _Run.model_validate(json.loads(path.read_text(encoding="utf-8")))
     except (ValidationError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise CorruptDataError(
-            f"evaluator: {path} is no evaluator.json of an earlier run ({error})"
+            f"evaluator: {path} is not the evaluator.json of an earlier run ({error})"
         ) from error
     return {(line.task, line.what): line for line in run.lines}
 
 
 def repetition(lines: Sequence[Line], earlier: Earlier) -> list[Requirement]:
-    """For each figure that both runs have, how far they are apart, and how far they may be.
+    """Difference of each figure that both runs have, with its tolerance.
 
     Args:
         lines: of this run.
         earlier: from `read_lines`.
 
     Raises:
-        InvalidInputError: not one line in common.
+        InvalidInputError: no line in common.
     """
     if not any((line.task, line.what) in earlier for line in lines):
         raise InvalidInputError(

@@ -1,4 +1,4 @@
-"""Touch that a world imagines of one chunk when it starts anew from what was really there."""
+"""Touch that a world imagines for one chunk when it is restarted from the true observation."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ from services.twin.world import TwinState, TwinWorld
 
 _NO_IMAGES = ReturnSelector(cameras=())
 _REACHED = ReturnSelector(cameras=(), steps="last")
-# What moves less than this within a chunk stands still.
+# Smaller motions within a chunk count as none.
 _STILL_M, _STILL_RAD = 1e-3, 0.02
 
 
@@ -33,8 +33,8 @@ def contact_with_true_context(
 ) -> list[list[float]]:
     """Contact counts of every chunk, each imagined from the true observation at its start.
 
-    The twin replays the commands to tell where hands and camera really were; image and touch are
-    those of the kept rollout, and the commands stay what they were.
+    The twin replays the commands to get the true poses of hands and camera; image and touch are
+    those of the kept rollout, and the commands are the same.
     """
     found = []
     reached = _reached_rows(twin, started, real)
@@ -53,7 +53,7 @@ def contact_with_true_context(
 def _reached_rows(
     twin: TwinWorld, started: StartedRollout[TwinState], real: TrueRollout
 ) -> list[Float64[np.ndarray, "67"]]:
-    """Where hands and camera were at the end of every chunk, relative to step 0."""
+    """Reached actions at the end of every chunk, relative to step 0."""
     rows, state = [], started.state
     for chunk in np.split(real.actions, len(real.images_of_chunks)):
         step = twin.step(state, chunk, seed=0, selector=_REACHED)
@@ -65,7 +65,7 @@ def _reached_rows(
 def _restart(
     first: RolloutStart, real: TrueRollout, index: int, reached: Float64[np.ndarray, "67"]
 ) -> RolloutStart:
-    """The true step before chunk `index` as a start of its own."""
+    """The true step before chunk `index` as a rollout start."""
     if first.anchor is None:
         raise ValueError("the twin gives an anchor with every start")
     observation = Observation(

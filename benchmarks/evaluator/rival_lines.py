@@ -1,4 +1,4 @@
-"""Lines of what imagination and touch add: the same rollouts judged by others, or without touch."""
+"""Lines that compare imagination and touch with baselines that judge the same rollouts."""
 
 from collections.abc import Sequence
 from typing import Any, Final
@@ -15,7 +15,7 @@ from benchmarks.evaluator.drawn import (
     undefined,
 )
 
-# Who judges what: the name in tables, by the kind of row.
+# Names of the judges in tables, by the kind of row.
 JUDGES: Final = {
     "imagined verdict": "imagined ending",
     "verdict without touch": "imagined ending, touch at zero",
@@ -35,7 +35,7 @@ _LESS: Final = {
 def rival_figures(
     sampling: Sampling, scripts: Sequence[Rolled], others: Sequence[Rolled]
 ) -> list[Drawn]:
-    """How much better imagined endings tell success than each rival that is there."""
+    """Difference of AUC between imagined endings and each available baseline."""
     found = []
     for kind, rollouts, where in (
         (_DIRECT, scripts, SCRIPTS),
@@ -48,7 +48,7 @@ def rival_figures(
             continue
         what = f"AUC of imagined endings less {_LESS[kind]}, {where}"
         if np.array_equal(probabilities(mine, "imagined verdict"), probabilities(mine, kind)):
-            # Nothing that the rival lacks was there to be judged, so nothing is compared.
+            # Without any imagined touch, the baseline gets the same input, so nothing is compared.
             found.append(undefined(what, ("at least", 0.0)))
             continue
         ours, theirs = (
@@ -66,7 +66,7 @@ def rival_rows(
 ) -> list[dict[str, Any]]:
     """AUC with its interval of every judge over scripts and over other policies.
 
-    `called_success` is the share of the rollouts that the judge calls likely successes, beside
+    `called_success` is the share of rollouts that the judge considers likely successes, next to
     the share that succeeded.
     """
     rows = []

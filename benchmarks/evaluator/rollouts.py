@@ -1,4 +1,4 @@
-"""One policy from one start: its rows, each computed from what is kept and kept in turn."""
+"""Rows of one policy from one start, computed from kept arrays where these exist."""
 
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -37,7 +37,7 @@ from services.twin.bounding_boxes import object_boxes_m
 from services.twin.scripted_actions import Actions
 from services.twin.world import TwinWorld
 
-# Kinds of rows by the digests that they depend on; every row is about a task, a seed and a policy.
+# Digests that each kind of row depends on, in addition to task, seed and policy.
 DEPENDS_ON: Final[dict[str, tuple[str, ...]]] = {
     "real": ("twin",),
     "imagined": ("twin", "world"),
@@ -58,8 +58,8 @@ class PolicyRollout:
     """One policy from one start, in the twin and in the world of every training seed.
 
     Args:
-        twin: where it really happens.
-        keep: folder of results; arrays that lie there are not made again.
+        twin: the real world.
+        keep: folder of results; existing arrays are not computed again.
         about: the task, the seed and the name of the policy.
         actor: the policy, or its actions.
     """
@@ -97,7 +97,7 @@ class PolicyRollout:
         }  # fmt: skip
 
     def row(self, kind: str, member: Member) -> Row:
-        """What one kind of row says, without what it is about."""
+        """Content of one kind of row, without its identity."""
         return self._rows[kind](member)
 
     def wrong_actions(self, member: Member, own: "PolicyRollout") -> Row:
@@ -106,7 +106,7 @@ class PolicyRollout:
 
     @cached_property
     def real(self) -> TrueRollout:
-        """What really happened."""
+        """The rollout in the twin."""
         path = self._path("real", self._twin.description.digest)
         if path.is_file():
             kept = read_arrays(path)
@@ -175,7 +175,7 @@ class PolicyRollout:
         return {"contact": contact, "moves": moves.tolist()}
 
     def _still_row(self, member: Member) -> Row:
-        """Of hands that are told to stay where they are seen to be, whatever was last commanded."""
+        """Hands commanded to stay at their observed poses, whatever was last commanded."""
         row = self._started.observation.action_reached[-1]
         path = self._path("held_still", self._twin.description.digest)
         if not path.is_file():
@@ -186,14 +186,14 @@ class PolicyRollout:
         return still_figures(imagined, read_arrays(path)["images"], self._first_image)
 
     def _untouched_row(self, member: Member) -> Row:
-        """The verdict on what a world imagines that learned nothing of touch; it shows none."""
+        """Verdict on the ending of a world model trained without touch, with touch at zero."""
         if member.untouched is None:
             raise InvalidInputError("evaluator: no world was given by --without-touch")
         ending = self._ending(self._imagined_by(member.untouched))
         return asdict(member.probe.verdict(without_touch(ending)))
 
     def _direct_row(self, member: Member) -> Row:
-        """What a judge says that sees the first observation and what was commanded in the twin."""
+        """Verdict of the direct judge, given the first observation and the twin's commands."""
         if member.direct is None:
             raise InvalidInputError("evaluator: no direct judge was given; name one by --direct")
         seen, first = self._started.observation, self._started
@@ -210,7 +210,7 @@ class PolicyRollout:
 
 
 def without_touch(ending: Ending) -> Ending:
-    """The ending as hands that feel nothing would report it."""
+    """The ending with all taxels at zero."""
     return replace(ending, tactile_kpa=np.zeros_like(ending.tactile_kpa))
 
 

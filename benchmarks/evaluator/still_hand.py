@@ -21,7 +21,7 @@ _LAST_IMAGE = ReturnSelector(cameras=(CAMERA,), steps="last")
 
 @dataclass(frozen=True)
 class StillRollout:
-    """What a world shows of hands that stand: the greatest pressure of all, and some images."""
+    """Rollout of hands that hold still: the greatest pressure, and some images."""
 
     greatest_kpa: float
     images: UInt8[np.ndarray, "shown h w 3"]

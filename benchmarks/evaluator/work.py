@@ -1,4 +1,4 @@
-"""All rows of one start that are not kept yet: one unit of work of the stage `evaluator`."""
+"""Missing rows of one start, the unit of work of the stage `evaluator`."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -20,11 +20,11 @@ from services.twin.scripted_actions import ELSEWHERE, HOLD, Actions, script_name
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 
-# What a row is: its kind, and the number of the training seed.
+# Name of a row: its kind, and the index of the training seed.
 RowName = tuple[str, int]
 Missing = Mapping[str, Sequence[RowName]]
 EXACT = script_name(0.0)
-# Rows that a rollout cannot be without, and those of scripts alone.
+# Rows that every rollout needs, and those of scripts only.
 NEEDED = ("real", "imagined", "true verdict", "imagined verdict")
 _OF_SCRIPTS = ("verdict of the last image", "sharpness", "true context")
 
@@ -44,7 +44,7 @@ class Study:
 
     @property
     def about(self) -> dict[str, str]:
-        """Digests of everything; a number is added where there are several training seeds."""
+        """Digests of all networks, numbered if there are several training seeds."""
         found = {"twin": self.twin.description.digest}
         for index, member in enumerate(self.members, 1):
             suffix = f" {index}" if len(self.members) > 1 else ""
@@ -53,7 +53,7 @@ class Study:
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """The asked tasks that the twin and the networks of all training seeds know."""
+        """Requested tasks that the twin and the networks of all training seeds support."""
         known = set(self.twin.description.tasks).intersection(*(m.tasks for m in self.members))
         return tuple(task for task in self.plan.tasks if task in known)
 
@@ -66,7 +66,7 @@ class Study:
         )
 
     def keys(self, task: str, seed: int, policy: str) -> dict[RowName, dict[str, Any]]:
-        """What each row of a rollout is about."""
+        """Identity of each row of a rollout."""
         rollout = {"task": task, "seed": seed, "policy": policy}
         found: dict[RowName, dict[str, Any]] = {}
         for number, member in enumerate(self.members):
@@ -92,7 +92,7 @@ class Study:
         return tuple(kinds)
 
     def missing(self, kept: KeptRows, task: str, seed: int) -> dict[str, tuple[RowName, ...]]:
-        """The rows of a start that are not kept yet, by policy."""
+        """Missing rows of a start, by policy."""
         found = {}
         for policy in self.policies(task):
             # Training seeds may share rows: twin and judge are often the same.
@@ -106,7 +106,7 @@ class Study:
         return found
 
     def rows(self, task: str, seed: int, missing: Missing) -> Iterator[Row]:
-        """Roll out and judge; rollouts whose arrays are kept are not made again.
+        """Roll out and judge; rollouts with kept arrays are not repeated.
 
         Raises:
             ConflictError: a judge or cloned policy was trained on this start.
@@ -142,7 +142,7 @@ class Study:
             refuse_training_starts([digest], trained_on=metadata.training_starts, what=what)
 
     def actor(self, task: str, seed: int, policy: str) -> Policy | Actions:
-        """A policy that looks, or the actions of one that does not."""
+        """A closed-loop policy, or the actions of an open-loop one."""
         if policy in self.actors:
             return self.actors[policy]
         return scripted_actions(self.twin.stage(task), seed, policy)
@@ -155,5 +155,5 @@ def open_study(plan: StudyPlan) -> Study:
 
 
 def unit_rows(plan: StudyPlan, task: str, seed: int, missing: Missing) -> list[Row]:
-    """What a worker process does."""
+    """Compute the missing rows of one start, in a worker process."""
     return list(open_study(plan).rows(task, seed, missing))

@@ -1,1 +1,1 @@
-"""Benchmark of retargeting on hands with known joint angles, beside rival solvers."""
+"""Benchmark of retargeting on hands with known joint angles, compared with other solvers."""

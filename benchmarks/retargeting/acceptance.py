@@ -43,7 +43,7 @@ def requirements(
 
 
 def worst_ratio(speeds: Sequence[Speed], ours: str, rival: str) -> float | None:
-    """Rival's time relative to ours: median over the rounds, for the worse input."""
+    """Other library's time relative to ours: median over the rounds, for the worse input."""
     times = {(speed.method, speed.motion): speed.cpu_us for speed in speeds}
     motions = {motion for method, motion in times if method == rival}
     ratios = [times[rival, motion].over(times[ours, motion]).median for motion in motions]

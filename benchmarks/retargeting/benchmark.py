@@ -40,16 +40,18 @@ _NONE = "none"
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
     parser.add_argument(
-        "--rounds", type=int, help=f"of the timing ({USUAL.num_rounds}; quick {QUICK.num_rounds})"
+        "--rounds", type=int, help=f"timing rounds ({USUAL.num_rounds}; quick {QUICK.num_rounds})"
     )
     parser.add_argument(
         "--samples", type=int, help=f"of a motion ({USUAL.num_samples}; quick {QUICK.num_samples})"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the first motion (%(default)s)")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the first motion (%(default)s)"
+    )
     parser.add_argument(
         "--rivals",
         metavar="A,B",
-        help=f"only these, by comma, or {_NONE} (all that are installed: {', '.join(RIVALS)})",
+        help=f"comma-separated libraries, or {_NONE} (all that are installed: {', '.join(RIVALS)})",
     )
 
 
@@ -105,15 +107,14 @@ def choose_rivals(words: str | None) -> tuple[list[Rival], list[Rival]]:
 def notes(chosen: list[Rival], left_out: list[Rival]) -> list[str]:
     """Notes on how methods were run, and why some were skipped."""
     told = [
-        f"{OURS_EXACT} is without its temporal term; times are with the person's profile known, "
-        "errors with a profile measured from the same samples"
+        f"{OURS_EXACT} is without temporal regularization; times assume a known profile of the "
+        "person, errors a profile measured from the same samples"
     ]
     if chosen:
         told.append(
-            "rivals run in processes of their own, sample by sample, without their low-pass "
-            f"filter and from a start that {NUM_WARM_UP} calls with the first sample have brought "
-            "near; their keypoints are scaled by the lengths of the fingers; ours starts from "
-            "nothing"
+            "other libraries run in separate processes, sample by sample, without their low-pass "
+            f"filter, and after {NUM_WARM_UP} warm-up calls with the first sample; their keypoints "
+            "are scaled by the lengths of the fingers; ours has a cold start"
         )
     if left_out:
         missing = sorted({module for rival in left_out for module in missing_modules(rival)})
@@ -125,7 +126,7 @@ def notes(chosen: list[Rival], left_out: list[Rival]) -> list[str]:
 
 
 def _effort(options: argparse.Namespace) -> Effort:
-    """What the options say, else the usual or the quick numbers."""
+    """Values of the options, otherwise the usual or the quick defaults."""
     effort = replace(QUICK if options.quick else USUAL, seed=options.seed)
     if options.rounds is not None:
         effort = replace(effort, num_rounds=options.rounds)

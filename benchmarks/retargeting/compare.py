@@ -1,6 +1,6 @@
-"""Comparison of retargeting methods on the same motions: errors, and times in turns.
+"""Comparison of retargeting methods on the same motions: errors, and interleaved times.
 
-A rival that does not finish has no score or speed; results of the others are kept.
+A library that does not finish has no score or speed; results of the others are kept.
 """
 
 import gc
@@ -130,10 +130,10 @@ def compare_pinches(
 
 
 def compare_speed(effort: Effort, rivals: Rivals, bar: Bar) -> list[Speed]:
-    """Every method on the same samples, in turns: robot motions and people's pinches, with noise.
+    """Every method alternately on the same samples: robot motions and pinches, with noise.
 
     A round is one hand; sides and seeds (or people) change from round to round. Profiles of the
-    person and scales for rivals are found before.
+    person and scales for the other libraries are computed beforehand.
     """
     warm_up()
     found = []

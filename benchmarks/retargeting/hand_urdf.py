@@ -1,4 +1,4 @@
-"""URDF of a robot hand for rival solvers, generated from its kinematic tables."""
+"""URDF of a robot hand for other solvers, generated from its kinematic tables."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable

@@ -27,7 +27,7 @@ PINCHED_M: Final = 0.003
 CLOSING: Final = 36
 HELD: Final = 28
 RESTING: Final = 10
-# Postures solved for while a pinch is held; in between the tips part by far less than 3 mm.
+# Postures solved for while a pinch is held; in between the tips move apart by much less than 3 mm.
 _ROLL_SOLVES: Final = 5
 # Half-closed start and end posture, thumb first.
 _RELAXED_RAD: Final = (0.1, -0.3, 0.2, 0.3, *(0.35, 0.0, 0.45, 0.25) * 4)

@@ -1,8 +1,8 @@
-"""Rival solver in a child process with a limit of processor time per call.
+"""Solver of another library in a child process with a limit of processor time per call.
 
-A rival that never returns, as one does for NaN, would block the whole measurement. Its process
+A library that never returns, as one does for NaN, would block the whole measurement. Its process
 therefore sets a timer before each call, which kills the process. The timer counts processor time,
-not wall time, so a busy machine does not abort a rival. Run as a module, this is the child process:
+not wall time, so a busy machine does not abort a call. Run as a module, this is the child process:
 requests on standard input and responses on standard output are a line of JSON followed by arrays as
 bytes.
 """
@@ -28,9 +28,10 @@ from dextouch.errors import InvalidInputError, LimitExceededError, UnavailableEr
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.hands.robot_hand import NUM_JOINTS, RobotHand
 
-# Limit of processor time; the slowest call of a rival takes hundredths of a second.
+# Limit of processor time; the slowest call of a library takes hundredths of a second.
 CALL_LIMIT_S = 10.0
-# Rivals start in the middle of all limits and need samples to come from there; not timed or judged.
+# Libraries start in the middle of all limits and need some samples to converge; these are not
+# measured.
 NUM_WARM_UP = 10
 
 
@@ -98,7 +99,7 @@ class RivalProcess(AbstractContextManager["RivalProcess"]):
                 limit_s=CALL_LIMIT_S,
             )
         return UnavailableError(
-            f"{self.rival.name}: its process ended with status {status}; its words are above"
+            f"{self.rival.name}: its process ended with status {status}; see its output above"
         )
 
     def _stop(self) -> int | None:

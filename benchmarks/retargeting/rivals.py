@@ -1,6 +1,6 @@
-"""Rival retargeting libraries with their objectives, configured for our hand.
+"""Other retargeting libraries with their objectives, configured for our hand.
 
-dex-retargeting and its port dexi-rs know three objectives, here in the form that does best on a
+dex-retargeting and its port dexi-rs have three objectives, used here in the form that is best for a
 hand with five full fingers: vectors from the wrist to PIP, DIP and tip of every finger, the same
 points as positions, and DexPilot's ten vectors between the tips with the five from the wrist. They
 run without their low-pass filter, which costs more accuracy than their solvers.
@@ -44,7 +44,7 @@ class Rival(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As the tables call it."""
+        """Name in tables."""
         return f"{self.library} {self.objective}"
 
 
@@ -62,7 +62,7 @@ Solve = Callable[[Any], Any]
 
 
 class Setup(NamedTuple):
-    """A library at work: what it is given for keypoints, its call, its order of the joints."""
+    """A configured library: its references, its solve function and its joint order."""
 
     references: list[Any]
     solve: Solve
@@ -70,7 +70,7 @@ class Setup(NamedTuple):
 
 
 def find_rival(name: str) -> Rival:
-    """The rival of that name.
+    """The library and objective of this name.
 
     Raises:
         UnknownNameError: there is none.

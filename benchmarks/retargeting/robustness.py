@@ -78,4 +78,4 @@ def _describe(motion: Motion, joints_rad: np.ndarray) -> str:
         lost = int((~np.isfinite(joints_rad).all(axis=1)).sum())
         return f"NaN in {lost} of {len(joints_rad)} samples"
     score = score_robot([motion], [joints_rad])
-    return f"goes on, tips {score.tip_mean_mm:.2g} mm off (worst {score.tip_max_mm:.2g})"
+    return f"continues, tips {score.tip_mean_mm:.2g} mm off (worst {score.tip_max_mm:.2g})"

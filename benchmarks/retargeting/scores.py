@@ -12,7 +12,7 @@ from benchmarks.simulated.hand_motions import Motion
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.hands.robot_hand import RobotHand
 
-# Rivals answer in float32, which may exceed a limit by rounding.
+# Other libraries return float32, which may exceed a limit by rounding.
 LIMIT_TOLERANCE_RAD = 1e-6
 
 
@@ -24,7 +24,7 @@ class RobotScore:
 
     Attributes:
         num_outside: joint angles beyond their limits.
-        max_step_deg: the largest turn of a joint from one sample to the next.
+        max_step_deg: the largest joint change from one sample to the next.
     """
 
     tip_mean_mm: float
@@ -114,7 +114,7 @@ def robot_gaps_m(side: str, joints_rad: np.ndarray) -> Float64[np.ndarray, "time
 
 
 def max_step_deg(answers: Sequence[np.ndarray]) -> float:
-    """The largest turn of a joint from one sample to the next; motions are not joined."""
+    """The largest joint change from one sample to the next, within each motion."""
     steps = [np.abs(np.diff(answer, axis=0)).max(initial=0.0) for answer in answers]
     return float(np.rad2deg(max(steps)))
 
@@ -136,4 +136,4 @@ def _check(motions: Sequence[Motion], answers: Sequence[np.ndarray]) -> None:
         )
     for index, answer in enumerate(answers):
         if not np.isfinite(answer).all():
-            raise NonFiniteError(f"answer to motion {index} holds NaN or infinity")
+            raise NonFiniteError(f"answer to motion {index}: contains NaN or infinity")

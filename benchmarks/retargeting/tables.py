@@ -26,18 +26,18 @@ def tables(
     outcomes: Sequence[Outcome],
     rivals: Sequence[str] = (),
 ) -> list[ResultTable]:
-    """All tables of the stage; rivals without a result are marked as not finished."""
+    """All tables of the stage; libraries without a result are marked as not finished."""
     return [
         *[_speed_table(speeds, motion, rivals) for motion in (ROBOT_INPUT, PINCH_INPUT)],
         *[_robot_table(robot, name, rivals) for name in robot],
         _pinch_table(pinches, rivals),
         ResultTable(
-            "Cold start: fingers of postures anywhere, found to 0.1 mm",
+            "Cold start: fingers of random postures solved within 0.1 mm",
             ("fingers", "with one start", "with retries"),
             [tuple(str(number) for number in cold)],
         ),
         ResultTable(
-            "What a tracker loses (robot motion, one second)",
+            "Behaviour on lost samples and nodes (robot motion, one second)",
             ("method", NODE_LOST, HAND_LOST, NODES_LOST),
             fault_rows(outcomes),
         ),
@@ -78,7 +78,7 @@ def _points(speeds: Sequence[Speed], motion: str, errors: Mapping[str, float]) -
 def _unfinished(
     rivals: Sequence[str], finished: Iterable[str], num_columns: int
 ) -> list[tuple[str, ...]]:
-    """A row for each rival without a result."""
+    """A row for each library without a result."""
     missing = set(rivals).difference(finished)
     return [
         (name, "did not finish", *[""] * (num_columns - 2)) for name in rivals if name in missing

@@ -1,1 +1,1 @@
-"""Cost of a chunk: our server beside echoes of the same bytes."""
+"""Benchmark of rollouts over the network: time per chunk compared with an echo server."""

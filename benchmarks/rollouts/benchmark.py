@@ -1,4 +1,4 @@
-"""Entry point of the benchmark stage `rollouts`: what a chunk costs beside an echo."""
+"""Entry point of the benchmark stage `rollouts`: time of a chunk compared with an echo."""
 
 import argparse
 import statistics
@@ -55,7 +55,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Time chunks of a world that computes nothing, and echoes of the same bytes, in turns.
+    """Time chunks of a world that computes nothing, alternating with echoes of the same bytes.
 
     Raises:
         InvalidInputError: no round, or more chunks than a rollout may have.

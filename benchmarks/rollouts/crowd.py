@@ -1,4 +1,4 @@
-"""Several rollouts at once, each of which sends its next chunk as soon as it has an answer."""
+"""Concurrent rollouts, each of which sends its next chunk as soon as it gets a response."""
 
 import asyncio
 import json

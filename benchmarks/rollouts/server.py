@@ -30,7 +30,7 @@ STEPS: Final[tuple[Literal["last", "all"], ...]] = ("last", "all")
 
 
 async def echo(scope: Scope, receive: Receive, send: Send) -> None:
-    """ASGI application that reads a body and answers with as many bytes as the path says."""
+    """ASGI application that reads a body and responds with the number of bytes in the path."""
     if scope["type"] != "http":
         return
     while (await receive()).get("more_body"):
@@ -56,7 +56,7 @@ def _decoded(found: dict[Any, Any]) -> Any:  # noqa: ANN401 - an array, or the m
 
 
 async def answer_messages(connection: ServerConnection) -> None:
-    """What a policy server of openpi does: unpack a message, take a step, pack what is seen."""
+    """Minimal server like openpi's: unpack a message, take a step, pack the observation."""
     world, state = StillWorld(), 0
     selectors = {steps: ReturnSelector(steps=steps) for steps in STEPS}
     with suppress(ConnectionClosed):

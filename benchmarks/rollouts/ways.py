@@ -40,7 +40,7 @@ class Way(NamedTuple):
 
 @contextmanager
 def opened(urls: Mapping[str, str], way: Way) -> Iterator[Chunk]:
-    """One rollout; every call advances it by a chunk and returns the bytes of the answer."""
+    """One rollout; every call advances it by a chunk and returns the size of the response."""
     start, actions = START | {"world": way.world}, resting_actions(MAX_STEPS)
     if way.protocol == "WebSocket":
         address = urls[way.server].replace("http", "ws") + "/v1/openpi"

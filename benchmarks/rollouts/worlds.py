@@ -25,7 +25,7 @@ FIXED_SHARE = 0.8
 
 
 def resting_actions(num_steps: int) -> Float64[np.ndarray, "steps 67"]:
-    """Actions that leave everything in its place."""
+    """Actions that hold everything still."""
     rows = np.zeros((num_steps, 67))
     for part in POSE_SLICES:
         rows[:, part] = IDENTITY_POSE_9D
@@ -101,7 +101,7 @@ class StillWorld:
 
 
 class Device(StillWorld):
-    """Takes as long as a device would, one rollout at a time."""
+    """Simulated device that computes one rollout at a time."""
 
     def __init__(self) -> None:
         super().__init__(is_quick=False)
@@ -120,7 +120,7 @@ class Device(StillWorld):
 
 
 class BatchDevice(Device):
-    """A device that takes most of its time once for all rollouts of a batch."""
+    """Simulated device whose time per batch hardly depends on the batch size."""
 
     def step_batch(
         self,

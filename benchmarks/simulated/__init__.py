@@ -1,1 +1,1 @@
-"""Simulated inputs with known truth, shared by benchmarks and accuracy tests."""
+"""Simulated inputs with ground truth, shared by benchmarks and accuracy tests."""

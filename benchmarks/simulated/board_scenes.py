@@ -19,7 +19,7 @@ DISTORTION = np.array([0.05, -0.1, 0.001, -0.0005, 0.02])
 COLUMNS, ROWS, SQUARE_M = 9, 6, 0.03
 MARGIN_PX = 5.0
 MAX_TRIES = 100_000
-# So that boards come to the edges of the image.
+# Large enough for boards to reach the edges of the image.
 SIDEWAYS_M = 0.25
 TURN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 

@@ -1,7 +1,7 @@
 """Self-collision check of a hand: which fingers touch each other or the palm.
 
-Fingers are capsules, the palm is a box, as in the twin. A sequence of robot postures must be
-collision-free to be feasible, which every second random posture is not.
+Fingers are capsules, the palm is a box, as in the twin. About half of all random postures are in
+collision, and thus infeasible for a robot.
 """
 
 from itertools import combinations

@@ -26,7 +26,7 @@ _NUM_SINES: Final = 3
 # Usual ranges: flexion, abduction and the two outer joints of a finger, then of the thumb.
 NATURAL_FINGER_RAD: Final = ((-0.15, 1.40), (-0.25, 0.25), (0.0, 1.75), (0.0, 1.25))
 NATURAL_THUMB_RAD: Final = ((-0.40, 0.90), (-0.90, 0.35), (0.0, 1.00), (0.0, 1.20))
-# Full range stops short of the limits, so that a sample at a limit has its truth inside.
+# Full range ends before the limits, so that true angles are inside them.
 _FULL_SHARE: Final = 0.98
 # Number of samples over which touching fingers are opened.
 _GATE_SAMPLES: Final = 25
@@ -40,7 +40,7 @@ class Motion:
 
     Attributes:
         side: of the hand.
-        joints_rad: the truth, firmware order.
+        joints_rad: true joint angles, firmware order.
         keypoints_m: wrist coordinates, order of `dextouch.hands.NODES`; NaN: not tracked.
         tips_m: true fingertips, thumb … little, wrist coordinates.
     """
@@ -83,13 +83,13 @@ def robot_motion(side: Side, num_samples: int, seed: int, *, natural: bool) -> M
         # The same motion, played more slowly.
         period_s *= 0.97 * MAX_SPEED_RAD_S / fastest
     raise LimitExceededError(
-        f"motion of the {side} hand, seed {seed}: its fastest joint does {fastest:.3g} rad/s after "
-        f"{_MAX_TRIES} tries, expected at most {MAX_SPEED_RAD_S:g}; take another seed"
+        f"motion of the {side} hand, seed {seed}: got a joint speed of {fastest:.3g} rad/s after "
+        f"{_MAX_TRIES} tries, expected at most {MAX_SPEED_RAD_S:g}; use another seed"
     )
 
 
 def motion_of(hand: TwinHand, joints_rad: np.ndarray) -> Motion:
-    """Motion of a robot hand with joint angles [T, 20]; nodes that it lacks are static."""
+    """Motion of a robot hand with joint angles [T, 20]; nodes that it does not have are static."""
     joints = np.asarray(joints_rad, dtype=np.float64)
     points = hand.kinematics.chain_points_m(joints)
     keypoints = np.zeros((len(joints), NUM_KEYPOINTS, 3))
@@ -102,14 +102,14 @@ def motion_of(hand: TwinHand, joints_rad: np.ndarray) -> Motion:
 
 
 def with_noise(motion: Motion, sigma_m: float, rng: Generator) -> Motion:
-    """Add Gaussian noise to all nodes except the wrist; the truth is unchanged."""
+    """Add Gaussian noise to all nodes except the wrist; joint angles are unchanged."""
     noise = rng.normal(0.0, sigma_m, motion.keypoints_m.shape)
     noise[:, NODE_INDEX["wrist", "wrist"]] = 0.0
     return replace(motion, keypoints_m=motion.keypoints_m + noise)
 
 
 def with_dropouts(motion: Motion, share: float, rng: Generator) -> Motion:
-    """Randomly drop nodes (NaN), except the wrist; the truth is unchanged.
+    """Randomly drop nodes (NaN), except the wrist; joint angles are unchanged.
 
     Raises:
         InvalidInputError: a share outside 0 … 1.

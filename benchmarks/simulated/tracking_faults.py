@@ -1,4 +1,4 @@
-"""Motions with injected faults of every kind, and the truth for each finger."""
+"""Motions with injected faults of every kind, and ground truth for each finger."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _BODY = np.array([node for chain in CHAINS for node in chain_indices(chain)])
 
 @dataclass(frozen=True)
 class FuzzedMotion:
-    """Keypoints with faults, and the truth about them.
+    """Keypoints with faults, and ground truth about these.
 
     Attributes:
         keypoints_m: wrist coordinates.

@@ -7,7 +7,7 @@ from benchmarks.store.appends import SPOOL, SPOOL_SYNCED, AppendResult
 from benchmarks.store.compare import DesignResult
 from benchmarks.store.live import SPEED, LiveResult
 
-# The default configuration that requirements refer to, and the rival compared with.
+# The default configuration that requirements refer to, and the design compared with.
 OURS, RIVAL = "ours-h264", "zarr-jpeg"
 
 

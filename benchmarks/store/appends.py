@@ -22,13 +22,13 @@ STREAM = "tactile_left"
 SPOOL, SPOOL_SYNCED, ZARR = "spool", "spool, on the disk", "zarr append"
 # Lower bound for any log: the same bytes written and synced to a file.
 DISK = "bare write and fdatasync"
-# Slow methods get fewer appends, so that all take about equally long.
+# Slow methods get fewer appends, so that all take about the same time.
 _NUM_APPENDS = {SPOOL: 4000, SPOOL_SYNCED: 1000, DISK: 1000, ZARR: 300}
 
 
 @dataclass(frozen=True)
 class AppendResult:
-    """Milliseconds of one append of one sample of a glove, a value a round."""
+    """Milliseconds per append of one glove sample; figures hold one value per round."""
 
     name: str
     num_appends: int

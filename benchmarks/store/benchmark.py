@@ -44,11 +44,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--rounds", type=int, help=f"rounds ({_USUAL['rounds']}; quick 1)")
     parser.add_argument(
-        "--windows", type=int, help=f"random windows a round ({_USUAL['windows']}; quick 4)"
+        "--windows", type=int, help=f"random windows per round ({_USUAL['windows']}; quick 4)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the scene (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the scene (%(default)s)")
     parser.add_argument(
-        "--designs", metavar="A,B", help=f"only these, by comma (all that can run: {names})"
+        "--designs", metavar="A,B", help=f"comma-separated designs (all available: {names})"
     )
 
 
@@ -61,9 +61,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """
     plan = _plan(options)
     chosen = choose(options.designs)
-    notes = [f"{d.name} is left out: needs {d.missing()}" for d in chosen if d.missing()]
+    notes = [f"{d.name} is skipped: needs {d.missing()}" for d in chosen if d.missing()]
     designs = [design for design in chosen if design.missing() is None]
-    with bar("making the scene", len(CAMERAS)) as step:
+    with bar("generating the scene", len(CAMERAS)) as step:
         workload = make_take(plan["seconds"], options.seed, on_camera=step)
     effort = Effort(plan["rounds"], plan["windows"], 1 if options.quick else 3, options.seed)
     results = compare(designs, workload, folder, effort, bar)
@@ -87,10 +87,10 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 
 
 def choose(names: str | None) -> list[Design]:
-    """The designs of `--designs`; all of them when it is not given.
+    """Designs of `--designs`; default: all.
 
     Raises:
-        UnknownNameError: a design that there is not.
+        UnknownNameError: an unknown design.
     """
     known = {design.name: design for design in DESIGNS}
     wanted = list(known) if names is None else [name.strip() for name in names.split(",")]
@@ -101,14 +101,14 @@ def choose(names: str | None) -> list[Design]:
 
 
 def _plan(options: argparse.Namespace) -> dict[str, Any]:
-    """What the options say, else the usual or the quick numbers."""
+    """Values of the options, otherwise the usual or the quick defaults."""
     defaults: Mapping[str, float] = _QUICK if options.quick else _USUAL
     given = {name: getattr(options, name) for name in defaults}
     plan = {name: given[name] if given[name] is not None else defaults[name] for name in defaults}
     if plan["seconds"] < _MIN_SECONDS:
         raise InvalidInputError(
-            f"--seconds: got {plan['seconds']:g}, expected at least {_MIN_SECONDS:g}: a window "
-            f"holds {WINDOW_IMAGES} images"
+            f"--seconds: got {plan['seconds']:g}, expected at least {_MIN_SECONDS:g}, the length "
+            f"of a window of {WINDOW_IMAGES} images"
         )
     for name in ("rounds", "windows"):
         if plan[name] < 1:

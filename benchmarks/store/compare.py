@@ -1,4 +1,4 @@
-"""Time, size and image error of each storage design on one take, measured in turns."""
+"""Time, size and image error of each storage design on one take, measured alternately."""
 
 import gc
 import os
@@ -158,8 +158,8 @@ def _check_numbers(name: str, window: StoreWindow, true: StoreWindow, start: int
         if not np.array_equal(got, expected):
             raise CorruptDataError(
                 f"design {name!r}: {part} of the window at image {start} are {got.dtype} "
-                f"{got.shape} that differ from the {expected.dtype} {expected.shape} that were "
-                "written; its other figures would mean nothing"
+                f"{got.shape} that differ from the written {expected.dtype} {expected.shape}; "
+                "its other figures would be meaningless"
             )
 
 

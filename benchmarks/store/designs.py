@@ -15,7 +15,7 @@ from benchmarks.store.workload import Workload
 
 @dataclass(frozen=True)
 class StoreWindow:
-    """17 images of one camera with the touch of both hands and the actions of their time."""
+    """17 images of one camera with the touch and actions of the same interval."""
 
     images: UInt8[np.ndarray, "17 480 640 3"]
     tactile_left: UInt16[np.ndarray, "34 360"]

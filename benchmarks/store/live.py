@@ -13,7 +13,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.schemas import RecordingAttributes
 
 SPEED = 4.0
-# A station's queues hold this much; a row that waits longer in front of the store is late.
+# A station's queues cover this time; a row that waits longer for the store is late.
 LATE_S = 0.1
 _RECORDING_ID = "live"
 
@@ -43,9 +43,9 @@ def write_live(workload: Workload, folder: Path, unit: str, *, speed: float = SP
     """Write a recording of the whole station at a multiple of real time.
 
     Args:
-        workload: the take; its stamps are the due times.
-        folder: of a store, emptied first.
-        unit: of the cameras.
+        workload: the take; its timestamps are the due times.
+        folder: folder of a store, emptied first.
+        unit: unit of the cameras.
         speed: multiple of real time.
     """
     shutil.rmtree(folder, ignore_errors=True)

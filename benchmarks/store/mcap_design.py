@@ -30,7 +30,7 @@ class McapDesign:
     reads: str | None = None
 
     def missing(self) -> str | None:
-        """The mcap library, where it is not there."""
+        """The mcap library, if it is not installed."""
         return None if importlib.util.find_spec("mcap") else "package mcap (pip install mcap)"
 
     def write(self, workload: Workload, folder: Path) -> None:
@@ -62,7 +62,7 @@ class McapDesign:
 
 
 class _OpenMcap(OpenStore):
-    """Windows by time; the stamps of a take are looked up when it is opened."""
+    """Windows by time; all timestamps of a take are read when it is opened."""
 
     def __init__(self, path: Path) -> None:
         from mcap.reader import SeekingReader
@@ -100,7 +100,7 @@ class _OpenMcap(OpenStore):
         from mcap.reader import SeekingReader
 
         stamps = self._stamps[name]
-        # A reader a call, since threads must not share one.
+        # One reader per call, since threads must not share one.
         with self._path.open("rb") as file:
             found = SeekingReader(file).iter_messages(
                 topics=[name], starting_at=stamps[start], ending_at=stamps[start + count - 1]

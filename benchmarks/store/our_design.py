@@ -43,7 +43,7 @@ class OurDesign:
         return f"ours-{self.unit}"
 
     def missing(self) -> str | None:
-        """What the store needs for H.264, where it is not there."""
+        """The package for H.264, if it is not installed."""
         needs = ("dextouch.episodes.image_codecs", "av") if self.unit == "h264" else ()
         for module in needs:
             if importlib.util.find_spec(module) is None:
@@ -51,7 +51,7 @@ class OurDesign:
         return None
 
     def write(self, workload: Workload, folder: Path) -> None:
-        """Append the take as it arrives: an image a call, numbers in the batches between."""
+        """Append the take as it arrives: image by image, numbers in batches in between."""
         attributes = episode_attributes(descriptors(workload, self.unit))
         with EpisodeStore(folder).writer(attributes=attributes) as writer:
             for name, values, t_ref_ns in arrivals(workload):
@@ -91,7 +91,7 @@ class _OpenOurs(OpenStore):
 
 
 def arrivals(workload: Workload) -> Iterator[Block]:
-    """The take in the order of time: stream, values, stamps."""
+    """The take in the order of time: stream, values, timestamps."""
     for index in range(workload.num_images):
         rows = slice(index, index + 1)
         for name, stream in workload.images.items():

@@ -17,7 +17,7 @@ _HAND_PX = (200, 260)
 _NUM_OBJECTS = 3
 _NUM_CLUTTER = 25
 _SKIN = (205.0, 160.0, 135.0)
-# Amplitudes fall by 2.2 an octave up to 64 cycles a width: soft colours, no pixel noise.
+# Amplitudes fall by 2.2 per octave up to 64 cycles per width: soft colours, no pixel noise.
 _SLOPE = 2.14
 _CUTOFF_CYCLES = 64.0
 
@@ -26,9 +26,9 @@ _CUTOFF_CYCLES = 64.0
 class Scene:
     """Static parts of a camera's view.
 
-    `pairs` holds each pixel of the background beside its right neighbour, and a fourth colour
-    that is never seen: rows of 32 bytes are what numpy gathers fastest. `noise` is as wide as two
-    images, the same twice, so that it can be shifted by looking elsewhere.
+    `pairs` holds each pixel of the background with its right neighbour, and an unused fourth
+    channel, because numpy gathers rows of 32 bytes fastest. `noise` is as wide as two images, the
+    same twice, so that a slice shifts it.
     """
 
     pairs: Float32[np.ndarray, "1300000 2 4"]
@@ -129,7 +129,7 @@ def _draw_box(picture: np.ndarray, rng: np.random.Generator) -> None:
 
 
 def _draw_word(picture: np.ndarray, rng: np.random.Generator) -> None:
-    """Ten signs of random strokes in one colour: edges like those of print."""
+    """Draw ten glyphs of random strokes in one colour, with edges like those of print."""
     signs: Bool[np.ndarray, "10 7 6"] = np.zeros((10, 7, 6), dtype=bool)
     for row in (0, 3, 6):
         signs[:, row, :5] = rng.random((10, 1)) < 0.6

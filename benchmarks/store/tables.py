@@ -18,7 +18,7 @@ def tables(
     appends: Sequence[AppendResult],
     live: Sequence[LiveResult],
 ) -> list[ResultTable]:
-    """All tables of the stage; those without rows are left out."""
+    """All tables of the stage; those without rows are omitted."""
     found = [
         write_table(results),
         read_table(results),
@@ -84,7 +84,7 @@ def read_table(results: Mapping[str, DesignResult]) -> ResultTable:
 
 
 def panels(results: Mapping[str, DesignResult]) -> list[Panel]:
-    """Time against image error: once of writing, once of reading."""
+    """Time against image error, for writing and for reading."""
     write = {name: result.write_s.scaled(1 / result.seconds) for name, result in results.items()}
     read = {name: result.window_ms for name, result in results.items()}
     error = "image error (RMS, levels of 255)"
@@ -109,7 +109,7 @@ def _points(results: Mapping[str, DesignResult], times: Mapping[str, Figure]) ->
 
 
 def rms_levels(psnr_db: float) -> float:
-    """The root mean square error of 8-bit images that a PSNR stands for."""
+    """Root mean square error (levels of 8-bit images) for a PSNR."""
     return float(255.0 * 10.0 ** (-psnr_db / 20.0))
 
 

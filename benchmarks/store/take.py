@@ -15,7 +15,7 @@ from benchmarks.store.workload import (
     Workload,
 )
 
-# Stamps start a little after zero, so that their jitter never makes them negative.
+# Timestamps start slightly after zero, so that jitter never makes them negative.
 FIRST_STAMP_NS = 10_000_000
 JITTER_NS = 200_000
 _SHAPES = {"keypoints": (25, 3), "wrist": (7,), "head": (7,), "action": (67,)}
@@ -27,8 +27,8 @@ def make_take(
     """Generate the streams of one take, deterministic by seed and length.
 
     Args:
-        seconds: length, of whole images.
-        seed: of everything random.
+        seconds: length, a whole number of images.
+        seed: random seed.
         on_camera: called with a camera's name before it is rendered, from its thread.
     """
     rng = np.random.default_rng(seed)
@@ -78,7 +78,7 @@ def _walk(shape: tuple[int, ...], rng: np.random.Generator) -> Float32[np.ndarra
 
 
 def _tactile(count: int, *, phase: float, rng: np.random.Generator) -> UInt16[np.ndarray, "n 360"]:
-    """Counts of a glove: five places pressed and let go, over the noise of every cell."""
+    """Counts of a glove: five spots that are pressed and released, plus noise of every cell."""
     t_s = np.arange(count)[:, None] / NUMERIC_RATES_HZ["tactile_left"]
     cell = np.arange(360)[None]
     pressed = np.zeros((count, 360))

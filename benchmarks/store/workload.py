@@ -29,7 +29,7 @@ NUMERIC_RATES_HZ = {
 
 @dataclass(frozen=True)
 class TimedStream:
-    """One stream: its samples and a stamp for each, strictly increasing."""
+    """One stream: its samples, with strictly increasing timestamps."""
 
     values: Shaped[np.ndarray, "n ..."]
     t_ref_ns: Int64[np.ndarray, " n"]
@@ -43,11 +43,11 @@ class TimedStream:
 
 @dataclass(frozen=True)
 class Workload:
-    """One take: images uint8 [n, 480, 640, 3] a camera, numbers as the docs of the bench list them.
+    """One take: images uint8 [n, 480, 640, 3] per camera, and the streams of docs/benchmarks.md.
 
     Sample 2k of a tactile stream, image k and action k belong together: a window that starts at
-    image k holds WINDOW_IMAGES images and actions from k on and WINDOW_TACTILE tactile samples
-    a hand from 2k on.
+    image k contains WINDOW_IMAGES images and actions from k on and WINDOW_TACTILE tactile samples
+    per hand from 2k on.
     """
 
     seconds: float

@@ -1,4 +1,4 @@
-"""JPEG codec for zarr-python, used by the rival design."""
+"""JPEG codec for zarr-python, used by the compared designs."""
 
 import asyncio
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from dextouch.errors import InvalidInputError
 
 @dataclass(frozen=True)
 class JpegCodec(ArrayBytesCodec):
-    """One image a chunk, with halved chroma as OpenCV's JPEG has by default.
+    """One image per chunk, with halved chroma resolution as in OpenCV's default.
 
     Works in the thread of zarr's event loop.
     """
@@ -40,7 +40,7 @@ class JpegCodec(ArrayBytesCodec):
         return cls(quality)
 
     def to_dict(self) -> dict[str, JSON]:
-        """What zarr.json says of the codec."""
+        """Configuration of the codec in zarr.json."""
         return {"name": self.key(), "configuration": {"quality": self.quality}}
 
     def compute_encoded_size(self, input_byte_length: int, chunk_spec: ArraySpec) -> int:
@@ -65,7 +65,7 @@ class JpegCodec(ArrayBytesCodec):
 
 @dataclass(frozen=True)
 class PooledJpegCodec(JpegCodec):
-    """The same in zarr's pool of threads, so that the images of a window share the cores."""
+    """The same codec in zarr's thread pool, so that one window uses all cores."""
 
     @classmethod
     def key(cls) -> str:
@@ -80,6 +80,6 @@ class PooledJpegCodec(JpegCodec):
 
 
 def register() -> None:
-    """Make both codecs known to zarr-python; twice does no harm."""
+    """Register both codecs with zarr-python; may be called repeatedly."""
     for codec in (JpegCodec, PooledJpegCodec):
         register_codec(codec.key(), codec)

@@ -21,10 +21,10 @@ _ZSTD_LEVEL = 1
 
 @dataclass(frozen=True)
 class ZarrDesign:
-    """zarr-python with images as `kind`; numbers and stamps in chunks of one second.
+    """zarr-python with images as `kind`; numbers and timestamps in chunks of one second.
 
-    Images are set one by one as they come. Numbers are written in one piece at the end, which
-    spares zarr its slow small appends. The arrays have their final length from the start.
+    Images are written one by one as they arrive. Numbers are written at once at the end, which
+    avoids zarr's slow small appends. The arrays have their final length from the start.
     """
 
     kind: Literal["jpeg", "jpeg-pool", "raw"]
@@ -36,11 +36,11 @@ class ZarrDesign:
         return f"zarr-{self.kind}"
 
     def missing(self) -> str | None:
-        """zarr-python, where it is not there."""
+        """zarr-python, if it is not installed."""
         return None if importlib.util.find_spec("zarr") else "package zarr (pip install zarr)"
 
     def write(self, workload: Workload, folder: Path) -> None:
-        """Set image by image, then all numbers."""
+        """Write image by image, then all numbers."""
         import zarr
 
         group = zarr.open_group(str(folder), mode="w")

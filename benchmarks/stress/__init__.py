@@ -1,1 +1,1 @@
-"""Stress of every stage: checks under numerical hazards, run by the command and as tests."""
+"""Stress tests of every stage: checks under numerical hazards, run by a command and as tests."""

@@ -53,10 +53,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of `python -m benchmarks stress`; a cell that fails always gives status 1."""
     parser.set_defaults(check=True)
     parser.add_argument(
-        "stage", nargs="*", metavar="STAGE", help=f"only these of {', '.join(STAGES)}"
+        "stage", nargs="*", metavar="STAGE", help=f"stages to run (all: {', '.join(STAGES)})"
     )
     parser.add_argument(
-        "--hazard", action="append", metavar="NAME", help=f"only these: {', '.join(HAZARDS)}"
+        "--hazard", action="append", metavar="NAME", help=f"may be repeated: {', '.join(HAZARDS)}"
     )
     parser.add_argument("--list", action="store_true", help="list the cells without running them")
 
@@ -160,7 +160,7 @@ def _listing(cells: Sequence[Cell | Exemption]) -> ResultTable:
         else (cell.stage, cell.hazard, cell.fed, "slow" if cell.slow else "")
         for cell in cells
     ]
-    columns = ("stage", "hazard", "fed, or why it does not apply", "takes")
+    columns = ("stage", "hazard", "input, or why it does not apply", "takes")
     return ResultTable(f"{len(cells)} cells", columns, rows, num_text_columns=4)
 
 

@@ -161,7 +161,7 @@ class StageCells:
         if hazard not in HAZARDS:
             raise UnknownNameError("hazard", hazard, list(HAZARDS))
         if hazard in self.cells or hazard in self.exemptions:
-            raise InvalidInputError(f"stress: {self.name}, {hazard} is given twice")
+            raise InvalidInputError(f"stress: {self.name}, {hazard} is registered twice")
 
 
 @dataclass(frozen=True)

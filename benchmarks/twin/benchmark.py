@@ -43,7 +43,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Time a chunk with every selector in turns, then chunks with contact with every solver.
+    """Time a chunk alternately with every selector, then chunks with contact with every solver.
 
     Raises:
         InvalidInputError: no round.
@@ -79,7 +79,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 
 
 def selector_table(times_ms: Mapping[str, Figure]) -> ResultTable:
-    """Milliseconds of a chunk, and how many times as fast as it is played."""
+    """Milliseconds of a chunk, and its speed relative to real time."""
     return ResultTable(
         "A chunk of 16 steps by requested observation",
         ("requested", "ms", "times real time"),
@@ -93,7 +93,7 @@ def selector_table(times_ms: Mapping[str, Figure]) -> ResultTable:
 def solver_table(
     times_ms: Mapping[str, Figure], errors: Mapping[str, ContactError], num_chunks: int
 ) -> ResultTable:
-    """What coarser solvers save and what they cost in contact."""
+    """Times and contact errors of coarser solvers."""
     return ResultTable(
         f"Solvers on {num_chunks} chunks with contact, no camera, errors after one chunk",
         ("solver", "ms", "force error (N)", "true force (N)", "object error (mm)"),
@@ -111,7 +111,7 @@ def solver_table(
 
 
 def panel(times_ms: Mapping[str, Figure], errors: Mapping[str, ContactError]) -> Panel:
-    """Time of a chunk against its contact error; what is served is its own truth."""
+    """Time of a chunk against its contact error, relative to the default solver."""
     points = [
         Point(
             label=name,
@@ -128,7 +128,7 @@ def panel(times_ms: Mapping[str, Figure], errors: Mapping[str, ContactError]) ->
 
 
 def requirements(times_ms: Mapping[str, Figure], *, states_are_equal: bool) -> list[Requirement]:
-    """What the twin promises of selectors."""
+    """Requirements on selectors of the twin."""
     saved = times_ms[HEAD_LAST].over(times_ms[HEAD]).median
     share = times_ms[HEAD].median / CHUNK_MS
     return [

@@ -12,7 +12,7 @@ from services.twin.stage import Stage
 from services.twin.world import TwinState, TwinWorld
 
 CHUNK_STEPS: Final = 16
-# Contact falls into the second chunk of both scripts.
+# Both scripts have contact in their second chunk.
 CHUNK: Final = 1
 EVERY_CAMERA: Final = "three cameras, 16 steps"
 HEAD: Final = "head camera, 16 steps"
@@ -27,7 +27,7 @@ SELECTORS: Final = {
 
 
 class TimedChunk:
-    """One chunk of a demonstration with contact, stepped again and again from the same state.
+    """One chunk of a demonstration with contact, stepped repeatedly from the same state.
 
     Args:
         task: of the twin.
@@ -46,11 +46,11 @@ class TimedChunk:
         self._state, self._actions = state, rows[CHUNK * CHUNK_STEPS :][:CHUNK_STEPS]
 
     def subjects(self) -> dict[str, Callable[[int], float]]:
-        """What to time: processor milliseconds of the chunk with each selector."""
+        """Functions that measure processor milliseconds of the chunk with each selector."""
         return {name: partial(self._timed, selector) for name, selector in SELECTORS.items()}
 
     def states_are_equal(self) -> bool:
-        """Whether the state after the chunk is the same to the last bit for every selector."""
+        """Whether the state after the chunk is bit-identical for every selector."""
         snapshots = {self._world.snapshot(self._step(selector)) for selector in SELECTORS.values()}
         return len(snapshots) == 1
 

@@ -20,7 +20,7 @@ _MM_PER_M: Final = 1e3
 
 @dataclass(frozen=True)
 class Solver:
-    """Options of MuJoCo's constraint solver; what is None stays as the twin has it."""
+    """Options of MuJoCo's constraint solver; None: as in the twin."""
 
     iterations: int | None = None
     kind: int | None = None
@@ -39,7 +39,7 @@ SOLVERS: Final = {
 
 @dataclass(frozen=True)
 class Played:
-    """What a chunk with contact led to: pad forces at 60 Hz and where the objects went."""
+    """Result of a chunk with contact: pad forces at 60 Hz and final object positions."""
 
     pad_forces_n: Float64[np.ndarray, "samples 2 6"]
     object_positions_m: Float64[np.ndarray, "objects 3"]
@@ -48,12 +48,12 @@ class Played:
 
 @dataclass(frozen=True)
 class ContactError:
-    """Of chunks that begin in the same states, against the twin as served.
+    """Errors of chunks relative to the default solver, from the same initial states.
 
     Attributes:
-        force_n: root mean square over pads and samples in which something is felt.
-        force_rms_n: of the true forces that are not zero.
-        object_mm: median over chunks and objects of how far objects end from where they should.
+        force_n: root mean square error over pads and samples with contact.
+        force_rms_n: root mean square of the true forces that are not zero.
+        object_mm: median error of final object positions over chunks and objects.
     """
 
     force_n: float
@@ -62,9 +62,9 @@ class ContactError:
 
 
 class ContactChunks:
-    """Chunks of demonstrations, begun from the states that the twin as served reaches.
+    """Chunks of demonstrations, started from the states that the default solver reaches.
 
-    So errors are those of one chunk and do not grow from one to the next.
+    Errors are therefore those of one chunk and do not accumulate.
 
     Args:
         tasks: of the twin.
@@ -90,7 +90,7 @@ class ContactChunks:
         return len(self._begins)
 
     def play(self, solver: Solver) -> list[Played]:
-        """Every chunk with one solver, which is taken back afterwards."""
+        """Play every chunk with one solver; the default options are restored afterwards."""
         played = []
         for task, plan, first, state in self._begins:
             simulation = self._stages[task].simulation
@@ -108,7 +108,7 @@ class ContactChunks:
 
 
 def contact_error(played: Sequence[Played], truth: Sequence[Played]) -> ContactError:
-    """How far chunks are from those of the twin as served."""
+    """Errors of chunks relative to the default solver."""
     true_n = np.concatenate([one.pad_forces_n for one in truth])
     off_n = np.concatenate([one.pad_forces_n for one in played]) - true_n
     off_m = np.concatenate([one.object_positions_m for one in played]) - np.concatenate(

@@ -55,16 +55,14 @@ TOGETHER: Final = (1, 4, 8)
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
     parser.add_argument(
-        "--checkpoint", type=Path, help="of the paper's form (default: the package's own)"
+        "--checkpoint", type=Path, help="model in the paper's form (default: the package's own)"
     )
     parser.add_argument("--rounds", type=int, help=f"rounds ({USUAL['rounds']}; quick 1)")
-    parser.add_argument(
-        "--seeds", type=int, help=f"episodes of each task ({USUAL['seeds']}; quick 1)"
-    )
+    parser.add_argument("--seeds", type=int, help=f"episodes per task ({USUAL['seeds']}; quick 1)")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Let the model imagine held-out demonstrations in many ways, in turns.
+    """Predict held-out demonstrations with different settings, alternately.
 
     Raises:
         InvalidInputError: no round or seed, or a model that knows none of the twin's tasks.
@@ -88,8 +86,8 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     tasks = [task for task in TASK_NAMES if task in world.description.tasks]
     if not tasks:
         raise InvalidInputError(
-            f"bench world-model: the model knows {world.description.tasks}, expected at least one "
-            f"task of the twin: {TASK_NAMES}"
+            f"bench world-model: the model supports {world.description.tasks}, expected at least "
+            f"one task of the twin: {TASK_NAMES}"
         )
     with bar("demonstrations of the twin", 1) as step:
         step("making")
@@ -112,7 +110,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         data=_data(times_ms, errors, costs_ms),
         notes=[
             "times are processor time of the whole process; OMP_NUM_THREADS=1 gives one thread",
-            "every chunk starts from what the one before it imagined",
+            "every chunk starts from the predicted end of the previous one",
         ],
     )
 
@@ -169,7 +167,7 @@ def _data(
 
 
 def _plan(options: argparse.Namespace) -> dict[str, Any]:
-    """What the options say, else the usual or the quick numbers."""
+    """Values of the options, otherwise the usual or the quick defaults."""
     plan: dict[str, Any] = dict(QUICK if options.quick else USUAL)
     for name in ("rounds", "seeds"):
         given = getattr(options, name)

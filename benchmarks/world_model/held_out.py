@@ -19,7 +19,7 @@ CHUNK_STEPS: Final = 16
 
 @dataclass(frozen=True)
 class HeldOut:
-    """One demonstration: where it starts, its commanded actions, and what really happened.
+    """One demonstration: its start, its commanded actions, and the true images and touch.
 
     Row i of `actions`, `images` and `tactile_kpa` belongs to step i + 1.
     """
@@ -31,7 +31,7 @@ class HeldOut:
 
     @property
     def chunks(self) -> list[Float64[np.ndarray, "16 67"]]:
-        """The actions in chunks of 16 steps; a shorter rest is left out."""
+        """The actions in chunks of 16 steps; a shorter remainder is dropped."""
         whole = len(self.actions) // CHUNK_STEPS
         return [self.actions[CHUNK_STEPS * k :][:CHUNK_STEPS] for k in range(whole)]
 
@@ -41,7 +41,7 @@ def held_out(tasks: Sequence[str], seeds: Sequence[int], image_px: int) -> list[
 
     Args:
         tasks: of the twin.
-        seeds: none of which anything was trained on.
+        seeds: held-out seeds.
         image_px: width and height of the images.
     """
     settings = TwinSettings(cameras=(CAMERA,), image_height_px=image_px, image_width_px=image_px)

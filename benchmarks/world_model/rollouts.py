@@ -15,7 +15,7 @@ from dextouch.worlds import BatchWorld, World
 
 @dataclass(frozen=True)
 class Imagined:
-    """All rollouts of one world: what was seen of each chunk, and milliseconds a chunk."""
+    """All rollouts of one world: the observation of each chunk, and milliseconds per chunk."""
 
     seen: list[list[Observation]]
     ms: float
@@ -23,7 +23,7 @@ class Imagined:
 
 @dataclass(frozen=True)
 class RolloutError:
-    """Of whole rollouts against the twin: root mean squares, and contact of taxels."""
+    """Errors of whole rollouts relative to the twin: RMS errors, and F1 of taxel contact."""
 
     image_levels: float
     touch_kpa: float
@@ -33,7 +33,7 @@ class RolloutError:
 def imagine(
     world: World[Any], episodes: Sequence[HeldOut], selector: ReturnSelector = EVERYTHING
 ) -> Imagined:
-    """Play every episode's actions, chunk after chunk, each from what the last one imagined."""
+    """Play every episode's actions, each chunk from the predicted end of the previous one."""
     states = [world.reset(episode.start).state for episode in episodes]
     seen: list[list[Observation]] = [[] for _ in episodes]
     num_chunks = 0
@@ -51,7 +51,7 @@ def imagine(
 def imagine_together(
     world: BatchWorld[Any], episode: HeldOut, num_rollouts: int, selector: ReturnSelector
 ) -> Imagined:
-    """Several rollouts of one episode in one batch; milliseconds a chunk of one rollout."""
+    """Several rollouts of one episode in one batch; milliseconds per chunk of one rollout."""
     states = [world.reset(episode.start).state] * num_rollouts
     begin_s = time.process_time()
     for actions in episode.chunks:
@@ -67,7 +67,7 @@ def imagine_together(
 
 
 def rollout_error(imagined: Imagined, episodes: Sequence[HeldOut]) -> RolloutError:
-    """How far rollouts that showed everything are from what the twin showed."""
+    """Errors of rollouts with all images relative to the twin."""
     all_seen = [one for seen in imagined.seen for one in seen]
     pairs = list(zip(imagined.seen, episodes, strict=True))
     true_images = [episode.images[: CHUNK_STEPS * len(seen)] for seen, episode in pairs]

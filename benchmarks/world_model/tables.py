@@ -16,7 +16,7 @@ MAX_CHUNK_MS: Final = 50.0
 
 
 def variant_name(euler_steps: int, precision: "Precision") -> str:
-    """A model that samples so, as tables and charts name it."""
+    """Name of a sampling setting in tables and charts."""
     return f"{euler_steps} Euler step{'s' if euler_steps > 1 else ''}, {precision}"
 
 
@@ -86,7 +86,7 @@ def requirements(
     errors: Mapping[str, RolloutError],
     served: str,
 ) -> list[Requirement]:
-    """What an imagined world promises: faster than its steps pass, better than standing still."""
+    """Requirements on speed, and on errors relative to repeating the first step."""
     ours, copied = errors[served], errors[COPY_FIRST]
     image, touch = ours.image_levels / copied.image_levels, ours.touch_kpa / copied.touch_kpa
     return [

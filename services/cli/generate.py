@@ -1,10 +1,9 @@
-"""Generate demonstrations: the actions of recorded robot episodes, imagined by a world model.
+"""Generate demonstrations: a world model predicts images and touch for recorded robot actions.
 
 Every imagined episode keeps the first observation and the actions of its source, a robot episode
-that the world model was not trained on; images and touch after the first step are the model's. Its
-`success` is that of the source. Training commands leave imagined episodes out; `dextouch train
-policy` takes stores of them as --imagined. Existing results are kept, so that an interrupted run
-can be repeated.
+that the world model was not trained on; later images and touch are predicted. Its `success` is that
+of the source. Training commands skip imagined episodes, except `dextouch train policy --imagined`.
+Existing results are kept, so an interrupted run can be repeated.
 """
 
 import argparse
@@ -54,7 +53,7 @@ def main(arguments: Sequence[str]) -> int:
         about = {"world model": options.checkpoint.name, "episodes": len(made)}
         page = {"title": "Recorded and imagined episodes", "about": about}
         write_report(page, ReportPictures(predictions=tuple(pictures)), options.strips)
-        print(f"strips of truth and imagination: {options.strips}")
+        print(f"recorded and imagined images: {options.strips}")
     write_result(options.json, {"episodes": sorted(made), "num_bytes": num_bytes})
     return 0
 

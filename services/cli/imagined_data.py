@@ -1,8 +1,8 @@
-"""Imagination of the robot episodes of a store by the world model.
+"""Predict the robot episodes of a store with the world model, to train the success probe on them.
 
-The outcome of each is that of the same actions in the twin. The success probe is trained on them as
-well as on true episodes, so that its probabilities hold for imagined endings, and is evaluated on
-those of other seeds. A state model draws only the images that the probe uses.
+Each imagined episode has the outcome of the same actions in the twin. The success probe is trained
+on real and imagined episodes, so that its probabilities are valid for imagined endings, and
+evaluated on those of other seeds. A state model renders only the images that the probe uses.
 """
 
 import argparse

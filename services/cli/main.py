@@ -19,16 +19,16 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "demo": Command("record, align, imagine and score on this machine", "cli.demo.command:main"),
+    "demo": Command("record, align, predict and evaluate on this machine", "cli.demo.command:main"),
     "up": Command("run every service in one process, with a dashboard", "cli.up:main"),
     "doctor": Command("check what this machine can do and what is missing", "cli.doctor:main"),
     "twin": Command(
-        "record true episodes in the physics twin, or serve it", "twin.command_line:main"
+        "record ground-truth episodes in the physics twin, or serve it", "twin.command_line:main"
     ),
-    "twin serve": Command("serve the twin as a world", "twin.serving:serve"),
+    "twin serve": Command("serve rollouts in the twin", "twin.serving:serve"),
     "station": Command("record and calibrate a station's devices"),
     "station serve": Command("record gloves, trackers and cameras", "acquisition.app:main"),
-    "station calibrate": Command("measure tare and gain, lenses and mounts", "cli.calibrate:main"),
+    "station calibrate": Command("calibrate gloves, cameras and latencies", "cli.calibrate:main"),
     "store": Command(
         "list, show, verify, repair, migrate, delete, restore, purge, serve",
         "episode_store.command_line:main",
@@ -38,25 +38,23 @@ COMMANDS = {
         "write LeRobot, MCAP, Rerun or UMI files from a store", "cli.exports:export_main"
     ),
     "import": Command("read LeRobot, MCAP or UMI files into a store", "cli.exports:import_main"),
-    "align": Command("turn recordings into synchronized episodes", "alignment.command_line:main"),
+    "align": Command("convert recordings to synchronized episodes", "alignment.command_line:main"),
     "align serve": Command("serve alignment over HTTP", "alignment.app:main"),
     "train": Command("train the world model, a policy or the success probe"),
-    "train data": Command(
-        "record the twin episodes that all training uses", "cli.training_data:main"
-    ),
+    "train data": Command("record training episodes in the twin", "cli.training_data:main"),
     "train world-model": Command(
-        "train the joint visuo-tactile flow-matching model",
+        "train the flow-matching world model, in the paper's form",
         "world_model.command_line:run_train",
     ),
     "train state": Command(
-        "train the state model: start readers and recurrent cores",
+        "train a state model, the default form of the world model",
         "world_model.command_line:run_train_state",
     ),
     "train imagined": Command(
-        "imagine these episodes with the world model", "cli.imagined_data:main"
+        "predict the episodes of a store with the world model", "cli.imagined_data:main"
     ),
     "train policy": Command(
-        "train a closed-loop policy on the demonstrations",
+        "train a closed-loop policy on demonstrations",
         "evaluation.command_line:run_train_policy",
     ),
     "train probe": Command(
@@ -64,11 +62,11 @@ COMMANDS = {
         "evaluation.command_line:run_train_probe",
     ),
     "train direct-judge": Command(
-        "train its baseline, for `python -m benchmarks evaluator --direct`",
+        "train the success probe's baseline, which imagines nothing",
         "evaluation.command_line:run_train_direct_judge",
     ),
     "generate": Command(
-        "imagine demonstrations from the actions of recorded ones", "cli.generate:main"
+        "generate demonstrations from the actions of recorded ones", "cli.generate:main"
     ),
     "checkpoint": Command(
         "show the provenance and accuracy of a world model",
@@ -83,12 +81,12 @@ COMMANDS = {
         "score policies in several worlds, defined in a file and resumable",
         "cli.study.command:main",
     ),
-    "rate": Command("score rollouts by people: a page for raters, and their agreement"),
+    "rate": Command("score rollouts by human raters, and measure their agreement"),
     "rate serve": Command(
         "serve the page on which raters mark rollouts", "evaluation.rating.app:main"
     ),
     "rate report": Command(
-        "print scores and how far raters agree",
+        "print scores and the agreement of raters",
         "evaluation.rating.command_line:report_main",
     ),
     "dashboard": Command("serve the operators' page", "dashboard.app:main"),
@@ -102,13 +100,14 @@ USAGE = """\
 usage: dextouch COMMAND [options]
        dextouch GROUP COMMAND [options]
 
-Collect human and robot touch, train a world model on it, evaluate policies in it.
+Record touch, images and motion of human and robot hands, train a world model on them,
+and evaluate policies in it.
 
 {rows}
 
 Every command has --help; commands that terminate write their result with
---json PATH, or --json - for standard output. A service (serve, station serve, …)
-takes its flags as variables too. All commands: docs/command_line.md
+--json PATH, or --json - for standard output. Services (serve, station serve, …) also
+read their flags from environment variables. All commands: docs/command_line.md
 
 example:
   dextouch demo"""

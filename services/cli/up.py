@@ -35,9 +35,9 @@ class UpSettings(BaseSettings):
 
     An explicit port must be free; a default port in use is replaced by a free one. All data is
     stored in one folder. Mock devices play an episode of its store, or a synthetic pattern; with
-    --no-mock the station has the devices of DEXTOUCH_ACQUISITION_DEVICES. Every service takes its
-    other settings from the same variables as alone (DEXTOUCH_ALIGNMENT_…, see `dextouch align
-    serve --help`).
+    --no-mock the station has the devices of DEXTOUCH_ACQUISITION_DEVICES. Every service reads its
+    other settings from the same environment variables as on its own (DEXTOUCH_ALIGNMENT_…, see
+    `dextouch align serve --help`).
 
     Example:
       dextouch up --data runs/station --without twin,world_model
@@ -70,7 +70,7 @@ class UpSettings(BaseSettings):
     twin_port: int = Field(default=8084, ge=0, le=65535, description=PORT)
     world_model_port: int = Field(default=8085, ge=0, le=65535, description=PORT)
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="warning", description="least level of log events"
+        default="warning", description="minimum level of log events"
     )
     json_path: Path | None = Field(
         default=None,

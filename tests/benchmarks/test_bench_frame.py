@@ -116,7 +116,7 @@ def test_the_machine_is_described():
 
 def test_a_process_with_shape_checks_is_refused():
     """This very process has them."""
-    with pytest.raises(ConflictError, match="process of its own"):
+    with pytest.raises(ConflictError, match="separate process"):
         command.main(["store", "--quick"])
 
 

@@ -51,7 +51,7 @@ def test_other_files_are_refused(path):
     with pytest.raises(NotFoundError, match="--repeats"):
         read_lines(path.with_name("none.json"))
     path.write_text('{"lines": 3}')
-    with pytest.raises(CorruptDataError, match=r"no evaluator\.json"):
+    with pytest.raises(CorruptDataError, match=r"not the evaluator\.json"):
         read_lines(path)
 
 

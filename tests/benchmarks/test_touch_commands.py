@@ -99,7 +99,7 @@ def test_shares_are_within_bounds_for_any_force():
         assert ((shares >= 0) & (shares <= 1)).all()
     for force_n in (np.nan, -1.0, np.inf):
         forces[25] = force_n
-        with pytest.raises(InvalidInputError, match="finite and 0 or more"):
+        with pytest.raises(InvalidInputError, match="increasing times and finite forces"):
             touch_shares(forces, times)
 
 
@@ -186,5 +186,5 @@ def test_what_does_not_fit_is_refused():
         commands_from_touch(hand, Ts, joints, np.full((NUM, 6), np.nan), SERVOS)
     with pytest.raises(InvalidInputError, match="wrist_n_m"):
         HandServos(finger_nm_rad=1.2, wrist_n_m=0.0, wrist_nm_rad=15.0)
-    with pytest.raises(InvalidInputError, match="times must rise"):
+    with pytest.raises(InvalidInputError, match="expected increasing times"):
         touch_shares(np.zeros((3, 6)), np.zeros(3))

@@ -111,7 +111,7 @@ def test_missing_nodes_count_nothing():
     assert np.isfinite(offsets).all()
     np.testing.assert_allclose(offsets, touch_offsets_m(points, without, T_S))
     nothing = MatchedPoints(points.human_m, points.robot_m, np.zeros_like(points.seen))
-    with pytest.raises(InvalidInputError, match="no sample with a fingertip"):
+    with pytest.raises(InvalidInputError, match="no sample with a tracked fingertip"):
         constant_offset_m(nothing)
 
 
@@ -149,9 +149,9 @@ def test_what_does_not_fit_is_refused():
     points, forces = random_points(), np.zeros((NUM, 6))
     with pytest.raises(ShapeError, match="got forces"):
         touch_offsets_m(points, forces[:, :5], T_S)
-    with pytest.raises(InvalidInputError, match="times must rise"):
+    with pytest.raises(InvalidInputError, match="expected increasing times"):
         touch_offsets_m(points, forces, np.zeros(NUM))
-    with pytest.raises(InvalidInputError, match="forces be 0 or more"):
+    with pytest.raises(InvalidInputError, match="forces ≥ 0"):
         touch_offsets_m(points, forces - 1.0, T_S)
     with pytest.raises(NonFiniteError):
         touch_offsets_m(points, forces * np.nan, T_S)

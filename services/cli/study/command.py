@@ -56,7 +56,7 @@ A study file:
   [policies.mine]
   factory = "package.module:make_policy"
 
-Everything that a study file can hold: docs/studies.md
+All keys of a study file: docs/studies.md
 """
 
 
@@ -89,10 +89,10 @@ def _parser() -> argparse.ArgumentParser:
         "--folder",
         type=Path,
         metavar="PATH",
-        help="where results, rollouts and reports go (default: the study file without .toml)",
+        help="folder of results, rollouts and reports (default: the study file without .toml)",
     )
     run.add_argument(
-        "--retry-failed", action="store_true", help="run rollouts that failed before once more"
+        "--retry-failed", action="store_true", help="run rollouts again that failed before"
     )
     run.set_defaults(run=_run)
     report = words.add_parser(

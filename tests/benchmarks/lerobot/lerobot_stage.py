@@ -35,7 +35,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rounds", type=int, help="rounds (3; quick 1)")
     parser.add_argument("--windows", type=int, help="random windows a round (40; quick 4)")
     parser.add_argument("--seed", type=int, default=0, help="of the scene (%(default)s)")
-    parser.add_argument("--designs", metavar="A,B", help=f"only these, by comma (all: {names})")
+    parser.add_argument("--designs", metavar="A,B", help=f"comma-separated designs (all: {names})")
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
@@ -48,7 +48,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     enter(folder / "cache")
     chosen = _choose(options.designs)
     designs = [design for design in chosen if design.missing() is None]
-    notes = [f"{d.name} is left out: needs {d.missing()}" for d in chosen if d.missing()]
+    notes = [f"{d.name} is skipped: needs {d.missing()}" for d in chosen if d.missing()]
     seconds = options.seconds or (2.0 if options.quick else 10.0)
     effort = Effort(
         num_rounds=options.rounds or (1 if options.quick else 3),
@@ -56,7 +56,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         num_compared=1 if options.quick else 3,
         seed=options.seed,
     )
-    with bar("making the scene", len(CAMERAS)) as step:
+    with bar("generating the scene", len(CAMERAS)) as step:
         workload = make_take(seconds, options.seed, on_camera=step)
     results = compare(designs, workload, folder, effort, bar)
     return StageReport(
