@@ -22,14 +22,11 @@ class HelpFormatter(argparse.HelpFormatter):
     """Help text whose plain paragraphs are wrapped and whose indented lines stay as they are."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        paragraphs = textwrap.dedent(text).strip("\n").split("\n\n")
-        return "\n\n".join(_filled(paragraph, width, indent) for paragraph in paragraphs)
-
-
-def _filled(paragraph: str, width: int, indent: str) -> str:
-    if re.search(r"^\s", paragraph, flags=re.MULTILINE):
-        return textwrap.indent(paragraph, indent)
-    return textwrap.fill(paragraph, width, initial_indent=indent, subsequent_indent=indent)
+        fill = textwrap.TextWrapper(width, initial_indent=indent, subsequent_indent=indent).fill
+        return "\n\n".join(
+            textwrap.indent(part, indent) if re.search(r"(?m)^\s", part) else fill(part)
+            for part in textwrap.dedent(text).strip("\n").split("\n\n")
+        )
 
 
 class CommandParser(argparse.ArgumentParser):

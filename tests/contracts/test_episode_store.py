@@ -40,7 +40,9 @@ class Place:
             return EpisodeStore(self._folder)
         self._num_machines += 1
         work = self._folder / str(self._num_machines)
-        return EpisodeStore(self._server.url(self._prefix), CREDENTIALS, work)
+        return EpisodeStore(
+            self._server.url(self._prefix), CREDENTIALS | {"work_folder": str(work)}
+        )
 
     @property
     def _bucket(self):

@@ -27,7 +27,7 @@ def test_services_keep_their_data_below_one_folder(monkeypatch, tmp_path, named)
     assert AcquisitionSettings().spool == folder / "spool"
     assert EpisodeStoreSettings().store_url == str(folder / "store")
     assert AlignmentSettings().store_url == str(folder / "store")
-    assert parse_address("s3://b/p", {}, None).work_folder.parent == folder / "work"
+    assert parse_address("s3://b/p", {}).work_folder.parent == folder / "work"
 
 
 def test_what_is_in_the_data_folder_is_listed_exported_and_imported(monkeypatch, tmp_path, capsys):

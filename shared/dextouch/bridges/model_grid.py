@@ -114,7 +114,8 @@ def store_episode(
 def _store_images(writer: EpisodeWriter, name: str, camera: GridImages, unit: ImageUnit) -> None:
     fresh = np.diff(camera.t_ref_ns, prepend=camera.t_ref_ns[0] - 1) > 0
     units = camera.read_units() if unit == "h264" and fresh.all() else None
-    if units is not None and _in_groups(units):
+    # The store's video is in closed groups of pictures.
+    if units and all(is_keyframe(u) == (k % GOP_IMAGES == 0) for k, u in enumerate(units)):
         writer.append(name, values=encoded_values(units), t_ref_ns=camera.t_ref_ns)
         return
     images = (image for image, wanted in zip(camera.read(), fresh, strict=True) if wanted)
@@ -125,8 +126,3 @@ def _store_images(writer: EpisodeWriter, name: str, camera: GridImages, unit: Im
     # Exhausts the reader, so that a file that is too short is refused.
     for _ in images:
         pass
-
-
-def _in_groups(units: list[bytes]) -> bool:
-    """Whether access units form the closed groups that the store requires."""
-    return all(is_keyframe(data) == (index % GOP_IMAGES == 0) for index, data in enumerate(units))

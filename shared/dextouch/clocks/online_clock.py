@@ -31,10 +31,10 @@ class OnlineClock:
 
     def __init__(self, descriptor: StreamDescriptor | None = None) -> None:
         self._counter = DeviceCounter(descriptor)
-        self._envelope: RunningEnvelope | None = None
+        self._envelope = RunningEnvelope()
         self._last_ns: int | None = None
-        self._device_start_ns = 0
-        self._reference_ns = 0
+        # Device time of the first sample, and its arrival minus that.
+        self._start: tuple[int, int] | None = None
 
     @property
     def source(self) -> Source | None:
@@ -44,17 +44,17 @@ class OnlineClock:
     @property
     def num_steps(self) -> int:
         """Steps and restarts of the device's clock found so far."""
-        return 0 if self._envelope is None else self._envelope.num_steps
+        return self._envelope.num_steps
 
     @property
     def skew_ppm(self) -> float:
         """How much faster the host's clock runs than the device's, present estimate."""
-        return 0.0 if self._envelope is None else self._envelope.slope_ns_per_s * 1e-3
+        return self._envelope.slope_ns_per_s * 1e-3
 
     @property
     def spread_ns(self) -> float:
         """Recent mean of the path delay above its minimum."""
-        return 0.0 if self._envelope is None else self._envelope.spread_ns
+        return self._envelope.spread_ns
 
     def update(
         self, *, t_host_ns: int, t_device_ns: int | None = None, sequence: int | None = None
@@ -78,21 +78,21 @@ class OnlineClock:
         return estimate_ns
 
     def _estimate(self, device_ns: int, t_host_ns: int) -> int:
-        envelope = self._envelope
-        if envelope is None:
+        if self._start is None:
+            self._start = device_ns, t_host_ns - device_ns
             counted = self._counter.source == "sequence"
-            envelope = self._envelope = RunningEnvelope(
+            self._envelope = RunningEnvelope(
                 resolution_ns=self._counter.resolution_ns,
                 min_slope_span_s=COUNTED_SLOPE_SPAN_S if counted else MIN_SLOPE_SPAN_S,
                 is_counted=counted,
             )
-            self._device_start_ns, self._reference_ns = device_ns, t_host_ns - device_ns
-        since_ns = device_ns - self._device_start_ns
-        ahead_ns = t_host_ns - device_ns - self._reference_ns
-        offset_ns = envelope.add(since_ns * 1e-9, float(ahead_ns), (since_ns + ahead_ns) * 1e-9)
+        start_ns, reference_ns = self._start
+        since_ns, ahead_ns = device_ns - start_ns, t_host_ns - device_ns - reference_ns
+        now_s = (since_ns + ahead_ns) * 1e-9
+        offset_ns = self._envelope.add(since_ns * 1e-9, float(ahead_ns), now_s)
         # Stamps are truncated to whole ticks: on average the sample is half a tick later. The line
         # does not show it, since it is determined by the stamps with the smallest truncation.
-        return device_ns + self._reference_ns + round(offset_ns) + self._counter.resolution_ns // 2
+        return device_ns + reference_ns + round(offset_ns) + self._counter.resolution_ns // 2
 
 
 class DeviceCounter:

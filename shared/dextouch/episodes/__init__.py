@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from dextouch.episodes.window import decode_window as decode_window
     from dextouch.episodes.window import encode_window as encode_window
     from dextouch.episodes.window import mean_over_ranges as mean_over_ranges
-    from dextouch.episodes.window import nearest_indices as nearest_indices
     from dextouch.episodes.window import step_ranges as step_ranges
     from dextouch.episodes.writer import EpisodeWriter as EpisodeWriter
 else:

@@ -213,12 +213,11 @@ def encode_commit(record: CommitRecord) -> tuple[bytes, str]:
     return canonical_json({"record": plain, "sha256": digest}), digest
 
 
-def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
-    """Inverse of `encode_commit`.
+def open_commit(data: bytes, *, what: str) -> tuple[dict[str, Any], str, object]:
+    """The fields of a record of any format version, its sha256, and the version.
 
     Raises:
-        StorageError: written by a newer version of the format.
-        CorruptDataError: not a valid commit record.
+        CorruptDataError: damaged bytes.
     """
     try:
         outer = json.loads(data)
@@ -229,6 +228,17 @@ def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} is damaged ({error})") from error
     if not whole:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} does not match its own sha256")
+    return plain, digest, version
+
+
+def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
+    """Inverse of `encode_commit`.
+
+    Raises:
+        StorageError: written by another version of the format.
+        CorruptDataError: not a valid commit record.
+    """
+    plain, digest, version = open_commit(data, what=what)
     if version != FORMAT_VERSION:
         older = isinstance(version, int) and 1 <= version < FORMAT_VERSION
         advice = (

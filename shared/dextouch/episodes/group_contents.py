@@ -9,7 +9,6 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import (
     COMMIT_FILE,
     MALFORMED,
@@ -27,24 +26,20 @@ from dextouch.episodes.format import (
 from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.episodes.journal import log_paths, part_path, read_rows
 from dextouch.episodes.shards import ShardReader, decode_rows
-from dextouch.episodes.sources import ByteSource, GroupFiles, LocalFile, LocalGroup
+from dextouch.episodes.sources import GroupFiles, LocalFile, LocalGroup
 from dextouch.episodes.staged_group import read_stage
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError
 from dextouch.images import jpeg_size
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 
 A = TypeVar("A", EpisodeAttributes, RecordingAttributes)
-MAX_METADATA_BYTES = 1 << 24
 # The largest picture of H.264 (level 6.2): 139,264 macroblocks.
 MAX_IMAGE_PIXELS = 139_264 * 256
 
 
 @dataclass
 class GroupContents(Generic[A]):
-    """A committed group, or the `stage` of one that is being written.
-
-    A stage has no content hash; `indexes` are the offset and length of its storage chunks.
-    """
+    """A committed group, or one that is being written, which has no content hash."""
 
     files: GroupFiles
     kind: Kind
@@ -52,22 +47,14 @@ class GroupContents(Generic[A]):
     entries: dict[str, ArrayEntry]
     content_sha256: str
     what: str
-    stage: Path | None = None
-    indexes: Mapping[str, np.ndarray] = field(default_factory=dict)
     _shards: dict[str, ShardReader] = field(default_factory=dict)
 
     def shard(self, name: str) -> ShardReader:
         """Reader of one array; its shard index is cached."""
         if name not in self._shards:
             entry, what = self.entries[name], f"{self.what}: array {name!r}"
-            if self.stage is not None:
-                source: ByteSource = _GrowingFile(part_path(self.stage, name))
-            else:
-                path = f"{name}/{shard_path(len(entry.shape))}"
-                refuse_links(self.files, path, what=self.what)
-                source = self.files.source(path)
-            index = self.indexes.get(name)
-            self._shards[name] = ShardReader(source, entry, what=what, index=index)
+            source = self.files.source(f"{name}/{shard_path(len(entry.shape))}")
+            self._shards[name] = ShardReader(source, entry, what=what)
         return self._shards[name]
 
     def inspect_array(
@@ -81,7 +68,7 @@ class GroupContents(Generic[A]):
         entry, what = self.entries[name], f"{self.what}: array {name!r}"
         digest, is_whole = hashlib.sha256(), True
         try:
-            metadata = get_metadata(self.files, f"{name}/{METADATA_FILE}", self.what)
+            metadata = self.files.get(f"{name}/{METADATA_FILE}")
             if metadata != array_metadata(entry):
                 is_whole = False
                 yield None, CorruptDataError(f"{what}: {METADATA_FILE} is damaged")
@@ -140,15 +127,16 @@ class _GrowingFile(LocalFile):
         return data
 
 
-def read_group(files: GroupFiles, kind: Kind, model: type[A]) -> GroupContents[A]:
+def read_group(files: GroupFiles, model: type[A]) -> GroupContents[A]:
     """Open a committed group; arrays are read lazily.
 
     Raises:
         CorruptDataError: the commit record or the attributes are damaged.
         StorageError: written by another version of the format.
     """
+    kind: Kind = "episode" if issubclass(model, EpisodeAttributes) else "recording"
     what = f"{kind} {files.item_id}"
-    commit, group = (get_metadata(files, name, what) for name in (COMMIT_FILE, METADATA_FILE))
+    commit, group = files.get(COMMIT_FILE), files.get(METADATA_FILE)
     if commit is None:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} is missing")
     record, content_sha256 = decode_commit(commit, what=what)
@@ -201,42 +189,6 @@ def _layout(entry: ArrayEntry) -> tuple[object, ...]:
     return entry.dtype, entry.shape[1:], entry.codec
 
 
-def get_metadata(files: GroupFiles, name: str, what: str) -> bytes | None:
-    """Contents of a small file of a group; None if it does not exist.
-
-    Raises:
-        CorruptDataError: a symbolic link, or a file larger than any metadata.
-    """
-    refuse_links(files, name, what=what)
-    if isinstance(files, LocalGroup):
-        path = files.folder / name
-        with disk_errors(f"read {name} of {what}"):
-            size = path.stat().st_size if path.is_file() else 0
-        if size > MAX_METADATA_BYTES:
-            raise CorruptDataError(
-                f"{what}: {name} holds {size} bytes, expected at most {MAX_METADATA_BYTES}"
-            )
-    return files.get(name)
-
-
-def refuse_links(files: GroupFiles, name: str, *, what: str) -> None:
-    """Refuse symbolic links: a group's files must lie inside its folder.
-
-    Raises:
-        CorruptDataError: the group's folder, the file or a folder between is a symbolic link.
-    """
-    if not isinstance(files, LocalGroup):
-        return
-    path = files.folder
-    for part in ("", *name.split("/")):
-        path = path / part
-        if path.is_symlink():
-            raise CorruptDataError(
-                f"{what}: {path.name!r} on the way to {name} is a symbolic link, expected a file "
-                "of the group itself; put the file in its place"
-            )
-
-
 def read_live(stage: Path, kind: Kind, model: type[A]) -> GroupContents[A]:
     """Snapshot of a stage: storage chunks that are complete in all arrays of a stream.
 
@@ -248,7 +200,8 @@ def read_live(stage: Path, kind: Kind, model: type[A]) -> GroupContents[A]:
     if not isinstance(attributes, model):
         raise NotFoundError(f"{stage.name}: is being written in a way that cannot be followed")
     entries: dict[str, ArrayEntry] = {}
-    indexes: dict[str, np.ndarray] = {}
+    shards: dict[str, ShardReader] = {}
+    what = f"{kind} {stage.name}"
     if any((stage / name).is_dir() for s in attributes.streams for name in stream_arrays(s, kind)):
         raise NotFoundError(f"{stage.name}: is being finished; open what is committed in a moment")
     for stream in attributes.streams:
@@ -263,6 +216,8 @@ def read_live(stage: Path, kind: Kind, model: type[A]) -> GroupContents[A]:
         for name, entry in arrays.items():
             entries[name] = with_rows(entry, count)
             columns = (rows[name]["offset"], rows[name]["length"]) if count else ((), ())
-            indexes[name] = np.stack([np.asarray(c, dtype=np.uint64) for c in columns], axis=1)
-    what = f"{kind} {stage.name}"
-    return GroupContents(LocalGroup(stage), kind, attributes, entries, "", what, stage, indexes)
+            index = np.stack([np.asarray(c, dtype=np.uint64) for c in columns], axis=1)
+            source = _GrowingFile(part_path(stage, name))
+            where = f"{what}: array {name!r}"
+            shards[name] = ShardReader(source, entries[name], what=where, index=index)
+    return GroupContents(LocalGroup(stage), kind, attributes, entries, "", what, shards)

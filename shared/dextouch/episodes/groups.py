@@ -159,7 +159,7 @@ class GroupReader(Generic[A]):
             InvalidInputError: a group that is still being written.
         """
         contents = self._contents
-        if contents.stage is not None:
+        if not contents.content_sha256:
             raise InvalidInputError(f"{self._what}: is still being written")
         sizes: list[int] = []
         for name in contents.entries:

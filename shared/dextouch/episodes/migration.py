@@ -4,7 +4,6 @@ Version 1 had no `h264` and kept concatenated JPEG images in one array of bytes,
 their end offsets. Attributes, stamps and numbers are the same in both.
 """
 
-import json
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -19,16 +18,16 @@ from dextouch.episodes.format import (
     ArrayEntry,
     Attributes,
     Kind,
-    canonical_json,
     decode_commit,
     group_attributes,
+    open_commit,
     sha256_hex,
     shard_path,
 )
 from dextouch.episodes.shards import ShardReader
 from dextouch.episodes.sources import GroupFiles
 from dextouch.episodes.writer import Block
-from dextouch.errors import CorruptDataError, StorageError
+from dextouch.errors import CorruptDataError
 from dextouch.schemas import LineageEntry
 from dextouch.streams import JPEG_UNIT, StreamDescriptor, encoded_values
 
@@ -42,22 +41,13 @@ class OldGroup:
 
     Raises:
         CorruptDataError: the commit record, the attributes or an array is damaged.
-        StorageError: another version.
     """
 
     def __init__(self, files: GroupFiles, kind: Kind) -> None:
         self._files, self._kind, self._what = files, kind, f"{kind} {files.item_id}"
         commit, group = files.get(COMMIT_FILE), files.get(METADATA_FILE)
+        record, digest, _ = open_commit(commit or b"", what=self._what)
         try:
-            outer = json.loads(commit or b"")
-            record, digest = outer["record"], outer["sha256"]
-            version = record["format_version"]
-            if sha256_hex(canonical_json(record)) != digest:
-                raise CorruptDataError(f"{self._what}: {COMMIT_FILE} does not match its sha256")
-            if version != OLD_VERSION:
-                raise StorageError(
-                    f"{self._what}: got format version {version!r}, expected {OLD_VERSION}"
-                )
             if sha256_hex(group or b"") != record["attributes_sha256"]:
                 raise CorruptDataError(f"{self._what}: attributes do not match their sha256")
             self._entries = {
@@ -109,12 +99,8 @@ def is_current(files: GroupFiles, *, what: str) -> bool:
         CorruptDataError: the commit record is damaged.
         StorageError: a newer version.
     """
-    try:
-        decode_commit(files.get(COMMIT_FILE) or b"", what=what)
-    except CorruptDataError:
-        raise
-    except StorageError as error:
-        if error.details.get("format_version") == OLD_VERSION:
-            return False
-        raise
+    data = files.get(COMMIT_FILE) or b""
+    if open_commit(data, what=what)[2] == OLD_VERSION:
+        return False
+    decode_commit(data, what=what)
     return True

@@ -100,9 +100,7 @@ class ObjectAddress:
         return hashlib.sha256(place.encode()).hexdigest()
 
 
-def parse_address(
-    url: str, storage_options: Mapping[str, str], work_folder: str | Path | None
-) -> ObjectAddress:
+def parse_address(url: str, storage_options: Mapping[str, str]) -> ObjectAddress:
     """Parse a URL; explicit options take precedence over those in the URL.
 
     Raises:
@@ -121,9 +119,7 @@ def parse_address(
             f"{where}: got {secrets} in the address, which ends up in logs; give them as storage "
             "options or as AWS_* environment"
         )
-    given: dict[str, object] = {**query, **storage_options}
-    if work_folder is not None:
-        given["work_folder"] = work_folder
+    given = {**query, **storage_options}
     for name in given:
         if name not in ObjectOptions.model_fields:
             raise UnknownNameError(f"option of {where}", name, list(ObjectOptions.model_fields))

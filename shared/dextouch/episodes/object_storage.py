@@ -24,7 +24,7 @@ from dextouch.episodes.format import (
 from dextouch.episodes.migration import is_current
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
 from dextouch.episodes.staged_group import (
-    abandoned_stages,
+    STAGING,
     new_stage,
     read_committed,
     unheld_folders,
@@ -94,9 +94,9 @@ class ObjectFile:
                 return b""
             if self._bucket.cache.capacity == 0:
                 return self._bucket.read(facts, offset, stop)
-            tail_start = max(0, facts.size - TAIL_BYTES)
-            if offset >= tail_start:
-                return self._tail(facts, tail_start)[offset - tail_start : stop - tail_start]
+            tail, tail_start = self._known(facts, _TAIL), max(0, facts.size - TAIL_BYTES)
+            if tail is not None and offset >= tail_start:
+                return tail[offset - tail_start : stop - tail_start]
             return self._from_blocks(facts, offset, stop)
 
     def _look(self) -> ObjectFacts | None:
@@ -107,13 +107,6 @@ class ObjectFile:
             self._facts = found[0]
             self._keep(self._facts, _TAIL, found[1])
         return self._facts
-
-    def _tail(self, facts: ObjectFacts, start: int) -> bytes:
-        data = self._known(facts, _TAIL)
-        if data is None:
-            data = self._bucket.read(facts, start, facts.size)
-            self._keep(facts, _TAIL, data)
-        return data
 
     def _from_blocks(self, facts: ObjectFacts, offset: int, stop: int) -> bytes:
         first, last = offset // BLOCK_BYTES, (stop - 1) // BLOCK_BYTES
@@ -206,10 +199,8 @@ class ObjectStorage:
         InvalidInputError, UnknownNameError: an invalid address or option.
     """
 
-    def __init__(
-        self, url: str, storage_options: Mapping[str, str], work_folder: str | Path | None
-    ) -> None:
-        self._address = parse_address(url, storage_options, work_folder)
+    def __init__(self, url: str, storage_options: Mapping[str, str]) -> None:
+        self._address = parse_address(url, storage_options)
         self._bucket = Bucket(self._address)
         self.root = self._address.work_folder
         self._outbox = self.root / _OUTBOX
@@ -290,7 +281,7 @@ class ObjectStorage:
         if not self.root.is_dir():
             return []
         self._own_work_folder()
-        _, failures = recover_all(abandoned_stages(self.root), self._recover_stage)
+        _, failures = recover_all(unheld_folders(self.root / STAGING), self._recover_stage)
         found: builtins.list[RecoveredGroup] = []
         for kind in KINDS:
             waiting = unheld_folders(self._outbox / f"{kind}s")

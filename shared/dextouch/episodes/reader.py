@@ -16,16 +16,15 @@ from dextouch.episodes.window import (
     StreamData,
     Window,
     mean_over_ranges,
-    nearest_indices,
     step_ranges,
 )
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
+from dextouch.geometry import nearest_index
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, EpisodeAttributes, RecordingAttributes
 from dextouch.streams import SampleBatch
-from dextouch.tactile.layout import NUM_TAXELS
+from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
-SIDES = ("left", "right")
 # Half a step, for a free-running camera at the model rate, plus some jitter.
 OWN_IMAGE_SHARE = 0.6
 # Tolerated share of dropped images; images of every second step miss more.
@@ -144,7 +143,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             cameras: image streams to read; the others are not decoded.
             action_kind: measured (reached) or commanded (sent) actions.
             grid: on the model grid; False gives all streams at their own rates, the camera
-                streams among them only for `cameras` (see `native_window`).
+                streams among them only for `cameras`.
             form: half size or gray images.
 
         Raises:
@@ -159,7 +158,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         stop = start + num_steps
         grid_ns = self._column("action_t_ref_ns")
         if not grid:
-            return self.native_window(start, num_steps, cameras=cameras, form=form)
+            return self._native_window(start, num_steps, cameras, form)
         nearest = {name: self._nearest(name, grid_ns[start:stop]) for name in cameras}
         pictures = each_camera(lambda name: self.images_at(name, nearest[name], form=form), cameras)
         left, right = (self._tactile(side, start, stop) for side in SIDES)
@@ -178,23 +177,9 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             K_head=self.attributes.K_head_matrix(),
         )
 
-    def native_window(
-        self,
-        start: int,
-        num_steps: int = 17,
-        *,
-        cameras: tuple[str, ...] = ("camera_head",),
-        streams: tuple[str, ...] | None = None,
-        form: ImageForm = FULL_FORM,
+    def _native_window(
+        self, start: int, num_steps: int, cameras: tuple[str, ...], form: ImageForm
     ) -> NativeWindow:
-        """The time span of steps start … start + num_steps − 1 with every stream at its own rate.
-
-        Arguments and errors are those of `window`; `streams` are the streams to read besides the
-        cameras, None for all.
-        """
-        self._check_steps(start, num_steps)
-        self._check_cameras(cameras)
-        others = tuple(n for n, d in self.streams.items() if d.kind != "image")
         grid_ns = self._column("action_t_ref_ns")
         first_ns, stop_ns = int(grid_ns[start]), int(grid_ns[start + num_steps - 1]) + 1
         ranges = {name: self._range(name, first_ns, stop_ns) for name in cameras}
@@ -205,7 +190,8 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         }
         data |= {
             name: self.read(name, first_ns, stop_ns)
-            for name in (others if streams is None else streams)
+            for name, stream in self.streams.items()
+            if stream.kind != "image"
         }
         return NativeWindow(
             streams=data,
@@ -228,7 +214,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         stamps, grid_ns = self.stamps_ns(camera), self._column("action_t_ref_ns")
         if not len(stamps):
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-        nearest = nearest_indices(stamps, grid_ns)
+        nearest = nearest_index(stamps, grid_ns)
         reach_ns = OWN_IMAGE_SHARE * 1e9 / self.attributes.model_rate_hz
         steps = np.flatnonzero(np.abs(stamps[nearest] - grid_ns) <= reach_ns)
         return steps.astype(np.int64), nearest[steps]
@@ -255,7 +241,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         stamps = self.stamps_ns(camera)
         if not len(stamps):
             raise NotFoundError(f"{self._what}: {camera!r} holds no image")
-        return nearest_indices(stamps, t_ns)
+        return nearest_index(stamps, t_ns)
 
     def _check_steps(self, start: int, num_steps: int) -> None:
         if num_steps < 1 or start < 0 or start + num_steps > self.num_steps:

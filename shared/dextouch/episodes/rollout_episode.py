@@ -1,18 +1,17 @@
 """Rollouts stored as episodes: a world's observations and the actions that it was sent."""
 
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from dextouch.episodes.store import EpisodeStore
 from dextouch.schemas import EpisodeAttributes, Observation
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import StreamDescriptor, StreamKind
 from dextouch.tactile.layout import SIDES
 
 CAMERA: Final = "camera_head"
 NS_PER_S: Final = 1_000_000_000
-_Kind = Literal["tactile", "image", "robot_state", "pose"]
 
 
 def write_rollout(
@@ -40,7 +39,7 @@ def write_rollout(
     shown_steps = np.concatenate([one.first_step + np.arange(len(one)) for one in shown])
     reached = np.concatenate([observation.action_reached for observation in observations])
     t_ref_ns = np.round(np.arange(len(tactile)) * NS_PER_S / rate_hz).astype(np.int64)
-    streams: list[tuple[str, _Kind, str, np.ndarray]] = [
+    streams: list[tuple[str, StreamKind, str, np.ndarray]] = [
         (CAMERA, "image", "rgb8", images),
         ("action", "robot_state", "action_m_rad", reached),
         ("action_commanded", "robot_state", "action_m_rad", np.asarray(commanded)),

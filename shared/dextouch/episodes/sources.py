@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from dextouch.episodes.files import disk_errors
+from dextouch.errors import CorruptDataError
 
 # Each mapping holds a file descriptor, and the usual limit is 1024 per process.
 MAX_MAPPED_FILES = 192
+MAX_METADATA_BYTES = 1 << 24
 
 
 @runtime_checkable
@@ -116,7 +118,12 @@ class LocalFile:
 
 
 class LocalGroup:
-    """The files of a group in a local folder."""
+    """The files of a group in a local folder, all of which must lie inside it.
+
+    Raises:
+        CorruptDataError: the folder, a file or a folder between is a symbolic link, or a small file
+            is larger than any metadata.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -128,10 +135,27 @@ class LocalGroup:
 
     def get(self, name: str) -> bytes | None:
         """All bytes of a small file; None where there is no such file."""
-        path = self.folder / name
+        path = self._path(name)
         with disk_errors(f"read {path}"):
-            return path.read_bytes() if path.is_file() else None
+            size = path.stat().st_size if path.is_file() else None
+            if size is not None and size > MAX_METADATA_BYTES:
+                raise CorruptDataError(
+                    f"{self.item_id}: {name} holds {size} bytes, expected at most "
+                    f"{MAX_METADATA_BYTES}"
+                )
+            return None if size is None else path.read_bytes()
 
     def source(self, name: str) -> LocalFile:
         """A file that is read in parts."""
-        return LocalFile(self.folder / name)
+        return LocalFile(self._path(name))
+
+    def _path(self, name: str) -> Path:
+        path = self.folder
+        for part in ("", *name.split("/")):
+            path = path / part
+            if path.is_symlink():
+                raise CorruptDataError(
+                    f"{self.item_id}: {path.name!r} on the way to {name} is a symbolic link, "
+                    "expected a file of the group itself; put the file in its place"
+                )
+        return path

@@ -141,9 +141,11 @@ def find_records(data: LogBytes) -> LogRecords:
     while place < len(data):
         row = _header_at(data, place)
         if row is None:
-            following = _next_header(data, place + 1)
-            gaps.append((place, following))
-            place = following
+            following = data.find(_MARK, place + 1)
+            while following >= 0 and _header_at(data, following) is None:
+                following = data.find(_MARK, following + 1)
+            gaps.append((place, following if following >= 0 else len(data)))
+            place = gaps[-1][1]
         else:
             rows += _ROW.pack(*row)
             place += HEADER_BYTES + row[4]
@@ -251,14 +253,6 @@ def _header_at(data: LogBytes, place: int) -> tuple[int, ...] | None:
     if not holds or offset != place or place + HEADER_BYTES + length > len(data):
         return None
     return offset, first, stream, num_samples, length, crc, _LAYOUTS[mark]
-
-
-def _next_header(data: LogBytes, place: int) -> int:
-    """Offset of the next complete record; the end of the data if there is none."""
-    place = data.find(_MARK, place)
-    while place >= 0 and _header_at(data, place) is None:
-        place = data.find(_MARK, place + 1)
-    return place if place >= 0 else len(data)
 
 
 class SpoolLogWriter:

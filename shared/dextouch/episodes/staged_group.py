@@ -77,11 +77,6 @@ def unheld_folders(parent: Path) -> Iterator[Path]:
             os.close(lock)
 
 
-def abandoned_stages(root: Path) -> Iterator[Path]:
-    """Iterate over stages whose writer is gone, holding each one's lock meanwhile."""
-    return unheld_folders(root / STAGING)
-
-
 def write_stage(stage: Path, attributes: Attributes) -> None:
     """Write `stage.json`, so that `recover` can complete the stage."""
     known = {"kind": kind_of(attributes), "attributes": json_ready(attributes)}

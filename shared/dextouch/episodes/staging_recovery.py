@@ -36,12 +36,13 @@ from dextouch.episodes.shards import CRC_BYTES, decode_rows, finish_shard
 from dextouch.episodes.sources import LocalGroup
 from dextouch.episodes.staged_group import (
     STAGE_FILE,
-    abandoned_stages,
+    STAGING,
     change_attributes,
     commit_stage,
     publish_stage,
     read_committed,
     read_stage,
+    unheld_folders,
 )
 from dextouch.errors import CorruptDataError, DexTouchError, StorageError
 from dextouch.schemas import RecordingAttributes
@@ -117,11 +118,7 @@ def recover_stage(
     # one.
     for name in (METADATA_FILE, COMMIT_FILE):
         (stage / name).unlink(missing_ok=True)
-    kind = kind_of(attributes)
-    num_samples = {
-        stream.name: _num_whole_samples(stage, stream_arrays(stream, kind))
-        for stream in attributes.streams
-    }
+    kind, num_samples = kind_of(attributes), _num_whole_samples(stage, attributes)
     if not any(num_samples.values()):
         return None
     entries = {}
@@ -166,12 +163,7 @@ def is_recoverable(stage: Path, is_taken: IsTaken) -> bool:
         return (stage / STAGE_FILE).exists() or not is_taken(record.kind, record.id)
     try:
         attributes = read_stage(stage)
-        if attributes is None:
-            return False
-        kind = kind_of(attributes)
-        return any(
-            _num_whole_samples(stage, stream_arrays(stream, kind)) for stream in attributes.streams
-        )
+        return attributes is not None and any(_num_whole_samples(stage, attributes).values())
     except CorruptDataError:
         return True
 
@@ -179,7 +171,7 @@ def is_recoverable(stage: Path, is_taken: IsTaken) -> bool:
 def sweep_stages(root: Path, is_taken: IsTaken) -> int:
     """Remove abandoned stages that `recover_stage` cannot recover, and return their number."""
     removed = 0
-    for stage in abandoned_stages(root):
+    for stage in unheld_folders(root / STAGING):
         if not is_recoverable(stage, is_taken):
             shutil.rmtree(stage)
             removed += 1
@@ -196,14 +188,17 @@ def _whole_commit(stage: Path) -> CommitRecord | None:
         return None
 
 
-def _num_whole_samples(stage: Path, arrays: dict[str, ArrayEntry]) -> int:
-    """Number of samples up to the last chunk boundary common to all arrays of a stream."""
-    ends = [
-        np.cumsum(_trusted_rows(stage, name, entry)["num_rows"], dtype=np.int64)
-        for name, entry in arrays.items()
-    ]
-    common = reduce(np.intersect1d, ends)
-    return int(common[-1]) if len(common) else 0
+def _num_whole_samples(stage: Path, attributes: Attributes) -> dict[str, int]:
+    """Samples of each stream up to the last chunk boundary common to all of its arrays."""
+    counts = {}
+    for stream in attributes.streams:
+        ends = [
+            np.cumsum(_trusted_rows(stage, name, entry)["num_rows"], dtype=np.int64)
+            for name, entry in stream_arrays(stream, kind_of(attributes)).items()
+        ]
+        common = reduce(np.intersect1d, ends)
+        counts[stream.name] = int(common[-1]) if len(common) else 0
+    return counts
 
 
 def _trusted_rows(stage: Path, name: str, entry: ArrayEntry) -> np.ndarray:

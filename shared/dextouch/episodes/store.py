@@ -23,7 +23,7 @@ from dextouch.episodes.group_contents import read_group, read_live
 from dextouch.episodes.migration import OldGroup, is_current
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.sources import GroupFiles, LocalGroup
-from dextouch.episodes.staged_group import STAGING, abandoned_stages, new_stage, stages_of
+from dextouch.episodes.staged_group import STAGING, new_stage, stages_of, unheld_folders
 from dextouch.episodes.staging_recovery import (
     RecoveredGroup,
     ids_below,
@@ -69,19 +69,13 @@ class EpisodeStore:
             `region` and others of `dextouch.episodes.object_bucket` after a `?`.
         storage_options: of an `s3://…` store; credentials belong here or in the usual AWS_*
             environment, which obstore reads.
-        work_folder: of an `s3://…` store: local folder where groups are written before the upload.
 
     `root` is the local folder of unfinished groups: the store itself if that is a folder, otherwise
     the work folder.
     """
 
-    def __init__(
-        self,
-        url: str | Path,
-        storage_options: Mapping[str, str] | None = None,
-        work_folder: str | Path | None = None,
-    ) -> None:
-        self._storage = _open_storage(url, storage_options, work_folder)
+    def __init__(self, url: str | Path, storage_options: Mapping[str, str] | None = None) -> None:
+        self._storage = _open_storage(url, storage_options or {})
         self.root = self._storage.root
 
     def writer(
@@ -113,12 +107,12 @@ class EpisodeStore:
             CorruptDataError, StorageError: damaged, or of a newer format.
         """
         group = self._storage.group(*_check("episode", episode_id))
-        return EpisodeReader(read_group(group, "episode", EpisodeAttributes))
+        return EpisodeReader(read_group(group, EpisodeAttributes))
 
     def recording(self, recording_id: str) -> RecordingReader:
         """Open a finished recording; raises as `open`."""
         group = self._storage.group(*_check("recording", recording_id))
-        return RecordingReader(read_group(group, "recording", RecordingAttributes))
+        return RecordingReader(read_group(group, RecordingAttributes))
 
     def files(self, item_id: str, *, kind: Kind = "episode") -> GroupFiles:
         """The raw files of a committed group, for inspection and repair.
@@ -227,7 +221,7 @@ class EpisodeStore:
 
 
 def _open_storage(
-    url: str | Path, storage_options: Mapping[str, str] | None, work_folder: str | Path | None
+    url: str | Path, storage_options: Mapping[str, str]
 ) -> "_LocalStorage | ObjectStorage":
     """Storage backend for a URL; see `EpisodeStore` for the arguments."""
     if isinstance(url, str) and url.startswith(_OBJECT_SCHEME):
@@ -240,10 +234,10 @@ def _open_storage(
             raise UnavailableError(
                 "episode store: s3://… needs obstore; run `pip install 'dextouch-wm[s3]'`"
             ) from error
-        return ObjectStorage(url, storage_options or {}, work_folder)
-    if storage_options or work_folder is not None:
+        return ObjectStorage(url, storage_options)
+    if storage_options:
         raise InvalidInputError(
-            f"episode store: got storage options or a work folder for {str(url)!r}, "
+            f"episode store: got storage options for {str(url)!r}, "
             "expected them with s3://bucket/prefix only"
         )
     return _LocalStorage(local_folder(url))
@@ -344,7 +338,7 @@ class _LocalStorage:
         return True
 
     def recover(self) -> builtins.list[RecoveredGroup]:
-        stages = abandoned_stages(self.root)
+        stages = unheld_folders(self.root / STAGING)
         found, failures = recover_all(stages, lambda stage: recover_stage(stage, self.root))
         raise_first(failures, found)
         return found

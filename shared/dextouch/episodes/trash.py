@@ -89,7 +89,8 @@ def restore_from_trash(root: Path, kind: TrashKind, item_id: str) -> TrashEntry:
     entries = [
         entry
         for entry in list_trash(root)
-        if (entry.kind, entry.item_id) == (kind, item_id) and _is_whole(entry)
+        if (entry.kind, entry.item_id) == (kind, item_id)
+        and (kind not in KINDS or (entry.folder / COMMIT_FILE).is_file())
     ]
     if not entries:
         raise NotFoundError(f"{kind} {item_id!r}: not in the trash of {root}")
@@ -128,10 +129,6 @@ def remove_for_good(folder: Path) -> None:
         # First, so that a partially removed group never passes for a complete one.
         (folder / COMMIT_FILE).unlink(missing_ok=True)
         shutil.rmtree(folder)
-
-
-def _is_whole(entry: TrashEntry) -> bool:
-    return entry.kind not in KINDS or (entry.folder / COMMIT_FILE).is_file()
 
 
 def _home(kind: TrashKind) -> str:

@@ -7,12 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry import nearest_index
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import ActionKind
 from dextouch.streams import pack, unpack
 
-nearest_indices = nearest_index
 # Stamps of one instant may differ by rounding.
 SAME_INSTANT_NS = 1_000
 _IMAGES, _IMAGE_DT = "images/", "image_dt_ns/"

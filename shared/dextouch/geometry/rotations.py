@@ -1,6 +1,9 @@
 """Conversions between rotation matrices, 6-D vectors, quaternions and rotation vectors."""
 
+from collections.abc import Sequence
+
 import numpy as np
+import numpy.typing as npt
 from jaxtyping import Float64
 
 from dextouch.errors import DegenerateRotationError, NonFiniteError, ShapeError
@@ -20,6 +23,11 @@ def _checked(values: np.ndarray, tail: tuple[int, ...], what: str) -> Float64[np
     if not np.isfinite(array).all():
         raise NonFiniteError(f"{what}: holds NaN or infinity; drop or mask those samples first")
     return array
+
+
+def _matrices(rows: Sequence[Sequence[npt.ArrayLike]]) -> Float64[np.ndarray, "*batch m n"]:
+    """Matrices from arrays of their entries."""
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def rotation_to_6d(R: np.ndarray) -> Float64[np.ndarray, "*batch 6"]:
@@ -100,7 +108,7 @@ def rotation_from_quaternion(q_wxyz: np.ndarray) -> Float64[np.ndarray, "*batch 
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return _matrices(rows)
 
 
 def quaternion_from_rotation(R: np.ndarray) -> Float64[np.ndarray, "*batch 4"]:
@@ -115,14 +123,13 @@ def quaternion_from_rotation(R: np.ndarray) -> Float64[np.ndarray, "*batch 4"]:
     w_z = m[..., 1, 0] - m[..., 0, 1]
     x_y, x_z = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0]
     y_z = m[..., 1, 2] + m[..., 2, 1]
-    rows = np.stack(
+    rows = _matrices(
         [
-            np.stack([squares[..., 0], w_x, w_y, w_z], axis=-1),
-            np.stack([w_x, squares[..., 1], x_y, x_z], axis=-1),
-            np.stack([w_y, x_y, squares[..., 2], y_z], axis=-1),
-            np.stack([w_z, x_z, y_z, squares[..., 3]], axis=-1),
-        ],
-        axis=-2,
+            [squares[..., 0], w_x, w_y, w_z],
+            [w_x, squares[..., 1], x_y, x_z],
+            [w_y, x_y, squares[..., 2], y_z],
+            [w_z, x_z, y_z, squares[..., 3]],
+        ]
     )
     best = np.argmax(squares, axis=-1)
     q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
@@ -140,14 +147,7 @@ def rotation_from_vector(rotation_vector_rad: np.ndarray) -> Float64[np.ndarray,
     b = np.where(small, 0.5 - angle**2 / 24 + angle**4 / 720, (1 - np.cos(safe)) / safe**2)
     zero = np.zeros_like(v[..., 0])
     x, y, z = np.moveaxis(v, -1, 0)
-    K = np.stack(
-        [
-            np.stack([zero, -z, y], axis=-1),
-            np.stack([z, zero, -x], axis=-1),
-            np.stack([-y, x, zero], axis=-1),
-        ],
-        axis=-2,
-    )
+    K = _matrices([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
     return np.eye(3) + a * K + b * (K @ K)
 
 

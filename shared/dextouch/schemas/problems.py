@@ -42,21 +42,12 @@ STATUS_OF_CLASS: tuple[tuple[type[DexTouchError], int], ...] = (
 )
 STATUS_OF_REASON = {"missing_scope": 403, "foreign_origin": 403, "foreign_host": 421}
 CLASS_OF_STATUS: dict[int, type[DexTouchError]] = {
-    400: InvalidInputError,
-    401: AccessDeniedError,
-    403: AccessDeniedError,
+    **dict.fromkeys((400, 405, 406, 415, 422), InvalidInputError),
+    **dict.fromkeys((401, 403, 421), AccessDeniedError),
     404: NotFoundError,
-    405: InvalidInputError,
-    406: InvalidInputError,
     409: ConflictError,
-    413: LimitExceededError,
-    415: InvalidInputError,
-    421: AccessDeniedError,
-    422: InvalidInputError,
-    429: LimitExceededError,
-    502: UnavailableError,
-    503: UnavailableError,
-    504: UnavailableError,
+    **dict.fromkeys((413, 429), LimitExceededError),
+    **dict.fromkeys((502, 503, 504), UnavailableError),
     507: StorageFullError,
 }
 

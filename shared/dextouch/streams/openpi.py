@@ -12,8 +12,8 @@ from typing import Any, Final
 import msgpack
 import numpy as np
 
-from dextouch.errors import InvalidInputError, LimitExceededError
-from dextouch.streams.packing import MAX_ITEMS, MAX_ITEMS_A_CONTAINER, array_of
+from dextouch.errors import InvalidInputError
+from dextouch.streams.packing import array_of, unpack_bounded
 
 # Kinds of dtypes that are read, bool, signed, unsigned and floating, and their names.
 _KINDS: Final = "biuf"
@@ -43,42 +43,15 @@ def unpack_openpi(data: bytes, *, max_bytes: int) -> dict[str, Any]:
         LimitExceededError: more bytes or items than allowed.
         InvalidInputError: not msgpack, not a map with text keys, or an invalid array.
     """
-    if len(data) > max_bytes:
-        raise LimitExceededError(
-            f"openpi message: got {len(data)} bytes, expected at most {max_bytes}"
-        )
-    num_items = 0
-
-    def count(container: list[Any] | dict[Any, Any]) -> None:
-        nonlocal num_items
-        num_items += 1 + len(container)
-        if num_items > MAX_ITEMS:
-            raise LimitExceededError(f"openpi message: holds more than {MAX_ITEMS} items")
 
     def of_map(found: dict[Any, Any]) -> Any:  # noqa: ANN401 - a map, an array or a number
-        count(found)
         if b"__ndarray__" in found:
             return _array(found)
         if b"__npgeneric__" in found:
             return _array(found | {b"shape": [], b"data": _scalar_bytes(found)})[()]
         return found
 
-    def of_list(found: list[Any]) -> list[Any]:
-        count(found)
-        return found
-
-    try:
-        message = msgpack.unpackb(
-            data,
-            object_hook=of_map,
-            list_hook=of_list,
-            max_array_len=MAX_ITEMS_A_CONTAINER,
-            max_map_len=MAX_ITEMS_A_CONTAINER,
-        )
-    except (ValueError, msgpack.UnpackException) as error:
-        raise InvalidInputError(
-            f"openpi message: not msgpack ({type(error).__name__}: {error})"
-        ) from error
+    message = unpack_bounded(data, max_bytes=max_bytes, what="openpi message", of_map=of_map)
     if not isinstance(message, dict) or not all(isinstance(name, str) for name in message):
         raise InvalidInputError("openpi message: expected a map whose keys are text")
     return message

@@ -1,7 +1,7 @@
 """Serialization of named numpy arrays and plain fields with msgpack."""
 
 import math
-from collections.abc import Mapping, Sized
+from collections.abc import Callable, Mapping, Sized
 from typing import Any, TypeVar
 
 import msgpack
@@ -59,28 +59,7 @@ def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np
         LimitExceededError: more bytes, arrays, or items of lists and maps than allowed.
         InvalidInputError: not msgpack, or not of this layout.
     """
-    if len(data) > max_bytes:
-        raise LimitExceededError(f"body: got {len(data)} bytes, expected at most {max_bytes}")
-    num_items = 0
-
-    def counted(container: C) -> C:
-        nonlocal num_items
-        num_items += 1 + len(container)
-        if num_items > MAX_ITEMS:
-            raise LimitExceededError(f"body: lists and maps hold more than {MAX_ITEMS} items")
-        return container
-
-    try:
-        message = msgpack.unpackb(
-            data,
-            strict_map_key=True,
-            object_hook=counted,
-            list_hook=counted,
-            max_array_len=MAX_ITEMS_A_CONTAINER,
-            max_map_len=MAX_ITEMS_A_CONTAINER,
-        )
-    except (ValueError, msgpack.UnpackException) as error:
-        raise InvalidInputError(f"body: not msgpack ({type(error).__name__}: {error})") from error
+    message = unpack_bounded(data, max_bytes=max_bytes, what="body")
     if (
         not isinstance(message, dict)
         or not isinstance(message.get("fields"), dict)
@@ -96,6 +75,48 @@ def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np
     return message["fields"], {
         name: _array(name, entry) for name, entry in message["arrays"].items()
     }
+
+
+def unpack_bounded(
+    data: bytes,
+    *,
+    max_bytes: int,
+    what: str,
+    of_map: Callable[[dict[Any, Any]], Any] | None = None,
+) -> Any:  # noqa: ANN401 - whatever msgpack holds
+    """Deserialize msgpack from an untrusted source, with a limit of lists' and maps' items.
+
+    Args:
+        data: the message.
+        max_bytes: size limit.
+        what: names the message in errors.
+        of_map: called with every map, whose place its result takes.
+
+    Raises:
+        LimitExceededError: more bytes, or items of lists and maps than allowed.
+        InvalidInputError: not msgpack.
+    """
+    if len(data) > max_bytes:
+        raise LimitExceededError(f"{what}: got {len(data)} bytes, expected at most {max_bytes}")
+    num_items = 0
+
+    def counted(container: C) -> C:
+        nonlocal num_items
+        num_items += 1 + len(container)
+        if num_items > MAX_ITEMS:
+            raise LimitExceededError(f"{what}: lists and maps hold more than {MAX_ITEMS} items")
+        return container
+
+    try:
+        return msgpack.unpackb(
+            data,
+            object_hook=counted if of_map is None else lambda found: of_map(counted(found)),
+            list_hook=counted,
+            max_array_len=MAX_ITEMS_A_CONTAINER,
+            max_map_len=MAX_ITEMS_A_CONTAINER,
+        )
+    except (ValueError, msgpack.UnpackException) as error:
+        raise InvalidInputError(f"{what}: not msgpack ({type(error).__name__}: {error})") from error
 
 
 def _array(name: str, entry: object) -> np.ndarray:

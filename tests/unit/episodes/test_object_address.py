@@ -15,16 +15,16 @@ from dextouch.errors import (
 
 def test_addresses():
     address = parse_address(
-        "s3://takes/a/b%20c/?endpoint=http://h:9000&allow_http=true&work_folder=/w", {}, None
+        "s3://takes/a/b%20c/?endpoint=http://h:9000&allow_http=true&work_folder=/w", {}
     )
     assert (address.bucket, address.prefix, str(address)) == ("takes", "a/b c", "s3://takes/a/b c")
     assert address.options.endpoint == "http://h:9000"
     assert str(address.work_folder) == "/w"
-    bare = parse_address("s3://takes", {"secret_access_key": "hush"}, None)
+    bare = parse_address("s3://takes", {"secret_access_key": "hush"})
     assert (bare.prefix, str(bare)) == ("", "s3://takes")
     assert "hush" not in repr(bare)
     # Two places never share a work folder that nobody chose.
-    one, other = (parse_address(f"s3://takes/{p}", {}, None).work_folder for p in ("a-b", "a/b"))
+    one, other = (parse_address(f"s3://takes/{p}", {}).work_folder for p in ("a-b", "a/b"))
     assert one != other
 
 

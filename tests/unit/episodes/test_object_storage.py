@@ -48,7 +48,7 @@ def url(s3_server, tmp_path):
 
 @pytest.fixture
 def store(url, tmp_path):
-    return EpisodeStore(url, CREDENTIALS, tmp_path / "work")
+    return EpisodeStore(url, CREDENTIALS | {"work_folder": str(tmp_path / "work")})
 
 
 @pytest.fixture
@@ -58,14 +58,18 @@ def bucket(store):
 
 def test_a_work_folder_belongs_to_one_address(made, store, s3_server):
     made.write(store)
-    elsewhere = EpisodeStore(s3_server.url("unit/elsewhere"), CREDENTIALS, store.root)
+    elsewhere = EpisodeStore(
+        s3_server.url("unit/elsewhere"), CREDENTIALS | {"work_folder": str(store.root)}
+    )
     with pytest.raises(InvalidInputError, match="belongs to another address"):
         made.write(elsewhere)
     assert elsewhere.list() == []
 
 
 def test_a_bucket_that_is_not_there(s3_server, made, tmp_path):
-    store = EpisodeStore(s3_server.url("p", bucket="nowhere"), CREDENTIALS, tmp_path)
+    store = EpisodeStore(
+        s3_server.url("p", bucket="nowhere"), CREDENTIALS | {"work_folder": str(tmp_path)}
+    )
     asks = (store.list, lambda: store.open("x"), lambda: store.exists("x"), store.sweep)
     for ask in (*asks, lambda: made.write(store)):
         with pytest.raises(StorageError, match="'nowhere' does not exist; create it first"):
@@ -101,9 +105,9 @@ def test_a_server_that_is_not_there(tmp_path, unused_port):
     options = CREDENTIALS | {"max_retries": "1", "retry_timeout_s": "1"}
     url = f"s3://b/p?endpoint=http://127.0.0.1:{unused_port}&region=eu"
     with pytest.raises(UnavailableError, match=r"no answer.*check endpoint"):
-        EpisodeStore(f"{url}&allow_http=true", options, tmp_path).list()
+        EpisodeStore(f"{url}&allow_http=true", options | {"work_folder": str(tmp_path)}).list()
     with pytest.raises(StorageError, match="needs the option allow_http=true"):
-        EpisodeStore(url, options, tmp_path).list()
+        EpisodeStore(url, options | {"work_folder": str(tmp_path)}).list()
 
 
 @pytest.fixture
@@ -129,7 +133,7 @@ def put_or_die(self, key, content, *, create=False):
         os.kill(os.getpid(), signal.SIGKILL)
     return put(self, key, content, create=create)
 Bucket.put = put_or_die
-episode_of().write(EpisodeStore(url, CREDENTIALS, work))
+episode_of().write(EpisodeStore(url, CREDENTIALS | {"work_folder": str(work)}))
 """
 
 
@@ -138,7 +142,7 @@ def test_a_kill_during_the_upload_loses_nothing(url, store, tmp_path, deadly):
     work = tmp_path / "work"
     dead = subprocess.run([sys.executable, "-c", DYING_WRITER, url, str(work), deadly], check=False)
     assert dead.returncode == -9
-    other = EpisodeStore(url, CREDENTIALS, tmp_path / "another machine")
+    other = EpisodeStore(url, CREDENTIALS | {"work_folder": str(tmp_path / "another machine")})
     assert other.list() == []
     with pytest.raises(NotFoundError):
         other.open(EPISODE)
@@ -230,7 +234,7 @@ def test_a_take_that_waits_gets_another_id_if_its_own_is_taken(s3_server, store,
     writer = begin_take(store, 17)
     with s3_server.checking_credentials(), pytest.raises(StorageError, match="refused"):
         writer.__exit__(None, None, None)
-    other = EpisodeStore(url, CREDENTIALS, tmp_path / "other")
+    other = EpisodeStore(url, CREDENTIALS | {"work_folder": str(tmp_path / "other")})
     with begin_take(other, 4):
         pass
     (group,) = store.recover()
@@ -304,7 +308,7 @@ def test_equal_content_of_two_writers_is_no_conflict_in_the_bucket(store, bucket
     commit = bucket.get(f"episodes/{EPISODE}/commit.json")
     bucket.remove([f"episodes/{EPISODE}/commit.json"])
     # As if the first one had died just before its last request.
-    made.write(EpisodeStore(url, CREDENTIALS, tmp_path / "second"))
+    made.write(EpisodeStore(url, CREDENTIALS | {"work_folder": str(tmp_path / "second")}))
     assert bucket.get(f"episodes/{EPISODE}/commit.json") == commit
     store.open(EPISODE).verify()
 
@@ -332,7 +336,9 @@ def test_an_object_that_is_replaced_while_it_is_read(store, bucket, made):
 
 def test_windows_need_few_requests_and_none_twice(store, url, tmp_path, monkeypatch, made):
     made.write(store)
-    reader = EpisodeStore(url, CREDENTIALS, tmp_path / "reader").open(EPISODE)
+    reader = EpisodeStore(url, CREDENTIALS | {"work_folder": str(tmp_path / "reader")}).open(
+        EPISODE
+    )
     requests = []
     for name in ("get", "tail", "read", "head"):
         request = getattr(Bucket, name)

@@ -6,8 +6,9 @@ import simplejpeg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dextouch.episodes import mean_over_ranges, nearest_indices, step_ranges
+from dextouch.episodes import mean_over_ranges, step_ranges
 from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.geometry import nearest_index
 from dextouch.hands import actions as act
 
 
@@ -153,13 +154,13 @@ def test_unknown_names_are_refused(made, store):
 )
 def test_nearest_is_nearest(stamps, t):
     stamps, t = np.array(stamps), np.array(t, dtype=np.int64)
-    got = nearest_indices(stamps, t)
+    got = nearest_index(stamps, t)
     for index, time in zip(got, t, strict=True):
         assert abs(stamps[index] - time) == abs(stamps - time).min()
 
 
 def test_of_two_equally_near_stamps_the_earlier_counts():
-    got = nearest_indices(np.array([10, 20, 30]), np.array([15, 25, 14, 26, 0, 99]))
+    got = nearest_index(np.array([10, 20, 30]), np.array([15, 25, 14, 26, 0, 99]))
     assert got.tolist() == [0, 1, 0, 2, 0, 2]
 
 

@@ -51,7 +51,6 @@ class ExportOptions:
     cameras: tuple[str, ...] | None = None
     video: VideoSettings = VIDEO
     group: int = 2
-    robot_type: str = "dextouch"
 
 
 DEFAULTS = ExportOptions()
@@ -316,7 +315,7 @@ class _Dataset:
             "video_files_size_in_mb": layout.VIDEO_FILE_MB,
             "data_path": layout.DATA_PATH,
             "video_path": layout.VIDEO_PATH if self._videos else None,
-            "robot_type": self._options.robot_type,
+            "robot_type": "dextouch",
             "splits": {"train": f"0:{self._num_episodes}"},
         }
 

@@ -13,11 +13,10 @@ from dextouch.episodes import (
     GOP_IMAGES,
     EpisodeReader,
     mean_over_ranges,
-    nearest_indices,
     step_ranges,
 )
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.geometry import bracket, interpolate_linear, interpolate_poses
+from dextouch.geometry import bracket, interpolate_linear, interpolate_poses, nearest_index
 from dextouch.hands.actions import (
     ACTION_DIM,
     AnchorPoses,
@@ -89,7 +88,7 @@ def frames_of(reader: EpisodeReader, cameras: Sequence[str], fps: int) -> Episod
     indices, offsets_ns = {}, np.zeros((len(t_ns), len(cameras)), dtype=np.int64)
     for column, camera in enumerate(cameras):
         stamps = _image_stamps(reader, camera)
-        indices[camera] = nearest_indices(stamps, t_ns)
+        indices[camera] = nearest_index(stamps, t_ns)
         offsets_ns[:, column] = stamps[indices[camera]] - t_ns
     numbers = {layout.STATE: state, layout.ACTION: action, layout.MEASURED: measured}
     columns = {name: values.astype(np.float32) for name, values in numbers.items()} | {

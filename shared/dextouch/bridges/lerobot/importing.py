@@ -113,17 +113,8 @@ def import_lerobot(
     return ids
 
 
-@dataclass(frozen=True)
-class _FeatureMap:
-    """The dataset's features by role; None where it has none of that role."""
-
-    action: str
-    state: str | None
-    tactile: str | None
-    cameras: dict[str, str]
-
-
-def _map_features(info: DatasetInfo, names: Mapping[str, str]) -> _FeatureMap:
+def _map_features(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]:
+    """The dataset's features by role; roles and cameras that it has no feature for are absent."""
     for ours, theirs in names.items():
         if ours not in _ROLES and not _CAMERA_NAME.fullmatch(ours):
             raise UnknownNameError("name of a mapping", ours, [*_ROLES, "camera_…"])
@@ -154,7 +145,7 @@ def _map_features(info: DatasetInfo, names: Mapping[str, str]) -> _FeatureMap:
             "ones, for example mapping={'camera_head': 'observation.images.top'}",
             missing=problems,
         )
-    return _FeatureMap(roles["action"], roles.get("state"), roles.get("tactile"), cameras)
+    return roles | cameras
 
 
 def _cameras(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]:
@@ -177,7 +168,7 @@ def _describe(feature: FeatureInfo) -> str:
 def _content(
     source: LeRobotFolder,
     entry: EpisodeEntry,
-    features: _FeatureMap,
+    features: Mapping[str, str],
     sidecar: layout.Sidecar | None,
 ) -> tuple[GridEpisode, AnchorPoses | None]:
     """An episode's numbers and where its videos are.
@@ -197,12 +188,14 @@ def _content(
     numbers = {"action": GridNumbers("robot_state", "action", measured)}
     if commanded is not None:
         numbers["action_commanded"] = GridNumbers("robot_state", "action", commanded)
-    if features.tactile is not None:
+    if "tactile" in features:
         valid = columns.get(layout.VALID, np.ones((entry.length, 2), dtype=bool))
-        kpa = columns[features.tactile].astype(np.float32)
+        kpa = columns[features["tactile"]].astype(np.float32)
         numbers = tactile_numbers(kpa, valid.astype(bool)) | numbers
     cameras = {}
-    for camera, key in features.cameras.items():
+    for camera, key in features.items():
+        if camera in _ROLES:
+            continue
         span = source.span(entry, key)
         stamps = _image_stamps(source, key, t_ns, columns.get(layout.IMAGE_DT), where)
         cameras[camera] = GridImages(
@@ -212,9 +205,9 @@ def _content(
 
 
 def _columns(
-    source: LeRobotFolder, entry: EpisodeEntry, features: _FeatureMap
+    source: LeRobotFolder, entry: EpisodeEntry, features: Mapping[str, str]
 ) -> dict[str, np.ndarray]:
-    wanted = [features.action, features.state, features.tactile]
+    wanted = [features[role] for role in _ROLES if role in features]
     for name, (dtype, shape) in _OURS.items():
         feature = source.info.features.get(name)
         if feature is None:
@@ -225,21 +218,21 @@ def _columns(
                 f"expected {dtype} {list(shape or ['cameras'])}"
             )
         wanted.append(name)
-    return source.columns(entry, [name for name in wanted if name is not None])
+    return source.columns(entry, wanted)
 
 
 def _actions(
     columns: dict[str, np.ndarray],
-    features: _FeatureMap,
+    features: Mapping[str, str],
     sidecar: layout.Sidecar | None,
     where: str,
 ) -> tuple[np.ndarray, np.ndarray | None, AnchorPoses | None]:
     """Measured and commanded actions, and the poses that they are relative to."""
-    action = columns[features.action].astype(np.float64)
+    action = columns[features["action"]].astype(np.float64)
     if sidecar is None:
-        if features.state is None:
+        if "state" not in features:
             return action, None, None
-        state = columns[features.state][:1].astype(np.float64)
+        state = columns[features["state"]][:1].astype(np.float64)
         return action, None, poses_from_actions(state, WORLD).anchor(0)
     measured, commanded = action, None
     if sidecar.action_kind == "commanded":
@@ -294,13 +287,13 @@ def _foreign_attributes(
     source: LeRobotFolder,
     entry: EpisodeEntry,
     anchor: AnchorPoses | None,
-    features: _FeatureMap,
+    features: Mapping[str, str],
     options: ImportOptions,
 ) -> dict[str, object]:
     if options.K_head is None:
         raise InvalidInputError(
             f"{source.folder}: has no information about its head camera "
-            f"({features.cameras[HEAD]!r}); give K_head= in pixels"
+            f"({features[HEAD]!r}); give K_head= in pixels"
         )
     name = re.sub(r"[^a-z0-9_-]+", "-", source.folder.resolve().name.lower()).strip("-_")
     data_file = source.data_file(entry)

@@ -7,7 +7,7 @@ even when the recordings that led to derived episodes are already gone.
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -212,10 +212,7 @@ def delete_for_good(
             break
     words = {v.id for v in known} | {v.sha256 for v in known if v.sha256} | {request.name}
     wanted = Wanted(words)
-    remaining, unreadable, num_files = _search(root, wanted, skip=path)
-    if checkpoints is not None:
-        more, num_more = _search_checkpoints(checkpoints, wanted)
-        remaining, num_files = remaining + more, num_files + num_more
+    remaining, unreadable, num_files = _search(root, wanted, checkpoints, skip=path)
     deleted = [v for v in known if not (root / v.place / v.folder).exists()]
     receipt = DeletionReceipt(
         request=request,
@@ -238,52 +235,38 @@ def delete_for_good(
     return receipt
 
 
-def _search(root: Path, wanted: Wanted, *, skip: Path) -> tuple[list[Reference], list[str], int]:
+def _search(
+    root: Path, wanted: Wanted, checkpoints: Path | None, *, skip: Path
+) -> tuple[list[Reference], list[str], int]:
     """What still refers to identifiers, what cannot be read, and the number of files searched.
 
-    Searched are all attributes files and the names of folders.
+    Searched are all attributes files, the names of folders, and of checkpoints the headers of
+    safetensors and the JSON beside them.
     """
-    found, num_files = [], 0
+    found, files = [], []
     facts = all_facts(root)
     for item in facts:
         where = f"{item.place}/{item.folder.name}"
         if named := wanted.in_text(item.item_id):
             found.append(Reference(where, tuple(named)))
-        files = [(f"{where}/{path.name}", path) for path in small_files(item.folder)]
-        num_files += len(files)
-        found += _references(wanted, files)
+        files += [(f"{where}/{path.name}", path) for path in small_files(item.folder)]
+    if checkpoints is not None:
+        with disk_errors(f"search {checkpoints}"):
+            paths = [p for p in checkpoints.rglob("*") if p.suffix in {".safetensors", ".json"}]
+            files += [(str(path), path) for path in sorted(paths) if path.is_file()]
     others = ((f"{INTENTS}/{p.name}", p) for p in small_files(root / INTENTS) if p != skip)
-    found += _references(wanted, others)
+    found += _references(wanted, [*files, *others])
     unreadable = [f"{item.place}/{item.folder.name}" for item in facts if not item.readable]
-    return found, unreadable, num_files
+    return found, unreadable, len(files)
 
 
-def _search_checkpoints(folder: Path, wanted: Wanted) -> tuple[list[Reference], int]:
-    """What refers to identifiers in safetensors headers and the JSON beside them."""
-    with disk_errors(f"search {folder}"):
-        paths = [p for p in sorted(folder.rglob("*")) if p.suffix in {".safetensors", ".json"}]
-        files = [(str(path), path) for path in paths if path.is_file()]
-        return _references(wanted, files, read=_header), len(files)
-
-
-def _header(path: Path) -> bytes:
-    with path.open("rb") as file:
-        if path.suffix == ".json":
-            return file.read(_MAX_HEADER_BYTES)
-        size = int.from_bytes(file.read(8), "little")
-        return file.read(min(size, _MAX_HEADER_BYTES))
-
-
-def _references(
-    wanted: Wanted,
-    files: Iterable[tuple[str, Path]],
-    *,
-    read: Callable[[Path], bytes] = Path.read_bytes,
-) -> list[Reference]:
+def _references(wanted: Wanted, files: Iterable[tuple[str, Path]]) -> list[Reference]:
     found = []
     for where, path in files:
-        with disk_errors(f"search {path.name}"):
-            data = read(path)
+        with disk_errors(f"search {path.name}"), path.open("rb") as file:
+            is_weights = path.suffix == ".safetensors"
+            size = int.from_bytes(file.read(8), "little") if is_weights else _MAX_HEADER_BYTES
+            data = file.read(min(size, _MAX_HEADER_BYTES))
         if named := wanted.found_in(data):
             found.append(Reference(where, tuple(named)))
     return found

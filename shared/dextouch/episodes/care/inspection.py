@@ -68,8 +68,8 @@ class ItemReport:
 def open_contents(files: GroupFiles, kind: Kind) -> Group:
     """Open a committed group of either kind; raises as `read_group`."""
     if kind == "episode":
-        return read_group(files, kind, EpisodeAttributes)
-    return read_group(files, kind, RecordingAttributes)
+        return read_group(files, EpisodeAttributes)
+    return read_group(files, RecordingAttributes)
 
 
 def inspect_group(

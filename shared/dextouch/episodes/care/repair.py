@@ -40,7 +40,6 @@ from dextouch.episodes.format import (
     stream_arrays,
     with_rows,
 )
-from dextouch.episodes.group_contents import get_metadata
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.spool import read_attributes
 from dextouch.episodes.staged_group import STAGING, read_stage, unheld_folders
@@ -195,7 +194,7 @@ def _damaged_arrays(files: GroupFiles, kind: Kind) -> set[str]:
 def _commit_of(files: LocalGroup, kind: Kind) -> tuple[CommitRecord, str] | None:
     what = f"{kind} {files.item_id}"
     try:
-        data = get_metadata(files, COMMIT_FILE, what)
+        data = files.get(COMMIT_FILE)
         return None if data is None else decode_commit(data, what=what)
     except CorruptDataError:
         return None
@@ -210,7 +209,7 @@ def _known(
         StorageError: another version, or attributes that are damaged.
     """
     what = f"{kind} {files.item_id}"
-    record, group = _commit_of(files, kind), get_metadata(files, METADATA_FILE, what)
+    record, group = _commit_of(files, kind), files.get(METADATA_FILE)
     if group is None or (record and sha256_hex(group) != record[0].attributes_sha256):
         raise CorruptDataError(
             f"{what}: attributes are damaged, and samples cannot be interpreted without them; "
