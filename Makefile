@@ -120,7 +120,7 @@ $(LEROBOT_POLICY_VENV)/.complete:
 	$(LEROBOT_POLICY_VENV)/bin/pip install --quiet --disable-pip-version-check '.[lerobot]'
 	touch $@
 
-check-lerobot-policy: $(VENV)/.dev $(LEROBOT_POLICY_VENV)/.complete   ## opt-in: a policy of LeRobot acts as in its own loop (8 GB)
+check-lerobot-policy: $(VENV)/.dev $(LEROBOT_POLICY_VENV)/.complete   ## opt-in: compare a served LeRobot policy with LeRobot's own control loop (8 GB)
 	$(BIN)/python tests/system/lerobot/check.py $(LEROBOT_POLICY_VENV)/bin/python
 
 # The site reads the docstrings of dextouch and needs neither torch nor mujoco, so it has an environment of its own.
