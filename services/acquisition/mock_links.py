@@ -12,19 +12,19 @@ class MockLinks(FrozenModel):
     """Which of the ways that real stations know the mock devices of a station take."""
 
     gloves: str = Field(
-        default="tactile_glove", description="kind of both gloves, ours or of another package"
+        default="tactile_glove", description="kind of both gloves, built in or of another package"
     )
     trackers: Literal["hid", "bridge"] = Field(
-        default="hid", description="how finger and pose trackers are connected"
+        default="hid", description="connection of finger and pose trackers"
     )
     wrists: Literal["robot", "trackers"] = Field(
-        default="robot", description="what gives the poses of the wrists where there is a robot"
+        default="robot", description="source of the wrist poses if there is a robot"
     )
     cameras: Literal["bridge", "station"] = Field(
         default="bridge", description="images over a socket, or from a camera on the station's bus"
     )
     images: Literal["rgb8", "jpeg", "h264"] = Field(
-        default="rgb8", description="how the bridge, or the station, encodes images"
+        default="rgb8", description="image encoding of the bridge or the station"
     )
 
     @field_validator("gloves")

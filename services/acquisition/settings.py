@@ -19,20 +19,20 @@ class SpoolSafety(FrozenModel):
         default=0.5,
         gt=0,
         le=3600,
-        description="seconds between two flushes to the disk, the most that a power loss can lose",
+        description="seconds between flushes to disk, the most that a power failure can lose",
     )
     min_free_bytes: int = Field(
         default=64 * 2**20,
         ge=0,
-        description="a take ends, and none begins, when less is left on the spool's disk",
+        description="bytes to keep free on the spool's disk: below, takes end and none can start",
     )
 
 
 class AcquisitionSettings(ServiceSettings, SpoolSafety):
     """Record the gloves, trackers, robots and cameras of a station, and serve them over HTTP.
 
-    Real devices are named by --devices. With --mock they are simulated: they play an episode of a
-    local store round and round, or a made-up pattern when none is named.
+    --devices lists the real devices. With --mock devices are simulated and replay an episode of a
+    local store in a loop, by default a synthetic pattern.
 
     Example:
       dextouch station serve --mock --port 8083 --spool data/spool
@@ -44,7 +44,7 @@ class AcquisitionSettings(ServiceSettings, SpoolSafety):
         default="station",
         min_length=1,
         max_length=128,
-        description="name of the station, as recordings carry it",
+        description="name of the station, stored in recordings",
     )
     spool: Path = Field(default_factory=default_spool, description="folder of the takes")
     mock: bool = Field(default=False, description="simulate the devices")
@@ -52,29 +52,27 @@ class AcquisitionSettings(ServiceSettings, SpoolSafety):
         default=None, description="local store of the episode that mock devices play"
     )
     mock_episode_id: str | None = Field(
-        default=None, description="episode that mock devices play (a made-up pattern)"
+        default=None, description="episode that mock devices replay (default: a synthetic pattern)"
     )
     mock_faults: Literal["none", "first_light"] = Field(
         default="none", description="first_light: losses, delays and drifts of an ordinary station"
     )
     mock_links: MockLinks = MockLinks()
-    seed: int = Field(default=0, ge=0, description="of everything random in mock devices")
+    seed: int = Field(default=0, ge=0, description="random seed of mock devices")
     devices: tuple[ChosenDevice, ...] = Field(
         default=(), description="real devices, see docs/stations.md"
     )
     calibration: Path | None = Field(
         default=None, description="JSON file of named matrices, see docs/calibration_guide.md"
     )
-    episode_store_url: str | None = Field(default=None, description="where takes are uploaded to")
+    episode_store_url: str | None = Field(default=None, description="store to upload takes to")
     episode_store_key: SecretStr | None = Field(
         default=None, description="bearer key of the episode store"
     )
     upload_period_s: float = Field(
-        default=2.0, gt=0, le=3600, description="seconds between two looks for takes to upload"
+        default=2.0, gt=0, le=3600, description="seconds between checks for takes to upload"
     )
-    keep_uploaded: bool = Field(
-        default=True, description="keep takes in the spool when they are uploaded"
-    )
+    keep_uploaded: bool = Field(default=True, description="keep uploaded takes in the spool")
 
     @model_validator(mode="after")
     def _mock_or_devices(self) -> "AcquisitionSettings":

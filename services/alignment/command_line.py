@@ -37,15 +37,15 @@ EXIT_REFUSED = 3
 # Width of a report that is not printed at a terminal.
 PAGE_WIDTH = 110
 EPILOG = """examples:
-  dextouch align run take-7 take-8           align two recordings, side by side
-  dextouch align run --all --workers 2       align whatever has no episode yet
-  dextouch align report take-7               clocks, retargeting, what was left out and why
+  dextouch align run take-7 take-8           align two recordings in parallel
+  dextouch align run --all --workers 2       align all recordings without an episode
+  dextouch align report take-7               clock fits, retargeting errors, omitted parts
   dextouch align retarget take-7 --model hand.urdf --mapping hand.toml --to joints.npz
-                                             joint angles of a robot hand of your own
+                                             joint angles of another robot hand
   dextouch align serve --port 8082           run the HTTP service
 
-An episode's id follows from the recording and the options: aligning again finds it and writes
-nothing, so a run that was interrupted is simply started again."""
+An episode's id is derived from the recording and the options: aligning again finds it and writes
+nothing, so an interrupted run can simply be started again."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -62,7 +62,7 @@ def main(argv: Sequence[str]) -> int:
 def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
     parser = CommandParser(
         prog="dextouch align",
-        description="Make synchronized, retargeted episodes of recordings, in the same store.",
+        description="Convert recordings to synchronized, retargeted episodes in the same store.",
         epilog=EPILOG,
     )
     shared = CommandParser(add_help=False)
@@ -100,7 +100,7 @@ def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
     other = commands.add_parser(
         "retarget",
         parents=[shared],
-        help="retarget an episode to a robot hand of your own",
+        help="retarget a recording to another robot hand",
         description="Joint angles of any robot hand that follow the tracked hand of an episode, "
         "written as NPZ: joint_names, t_ref_ns, joints_rad, status, tip_error_m.",
         epilog="example:\n  dextouch align retarget take-7 --model allegro_right.urdf \\\n"

@@ -8,15 +8,15 @@ from dextouch.frozen_model import FrozenModel
 class AlignmentOptions(FrozenModel):
     """Options of one alignment; they are part of the episode's identity."""
 
-    model_rate_hz: float = Field(default=15.0, gt=0, le=1000, description="of the action grid")
+    model_rate_hz: float = Field(default=15.0, gt=0, le=1000, description="rate of the model grid")
     max_gap_ms: float = Field(
         default=50.0,
         gt=0,
         le=10_000,
-        description="samples further apart are not interpolated between",
+        description="longest gap between samples that is interpolated",
     )
     min_num_steps: int = Field(
-        default=17, ge=2, description="shorter stretches without a gap become no episode"
+        default=17, ge=2, description="shortest gap-free interval that becomes an episode"
     )
 
     @property

@@ -18,7 +18,7 @@ def usable_cores() -> int:
 class AlignmentSettings(ServiceSettings):
     """Serve alignment over HTTP, and align recordings that arrive in a store.
 
-    The options are the defaults of a request.
+    The options are used for requests that do not set their own.
 
     Example:
       dextouch align serve --store-url data/store --port 8082
@@ -32,24 +32,22 @@ class AlignmentSettings(ServiceSettings):
         description="store that recordings arrive in: folder, file:///… or s3://…",
     )
     jobs_folder: Path | None = Field(
-        default=None, description="folder of the jobs (.alignments in the store)"
+        default=None, description="folder of the jobs (default: .alignments in the store)"
     )
     options: AlignmentOptions = AlignmentOptions()
     num_workers: int = Field(
         default_factory=usable_cores,
         ge=1,
         le=64,
-        description="alignments at once, each in a process of its own (one a core)",
+        description="concurrent alignments, each in its own process (default: one per core)",
     )
-    max_waiting: int = Field(default=10_000, ge=1, le=100_000, description="jobs that may wait")
-    max_kept: int = Field(
-        default=10_000, ge=1, le=100_000, description="finished jobs that are remembered"
-    )
+    max_waiting: int = Field(default=10_000, ge=1, le=100_000, description="waiting jobs")
+    max_kept: int = Field(default=10_000, ge=1, le=100_000, description="finished jobs to keep")
     max_attempts: int = Field(
         default=3,
         ge=1,
         le=100,
-        description="starts of a job whose process died, until it is failed",
+        description="starts of a job whose process dies before it fails",
     )
     align_new: bool = Field(
         default=True, description="align every recording that arrives in the store"
@@ -58,7 +56,7 @@ class AlignmentSettings(ServiceSettings):
         default=None,
         gt=0,
         le=3600,
-        description="seconds between two listings of the store (2 for a folder, 30 for a bucket)",
+        description="seconds between listings of the store (default: 2; 30 for a bucket)",
     )
 
     @property

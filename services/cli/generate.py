@@ -130,9 +130,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = imagination_parser(prog="dextouch generate", description=__doc__, epilog=_EPILOG)
     add = parser.add_argument
     add("--split", choices=SPLITS, help="only scenes of this split (default: all)")
-    add("--count", type=positive, metavar="N", help="at most so many, evenly over tasks")
+    add("--count", type=positive, metavar="N", help="largest number of episodes, over all tasks")
     add("--with-failures", action="store_true", help="also imagine episodes that failed")
-    add("--strips", type=Path, metavar="PATH", help="HTML page of truth above imagination")
+    add("--strips", type=Path, metavar="PATH", help="HTML page of recorded and imagined images")
     shown = "episodes on that page (%(default)s)"
     add("--num-strips", type=positive, default=12, metavar="N", help=shown)
     return parser

@@ -292,9 +292,9 @@ def _parser() -> argparse.ArgumentParser:
     mixes = parser.add_mutually_exclusive_group()
     kinds = "kinds of takes (%(default)s)"
     mixes.add_argument("--mix", choices=list(MIXES), default=DEFAULT_MIX, help=kinds)
-    for name, effect in (("exact", "no errors"), ("ladder", "errors of 0 … 40 mm in turn")):
+    for name, effect in (("exact", "without errors"), ("ladder", "with errors of 0 … 40 mm")):
         short = mixes.add_argument(f"--{name}", dest="mix", action="store_const", const=name)
-        short.help = f"{effect}, no other kinds"
+        short.help = f"only scripts {effect}"
     add("--miss-fraction", type=float, help="share of misses (default: the mix's)")
     add("--still-fraction", type=float, help="share of takes that stop or never start")
     add("--policy", metavar="[NAME=]MODULE:FACTORY", help="record rollouts of this policy instead")

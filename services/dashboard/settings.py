@@ -25,29 +25,29 @@ class DashboardSettings(ServiceSettings):
         description="tasks that the operator may choose",
     )
     acquisition_url: str | None = Field(
-        default=None, description="of the station; a service without URL is not shown"
+        default=None, description="URL of the station; services without a URL are not shown"
     )
-    episode_store_url: str | None = Field(default=None, description="of the episode store")
-    alignment_url: str | None = Field(default=None, description="of the alignment service")
-    twin_url: str | None = Field(default=None, description="of the twin")
-    world_model_url: str | None = Field(default=None, description="of the world model")
+    episode_store_url: str | None = Field(default=None, description="URL of the episode store")
+    alignment_url: str | None = Field(default=None, description="URL of the alignment service")
+    twin_url: str | None = Field(default=None, description="URL of the twin")
+    world_model_url: str | None = Field(default=None, description="URL of the world model")
     upstream_key: SecretStr | None = Field(
         default=None, description="bearer key of the other services"
     )
     upstream_timeout_s: float = Field(
-        default=2.0, gt=0, le=30, description="seconds until a silent service counts as away"
+        default=2.0, gt=0, le=30, description="seconds until a silent service counts as unavailable"
     )
     station_period_s: float = Field(
-        default=0.2, ge=0.05, le=10, description="seconds between two states of the station"
+        default=0.2, ge=0.05, le=10, description="seconds between updates of the station's state"
     )
     taxel_period_s: float = Field(
-        default=0.1, ge=0.02, le=10, description="seconds between two taxel maps"
+        default=0.1, ge=0.02, le=10, description="seconds between updates of the taxel maps"
     )
     list_period_s: float = Field(
-        default=2.0, ge=0.2, le=60, description="seconds between two listings of takes and episodes"
+        default=2.0, ge=0.2, le=60, description="seconds between listings of takes and episodes"
     )
     session_hours: float = Field(
-        default=12.0, gt=0, le=24 * 30, description="until an operator must sign in again"
+        default=12.0, gt=0, le=24 * 30, description="hours until an operator must sign in again"
     )
 
     def upstream_urls(self) -> dict[str, str]:

@@ -9,8 +9,8 @@ from dextouch.serving import ServiceSettings, service_config
 class EpisodeStoreSettings(ServiceSettings):
     """Serve a store over HTTP, with limits per request, in flight and per station.
 
-    Unfinished uploads are kept below the store. The largest body must hold one batch of the wire
-    format. An upload that is not kept open reads its whole log when it goes on.
+    Unfinished uploads are kept in the store's folder. The largest body must hold one batch of the
+    wire format. Resuming an upload whose files were closed reads its whole log.
 
     Example:
       dextouch store serve --store-url data/store --port 8081
@@ -28,20 +28,20 @@ class EpisodeStoreSettings(ServiceSettings):
         default=128,
         ge=1,
         le=1024,
-        description="unfinished uploads whose files stay open; at least one a station",
+        description="unfinished uploads whose files stay open; at least one per station",
     )
     max_batches_in_flight: int = Field(
-        default=32, ge=1, le=1024, description="batches at once; more are refused with 429"
+        default=32, ge=1, le=1024, description="concurrent batches; more are refused with 429"
     )
     max_bytes_in_flight: int = Field(
         default=128 * 2**20,
         ge=1024,
-        description="bytes of batches at once; more are refused with 429",
+        description="bytes of concurrent batches; more are refused with 429",
     )
     min_free_bytes: int = Field(
         default=512 * 2**20,
         ge=0,
-        description="bytes that stay free on the disk; less is refused with 507",
+        description="bytes to keep free on the disk; batches that need them are refused with 507",
     )
     quota_bytes_per_station: int | None = Field(
         default=None,
@@ -57,4 +57,4 @@ class EpisodeStoreSettings(ServiceSettings):
     max_window_steps: int = Field(
         default=321, ge=1, le=10_000, description="steps of one window of an episode"
     )
-    max_answer_bytes: int = Field(default=64 * 2**20, ge=1024, description="of one answer")
+    max_answer_bytes: int = Field(default=64 * 2**20, ge=1024, description="bytes of one response")

@@ -72,7 +72,7 @@ def _seed_range(text: str) -> range:
 def _parser() -> argparse.ArgumentParser:
     parser = CommandParser(
         prog="dextouch twin",
-        description="Record ground-truth episodes in the physics twin, or serve it as a world.",
+        description="Record ground-truth episodes in the physics twin, or serve rollouts in it.",
         epilog="example:\n  dextouch twin serve --port 8084",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="{record,serve}")
@@ -129,7 +129,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     make.add_argument("--jobs", default=1, type=int, metavar="N", help="processes (%(default)s)")
     add_json(make)
-    commands.add_parser("serve", help="serve the twin as a world; flags: serve --help")
+    commands.add_parser("serve", help="serve rollouts in the twin; flags: serve --help")
     return parser
 
 

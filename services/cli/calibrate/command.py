@@ -13,13 +13,13 @@ from services.cli.calibrate.boards import BOARD_HELP
 EXIT_LEVEL = 1
 
 _ABOUT = """\
-Measure what a station must know of its devices. Everything goes into one folder:
-  calibration.json           the matrices as recordings carry them; give it to the station with
+Calibrate the devices of a station. All results are written to one folder:
+  calibration.json           matrices, as stored in recordings; start the station with
                              DEXTOUCH_ACQUISITION_CALIBRATION=FOLDER/calibration.json
   calibration_details.json   sigma, time, software, inputs
-  pictures/                  coverage and residuals, to look at
+  pictures/                  plots of coverage and residuals
 
-A whole calibration:
+A complete calibration:
   1. glove     at a running station, which records rest and known pressures step by step
                dextouch station calibrate glove --side left --url http://127.0.0.1:8083 \\
                  --to calibration
@@ -32,10 +32,10 @@ A whole calibration:
   4. show      age and sigma of everything; warns after seven days
                dextouch station calibrate show calibration
 
-Where the station needs them:
+If required:
   wrist        gloves whose keypoints are not in wrist axes: a take of the flat hand
-  profile      once a person: a take in which the hand opens, closes and spreads
-  robot-base   robots that report poses in their base: pairs of poses of tracker and effector
+  profile      once per person: a take in which the hand opens, closes and spreads
+  robot-base   robots that report poses in their base frame: pose pairs of tracker and effector
   latency      streams with unknown path delay: a take of brisk motion, or of taps
 
 More: docs/calibration_guide.md"""
@@ -57,8 +57,8 @@ example:
 _HAND_EYE = """\
 The board is fixed; hold the tracker with its camera still at every photo. Rotate it by 30 degrees
 or more about at least two of its axes, better three. The camera must be calibrated first
-(--intrinsics names its folder, if it is another one). With poses of the board in the file no
-photos are needed. If poses are refused as inverted, --invert inverts that side.
+(--intrinsics: its folder, if it is not --to). With poses of the board in the file no photos are
+needed. If poses are refused as inverted, --invert inverts that side.
 
 example:
   dextouch station calibrate hand-eye --camera head --photos photos/mount \\

@@ -42,9 +42,9 @@ def parse(argv: Sequence[str]) -> DemoPlan:
         prog="dextouch demo",
         epilog="example:\n  dextouch demo --output runs/demo --seeds 2",
         description="Record a human and a robot take through mock devices, align them, compare "
-        "with the twin's truth, predict with the world model, and score policies in the twin and "
+        "with ground truth, predict with the world model, and score policies in the twin and "
         "in the world model. Ends with a table, report.json and report.html; both takes stay in "
-        f"the store {default_store()}, where the next run replaces them (DEXTOUCH_DATA names "
+        f"the store {default_store()}, where the next run replaces them (DEXTOUCH_DATA sets "
         "another data folder).",
     )
     results = "folder of the results (%(default)s)"
@@ -53,8 +53,8 @@ def parse(argv: Sequence[str]) -> DemoPlan:
     parser.add_argument(
         "--train",
         action="store_true",
-        help="train a small state model, the policy and the probe anew instead of using the "
-        "committed ones (takes far longer than the demo itself)",
+        help="train a small state model, the policy and the probe instead of using the "
+        "committed ones (takes much longer than the demo itself)",
     )
     scenes = "held-out scenes per task for scoring policies (%(default)s)"
     parser.add_argument("--seeds", type=int, metavar="N", default=6, help=scenes)

@@ -48,33 +48,33 @@ class ServiceSettings(BaseSettings):
 
     host: str = Field(
         default="127.0.0.1",
-        description="address to listen on; anything but loopback needs api keys",
+        description="address to listen on; addresses other than loopback need --api-keys",
     )
     port: int = Field(
         default=0, ge=0, le=65535, description="port to listen on; 0 for any free one"
     )
     api_keys: tuple[ApiKey, ...] = Field(
-        default=(), description="keys and their scopes, see docs/access.md"
+        default=(), description="API keys with their scopes, see docs/access.md"
     )
     max_body_bytes: int = Field(
         default=16 * 2**20, ge=1024, description="largest body of a request"
     )
     allowed_hosts: tuple[HostName, ...] = Field(
         default=(),
-        description="host names besides loopback that are accepted without a key",
+        description="host names other than loopback that are accepted without a key",
     )
     allowed_origins: tuple[Origin, ...] = Field(
         default=(),
         description="origins of the service behind a TLS proxy, such as https://lab.example",
     )
     log_format: Literal["auto", "json", "console"] = Field(
-        default="auto", description="of log events; auto: console at a terminal, JSON otherwise"
+        default="auto", description="auto: console at a terminal, JSON otherwise"
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="least level of log events"
+        default="info", description="minimum level of log events"
     )
     max_connections: int = Field(
-        default=512, ge=1, description="open at the same time; further clients get status 503"
+        default=512, ge=1, description="open connections; further clients get status 503"
     )
     client_timeout_s: float = Field(
         default=20.0,
@@ -83,7 +83,7 @@ class ServiceSettings(BaseSettings):
         "response",
     )
     shutdown_grace_s: int = Field(
-        default=10, ge=0, le=600, description="seconds that requests in flight get to end"
+        default=10, ge=0, le=600, description="seconds for requests in flight to finish"
     )
 
     @model_validator(mode="after")

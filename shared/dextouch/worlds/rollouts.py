@@ -56,15 +56,15 @@ logger = structlog.get_logger(__name__)
 class RolloutLimits(FrozenModel):
     """Limits of this installation; every chunk renews `ttl_s`."""
 
-    max_rollouts: int = Field(default=64, ge=1, description="open at the same time")
+    max_rollouts: int = Field(default=64, ge=1, description="rollouts open at the same time")
     max_rollouts_per_key: int | None = Field(
-        default=None, ge=1, description="of them, begun with one API key; unset: all"
+        default=None, ge=1, description="open rollouts of one API key (default: no limit)"
     )
-    max_chunks: int = Field(default=1000, ge=1, description="of one rollout")
+    max_chunks: int = Field(default=1000, ge=1, description="chunks of one rollout")
     ttl_s: float = Field(
         default=600.0,
         gt=0,
-        description="seconds until an unused rollout is dropped; every chunk renews them",
+        description="seconds until an unused rollout expires; every chunk restarts them",
     )
 
 

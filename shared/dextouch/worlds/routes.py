@@ -91,11 +91,11 @@ class WorldServiceSettings(ServiceSettings):
 
     state_url: str = Field(
         default="memory://",
-        description="where rollouts are kept: memory:// or redis://HOST:PORT/DB",
+        description="store of rollouts: memory:// or redis://HOST:PORT/DB",
     )
     limits: RolloutLimits = RolloutLimits()
     workers: int = Field(
-        default=1, ge=1, le=64, description="processes on one port; more than 1 need redis://"
+        default=1, ge=1, le=64, description="processes on one port; more than one needs redis://"
     )
     drain_s: float = Field(
         default=0.0,
