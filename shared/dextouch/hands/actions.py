@@ -70,8 +70,9 @@ def check_actions(actions: np.ndarray, *, where: str = "actions") -> Float64[np.
     checked = np.asarray(actions, dtype=np.float64)
     if checked.ndim != 2 or checked.shape[1] != ACTION_DIM or len(checked) == 0:
         raise ShapeError(f"{where}: got shape {checked.shape}, expected [T ≥ 1, {ACTION_DIM}]")
-    bad = np.argwhere(~np.isfinite(checked))
-    if len(bad):
+    is_finite = np.isfinite(checked)
+    if not is_finite.all():
+        bad = np.argwhere(~is_finite)
         row, column = bad[0]
         raise NonFiniteError(
             f"{where}: {len(bad)} values are NaN or infinite, first in row {row}, column {column}; "

@@ -94,6 +94,8 @@ class Observation:
         always kept; whether it is sent is decided by the sender.
         """
         shown = self.last() if selector.steps == "last" else self
+        if selector.cameras is None:
+            return shown
         wanted = {camera: rows for camera, rows in shown.images.items() if selector.wants(camera)}
         return replace(shown, images=wanted)
 

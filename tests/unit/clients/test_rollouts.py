@@ -1,9 +1,12 @@
 """The client against a real server: what a policy sees, retries that take nothing twice, errors."""
 
+import socket
+import threading
+
 import numpy as np
 import pytest
 
-from dextouch.clients import RolloutClient
+from dextouch.clients import HttpLink, RolloutClient
 from dextouch.errors import (
     ConflictError,
     EndedError,
@@ -250,3 +253,26 @@ def test_images_as_jpeg_are_decoded_by_the_client(client):
     for camera, images in raw.images.items():
         assert seen.images[camera].shape == images.shape
     np.testing.assert_array_equal(seen.tactile_kpa, raw.tactile_kpa)
+
+
+def test_a_request_arrives_whole():
+    """In two pieces the server would wake up twice."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        link = HttpLink(f"http://127.0.0.1:{listening.getsockname()[1]}")
+        found = []
+
+        def serve() -> None:
+            connection, _ = listening.accept()
+            with connection:
+                for _ in range(2):
+                    found.append(connection.recv(65536))
+                    connection.sendall(b"HTTP/1.1 200 OK\r\ncontent-length: 2\r\n\r\n{}")
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        for body in (b"x" * 1000, None):
+            assert link.request("POST", "/some", body=body).body == b"{}"
+        thread.join()
+        link.close()
+    assert [data.count(b"\r\n\r\n") for data in found] == [1, 1]
+    assert found[0].endswith(b"\r\n\r\n" + b"x" * 1000)
