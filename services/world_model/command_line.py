@@ -77,7 +77,7 @@ def run_serve(arguments: list[str]) -> int:
         partial(_open_worlds, settings),
         settings,
         name="world_model",
-        reopen=partial(_open_by_digest, settings),
+        reopen=partial(open_by_digest, settings),
     )
     return 0
 
@@ -90,7 +90,7 @@ def _open_worlds(settings: WorldModelSettings) -> dict[str, World[Any]]:
     return {settings.world_name: world}
 
 
-def _open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> World[Any] | None:
+def open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> World[Any] | None:
     """The world of the checkpoint with this digest beside the one that is served."""
     for path, found in list_checkpoints(settings.checkpoint.parent).items():
         if found == digest:

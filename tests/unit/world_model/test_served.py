@@ -1,11 +1,16 @@
 """The model behind the rollout routes: started from an observation, stepped, refused clearly."""
 
+import hashlib
+import shutil
+
 import numpy as np
 import pytest
 from httpx import ASGITransport, AsyncClient
 
 from dextouch.schemas import StartRequest, decode_answer, encode_start
 from dextouch.worlds import create_world_app
+from services.world_model.checkpoints import PAPER_FORM, PRETRAINED, STATE_MODEL
+from services.world_model.command_line import open_by_digest
 from services.world_model.settings import WorldModelSettings
 from services.world_model.world import ModelWorld
 from tests.unit.world_model.test_world import make_start
@@ -56,3 +61,17 @@ async def test_it_is_listed_with_its_digest(client, checkpoint):
     worlds = (await client.get("/v1/worlds")).json()["worlds"]
     assert worlds[0]["digest"] == checkpoint.digest
     assert worlds[0]["kind"] == "model"
+
+
+def test_rollouts_of_another_checkpoint_continue_while_it_is_in_the_folder(tmp_path):
+    for path in PRETRAINED.glob("*.safetensors"):
+        shutil.copy(path, tmp_path)
+    current = tmp_path / "current.safetensors"
+    current.symlink_to(STATE_MODEL)
+    settings = WorldModelSettings(checkpoint=current, sampling_steps=3)
+    for name in (PAPER_FORM, STATE_MODEL):
+        digest = hashlib.sha256((PRETRAINED / name).read_bytes()).hexdigest()
+        world = open_by_digest(settings, settings.world_name, digest)
+        assert world is not None
+        assert world.description.digest == digest
+    assert open_by_digest(settings, settings.world_name, "0" * 64) is None
