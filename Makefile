@@ -6,13 +6,14 @@ LEROBOT := tests/benchmarks/lerobot
 LEROBOT_VENV ?= .venv-lerobot
 OPENPI_VENV ?= .venv-openpi
 LEROBOT_POLICY_VENV ?= .venv-lerobot-policy
+RAY_VENV ?= .venv-ray
 STAGE ?= store loader acquisition clocks calibration retargeting alignment closure twin world-model evaluator agreement rollouts
 MADE := runs/reproduce
 DOCS_VENV ?= .venv-docs
 SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow kills vm fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi wheel-test \
+.PHONY: demo test check slow kills vm fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -122,6 +123,14 @@ $(LEROBOT_POLICY_VENV)/.complete:
 
 check-lerobot-policy: $(VENV)/.dev $(LEROBOT_POLICY_VENV)/.complete   ## opt-in: compare a served LeRobot policy with LeRobot's own control loop (8 GB)
 	$(BIN)/python tests/system/lerobot/check.py $(LEROBOT_POLICY_VENV)/bin/python
+
+$(RAY_VENV)/.complete: pyproject.toml
+	$(PYTHON) -m venv $(RAY_VENV)
+	$(RAY_VENV)/bin/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[scale]' psutil pytest
+	touch $@
+
+check-ray: $(RAY_VENV)/.complete   ## opt-in: kill replicas of a local Ray Serve deployment while rollouts run; 500 MB; apt-get install redis-server
+	PYTHONPATH=.:shared $(RAY_VENV)/bin/python -m tests.system.ray_serve.check $(ARGS)
 
 # The site reads the docstrings of dextouch and needs neither torch nor mujoco, so it has an environment of its own.
 $(DOCS_VENV)/.complete: pyproject.toml constraints.txt

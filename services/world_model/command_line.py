@@ -74,7 +74,7 @@ def run_serve(arguments: list[str]) -> int:
     """
     settings = load_settings(WorldModelSettings, arguments)
     serve_worlds(
-        partial(_open_worlds, settings),
+        partial(open_worlds, settings),
         settings,
         name="world_model",
         reopen=partial(open_by_digest, settings),
@@ -82,7 +82,8 @@ def run_serve(arguments: list[str]) -> int:
     return 0
 
 
-def _open_worlds(settings: WorldModelSettings) -> dict[str, World[Any]]:
+def open_worlds(settings: WorldModelSettings) -> dict[str, World[Any]]:
+    """The world of the checkpoint to serve."""
     import torch
 
     torch.set_num_threads(settings.num_threads)

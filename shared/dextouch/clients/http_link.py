@@ -83,12 +83,13 @@ class HttpLink:
         body: bytes | None = None,
         content_type: str = "application/json",
         accept: str = "application/json",
+        session: str | None = None,
     ) -> Reply:
         """Send a request, again after a lost connection: every request must be idempotent.
 
         A service that has ever responded may be away for `patience_s`: until then the request is
         also repeated after responses with `Retry-After`, not before the time it says, and after
-        502, 503 and 504 of a proxy.
+        errors of a proxy. Proxies that route by a header find `session` in `x-session-id`.
 
         Raises:
             UnavailableError: no response after all attempts.
@@ -97,6 +98,8 @@ class HttpLink:
         headers = self._headers | {"Accept": accept}
         if body is not None:
             headers["Content-Type"] = content_type
+        if session is not None:
+            headers["x-session-id"] = session
         began_s, paused_s = time.monotonic(), 0.0
         problem: Reply | OSError | http.client.HTTPException
         pauses_s = itertools.chain(RETRY_PAUSES_S, itertools.repeat(LAST_PAUSE_S))
@@ -143,8 +146,9 @@ def _busy_s(answer: http.client.HTTPResponse) -> float | None:
     retry_after = answer.getheader("Retry-After")
     if retry_after is not None:
         return float(retry_after) if retry_after.isdecimal() else 0.0
+    # Of services every refusal has a problem; Ray's proxy gives 500 where a replica died.
     is_of_proxy = answer.getheader("Content-Type") != PROBLEM_MEDIA_TYPE
-    return 0.0 if answer.status in {502, 503, 504} and is_of_proxy else None
+    return 0.0 if answer.status >= 500 and is_of_proxy else None
 
 
 def _checked(reply: Reply, where: str) -> Reply:

@@ -190,6 +190,7 @@ class Rollout:
             body=checked.astype("<f8").tobytes(),
             content_type=ACTIONS_TYPE,
             accept=MSGPACK,
+            session=self.id,
         )
         answer = decode_answer(reply.body, max_bytes=MAX_ANSWER_BYTES)
         self.info, self.observation, self.told = answer.rollout, answer.observation, answer.info

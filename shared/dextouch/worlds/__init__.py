@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from dextouch.worlds.baseline import CopyFirstWorld as CopyFirstWorld
     from dextouch.worlds.fixed_batch import FixedBatchWorld as FixedBatchWorld
     from dextouch.worlds.routes import WorldServiceSettings as WorldServiceSettings
+    from dextouch.worlds.routes import create_serving_app as create_serving_app
     from dextouch.worlds.routes import create_world_app as create_world_app
     from dextouch.worlds.routes import serve_worlds as serve_worlds
     from dextouch.worlds.world import BatchWorld as BatchWorld

@@ -179,7 +179,7 @@ def serve_worlds(
         reopen: see create_world_app; picklable, too.
     """
     configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
-    create_app = partial(_serving_app, open_worlds, settings, name, reopen)
+    create_app = partial(create_serving_app, open_worlds, settings, name, reopen)
     if settings.workers == 1:
         app = create_app()
         run(app, settings, drain=app.state.drain, drain_s=settings.drain_s)
@@ -193,12 +193,13 @@ def serve_worlds(
     )
 
 
-def _serving_app(
+def create_serving_app(
     open_worlds: Callable[[], Mapping[str, World[Any]]],
     settings: WorldServiceSettings,
     name: str,
-    reopen: Reopen | None,
+    reopen: Reopen | None = None,
 ) -> FastAPI:
+    """The application of one of several processes, which computes a first chunk in each world."""
     configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
     return create_world_app(open_worlds(), settings, name=name, reopen=reopen, warm_up=True)
 

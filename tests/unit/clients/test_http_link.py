@@ -59,12 +59,13 @@ def test_it_waits_as_long_as_asked_and_sends_the_same_again(scripted):
         (503, OURS | {"Retry-After": "3"}, PROBLEM),
         (429, OURS | {"retry-after": "1"}, PROBLEM),
         (502, {"Content-Type": "text/html"}, b"bad gateway"),
+        (500, {}, b"Internal Server Error"),
         (None, {}, b""),
         (504, {}, b""),
     ]
     assert link.request("POST", "/", body=b"chunk").body == b"yes"
-    assert pauses == [3.0, 1.0, 0.8, 0.8, 0.8]
-    assert bodies == [b"first", *[b"chunk"] * 6]
+    assert pauses == [3.0, 1.0, 0.8, 0.8, 0.8, 0.8]
+    assert bodies == [b"first", *[b"chunk"] * 7]
     link.close()
 
 

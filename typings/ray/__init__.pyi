@@ -1,0 +1,1 @@
+# Ray is an extra of its own (scale), which is not installed beside the type checker.
