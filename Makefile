@@ -130,7 +130,7 @@ $(RAY_VENV)/.complete: pyproject.toml
 	touch $@
 
 check-ray: $(RAY_VENV)/.complete   ## opt-in: kill replicas of a local Ray Serve deployment while rollouts run; 500 MB; apt-get install redis-server
-	PYTHONPATH=.:shared $(RAY_VENV)/bin/python -m tests.system.ray_serve.check $(ARGS)
+	RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S=60 PYTHONPATH=.:shared $(RAY_VENV)/bin/python -m tests.system.ray_serve.check $(ARGS)
 
 # The site reads the docstrings of dextouch and needs neither torch nor mujoco, so it has an environment of its own.
 $(DOCS_VENV)/.complete: pyproject.toml constraints.txt
