@@ -203,10 +203,8 @@ class PathWatch:
 
     def num_failures(self, stream: str) -> int | None:
         """Requests that the stream's device did not answer; None of one that is never asked."""
-        counts = [
-            d.num_failures for d in self._devices for path in d.streams if path.name == stream
-        ]
-        return counts[0] if counts else None
+        devices = (d for d in self._devices for path in d.streams if path.name == stream)
+        return next((device.num_failures for device in devices), None)
 
 
 def add_latencies(

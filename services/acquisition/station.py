@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from dextouch.errors import DeviceError, NotFoundError, StaleDataError
+from dextouch.images import encode_jpeg
 from dextouch.schemas import CameraLive, Matrix
 from dextouch.streams import H264_UNIT, Sample
 from services.acquisition.clock import StationClock
@@ -183,8 +184,6 @@ class LiveView:
             NotFoundError: no such camera, or no image yet (of H.264: no key frame yet).
             StaleDataError: the newest image is older than 0.5 s.
         """
-        from dextouch.images import encode_jpeg
-
         descriptor = self._descriptors.get(camera)
         sample = self._newest.get(camera)
         if descriptor is None or descriptor.kind != "image" or sample is None:

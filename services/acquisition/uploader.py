@@ -3,7 +3,7 @@
 import hashlib
 import shutil
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import structlog
@@ -301,9 +301,5 @@ def _stored_as(path: Path) -> str | None:
         return None
 
 
-def _spools(spool_root: Path) -> Iterator[Path]:
-    if not spool_root.is_dir():
-        return
-    for path in sorted(spool_root.iterdir()):
-        if (path / RECORDING_FILE).is_file():
-            yield path
+def _spools(spool_root: Path) -> list[Path]:
+    return sorted(path.parent for path in spool_root.glob(f"*/{RECORDING_FILE}"))

@@ -311,7 +311,6 @@ class BridgeDriver(Driver):
             DeviceError: no connection, no hello within 2 s, or another device than requested.
         """
         super().open()
-        self._t_heard_ns = self._clock.now_ns()
         for _ in range(HELLO_READS):
             self._first = super().read()
             if self._link.hello is not None:

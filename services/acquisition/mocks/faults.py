@@ -229,6 +229,8 @@ class PacketEdits(ABC):
         pinned: what a pinned raw cell of a glove shows; none of what has no cells.
     """
 
+    marks_nan = False
+
     def __init__(self, pinned: Mapping[Pinned, float] | None = None) -> None:
         self._pinned = pinned or {}
 
@@ -247,7 +249,7 @@ class PacketEdits(ABC):
 
     def is_marked_when_nan(self, units: Sequence[bytes]) -> bool:
         """Whether a driver records a NaN as a missing part of a sample, and refuses no packet."""
-        return False
+        return self.marks_nan
 
     def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
         """Raw cells of a glove that show the same whatever presses them."""

@@ -2,8 +2,9 @@
 
 import socket
 from abc import abstractmethod
+from functools import partial
 
-from services.acquisition.clock import PeriodicCall, StationClock, VirtualClock
+from services.acquisition.clock import PeriodicCall, VirtualClock
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.sdk_link import (
     PROTOCOL,
@@ -47,12 +48,6 @@ def mock_hello(**says: object) -> bytes:
     return hello.model_dump_json(exclude_none=True).encode() + b"\n"
 
 
-def sign_of_life(magic: bytes, sequence: int, t_device_ns: int) -> bytes:
-    """A packet without a payload."""
-    packet = Packet(VERSION, SOURCES["none"], sequence, t_device_ns, b"")
-    return encode_packet(magic, packet)
-
-
 class BridgePort(SocketPort):
     """A mock device's end of a bridge: a socket pair whose connections begin with the hello.
 
@@ -85,21 +80,21 @@ class BridgePort(SocketPort):
         return host_end
 
 
-def signs_of_life(device: MockDevice, magic: bytes, clock: StationClock) -> PeriodicCall:
-    """A thread that shows the bridge of a device to live while the device says nothing."""
-
-    def show_life() -> None:
-        device.send_aside(lambda sequence: sign_of_life(magic, sequence, 0))
-
-    return PeriodicCall(show_life, period_ns=LIFE_PERIOD_NS, clock=clock, name="bridge-life")
-
-
 def bridged_pair(place: MockPlace, source: BridgeSource, decoder: BridgeDecoder) -> MockPair:
     """A simulated device behind a bridge, and the driver that asks the bridge for it."""
     port, clock = BridgePort(place.name, source.hello), place.clock
     device = MockDevice(place, source, port)
+
+    def sign_of_life(sequence: int) -> bytes:
+        return encode_packet(source.magic, Packet(VERSION, SOURCES["none"], sequence, 0, b""))
+
     # With a virtual clock, time stands while nothing is sent.
     if not isinstance(clock, VirtualClock):
-        port.life = signs_of_life(device, source.magic, clock)
+        port.life = PeriodicCall(
+            partial(device.send_aside, sign_of_life),
+            period_ns=LIFE_PERIOD_NS,
+            clock=clock,
+            name="bridge-life",
+        )
     driver = BridgeDriver(place.name, transport=port.transport, decoder=decoder, clock=clock)
     return MockPair(device, driver)

@@ -31,7 +31,7 @@ from services.acquisition.devices.pose_tracker.mock import (
     POSE_INDEX,
     BridgePoseSource,
 )
-from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
+from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.sdk_link import BridgeDriver, FrameConvention
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
@@ -39,7 +39,6 @@ from services.acquisition.mocks.sdk_link import (
     LEFT_HANDED,
     Y_UP,
     BridgePort,
-    sign_of_life,
 )
 
 MS = 1_000_000
@@ -370,7 +369,8 @@ def test_a_sign_of_life_is_no_sample_but_ends_the_silence(stage):
     stage.driver.open()
     for sequence in range(6):
         stage.pass_time(190 * MS)
-        stage.port.send(sign_of_life(b"DXPM", sequence, sequence))
+        life = Packet(VERSION, SOURCES["none"], sequence, sequence, b"")
+        stage.port.send(encode_packet(b"DXPM", life))
         assert stage.driver.read() == {}
     assert stage.driver.statistics.packets == 6
 

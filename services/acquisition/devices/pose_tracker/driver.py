@@ -119,21 +119,17 @@ class PoseGate:
 
 def pose_descriptor(stream: str) -> StreamDescriptor:
     """The stream of a tracker on a wrist, the head or anything else, by its name."""
-    last = stream.rpartition("_")[2]
-    side = last if last in SIDES else None
-    return StreamDescriptor.model_validate(
-        {
-            "name": stream,
-            "kind": "pose",
-            "shape": (7,),
-            "dtype": "float64",
-            "unit": "pose_m_wxyz",
-            "nominal_rate_hz": NOMINAL_RATE_HZ,
-            "frame": "world",
-            "side": side,
-            "device": f"pose_tracker_{stream}",
-            "capabilities": ClockCapabilities(crc=True, sequence=True, device_time=True),
-        }
+    return StreamDescriptor(
+        name=stream,
+        kind="pose",
+        shape=(7,),
+        dtype="float64",
+        unit="pose_m_wxyz",
+        nominal_rate_hz=NOMINAL_RATE_HZ,
+        frame="world",
+        side=next((side for side in SIDES if stream.rpartition("_")[2] == side), None),
+        device=f"pose_tracker_{stream}",
+        capabilities=ClockCapabilities(crc=True, sequence=True, device_time=True),
     )
 
 

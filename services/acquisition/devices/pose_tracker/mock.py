@@ -93,19 +93,9 @@ class TrackedPoses(PacketSource):
         drift_s = (self.t_ns[during] - start_s * 1e9) / 1e9
         self.poses[during, 0] += DRIFT_M_PER_S * drift_s
 
-    def move(
-        self,
-        start_s: float,
-        stop_s: float,
-        offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    ) -> None:
+    def move(self, start_s: float, stop_s: float, offset_m: tuple[float, float, float]) -> None:
         """The tracker says it runs for a while, but its pose is elsewhere by this much."""
-        during = self._labelled(start_s, stop_s, "jumped")
-        self.poses[during, :3] += np.array(offset_m)
-        R_world_body = rotation_from_quaternion(self.poses[during, 3:])
-        turned = rotation_from_vector(np.array(turn_rad)) @ R_world_body
-        self.poses[during, 3:] = quaternion_from_rotation(turned)
+        self.poses[self._labelled(start_s, stop_s, "jumped"), :3] += np.array(offset_m)
 
     def _labelled(self, start_s: float, stop_s: float, label: str) -> Bool[np.ndarray, " n"]:
         during = (self.t_ns >= start_s * 1e9) & (self.t_ns < stop_s * 1e9)

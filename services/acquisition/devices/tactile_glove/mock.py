@@ -62,10 +62,7 @@ class GloveAnswers:
         self, side: Side, *, serial_number: str, device_time_ns: Callable[[], int]
     ) -> None:
         self._side: Side = side
-        self._bodies = {
-            Command.IDENTIFY: lambda _: encode_identity(serial_number, FIRMWARE),
-            Command.TIME_SYNC: TIME_SYNC.pack,
-        }
+        self._identity = encode_identity(serial_number, FIRMWARE)
         self._device_time_ns = device_time_ns
         # Requests are no sequence: a driver that was started anew counts from 1 again.
         sizes = (REQUEST.size, REQUEST.size)
@@ -79,12 +76,14 @@ class GloveAnswers:
         return [self._reply(packet, t_received_ns) for packet in self._requests.feed(data)]
 
     def _reply(self, packet: Packet, t_received_ns: int) -> bytes:
-        make = self._bodies.get(REQUEST.unpack(packet.payload)[0])
-        status, body = Status.UNKNOWN_COMMAND, b""
-        if make is not None:
-            status, body = Status.OK, make(t_received_ns)
+        bodies = {
+            Command.IDENTIFY: self._identity,
+            Command.TIME_SYNC: TIME_SYNC.pack(t_received_ns),
+        }
+        body = bodies.get(REQUEST.unpack(packet.payload)[0])
+        status = Status.UNKNOWN_COMMAND if body is None else Status.OK
         source, t_device_ns = SOURCES[self._side], self._device_time_ns()
-        return encode_reply(packet, status, body, source=source, t_device_ns=t_device_ns)
+        return encode_reply(packet, status, body or b"", source=source, t_device_ns=t_device_ns)
 
 
 @dataclass(frozen=True)

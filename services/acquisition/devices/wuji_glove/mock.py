@@ -54,6 +54,9 @@ def mock_wuji_glove(place: MockPlace) -> MockPair:
 class WujiPacketEdits(PacketEdits):
     """Faults inside a Wuji glove's packet, which tells its hand and no version."""
 
+    # A cell may be NaN.
+    marks_nan = True
+
     def fields(self, data: bytes) -> PacketFields:
         """Hand and cells of the grid, row by row."""
         cells = np.frombuffer(data, "<f4", NUM_CELLS, HEAD.size).copy()
@@ -64,10 +67,6 @@ class WujiPacketEdits(PacketEdits):
         sequence, time_ms = STAMPS.unpack_from(data, CRC_OFFSET - STAMPS.size)
         hand = 0 if fields.side == "left" else 1
         return encode_wuji(hand, sequence, time_ms, np.asarray(fields.numbers).tobytes())
-
-    def is_marked_when_nan(self, units: Sequence[bytes]) -> bool:
-        """A cell may be NaN."""
-        return bool(units)
 
 
 class WujiGloveSource(PacketSource):
