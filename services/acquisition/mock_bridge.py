@@ -21,6 +21,8 @@ from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import ROUND_S, pattern_streams
 from services.acquisition.mocks.sdk_link import BridgeSource
 
+ROUND_NS = round(ROUND_S * 1e9)
+
 
 def pattern_source(kind: str, place: str, *, seed: int) -> BridgeSource:
     """The pattern of `finger_tracker` `left`/`right`, or `pose_tracker` `wrist_left`/…/`head`."""
@@ -59,9 +61,10 @@ class BridgeConnection(socketserver.StreamRequestHandler):
         source, start_ns = self.server.source, self.server.start_ns
         with contextlib.suppress(OSError):  # the station has gone
             self.wfile.write(source.hello)
-            for number in itertools.count():
+            first_lap = (time.monotonic_ns() - start_ns) // ROUND_NS
+            for number in itertools.count(first_lap * len(source.t_ns)):
                 lap, index = divmod(number, len(source.t_ns))
-                t_ns = round(lap * ROUND_S * 1e9) + int(source.t_ns[index])
+                t_ns = lap * ROUND_NS + int(source.t_ns[index])
                 ahead_ns = start_ns + t_ns - time.monotonic_ns()
                 if ahead_ns > 0:
                     time.sleep(ahead_ns * 1e-9)

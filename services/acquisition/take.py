@@ -131,8 +131,9 @@ class Take:
                 self._failure = error.message
                 logger.error("stop_take_by_disk", error=error.message)
             self.watch.end()
-            if self._flushes is not None:
-                self._flushes.cancel()
+            flushes = self._flushes  # Another thread may end it meanwhile.
+            if flushes is not None:
+                flushes.cancel()
 
     def _flush(self) -> None:
         """Make what was spooled survive a power loss."""

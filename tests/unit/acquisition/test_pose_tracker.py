@@ -6,7 +6,11 @@ from operator import methodcaller
 import numpy as np
 import pytest
 
-from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
+from dextouch.geometry.rotations import (
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    rotation_from_vector,
+)
 from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.pose_tracker.driver import (
     PoseGate,
@@ -21,6 +25,18 @@ PERIOD_NS = 10_000_000
 BOOT_NS = 10_000_000_000_000
 UNIT = (1.0, 0.0, 0.0, 0.0)
 NOTHING = {"occluded": 0, "jumped": 0, "stale": 0}
+
+
+def turned(start_s, stop_s, turn_rad):
+    """The tracker says it runs for a while, but its pose is turned by this much."""
+
+    def turn(tracked):
+        during = tracked._labelled(start_s, stop_s, "jumped")
+        R_world_body = rotation_from_quaternion(tracked.poses[during, 3:])
+        R = rotation_from_vector(np.array(turn_rad)) @ R_world_body
+        tracked.poses[during, 3:] = quaternion_from_rotation(R)
+
+    return turn
 
 
 def brisk_stream(seconds=4.0):
@@ -75,8 +91,8 @@ def test_occlusion_is_counted_and_a_gap(state):
     [
         methodcaller("move", 1.0, 1.03, offset_m=(0.5, 0.0, 0.0)),
         methodcaller("move", 1.0, 1.01, offset_m=(0.0, 0.0, -0.12)),
-        methodcaller("move", 1.0, 1.02, turn_rad=(0.0, 0.0, 1.2)),
-        methodcaller("move", 1.0, 1.04, turn_rad=(math.pi - 0.1, 0.0, 0.0)),
+        turned(1.0, 1.02, (0.0, 0.0, 1.2)),
+        turned(1.0, 1.04, (math.pi - 0.1, 0.0, 0.0)),
     ],
 )
 def test_jump_is_counted_and_a_gap(jump):

@@ -4,8 +4,8 @@ import numpy as np
 
 from dextouch.hands import NODES, NUM_KEYPOINTS
 from services.acquisition.devices.finger_tracker import driver as finger_tracker
-from services.acquisition.devices.pose_tracker import packets as pose_tracker
-from services.acquisition.devices.tactile_glove import packets as tactile_glove
+from services.acquisition.devices.pose_tracker import driver as pose_tracker
+from services.acquisition.devices.tactile_glove import driver as tactile_glove
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.reports import (
     DATA_REPORT,
