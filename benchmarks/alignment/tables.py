@@ -47,7 +47,7 @@ def _errors(results: Results) -> ResultTable:
     found = [results[name].errors for name in METHODS]
     rows = [(what, *(f"{errors[what]:.3g}" for errors in found)) for what in found[0]]
     take_s = results[OURS].take_s
-    return ResultTable(f"Take of {take_s:g} s: errors against the truth", ("", *METHODS), rows)
+    return ResultTable(f"Take of {take_s:g} s: errors against ground truth", ("", *METHODS), rows)
 
 
 def panels(results: Results) -> list[Panel]:

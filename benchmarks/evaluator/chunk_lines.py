@@ -1,4 +1,4 @@
-"""Lines of chained touch and images by chunk, for scripts only: other policies move little."""
+"""Lines of chained touch and images by chunk, for scripts only."""
 
 from collections.abc import Sequence
 from typing import Any

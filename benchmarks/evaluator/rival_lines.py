@@ -48,7 +48,7 @@ def rival_figures(
             continue
         what = f"AUC of imagined endings less {_LESS[kind]}, {where}"
         if np.array_equal(probabilities(mine, "imagined verdict"), probabilities(mine, kind)):
-            # Without any imagined touch, the baseline gets the same input, so nothing is compared.
+            # Equal probabilities: the baseline got the same input, so there is nothing to compare.
             found.append(undefined(what, ("at least", 0.0)))
             continue
         ours, theirs = (

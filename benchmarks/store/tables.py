@@ -23,12 +23,12 @@ def tables(
         write_table(results),
         read_table(results),
         ResultTable(
-            "Appending one sample of a glove (ms)",
+            "Appending one glove sample (ms)",
             ("way", "p50", "p99", "appends a round"),
             [(a.name, a.p50_ms.text(), a.p99_ms.text(), str(a.num_appends)) for a in appends],
         ),
         ResultTable(
-            "A whole station, live (late: handed over more than 0.1 s after it was due)",
+            "Live recording of a full station (late: accepted more than 0.1 s after it was due)",
             ("speed", "rows", "late", "dropped", "worst lag (ms)", "closing (s)"),
             [
                 (
@@ -60,7 +60,7 @@ def write_table(results: Mapping[str, DesignResult]) -> ResultTable:
         for result in results.values()
     ]
     return ResultTable(
-        "Writing (speed: 1 is real time; CPU: of a recorded second; PSNR: head, left, right)",
+        "Writing (speed: 1 is real time; CPU per recorded second; PSNR: head, left, right)",
         _WRITE_COLUMNS,
         rows,
     )
@@ -79,7 +79,7 @@ def read_table(results: Mapping[str, DesignResult]) -> ResultTable:
         for result in results.values()
     ]
     return ResultTable(
-        "Random windows of 17 images a second, and the touch of one", _READ_COLUMNS, rows
+        "Random windows of 17 images per second, and time for their touch", _READ_COLUMNS, rows
     )
 
 

@@ -166,7 +166,7 @@ def noise_covariance(
     """Covariance of the mean scores of several series of rollouts over the same starts.
 
     Variances include two additional rollouts, one of score 0 and one of score 1 (the rule of
-    Agresti and Coull 1998 for binomial rates), so that ten of ten successes are not certainty.
+    Agresti and Coull 1998 for binomial rates), so that ten of ten successes are not certain.
     Correlations are shrunk towards zero; with four starts or fewer they are zero.
     """
     num_series, num_starts = rollouts.shape
