@@ -6,7 +6,7 @@ from benchmarks.stress.cells import Check, StageCells
 from dextouch.errors import NonFiniteError
 from dextouch.tactile import pad_forces_n
 from dextouch.tactile.layout import NUM_TAXELS, raw_indices
-from services.alignment.calibration.tactile_baseline import TactileCalibration, TaxelSurvey
+from services.alignment.calibration.tactile_baseline import TactileCalibration, unusable_taxels
 from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
 from services.alignment.calibration.tactile_tare import SATURATED, STATES, TaxelTare, measure_tare
 
@@ -40,9 +40,7 @@ def _non_finite(check: Check) -> None:
     counts = _take(10.0)
     counts[:, _CELLS[3]] = np.nan
     found = _calibration(np.full(360, _GAIN))
-    survey = TaxelSurvey(found)
-    survey.add(counts)
-    refused = survey.refused()
+    refused = unusable_taxels(found, [counts])
     kpa = found.to_kpa(counts, refused=refused)
     check.true("an absent taxel is named and zero", refused[3] > 0 and not kpa[:, 3].any())
     check.finite("pressures", kpa)

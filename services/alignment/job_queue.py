@@ -234,7 +234,10 @@ class JobDatabase:
         delete = "DELETE FROM jobs WHERE alignment_id = ?"
         with self._errors("write"), self._guard, self._connection as connection:
             connection.executemany(delete, [(key,) for key in removed])
-            connection.executemany(UPSERT, [_row(job) for job in saved])
+            for job in saved:
+                body = job.model_dump_json(exclude_none=True)
+                crc32c = google_crc32c.value(body.encode())
+                connection.execute(UPSERT, (job.alignment_id, crc32c, body))
 
     def close(self) -> None:
         """Close the database, so that another process may open it."""
@@ -282,8 +285,3 @@ class JobDatabase:
             if code in DAMAGED:
                 raise CorruptDataError(f"{what}: damaged ({error}); {MOVE_AWAY}") from error
             raise StorageError(f"{what}: {error}") from error
-
-
-def _row(job: AlignmentJob) -> tuple[str, int, str]:
-    body = job.model_dump_json(exclude_none=True)
-    return job.alignment_id, google_crc32c.value(body.encode()), body

@@ -72,27 +72,13 @@ def compare_with_truth(
     Raises:
         InvalidInputError: the two share no stream.
     """
-    shared = [
-        name
-        for name, stream in episode.streams.items()
-        if name in truth.streams and stream.unit != "action"
-    ]
-    if not shared:
+    origin_ns = origin_in_truth_ns
+    matches = match_streams(episode, truth, origin_ns)
+    if not matches:
         raise InvalidInputError(
             f"truth: the episode has {sorted(episode.streams)}, the truth "
             f"{sorted(truth.streams)}; expected common streams"
         )
-    origin_ns = origin_in_truth_ns
-    matches = {
-        name: match_samples(
-            episode.read(name),
-            truth.read(name),
-            origin_ns,
-            NEAR_NS,
-            period_ns=truth.streams[name].period_ns(),
-        )
-        for name in shared
-    }
     left = {name: (m.mean_offset_ns + origin_ns) / NS_PER_MS for name, m in matches.items()}
     known = {report.stream: report.latency_ms or 0.0 for report in episode.attributes.clocks}
     gloves = (
@@ -110,6 +96,23 @@ def compare_with_truth(
         "num_dropped": {name: m.num_dropped for name, m in matches.items()},
         **_taxel_errors(gloves),
         **_pose_errors(episode, truth, origin_ns),
+    }
+
+
+def match_streams(
+    episode: EpisodeReader, truth: EpisodeReader, origin_in_truth_ns: int
+) -> dict[str, Match]:
+    """`match_samples` for all streams that an episode shares with its truth, but actions."""
+    return {
+        name: match_samples(
+            episode.read(name),
+            truth.read(name),
+            origin_in_truth_ns,
+            NEAR_NS,
+            period_ns=truth.streams[name].period_ns(),
+        )
+        for name, stream in episode.streams.items()
+        if name in truth.streams and stream.unit != "action"
     }
 
 

@@ -10,9 +10,8 @@ from fastapi.staticfiles import StaticFiles
 
 from dextouch.serving import AccessControl, create_service_app, serve
 from services.dashboard.feeds import Feeds
-from services.dashboard.pages import page_router, refusal_page
+from services.dashboard.pages import Sessions, page_router, refusal_page
 from services.dashboard.routes import api_router, live_router
-from services.dashboard.sessions import Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.upstream import Upstream
 

@@ -15,7 +15,7 @@ from starlette.websockets import WebSocketState
 from dextouch.errors import AccessDeniedError
 from dextouch.frozen_model import FrozenModel
 from services.dashboard.feeds import Feeds, Topic, heatmap_layout
-from services.dashboard.sessions import COOKIE, Sessions
+from services.dashboard.pages import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView
 

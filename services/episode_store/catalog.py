@@ -288,7 +288,17 @@ class Catalog:
         groups: defaultdict[tuple[str, str, str], list[EpisodeSummary]] = defaultdict(list)
         for episode in _matching(self._episodes.entries(), wanted).values():
             groups[episode.task, episode.domain, episode.origin].append(episode)
-        rows = [_hours_row(group) for _, group in sorted(groups.items())]
+        rows = [
+            HoursRow(
+                task=task,
+                domain=group[0].domain,
+                origin=group[0].origin,
+                num_episodes=len(group),
+                num_successes=sum(episode.success is True for episode in group),
+                hours=sum(episode.duration_s for episode in group) / SECONDS_AN_HOUR,
+            )
+            for (task, *_), group in sorted(groups.items())
+        ]
         return CatalogHours(
             rows=tuple(rows),
             num_episodes=sum(row.num_episodes for row in rows),
@@ -358,17 +368,6 @@ def _page(
     next_after = None if first + limit >= len(names) else chosen[-1]
     facts = {"num_matching": len(found), "next_after": next_after}
     return tuple(found[name] for name in chosen), facts
-
-
-def _hours_row(group: list[EpisodeSummary]) -> HoursRow:
-    return HoursRow(
-        task=group[0].task,
-        domain=group[0].domain,
-        origin=group[0].origin,
-        num_episodes=len(group),
-        num_successes=sum(episode.success is True for episode in group),
-        hours=sum(episode.duration_s for episode in group) / SECONDS_AN_HOUR,
-    )
 
 
 def _nominal_duration_s(reader: EpisodeReader | RecordingReader) -> float:

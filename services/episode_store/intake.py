@@ -1,6 +1,6 @@
 """Limits of uploads: batches in flight, the disk, and what each station may use; and metrics."""
 
-import os
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -36,7 +36,7 @@ class Admission:
     """Limits the batches in flight, by number and by the bytes of their bodies (backpressure).
 
     A batch is admitted before its body is read, so a refused one costs no memory. A single batch is
-    always admitted.
+    always admitted. Belongs to one event loop.
     """
 
     def __init__(self, *, max_requests: int, max_bytes: int) -> None:
@@ -44,7 +44,6 @@ class Admission:
         self.threads = anyio.CapacityLimiter(max_requests)
         self._max_requests, self._max_bytes = max_requests, max_bytes
         self._num_requests = self._num_bytes = 0
-        self._guard = threading.Lock()
 
     @contextmanager
     def admitted(self, num_bytes: int) -> Iterator[None]:
@@ -53,26 +52,24 @@ class Admission:
         Raises:
             LimitExceededError: with `retry_after_s`, so the answer is 429.
         """
-        with self._guard:
-            full = self._num_requests >= self._max_requests or (
-                self._num_requests and self._num_bytes + num_bytes > self._max_bytes
+        full = self._num_requests >= self._max_requests or (
+            self._num_requests and self._num_bytes + num_bytes > self._max_bytes
+        )
+        if full:
+            raise LimitExceededError(
+                f"store is busy: {self._num_requests} batches with {self._num_bytes} bytes "
+                f"are being written, allowed are {self._max_requests} and {self._max_bytes}; "
+                f"send the batch again in {BUSY_RETRY_S} s",
+                reason="busy",
+                retry_after_s=BUSY_RETRY_S,
             )
-            if full:
-                raise LimitExceededError(
-                    f"store is busy: {self._num_requests} batches with {self._num_bytes} bytes "
-                    f"are being written, allowed are {self._max_requests} and {self._max_bytes}; "
-                    f"send the batch again in {BUSY_RETRY_S} s",
-                    reason="busy",
-                    retry_after_s=BUSY_RETRY_S,
-                )
-            self._num_requests += 1
-            self._num_bytes += num_bytes
+        self._num_requests += 1
+        self._num_bytes += num_bytes
         try:
             yield
         finally:
-            with self._guard:
-                self._num_requests -= 1
-                self._num_bytes -= num_bytes
+            self._num_requests -= 1
+            self._num_bytes -= num_bytes
 
 
 def free_bytes_of(folder: Path) -> int:
@@ -80,8 +77,7 @@ def free_bytes_of(folder: Path) -> int:
     with disk_errors(f"measure free space of {folder}"):
         while not folder.exists():
             folder = folder.parent
-        state = os.statvfs(folder)
-    return state.f_bavail * state.f_frsize
+        return shutil.disk_usage(folder).free
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """Conversion of a glove's raw counts to pressures in kPa, and detection of unusable taxels."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,7 +101,7 @@ class TactileCalibration:
 
         Args:
             counts: [T, cells] raw readings of the glove.
-            refused: uint8 [320] of a `TaxelSurvey`, taxels that are set to zero; by default those
+            refused: uint8 [320] of `unusable_taxels`, taxels that are set to zero; by default those
                 that the calibration refuses.
 
         Raises:
@@ -126,51 +126,41 @@ class TactileCalibration:
         return raw[:, self.cells]
 
 
-class TaxelSurvey:
-    """Detection of unusable taxels in a take, which may be read in pieces.
+def unusable_taxels(
+    calibration: TactileCalibration, pieces: Iterable[np.ndarray]
+) -> UInt8[np.ndarray, "320"]:
+    """Why each taxel of a take is unusable, index into `REASONS`; 0 if usable.
 
     In addition to those that the glove's calibration refuses: cells that are constant but not at
     their tare (dead at zero, stuck elsewhere), and cells that are NaN in more than a tenth of the
     samples.
+
+    Args:
+        calibration: of the glove.
+        pieces: consecutive raw readings [T, cells] of the take.
+
+    Raises:
+        ShapeError: not [T, cells].
     """
-
-    def __init__(self, calibration: TactileCalibration) -> None:
-        self._calibration = calibration
-        self._first: np.ndarray | None = None
-        self._low, self._high = np.full(NUM_TAXELS, np.inf), np.full(NUM_TAXELS, -np.inf)
-        self._num_finite = np.zeros(NUM_TAXELS, dtype=np.int64)
-        self._num_samples = 0
-
-    def add(self, counts: np.ndarray) -> None:
-        """Add consecutive raw readings [T, cells].
-
-        Raises:
-            ShapeError: not [T, cells].
-        """
-        taxels = self._calibration.taxels(counts)
+    reasons, first, num_samples = calibration.state.copy(), None, 0
+    low, high = np.full(NUM_TAXELS, np.inf), np.full(NUM_TAXELS, -np.inf)
+    num_finite = np.zeros(NUM_TAXELS, dtype=np.int64)
+    for counts in pieces:
+        taxels = calibration.taxels(counts)
         if not len(taxels):
-            return
-        if self._first is None:
-            self._first = taxels[0].astype(np.float64)
-        self._low = np.minimum(self._low, taxels.min(axis=0))
-        self._high = np.maximum(self._high, taxels.max(axis=0))
-        self._num_finite += np.isfinite(taxels).sum(axis=0)
-        self._num_samples += len(taxels)
-
-    def refused(self) -> UInt8[np.ndarray, "320"]:
-        """Why each taxel is unusable, index into `REASONS`, by all that was added; 0 if usable."""
-        calibration = self._calibration
-        reasons = calibration.state.copy()
-        if self._first is None or self._num_samples < MIN_SAMPLES_TO_JUDGE:
-            return reasons
-        missing = 1.0 - self._num_finite / self._num_samples
-        reasons[(reasons == OK) & (missing > MAX_MISSING)] = ABSENT
-        still = self._low == self._high
-        offset_counts = np.abs(self._first - calibration.tare_counts)
-        offset_kpa = offset_counts / calibration.gain_counts_per_kpa
-        silent = (reasons == OK) & still & (offset_kpa > DEAD_OFFSET_KPA)
-        reasons[silent] = np.where(self._first[silent] == 0, DEAD, STUCK)
+            continue
+        if first is None:
+            first = taxels[0].astype(np.float64)
+        low, high = np.minimum(low, taxels.min(axis=0)), np.maximum(high, taxels.max(axis=0))
+        num_finite += np.isfinite(taxels).sum(axis=0)
+        num_samples += len(taxels)
+    if first is None or num_samples < MIN_SAMPLES_TO_JUDGE:
         return reasons
+    reasons[(reasons == OK) & (1.0 - num_finite / num_samples > MAX_MISSING)] = ABSENT
+    offset_kpa = np.abs(first - calibration.tare_counts) / calibration.gain_counts_per_kpa
+    silent = (reasons == OK) & (low == high) & (offset_kpa > DEAD_OFFSET_KPA)
+    reasons[silent] = np.where(first[silent] == 0, DEAD, STUCK)
+    return reasons
 
 
 def _row(record: Record, name: str, size: int) -> Float64[np.ndarray, " size"]:

@@ -21,7 +21,7 @@ from dextouch.tactile.layout import NUM_TAXELS
 from services.alignment.calibration.tactile_baseline import (
     REASONS,
     TactileCalibration,
-    TaxelSurvey,
+    unusable_taxels,
 )
 from services.alignment.retargeting.wrist_frame import (
     calibrated_transform,
@@ -206,10 +206,7 @@ def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:
         )
     num_cells = raw.descriptor.shape[0]
     glove = TactileCalibration.from_record(calibration, side, num_cells=num_cells, stream=name)
-    survey = TaxelSurvey(glove)
-    for piece in raw.pieces():
-        survey.add(piece.values)
-    refused = survey.refused()
+    refused = unusable_taxels(glove, (piece.values for piece in raw.pieces()))
     quality = {f"{name}_num_refused_taxels": float(np.count_nonzero(refused))}
     for state in np.unique(refused[refused > 0]).tolist():
         quality[f"{name}_num_{REASONS[state]}_taxels"] = float(np.count_nonzero(refused == state))

@@ -35,7 +35,7 @@ from services.acquisition.path_latency import add_latencies
 from services.acquisition.uploader import Uploader
 from services.alignment.calibration.tactile_gain import TaxelPress, calibrate_glove
 from services.alignment.calibration.tactile_tare import measure_tare
-from services.alignment.recording_error import NEAR_NS, compare_with_truth, match_samples
+from services.alignment.recording_error import compare_with_truth, match_streams
 from services.alignment.schemas import AlignmentJob
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan
 from services.cli.training_data import Order, in_processes, make_episode
@@ -220,12 +220,8 @@ def measure(
     origin_in_truth_ns = origin_ns - take.ledger.start_host_ns
     errors = compare_with_truth(episode, truth, origin_in_truth_ns=origin_in_truth_ns)
     residuals = {}
-    for name in errors["clock_rms_ms"]:
-        mine, period_ns = episode.read(name), truth.streams[name].period_ns()
-        match = match_samples(
-            mine, truth.read(name), origin_in_truth_ns, NEAR_NS, period_ns=period_ns
-        )
-        t_s = mine.t_ref_ns[match.index] * 1e-9
+    for name, match in match_streams(episode, truth, origin_in_truth_ns).items():
+        t_s = episode.read(name).t_ref_ns[match.index] * 1e-9
         residuals[name] = np.stack([t_s, (match.offset_ns - match.mean_offset_ns) * 1e-6])
     return Take(episode, errors, devices, residuals)
 

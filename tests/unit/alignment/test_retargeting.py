@@ -228,8 +228,8 @@ def test_options_are_checked():
         RetargetOptions(pinch_far_m=0.001)
     with pytest.raises(InvalidInputError, match="temporal_weight_m2 nan"):
         RetargetOptions(temporal_weight_m2=np.nan)
-    with pytest.raises(InvalidInputError, match="posture_weight_m2 inf"):
-        RetargetOptions(posture_weight_m2=np.inf)
+    with pytest.raises(InvalidInputError, match="temporal_weight_m2 inf"):
+        RetargetOptions(temporal_weight_m2=np.inf)
 
 
 def test_single_step_is_enough():

@@ -6,7 +6,11 @@ import pytest
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.schemas import matrix_rows
 from dextouch.tactile.layout import expand_taxels, raw_indices
-from services.alignment.calibration.tactile_baseline import REASONS, TactileCalibration, TaxelSurvey
+from services.alignment.calibration.tactile_baseline import (
+    REASONS,
+    TactileCalibration,
+    unusable_taxels,
+)
 
 RNG = np.random.default_rng(0)
 TARE, GAIN = RNG.uniform(110, 130, 360), RNG.uniform(38, 42, 360)
@@ -20,9 +24,7 @@ def record(side, tare=TARE, gain=GAIN):
 
 
 def refused_taxels(glove, counts):
-    survey = TaxelSurvey(glove)
-    survey.add(counts)
-    return survey.refused()
+    return unusable_taxels(glove, [counts])
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

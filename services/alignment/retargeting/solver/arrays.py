@@ -21,8 +21,13 @@ NUM_POINTS: Final = 4
 MAX_STARTS: Final = 8
 # The rate at which `temporal_weight_m2` is stated.
 NOMINAL_PERIOD_S: Final = 1 / 60
-# Of a pinch that begins.
+# Below this distance the vector from a fingertip to the thumb's has its full weight, beside points
+# of unit weight. Then that of a pinch that begins, and the pull of joints in a pinch towards what
+# their own points ask for.
+PINCH_NEAR_M: Final = 0.005
+PINCH_WEIGHT: Final = 100.0
 PINCH_WEIGHT_FAR: Final = 1e-3
+POSTURE_WEIGHT_M2: Final = 3e-3
 
 # Beyond, products of weights and distances drown what the points say.
 MAX_WEIGHT = 1e6
@@ -172,11 +177,8 @@ class RetargetOptions:
             regardless of the elapsed time; the default is 9.6 rad/s at 60 Hz. Motors that are led
             to their targets smoothly may be given the velocity limit times the period of a slower
             tracker.
-        pinch_near_m: below this distance of thumb and fingertip the vector between them has its
-            full weight.
-        pinch_far_m: from here on it has none, and thumb and finger are solved apart.
-        pinch_weight: the full weight, beside points of unit weight.
-        posture_weight_m2: pull of joints in a pinch towards what their own points ask for, m²/rad².
+        pinch_far_m: from this distance of thumb and fingertip on the vector between them has no
+            weight, and they are solved apart.
         reacquire_after_s: a finger that was lost for so long is searched from several starts.
         num_starts: of such a search, 1 … 8.
     """
@@ -184,10 +186,7 @@ class RetargetOptions:
     temporal_weight_m2: float = 1e-4
     velocity_limit_rad_s: float = 9.6
     max_step_rad: float = 0.16
-    pinch_near_m: float = 0.005
     pinch_far_m: float = 0.060
-    pinch_weight: float = 100.0
-    posture_weight_m2: float = 3e-3
     reacquire_after_s: float = 0.1
     num_starts: int = len(STARTS)
 
@@ -196,10 +195,7 @@ class RetargetOptions:
             "temporal_weight_m2": (0.0, MAX_WEIGHT),
             "velocity_limit_rad_s": (LEAST, np.inf),
             "max_step_rad": (LEAST, np.inf),
-            "pinch_near_m": (LEAST, 1.0),
-            "pinch_far_m": (self.pinch_near_m + LEAST, 1.0),
-            "pinch_weight": (PINCH_WEIGHT_FAR, MAX_WEIGHT),
-            "posture_weight_m2": (0.0, MAX_WEIGHT),
+            "pinch_far_m": (PINCH_NEAR_M + LEAST, 1.0),
             "reacquire_after_s": (LEAST, np.inf),
             "num_starts": (1, len(STARTS)),
         }

@@ -18,7 +18,10 @@ from services.alignment.retargeting.solver.arrays import (
     NOMINAL_PERIOD_S,
     NUM_POINTS,
     PARTIAL,
+    PINCH_NEAR_M,
+    PINCH_WEIGHT,
     PINCH_WEIGHT_FAR,
+    POSTURE_WEIGHT_M2,
     REACQUIRED,
     SOLVED,
     UNCONVERGED,
@@ -147,10 +150,8 @@ def find_pinches(hand, tuning, work, status):
         gap = np.sqrt(squared)
         if gap >= tuning.pinch_far_m:
             continue
-        apart = max(gap - tuning.pinch_near_m, 0.0) / (tuning.pinch_far_m - tuning.pinch_near_m)
-        work.pinch_weight[finger] = (
-            tuning.pinch_weight * (PINCH_WEIGHT_FAR / tuning.pinch_weight) ** apart
-        )
+        apart = max(gap - PINCH_NEAR_M, 0.0) / (tuning.pinch_far_m - PINCH_NEAR_M)
+        work.pinch_weight[finger] = PINCH_WEIGHT * (PINCH_WEIGHT_FAR / PINCH_WEIGHT) ** apart
         work.members[count] = finger
         work.is_near[finger] = work.is_near[thumb] = 1
         count += 1
@@ -251,12 +252,8 @@ def solve_pinches(hand, person, tuning, work, memory, num_near, output):
                 memory.is_behind[finger] = 1
             reach = allowed
         set_box(hand, work, finger, work.sent, reach)
-        work.posture_weight_m2[finger] = tuning.posture_weight_m2
+        work.posture_weight_m2[finger] = POSTURE_WEIGHT_M2
         work.posture[finger] = alone[finger]
-    group = work.members[:num_near]
-    for finger in range(hand.num_fingers):
-        if status[finger] >= IMPLAUSIBLE:
-            continue
         is_lost = memory.unsolved_s[finger] >= tuning.reacquire_after_s
         if work.is_near[finger] and not (is_lost or memory.is_behind[finger]):
             continue
@@ -264,6 +261,7 @@ def solve_pinches(hand, person, tuning, work, memory, num_near, output):
             lower, upper = work.lower[finger, joint], work.upper[finger, joint]
             joints[finger, joint] = min(max(alone[finger, joint], lower), upper)
     if num_near:
+        group = work.members[:num_near]
         _, at_rest = minimize(hand, person, work, group, joints, STEP_TOLERANCE_RAD)
         for finger in group:
             errors_m[finger] = tip_error(work, finger, hand.num_joints[finger])
