@@ -1,17 +1,29 @@
-"""The FastAPI application of the alignment service."""
+"""The FastAPI application of the alignment service: submit, list, show and cancel jobs."""
 
 import asyncio
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from typing import Annotated
 
-from fastapi import FastAPI
+from fastapi import APIRouter, Depends, FastAPI, Query, Response, status
 
 from dextouch.episodes import EpisodeStore
-from dextouch.serving import create_service_app, serve
+from dextouch.schemas import error_from_problem
+from dextouch.serving import JSON, KIB, JsonBody, RequireScope, create_service_app, serve, takes
 from services.alignment.job_runner import JobRunner
 from services.alignment.new_recordings import NewRecordings
-from services.alignment.routes import alignments_router
+from services.alignment.schemas import (
+    ENDED,
+    MAX_BATCH,
+    AlignmentJob,
+    AlignmentList,
+    AlignmentRequest,
+    JobState,
+)
 from services.alignment.settings import AlignmentSettings
+
+SCOPE = "align"
+PAGE = 100
 
 
 def create_app(settings: AlignmentSettings) -> FastAPI:
@@ -44,6 +56,58 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
         lifespan=lifespan,
         readiness=readiness,
     )
+
+
+def alignments_router(jobs: JobRunner) -> APIRouter:
+    """Routes under /v1/alignments."""
+    router = APIRouter(
+        prefix="/v1/alignments", tags=["alignments"], dependencies=[Depends(RequireScope(SCOPE))]
+    )
+
+    @router.post("", status_code=status.HTTP_202_ACCEPTED)
+    @takes({JSON: 256 * KIB})
+    async def start(
+        request: Annotated[AlignmentRequest, Depends(JsonBody(AlignmentRequest))],
+        response: Response,
+        wait: bool = Query(default=False),  # noqa: FBT001 - a query parameter
+    ) -> AlignmentJob | AlignmentList:
+        """Submit recordings for alignment; submitting again returns the same jobs.
+
+        `recording_id` gives one job, `recording_ids` a list of them, all taken or none. With
+        `wait=true` the answer comes when all have ended (200); the failure of a single one is then
+        the error itself.
+        """
+        asked = await jobs.submit(request)
+        if wait:
+            asked = tuple([await jobs.wait(job.alignment_id) for job in asked])
+        if all(job.state in ENDED for job in asked):
+            response.status_code = status.HTTP_200_OK
+        if request.recording_id is None:
+            return AlignmentList(alignments=asked, num_matching=len(asked))
+        if wait and asked[0].problem is not None:
+            raise error_from_problem(asked[0].problem)
+        return asked[0]
+
+    @router.get("", responses={404: {}})
+    async def listing(
+        state: JobState | None = None,
+        after: str | None = None,
+        limit: Annotated[int, Query(ge=1, le=MAX_BATCH)] = PAGE,
+    ) -> AlignmentList:
+        """Alignments, oldest first, a page at a time; `after` is the last id of the page before."""
+        return jobs.queue.page(state=state, after=after, limit=limit)
+
+    @router.get("/{alignment_id}")
+    async def one(alignment_id: str) -> AlignmentJob:
+        """The state of one alignment."""
+        return jobs.queue.get(alignment_id)
+
+    @router.post("/{alignment_id}/cancel")
+    async def cancel(alignment_id: str) -> AlignmentJob:
+        """Cancel an alignment that waits or runs; one that is done or failed is a conflict."""
+        return await jobs.cancel(alignment_id)
+
+    return router
 
 
 def main(argv: Sequence[str]) -> int:

@@ -36,7 +36,6 @@ from services.dashboard.station_view import (
     StationView,
     recorder_view,
     station_view,
-    unreachable_station,
 )
 from services.dashboard.upstream import Upstream
 
@@ -177,7 +176,7 @@ class Feeds:
                 acquisition.read(RecorderStatus, "/v1/recorder"),
             )
         except DexTouchError as error:
-            return unreachable_station(error.message)
+            return StationView(note=error.message)
         return station_view(health, recorder)
 
     async def services(self) -> list[ServiceView]:

@@ -55,28 +55,15 @@ class RecorderView(FrozenModel):
 
 
 class StationView(FrozenModel):
-    """Overview of the station."""
+    """Overview of the station; by default of one that does not respond, for the reason `note`."""
 
-    reachable: bool
-    level: HealthLevel
-    summary: str
+    reachable: bool = False
+    level: HealthLevel = "ERROR"
+    summary: str = "acquisition does not respond"
     note: str
-    note_level: HealthLevel
-    streams: tuple[StreamView, ...]
-    recorder: RecorderView
-
-
-def unreachable_station(reason: str) -> StationView:
-    """The station view while the acquisition service is unreachable, without stale values."""
-    return StationView(
-        reachable=False,
-        level="ERROR",
-        summary="acquisition does not respond",
-        note=reason,
-        note_level="ERROR",
-        streams=(),
-        recorder=RecorderView(state="unknown", level="ERROR"),
-    )
+    note_level: HealthLevel = "ERROR"
+    streams: tuple[StreamView, ...] = ()
+    recorder: RecorderView = RecorderView(state="unknown", level="ERROR")
 
 
 def station_view(station: StationHealth, recorder: RecorderStatus) -> StationView:

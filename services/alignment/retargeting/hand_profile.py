@@ -178,7 +178,7 @@ def person_arrays(profile: HandProfile | None, hand: HandModel) -> np.ndarray:
         person["knuckle_m"][:num], person["travel"][:] = zero_points_m(hand)[:, 0], 1.0
         person["freedom"][:] = UNKNOWN_FREEDOM
         return record
-    rows = _chains_of(hand)
+    rows = [CHAINS.index(finger.chain) for finger in hand.fingers]
     bone_m, knuckle_sigma_m = profile.bone_m[rows].copy(), profile.knuckle_sigma_m[rows]
     for finger, bone in zip(*np.nonzero(own_m[:, :2] < LEAST_BONE_M), strict=True):
         # Two bones of the person in a row are one of the robot's.
@@ -199,11 +199,6 @@ def person_arrays(profile: HandProfile | None, hand: HandModel) -> np.ndarray:
     spread_m = KNUCKLE_SIGMAS * np.hypot(knuckle_sigma_m, profile.point_sigma_m)
     person["knuckle_tolerance_m"][:num] = np.clip(spread_m, *KNUCKLE_TOLERANCE_M)
     return record
-
-
-def _chains_of(hand: HandModel) -> list[int]:
-    """Which chain of the tracked skeleton (thumb … little) each of the hand's fingers follows."""
-    return [CHAINS.index(finger.chain) for finger in hand.fingers]
 
 
 def robot_bone_m(hand: HandModel) -> Float64[np.ndarray, "fingers 3"]:
@@ -264,7 +259,8 @@ def _check_seen(whole: np.ndarray, side: str) -> None:
 
 def _knuckle_motion(points_m: np.ndarray, hand: HandModel) -> Float64[np.ndarray, "n 5 3"]:
     """Knuckles of the robot when its fingers point like the tracked ones; NaN if unknown."""
-    own, rows, num = hand_arrays(hand), _chains_of(hand), len(points_m)
+    own, num = hand_arrays(hand), len(points_m)
+    rows = [CHAINS.index(finger.chain) for finger in hand.fingers]
     keypoints = np.full((num, NUM_KEYPOINTS, 3), np.nan)
     keypoints[:, _NODES] = points_m
     output, person = Output.of(num, len(rows)), person_arrays(None, hand)
