@@ -120,9 +120,9 @@ class Answer:
     refusal: str | None = None
 
 
-# Compiled once per process.
 @lru_cache(maxsize=12)
-def _stage(task: str, domain: Domain) -> Stage:
+def stage_of(task: str, domain: Domain) -> Stage:
+    """The stage of a task, compiled once per process."""
     return Stage(task, domain, TwinSettings())
 
 
@@ -165,7 +165,7 @@ def _played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
 
 def make_episode(order: Order) -> Answer:
     """Record one episode and write it to its store."""
-    stage = _stage(order.task, order.domain)
+    stage = stage_of(order.task, order.domain)
     try:
         if order.policy is None:
             episode = record(stage, order.seed, order.options)

@@ -258,12 +258,11 @@ class UploadMetrics:
         counts = (self.batches, self.bytes, self.refused)
         for metric in (*counts, self.ack_seconds, self.finish_seconds):
             registry.register(metric)
-        uploads = Gauge("dextouch_store_open_uploads", "Unfinished uploads.", registry=registry)
-        uploads.set_function(lambda: limits.num_open)
-        free = Gauge(
-            "dextouch_store_free_bytes", "Free bytes on the store's disk.", registry=registry
-        )
-        free.set_function(limits.free_bytes)
+        for name, text, measure in (
+            ("open_uploads", "Unfinished uploads.", lambda: limits.num_open),
+            ("free_bytes", "Free bytes on the store's disk.", limits.free_bytes),
+        ):
+            Gauge(f"dextouch_store_{name}", text, registry=registry).set_function(measure)
 
     @contextmanager
     def counting_refusals(self) -> Iterator[None]:

@@ -117,17 +117,9 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
     centred = centred - centred.mean(axis=0)
     inertia = np.square(centred).sum() * np.eye(3) - centred.T @ centred
     covariance = np.asarray(variance * np.linalg.inv(inertia))
-    sigma_rad = float(np.sqrt(np.trace(covariance)))
-    if sigma_rad > MAX_SIGMA_RAD:
-        raise InvalidInputError(
-            f"{where}: the uncertainty of the wrist's axes is {np.rad2deg(sigma_rad):.1f} degrees "
-            f"(one sigma), expected at most {np.rad2deg(MAX_SIGMA_RAD):.0f}; the palm's nodes "
-            f"deviate by {misfit_m * 1e3:.1f} mm RMS",
-            fault="uncertain",
-        )
     has_wrist = is_used[PALM_NODES.index(WRIST_NODE)]
     origin = palm[PALM_NODES.index(WRIST_NODE)] if has_wrist else offsets[0]
-    return WristFrame(
+    frame = WristFrame(
         T_tracker_wrist=transform(R_tracker_wrist, origin),
         covariance=covariance,
         size=size,
@@ -135,6 +127,14 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
         turn_rad=turn_rad,
         num_samples=len(samples),
     )
+    if frame.sigma_rad > MAX_SIGMA_RAD:
+        raise InvalidInputError(
+            f"{where}: the uncertainty of the wrist's axes is {np.rad2deg(frame.sigma_rad):.1f} "
+            f"degrees (one sigma), expected at most {np.rad2deg(MAX_SIGMA_RAD):.0f}; the palm's "
+            f"nodes deviate by {misfit_m * 1e3:.1f} mm RMS",
+            fault="uncertain",
+        )
+    return frame
 
 
 def calibrate_wrist(

@@ -18,13 +18,12 @@ from dextouch import __version__
 from dextouch.command_line import write_result
 from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.schemas import WorldDescription
 from dextouch.serving import configure_logging
 from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, create_world_app
 from services.alignment.app import create_app as create_alignment
 from services.alignment.settings import AlignmentSettings
 from services.cli.demo import recording, scoring
-from services.cli.demo.settings import TASKS, DemoPlan, parse
+from services.cli.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan, parse
 from services.cli.servers import served
 from services.cli.study.command import refuse_trained
 from services.episode_store.app import create_app as create_store
@@ -106,6 +105,10 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
             models = scoring.train_models(plan.output / "trained")
     else:
         models = scoring.committed_models()
+    starts = range(
+        FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + max(plan.num_seeds, plan.num_predicted)
+    )
+    refuse_trained(scoring.MODEL, models.checkpoint, TASKS, starts)
     with served(_apps(folder / "alignments", models.world_model)) as urls:
         takes: dict[str, recording.Take] = {}
         for seed, original in enumerate(map(truths.open, originals)):
@@ -113,16 +116,16 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
             takes[original.attributes.domain] = taken
         with stages.stage("predict", "predicting held-out scenes with the world model"):
             scenes = [read_scene(truths.open(episode_id)) for episode_id in demonstrations]
-            seeds = [scene.start.seed for scene in scenes]
-            refuse_trained(scoring.MODEL, models.checkpoint, TASKS, seeds)
             prediction = measure_prediction(models.world_model, scenes)
         with stages.stage("judge", "scoring policies in the twin and in the world model"):
             policies = {**scoring.ladder(plan), "behaviour cloning": models.policy}
             scores = scoring.judge(urls, policies, models, plan)
+    world = models.world_model.description
+    form = "state model" if world.object_names else "paper's form"
     report = {
         "about": {
             "version": __version__,
-            "world model": _described(models.world_model.description),
+            "world model": f"{world.name}, {form}, {world.digest[:12]}",
             "held-out seeds": f"{plan.seeds[0]} … {plan.seeds[-1]}",
         },
         "success_probe": models.probe.metadata.metrics,
@@ -179,11 +182,6 @@ def _take(
     with stages.stage(f"align_{domain}", f"aligning the {domain} take"):
         job = recording.align(urls["alignment"], recorded.recording_id)
         return recording.measure(store, truth, recorded, job.alignment_id, devices=devices)
-
-
-def _described(world: WorldDescription) -> str:
-    form = "state model" if world.object_names else "paper's form"
-    return f"{world.name}, {form}, {world.digest[:12]}"
 
 
 def worst_errors(takes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from dextouch.errors import DexTouchError
 from dextouch.worlds import BatchWorld
 from services.cli.demo.settings import TASKS, DemoPlan
 from services.cli.main import run_command
-from services.cli.study.command import demonstrator, refuse_trained
+from services.cli.study.command import demonstrator
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
@@ -116,7 +116,6 @@ def judge(
     Returns:
         `policies`, `agreement` and other entries of `report.json`.
     """
-    refuse_trained(MODEL, models.checkpoint, TASKS, plan.seeds)
     twin, imagined = RolloutClient(urls["twin"]), RolloutClient(urls["imagined"])
     tasks = EvaluationPlan(
         instructions={task: get_task(task).instruction for task in TASKS},

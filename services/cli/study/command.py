@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from dextouch.command_line import CommandParser, add_json
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.serving import ChildProcess
+from services.cli.training_data import stage_of
 from services.evaluation.command_line import (
     EXIT_FAILED,
     instructions_for,
@@ -31,8 +32,6 @@ from services.evaluation.studies.results import StudyHeader, StudyResults
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_probe import SuccessProbe
 from services.twin.scripted_actions import scripted_actions
-from services.twin.settings import TwinSettings
-from services.twin.stage import Stage
 from services.world_model.checkpoints import default_checkpoint
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 
@@ -267,16 +266,10 @@ def demonstrator(tasks: Sequence[str], seeds: Sequence[int], script: str) -> Rep
     Raises:
         UnknownNameError: no such script or task.
     """
-    stages = {task: _robot_stage(task) for task in tasks}
     return ReplayPolicy(
         {
-            (task, seed): scripted_actions(stage, seed, script)
-            for task, stage in stages.items()
+            (task, seed): scripted_actions(stage_of(task, "robot"), seed, script)
+            for task in tasks
             for seed in seeds
         }
     )
-
-
-@lru_cache(maxsize=4)
-def _robot_stage(task: str) -> Stage:
-    return Stage(task, "robot", TwinSettings())
