@@ -6,7 +6,7 @@ Every response has a request id and a Server-Timing header; `timed` adds parts t
 import re
 import secrets
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import (
     AbstractAsyncContextManager,
     asynccontextmanager,
@@ -271,7 +271,15 @@ class RequestMiddleware:
             buckets=SECONDS,
             registry=registry,
         )
+        self._parts_seconds = Histogram(
+            "dextouch_http_part_seconds",
+            "Parts of the time to an answer, as in its Server-Timing header.",
+            ("route", "part"),
+            buckets=SECONDS,
+            registry=registry,
+        )
         self._counter = cache(self._requests.labels)
+        self._part_histogram = cache(self._parts_seconds.labels)
         self._histogram = cache(self._seconds.labels)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -298,7 +306,7 @@ class RequestMiddleware:
                     (b"x-request-id", request_id.encode()),
                     (b"server-timing", ", ".join(timings).encode()),
                 ]
-                self._count(scope, message["status"], duration_s)
+                self._count(scope, message["status"], duration_s, timings_s)
             await send(message)
 
         tokens = structlog.contextvars.bind_contextvars(request_id=request_id)
@@ -307,12 +315,16 @@ class RequestMiddleware:
         finally:
             structlog.contextvars.reset_contextvars(**tokens)
 
-    def _count(self, scope: Scope, status: int, duration_s: float) -> None:
+    def _count(
+        self, scope: Scope, status: int, duration_s: float, timings_s: Mapping[str, float]
+    ) -> None:
         # The route template, not the path, to keep the number of labels bounded.
         route = getattr(scope.get("route"), "path", "unmatched")
         method = scope["method"] if scope["method"] in KNOWN_METHODS else "OTHER"
         self._counter(method, route, str(status)).inc()
         self._histogram(method, route).observe(duration_s)
+        for part, spent_s in timings_s.items():
+            self._part_histogram(route, part).observe(spent_s)
 
 
 def _request_id(scope: Scope) -> str:

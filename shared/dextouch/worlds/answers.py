@@ -1,7 +1,8 @@
 """Responses of the rollout service, as parts and encoded."""
 
 import asyncio
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any, Final
 
@@ -19,14 +20,14 @@ AnswerParts = tuple[dict[str, Any], dict[str, np.ndarray]]
 class Answer:
     """An encoded response; `replayed` if it was computed for an earlier, equal request.
 
-    `parts` are its fields and arrays; None where only the bytes are known.
+    `parts` are its fields and arrays; None where only the bytes are known. `spent_s` are the times
+    in queue, device, encoder and store; empty where nothing was computed.
     """
 
     payload: bytes
     parts: AnswerParts | None = None
     replayed: bool = False
-    queued_s: float = 0.0
-    device_s: float = 0.0
+    spent_s: Mapping[str, float] = field(default_factory=dict)
 
 
 async def parts_of(

@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
+from prometheus_client import Histogram
 
 from dextouch.errors import LimitExceededError, UnavailableError
 from dextouch.schemas import EVERYTHING, ReturnSelector
@@ -44,6 +45,13 @@ class StepJob(Generic[State]):
     )
 
 
+def batch_histogram() -> Histogram:
+    """A metric of batch sizes for the workers of a service, in no registry yet."""
+    name = "dextouch_batch_rollouts"
+    sizes = (1, 2, 4, 8, 16, 32)
+    return Histogram(name, "Rollouts of a batch.", ("world",), buckets=sizes, registry=None)
+
+
 class WorldWorker(Generic[State]):
     """One world, one thread, one queue; a `QuickWorld` needs neither thread nor queue.
 
@@ -51,8 +59,16 @@ class WorldWorker(Generic[State]):
     more; other worlds get them one by one. Bound to the event loop that first uses it.
     """
 
-    def __init__(self, world: World[State], *, max_waiting: int = 256, max_batch: int = 32) -> None:
+    def __init__(
+        self,
+        world: World[State],
+        *,
+        max_waiting: int = 256,
+        max_batch: int = 32,
+        on_batch: Callable[[float], object] | None = None,
+    ) -> None:
         self.world = world
+        self._on_batch = on_batch
         self._max_waiting = max_waiting
         self._max_batch = max_batch if isinstance(world, BatchWorld) else 1
         self._waiting: deque[StepJob[State]] = deque()
@@ -130,6 +146,8 @@ class WorldWorker(Generic[State]):
     def _step_all(self, jobs: Sequence[StepJob[State]]) -> SteppedBatch[State]:
         """Runs in the world's thread; returns start time, duration, steps and snapshots."""
         began_s = time.perf_counter()
+        if self._on_batch is not None:
+            self._on_batch(len(jobs))
         # The test of a protocol takes longer than a step may.
         if len(jobs) > 1 and isinstance(self.world, BatchWorld):
             stepped = self.world.step_batch(

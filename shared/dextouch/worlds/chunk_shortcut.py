@@ -19,7 +19,6 @@ from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands.actions import ACTION_DIM
 from dextouch.schemas import ReturnSelector
 from dextouch.serving import JSON, MSGPACK, OCTETS, AccessControl
-from dextouch.worlds.answers import Answer
 from dextouch.worlds.rollouts import RolloutService
 
 SCOPE: Final = "rollout"
@@ -70,7 +69,7 @@ class ChunkShortcut:
             finally:
                 spent_s["decode"] = time.perf_counter() - began_s
             answer = await self._service.step(rollout_id, chunk, actions, selector)
-            spent_s |= timings_s(answer)
+            spent_s |= answer.spent_s
             size = str(len(answer.payload)).encode()
             replayed = b"true" if answer.replayed else b"false"
             shown = [
@@ -93,11 +92,6 @@ async def _body(receive: Receive) -> bytes:
         parts.append(message.get("body", b""))
         more = message.get("more_body", False)
     return parts[0] if len(parts) == 1 else b"".join(parts)
-
-
-def timings_s(answer: Answer) -> dict[str, float]:
-    """Parts of the Server-Timing header."""
-    return {"queue": answer.queued_s, "device": answer.device_s}
 
 
 def wants_json(accepted: str) -> bool:

@@ -6,6 +6,7 @@ committed when its record replaces the version it was computed from (compare and
 
 import asyncio
 import hashlib
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import AbstractAsyncContextManager
@@ -38,7 +39,7 @@ from dextouch.schemas import (
 from dextouch.serving import StateStore
 from dextouch.streams import pack
 from dextouch.worlds.answers import Answer, parts_of, selector_bytes
-from dextouch.worlds.batcher import StepJob, WorldWorker
+from dextouch.worlds.batcher import StepJob, WorldWorker, batch_histogram
 from dextouch.worlds.records import RecordStore, RolloutRecord, new_rollout_id
 from dextouch.worlds.warm_up import first_chunk_s
 from dextouch.worlds.world import (
@@ -97,7 +98,11 @@ class RolloutService:
         self._reopen = reopen
         self._reopened: dict[tuple[str, str], WorldWorker[Any]] = {}
         self._reopening = asyncio.Lock()
-        self._workers = {name: WorldWorker(world) for name, world in worlds.items()}
+        self.batches = batch_histogram()
+        self._workers = {
+            name: WorldWorker(world, on_batch=self.batches.labels(name).observe)
+            for name, world in worlds.items()
+        }
         self._records = RecordStore(store, ttl_s=self.limits.ttl_s)
         # The newest states of this process's rollouts, least recently used first, with their
         # records, of which snapshot and payload are left out.
@@ -285,12 +290,16 @@ class RolloutService:
                 "last_step": before.last_step + num_steps,
             }
         )
+        began_s = time.perf_counter()
         parts = await parts_of(info, seen, selector, info=outcome.stepped.info)
         payload = pack(*parts)
+        encoded_s = time.perf_counter() - began_s
         record = RolloutRecord(info, outcome.snapshot, request_sha256, payload, stored.version)
         version = await self._records.write(record)
         self._keep(RolloutRecord(info, b"", version=version), outcome.stepped.state)
-        return Answer(payload, parts, queued_s=outcome.queued_s, device_s=outcome.device_s)
+        stored_s = time.perf_counter() - began_s - encoded_s
+        spent_s = {"queue": outcome.queued_s, "device": outcome.device_s}
+        return Answer(payload, parts, spent_s=spent_s | {"encode": encoded_s, "store": stored_s})
 
     async def _end(self, record: RolloutRecord, error: EndedError) -> EndedError:
         """Mark a rollout as ended; returns the error that later chunks get."""
@@ -344,7 +353,8 @@ class RolloutService:
             if began not in self._reopened and self._reopen is not None:
                 world = await asyncio.to_thread(self._reopen, *began)
                 if world is not None:
-                    self._reopened[began] = WorldWorker(world)
+                    observe = self.batches.labels(info.world).observe
+                    self._reopened[began] = WorldWorker(world, on_batch=observe)
                     logger.info("world_reopened", world=info.world, digest=info.world_digest)
         if began not in self._reopened:
             raise ConflictError(

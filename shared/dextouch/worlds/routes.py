@@ -52,7 +52,6 @@ from dextouch.worlds.chunk_shortcut import (
     SCOPE,
     ChunkShortcut,
     actions_from,
-    timings_s,
     wants_json,
 )
 from dextouch.worlds.openpi import openpi_router
@@ -160,6 +159,7 @@ def create_world_app(
     )
     app.state.shortcut = shortcut
     app.state.drain = service.drain
+    app.state.registry.register(service.batches)
     return app
 
 
@@ -251,7 +251,7 @@ def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRoute
         with timed(request, "decode"):
             actions = await _actions_of(request)
         answer = await service.step(rollout_id, chunk, actions, selector)
-        request.state.timings_s |= timings_s(answer)
+        request.state.timings_s |= answer.spent_s
         shortcut.learn(request, selector)
         return _response(request, answer)
 

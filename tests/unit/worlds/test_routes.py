@@ -110,7 +110,18 @@ async def test_timing_tells_queue_and_device(client):
     path = f"/v1/rollouts/{await begin(client)}/chunks/0"
     response = await client.post(path, content=actions(4).tobytes(), headers=FLOAT64)
     names = [part.split(";")[0] for part in response.headers["server-timing"].split(", ")]
-    assert names == ["decode", "queue", "device", "total"]
+    assert names == ["decode", "queue", "device", "encode", "store", "total"]
+
+
+async def test_metrics_tell_parts_and_batches(client):
+    path = f"/v1/rollouts/{await begin(client)}/chunks/0"
+    await client.post(path, content=actions(4).tobytes(), headers=FLOAT64)
+    text = (await client.get("/metrics")).text
+    route = "/v1/rollouts/{rollout_id}/chunks/{chunk}"
+    for part in ("decode", "queue", "device", "encode", "store"):
+        labels = f'{{part="{part}",route="{route}"}}'
+        assert f"dextouch_http_part_seconds_count{labels} 1.0" in text
+    assert 'dextouch_batch_rollouts_bucket{le="1.0",world="sum"} 1.0' in text
 
 
 async def test_the_selector_narrows_the_answer(client):
