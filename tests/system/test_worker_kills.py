@@ -4,15 +4,27 @@ import os
 import random
 import shutil
 import signal
+import subprocess
 import time
 
 import numpy as np
 import pytest
+import yaml
 
 from dextouch.clients import RolloutClient
 from dextouch.errors import UnavailableError
 from tests.contracts.redis_server import running_redis
-from tests.system.scaled import ASKED, Load, Service, haproxy, is_ready, noise, wait_until
+from tests.system.scaled import (
+    ASKED,
+    ROOT,
+    Load,
+    Service,
+    free_port,
+    haproxy,
+    is_ready,
+    noise,
+    wait_until,
+)
 from tests.unit.worlds.fakes import actions
 
 pytestmark = pytest.mark.system
@@ -143,3 +155,31 @@ def test_a_worker_that_cannot_start_ends_the_service(tmp_path, redis_url):
     log = service.log_path.read_text()
     assert "step_s: got -1.0" in log
     assert "a worker could not start" in log
+
+
+def start_redis(folder, port):
+    """Redis as in the compose file."""
+    if shutil.which("redis-server") is None:
+        pytest.skip("no redis-server on the PATH: apt-get install redis-server")
+    services = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
+    here = ["--port", str(port), "--bind", "127.0.0.1", "--dir", str(folder)]
+    return subprocess.Popen([*services["redis"]["command"], *here], stdout=subprocess.DEVNULL)
+
+
+def test_rollouts_outlast_a_restart_of_redis(tmp_path):
+    port = free_port()
+    redis = start_redis(tmp_path, port)
+    service = Service(tmp_path, f"redis://127.0.0.1:{port}/0")
+    try:
+        wait_until(lambda: is_ready(service.url), "service")
+        with Load(service.url, num_rollouts=4) as load:
+            redis.terminate()
+            redis.wait(20)
+            wait_until(lambda: not is_ready(service.url), "not ready")
+            redis = start_redis(tmp_path, port)
+            load.advance()
+        assert load.mistakes == []
+    finally:
+        service.stop()
+        redis.kill()
+        redis.wait(20)

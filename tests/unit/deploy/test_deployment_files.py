@@ -171,7 +171,9 @@ def test_prometheus_scrapes_every_service():
     (job,) = config["scrape_configs"]
     targets = {target for entry in job["static_configs"] for target in entry["targets"]}
     lasting = {name for name, service in OURS.items() if not service.get("profiles")}
-    assert targets == {f"{name}:8000" for name in lasting}
+    (found,) = job["dns_sd_configs"]
+    assert (found["type"], found["port"], found["names"]) == ("A", 8000, ["twin", "world_model"])
+    assert targets == {f"{name}:8000" for name in lasting - set(found["names"])}
 
 
 def test_all_threads_of_a_station_share_one_heap_as_in_the_soak_test():
