@@ -9,6 +9,7 @@ import pytest
 
 from dextouch.errors import InvalidInputError, LimitExceededError, UnavailableError
 from dextouch.schemas import EVERYTHING, ReturnSelector
+from dextouch.worlds import CopyFirstWorld
 from dextouch.worlds.batcher import StepJob, WorldWorker
 from tests.unit.worlds.fakes import BatchSumWorld, SumState, SumWorld, actions
 
@@ -154,3 +155,37 @@ async def test_closing_tells_those_who_wait():
     with pytest.raises(UnavailableError, match="shutting down"):
         await others[0]
     first.cancel()
+
+
+class QuickSum(SumWorld):
+    """Notes the threads of its calls."""
+
+    def __init__(self, *, is_quick: bool) -> None:
+        super().__init__()
+        self.is_quick = is_quick
+        self.threads: set[int] = set()
+
+    def step(self, state, actions, *, seed, selector=EVERYTHING):
+        self.threads.add(threading.get_ident())
+        return super().step(state, actions, seed=seed, selector=selector)
+
+
+@pytest.mark.parametrize("is_quick", [True, False])
+async def test_only_a_quick_world_is_called_in_the_event_loop(is_quick):
+    worker = WorldWorker(QuickSum(is_quick=is_quick))
+    outcome = await worker.step(job(5.0))
+    thread = await worker.call(threading.get_ident)
+    assert (thread == threading.get_ident()) is is_quick
+    assert worker.world.threads == {thread}
+    expected = SumWorld().step(SumState(0, 5.0), actions(4), seed=1)
+    assert outcome.stepped.state == expected.state
+    assert outcome.snapshot == worker.world.snapshot(expected.state)
+    with pytest.raises(InvalidInputError):
+        await worker.step(StepJob(SumState(0, 0.0), actions(4, 1e6), 1))
+    worker.close()
+
+
+def test_the_baseline_is_quick_while_its_images_are_small():
+    small = CopyFirstWorld(tasks=("rest",))
+    large = CopyFirstWorld(tasks=("rest",), image_height_px=480, image_width_px=640)
+    assert (small.is_quick, large.is_quick) == (True, False)

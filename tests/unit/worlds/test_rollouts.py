@@ -1,7 +1,9 @@
 """The rollout service: numbering, replay, branches, expiry, and going on in another process."""
 
 import asyncio
+import threading
 
+import msgpack
 import numpy as np
 import pytest
 
@@ -12,13 +14,16 @@ from dextouch.errors import (
     InvalidInputError,
     NonFiniteError,
     NotFoundError,
+    StorageError,
     UnknownNameError,
 )
-from dextouch.schemas import MAX_SEED, ReturnSelector, RolloutStart
+from dextouch.schemas import MAX_SEED, ReturnSelector, RolloutStart, jpeg_images
 from dextouch.serving.state import MemoryState
+from dextouch.worlds import answers
 from dextouch.worlds.rollouts import chunk_seed
 from tests.unit.worlds.begun import ALL, START, begin, decoded, service
 from tests.unit.worlds.fakes import (
+    CAMERAS,
     K_HEAD,
     BatchSumWorld,
     SumWorld,
@@ -193,6 +198,73 @@ async def test_another_process_goes_on_where_the_first_was(state):
         await first.step(rollout_id, 4, actions(4), ALL)
     for made in (alone, first, second):
         made.close()
+
+
+async def test_what_is_stored_is_read_only_where_it_is_needed(state):
+    made, other = service(state), service(state)
+    rollout_id = await begin(made)
+    reads = []
+    read = made._records.read
+
+    async def noted(rollout_id):
+        reads.append(rollout_id)
+        return await read(rollout_id)
+
+    made._records.read = noted
+    for chunk in range(3):
+        await made.step(rollout_id, chunk, actions(4), ALL)
+    assert not reads
+    assert (await made.step(rollout_id, 2, actions(4), ALL)).replayed
+    assert len(reads) == 1
+    await other.step(rollout_id, 3, actions(4), ALL)
+    await other.step(rollout_id, 4, actions(4), ALL)
+    # The state that this process holds is after chunk 2: the store is read, and its state restored.
+    num_steps = made._workers["sum"].world.num_steps
+    with pytest.raises(ConflictError, match="expected chunk 5"):
+        await made.step(rollout_id, 3, actions(4), ALL)
+    assert made._workers["sum"].world.num_steps == num_steps
+    await made.step(rollout_id, 5, actions(4), ALL)
+    made.close()
+    other.close()
+
+
+async def test_a_record_of_another_version_is_refused():
+    store = MemoryState()
+    made = service(store)
+    rollout_id = await begin(made)
+    key = f"rollout:{rollout_id}"
+    for value, tail, says in [
+        (msgpack.packb({"fields": {}, "arrays": {}}), b"", "another version"),
+        ((await store.get(key)).value, b"x", "got 1 bytes"),
+    ]:
+        version = await store.version(key)
+        await store.set(key, value, tail=tail, expected_version=version, ttl_s=60.0)
+        with pytest.raises(StorageError, match=says):
+            await made.step(rollout_id, 0, actions(4), ALL)
+    made.close()
+
+
+async def test_many_jpeg_images_are_encoded_beside_the_event_loop(monkeypatch):
+    threads = []
+    encode = jpeg_images.encode_jpeg
+
+    def noted(image):
+        threads.append(threading.get_ident())
+        return encode(image)
+
+    monkeypatch.setattr(jpeg_images, "encode_jpeg", noted)
+    made = service()
+    rollout_id = await begin(made)
+    selector = ReturnSelector(images="jpeg")
+    await made.step(rollout_id, 0, actions(4), selector)
+    assert set(threads) == {threading.get_ident()}
+    monkeypatch.setattr(answers, "MAX_INLINE_IMAGE_BYTES", 100)
+    threads.clear()
+    answer = decoded(await made.step(rollout_id, 1, actions(4), selector))
+    assert threads
+    assert threading.get_ident() not in threads
+    assert set(answer.observation.images) == set(CAMERAS)
+    made.close()
 
 
 async def test_two_processes_that_take_the_same_chunk_agree(state):
