@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from dextouch.worlds.routes import create_world_app as create_world_app
     from dextouch.worlds.routes import serve_worlds as serve_worlds
     from dextouch.worlds.world import BatchWorld as BatchWorld
+    from dextouch.worlds.world import QuickWorld as QuickWorld
     from dextouch.worlds.world import StartedRollout as StartedRollout
     from dextouch.worlds.world import State as State
     from dextouch.worlds.world import SteppedRollout as SteppedRollout
