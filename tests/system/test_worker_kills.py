@@ -51,13 +51,14 @@ def gateway(tmp_path, redis_url):
     """Two processes behind HAProxy: its address, and the processes."""
     if shutil.which("haproxy") is None:
         pytest.skip("no haproxy on the PATH: apt-get install haproxy")
-    services = [Service(tmp_path, redis_url, ("--drain-s", 2)) for _ in range(2)]
+    services = [Service(tmp_path, redis_url, ("--drain-s", 60)) for _ in range(2)]
     for service in services:
         wait_until(lambda service=service: is_ready(service.url), "service")
     with haproxy(tmp_path, services) as url:
         yield url, services
     for service in services:
-        service.stop()
+        service.process.kill()
+        service.process.wait()
 
 
 def report(load, kills_s, what):
@@ -123,6 +124,7 @@ def test_a_drained_worker_finishes_and_begins_nothing(gateway):
             assert caught.value.details["retry_after_s"] == 1
         with RolloutClient(url, patience_s=0.0) as client:
             after = client.start(seed=2, **ASKED)
+            first.process.send_signal(signal.SIGTERM)
             assert first.process.wait(20) in {0, -signal.SIGTERM}
             after.step(actions(4))
         load.advance()
