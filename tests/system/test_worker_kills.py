@@ -16,6 +16,7 @@ from dextouch.errors import UnavailableError
 from tests.contracts.redis_server import running_redis
 from tests.system.scaled import (
     ASKED,
+    LAST,
     ROOT,
     Load,
     Service,
@@ -109,6 +110,24 @@ def test_kills_of_workers_behind_the_gateway(gateway, num_kills):
             wait_until(lambda victim=victim: is_ready(victim.url), "the service again")
             time.sleep(1.0)  # the gateway looks twice a second
     report(load, kills_s, "workers behind HAProxy")
+
+
+def test_the_gateway_sends_a_rollout_to_the_worker_that_has_it(gateway):
+    url, services = gateway
+
+    def num_restores():
+        return [service.log_path.read_text().count("restored in [") for service in services]
+
+    with RolloutClient(url, selector=LAST) as client:
+        rollouts = [client.start(seed=seed, **ASKED) for seed in range(12)]
+        for rollout in rollouts:
+            rollout.step(actions(4))
+        # Starts go round, so that half of the first chunks find their rollout in Redis.
+        before = num_restores()
+        for _ in range(4):
+            for rollout in rollouts:
+                rollout.step(actions(4))
+        assert num_restores() == before
 
 
 def test_a_drained_worker_finishes_and_begins_nothing(gateway):
