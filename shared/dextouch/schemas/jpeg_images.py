@@ -20,7 +20,7 @@ SIZES_PREFIX: Final = "jpeg_bytes/"
 CHANNELS: Final = 3
 
 
-def with_jpeg_images(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def encode_images(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Arrays of a response with its images as JPEG of quality 90."""
     found = {}
     for name, array in arrays.items():
@@ -33,10 +33,10 @@ def with_jpeg_images(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return found
 
 
-def with_raw_images(
+def decode_images(
     arrays: Mapping[str, np.ndarray], *, max_bytes: int, where: str
 ) -> dict[str, np.ndarray]:
-    """Inverse of `with_jpeg_images`, for a response that may hold JPEG.
+    """Inverse of `encode_images`, for a response that may hold JPEG.
 
     Raises:
         InvalidInputError: sizes that are missing or do not fit the bytes, or images of different

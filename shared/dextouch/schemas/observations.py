@@ -14,7 +14,7 @@ from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFinit
 from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import rigid_error
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
-from dextouch.schemas.jpeg_images import IMAGE_PREFIX, with_jpeg_images, with_raw_images
+from dextouch.schemas.jpeg_images import IMAGE_PREFIX, JPEG_PREFIX, decode_images, encode_images
 from dextouch.schemas.problems import first_problems
 from dextouch.schemas.rollouts import ActionKind, Doubt, RolloutInfo, StartRequest
 from dextouch.streams import pack, unpack
@@ -240,7 +240,7 @@ def answer_parts(
     if not selector.tactile:
         del arrays["tactile_kpa"]
     if selector.images == "jpeg":
-        arrays = with_jpeg_images(arrays)
+        arrays = encode_images(arrays)
     if origin is not None:
         arrays |= _origin_arrays(origin)
     # As of AnswerFields, but each part is validated once.
@@ -258,9 +258,10 @@ def decode_answer(data: bytes, *, max_bytes: int) -> RolloutAnswer:
     Raises:
         InvalidInputError: not a valid response.
     """
-    raw, packed = unpack(data, max_bytes=max_bytes)
+    raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = validate_fields(AnswerFields, raw, where="answer")
-    arrays = with_raw_images(packed, max_bytes=max_bytes, where="answer")
+    if any(name.startswith(JPEG_PREFIX) for name in arrays):
+        arrays = decode_images(arrays, max_bytes=max_bytes, where="answer")
     origin = _origin_from(arrays, where="answer") if "K_head" in arrays else None
     observation = _observation_from(fields.observation, arrays, where="answer")
     return RolloutAnswer(fields.rollout, observation, fields.info, origin)

@@ -6,10 +6,10 @@ from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from dextouch.serving.app import create_service_app as create_service_app
-    from dextouch.serving.app import timed as timed
     from dextouch.serving.child_process import Answer as Answer
     from dextouch.serving.child_process import ChildProcess as ChildProcess
     from dextouch.serving.child_process import serve_parent as serve_parent
+    from dextouch.serving.connections import timed as timed
     from dextouch.serving.guard import AS_SET as AS_SET
     from dextouch.serving.guard import FORM as FORM
     from dextouch.serving.guard import JSON as JSON

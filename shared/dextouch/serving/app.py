@@ -1,20 +1,12 @@
-"""Factory of service applications: problem+json errors, health, metrics, request ids and timings.
+"""Factory of service applications: middleware, problem+json errors, health and metrics."""
 
-Every response has a request id and a Server-Timing header; `timed` adds parts to the latter.
-"""
-
-import re
-import secrets
-import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import (
     AbstractAsyncContextManager,
     asynccontextmanager,
-    contextmanager,
     nullcontext,
 )
-from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from http import HTTPStatus
 
 import structlog
@@ -24,12 +16,9 @@ from fastapi.responses import JSONResponse
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
     CollectorRegistry,
-    Counter,
-    Histogram,
     generate_latest,
 )
 from starlette.exceptions import HTTPException
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from dextouch import __version__
 from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
@@ -41,26 +30,19 @@ from dextouch.schemas import (
     Readiness,
     problem_from_error,
 )
+from dextouch.serving.connections import RequestMiddleware, ShortcutMiddleware
 from dextouch.serving.documentation import document_service
 from dextouch.serving.guard import AccessControl, Admits, BodyRules, GuardMiddleware, SitePolicy
 from dextouch.serving.settings import ServiceSettings
 
 logger = structlog.get_logger(__name__)
 
-REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
-OWN_HEADERS = frozenset({b"x-request-id", b"server-timing"})
-KNOWN_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 # A body of 1 MiB can hold 500,000 mistakes.
 MAX_MISTAKES = 10
-SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
 # Names of what is missing before requests are accepted; empty when ready.
 ReadinessCheck = Callable[[], Awaitable[Sequence[str]]]
-# Finds the ASGI application that answers a request in place of its route, which takes some 0.4 ms
-# of FastAPI's time; None leaves the request to the route. It checks the scope of the key itself,
-# sets `scope["route"]`, raises DexTouch errors like a route, and sends nothing before it succeeds.
-Shortcut = Callable[[Scope], ASGIApp | None]
 
 
 def create_service_app(
@@ -103,7 +85,7 @@ def create_service_app(
     app.state.running = False
     # The last one added is outermost, so that refusals of the guard have request ids and are
     # counted, and the shortcut gets no request that the guard refuses.
-    app.add_middleware(ShortcutMiddleware)
+    app.add_middleware(ShortcutMiddleware, refuse=_refusal)
     app.add_middleware(
         GuardMiddleware,
         access=app.state.access,
@@ -227,121 +209,3 @@ def _problem_response(
     return JSONResponse(
         problem.model_dump(), problem.status, headers=headers, media_type=PROBLEM_MEDIA_TYPE
     )
-
-
-@dataclass(frozen=True)
-class ShortcutMiddleware:
-    """ASGI middleware that lets a shortcut answer the requests that it knows."""
-
-    app: ASGIApp
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request; other scopes (lifespan, websocket) pass through."""
-        shortcut: Shortcut | None = scope["app"].state.shortcut
-        direct = shortcut(scope) if shortcut is not None and scope["type"] == "http" else None
-        if direct is None:
-            await self.app(scope, receive, send)
-            return
-        try:
-            await direct(scope, receive, send)
-        except DexTouchError as error:
-            await _problem_response(Request(scope), error)(scope, receive, send)
-        except HTTPException as error:
-            await _refusal(Request(scope), error)(scope, receive, send)
-
-
-class RequestMiddleware:
-    """Sets `request.state.request_id` and `.timings_s`, the headers for them, and counts requests.
-
-    The counters belong to the given Prometheus registry.
-    """
-
-    def __init__(self, app: ASGIApp, *, registry: CollectorRegistry) -> None:
-        self._app = app
-        self._requests = Counter(
-            "dextouch_http_requests",
-            "Answered requests.",
-            ("method", "route", "status"),
-            registry=registry,
-        )
-        self._seconds = Histogram(
-            "dextouch_http_request_seconds",
-            "Time from the first byte to the answer's head.",
-            ("method", "route"),
-            buckets=SECONDS,
-            registry=registry,
-        )
-        self._parts_seconds = Histogram(
-            "dextouch_http_part_seconds",
-            "Parts of the time to an answer, as in its Server-Timing header.",
-            ("route", "part"),
-            buckets=SECONDS,
-            registry=registry,
-        )
-        self._counter = cache(self._requests.labels)
-        self._part_histogram = cache(self._parts_seconds.labels)
-        self._histogram = cache(self._seconds.labels)
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request; other scopes (lifespan, websocket) pass through."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        started = time.perf_counter()
-        request_id = _request_id(scope)
-        timings_s: dict[str, float] = {}
-        scope.setdefault("state", {}).update(request_id=request_id, timings_s=timings_s)
-
-        async def send_with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                duration_s = time.perf_counter() - started
-                timings = [f"{part};dur={spent_s * 1e3:.2f}" for part, spent_s in timings_s.items()]
-                timings.append(f"total;dur={duration_s * 1e3:.2f}")
-                message["headers"] = [
-                    *(
-                        header
-                        for header in message.get("headers", ())
-                        if header[0] not in OWN_HEADERS
-                    ),
-                    (b"x-request-id", request_id.encode()),
-                    (b"server-timing", ", ".join(timings).encode()),
-                ]
-                self._count(scope, message["status"], duration_s, timings_s)
-            await send(message)
-
-        tokens = structlog.contextvars.bind_contextvars(request_id=request_id)
-        try:
-            await self._app(scope, receive, send_with_headers)
-        finally:
-            structlog.contextvars.reset_contextvars(**tokens)
-
-    def _count(
-        self, scope: Scope, status: int, duration_s: float, timings_s: Mapping[str, float]
-    ) -> None:
-        # The route template, not the path, to keep the number of labels bounded.
-        route = getattr(scope.get("route"), "path", "unmatched")
-        method = scope["method"] if scope["method"] in KNOWN_METHODS else "OTHER"
-        self._counter(method, route, str(status)).inc()
-        self._histogram(method, route).observe(duration_s)
-        for part, spent_s in timings_s.items():
-            self._part_histogram(route, part).observe(spent_s)
-
-
-def _request_id(scope: Scope) -> str:
-    """The caller's, if it is a valid one, or a new one."""
-    for name, value in scope["headers"]:
-        if name == b"x-request-id":
-            given = value.decode("latin-1")
-            return given if REQUEST_ID.fullmatch(given) else secrets.token_hex(16)
-    return secrets.token_hex(16)
-
-
-@contextmanager
-def timed(request: Request, part: str) -> Iterator[None]:
-    """Time a part of a request (`queue`, `device`, `encode`, …) for its Server-Timing header."""
-    started = time.perf_counter()
-    try:
-        yield
-    finally:
-        timings_s: dict[str, float] = request.state.timings_s
-        timings_s[part] = timings_s.get(part, 0.0) + time.perf_counter() - started

@@ -1,21 +1,31 @@
-"""Connections of a service: how many there are, and how long a client may keep it waiting.
+"""Connections and requests of a service: limits and deadlines, request ids, timings, shortcuts.
 
 uvicorn by itself waits for ever for a request that has begun, and for clients that do not read.
+Every response has a request id and a Server-Timing header; `timed` adds parts to the latter.
 """
 
 import asyncio
-from collections.abc import Mapping
+import re
+import secrets
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from http import HTTPStatus
 from typing import Any
 
 import structlog
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
 from dextouch.schemas import PROBLEM_MEDIA_TYPE, problem_from_error
+from dextouch.serving.guard import Refuse
 
 logger = structlog.get_logger(__name__)
 
@@ -26,6 +36,15 @@ MAX_HEADER_BYTES = 2**16
 # Clients that are told at the same time that there is no place; further ones are just closed.
 MAX_REFUSED = 64
 MAX_CHECK_PERIOD_S = 1.0
+REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+OWN_HEADERS = frozenset({b"x-request-id", b"server-timing"})
+KNOWN_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+
+# Finds the ASGI application that answers a request in place of its route, which takes some 0.4 ms
+# of FastAPI's time; None leaves the request to the route. It checks the scope of the key itself,
+# sets `scope["route"]`, raises DexTouch errors like a route, and sends nothing before it succeeds.
+Shortcut = Callable[[Scope], ASGIApp | None]
 
 
 def limited_protocols(*, max_connections: int, client_timeout_s: float) -> dict[str, Any]:
@@ -229,3 +248,123 @@ def _answer(status: int, error: DexTouchError) -> bytes:
     }
     lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
     return f"HTTP/1.1 {status} {HTTPStatus(status).phrase}\r\n{lines}\r\n".encode() + body
+
+
+@dataclass(frozen=True)
+class ShortcutMiddleware:
+    """ASGI middleware that lets a shortcut answer the requests that it knows.
+
+    `refuse` makes the response to a refused request.
+    """
+
+    app: ASGIApp
+    refuse: Refuse
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request; other scopes (lifespan, websocket) pass through."""
+        shortcut: Shortcut | None = scope["app"].state.shortcut
+        direct = shortcut(scope) if shortcut is not None and scope["type"] == "http" else None
+        if direct is None:
+            await self.app(scope, receive, send)
+            return
+        try:
+            await direct(scope, receive, send)
+        except (DexTouchError, HTTPException) as error:
+            await self.refuse(Request(scope), error)(scope, receive, send)
+
+
+class RequestMiddleware:
+    """Sets `request.state.request_id` and `.timings_s`, the headers for them, and counts requests.
+
+    The counters belong to the given Prometheus registry.
+    """
+
+    def __init__(self, app: ASGIApp, *, registry: CollectorRegistry) -> None:
+        self._app = app
+        self._requests = Counter(
+            "dextouch_http_requests",
+            "Answered requests.",
+            ("method", "route", "status"),
+            registry=registry,
+        )
+        self._seconds = Histogram(
+            "dextouch_http_request_seconds",
+            "Time from the first byte to the answer's head.",
+            ("method", "route"),
+            buckets=SECONDS,
+            registry=registry,
+        )
+        self._parts_seconds = Histogram(
+            "dextouch_http_part_seconds",
+            "Parts of the time to an answer, as in its Server-Timing header.",
+            ("route", "part"),
+            buckets=SECONDS,
+            registry=registry,
+        )
+        self._counter = cache(self._requests.labels)
+        self._part_histogram = cache(self._parts_seconds.labels)
+        self._histogram = cache(self._seconds.labels)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request; other scopes (lifespan, websocket) pass through."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        started = time.perf_counter()
+        request_id = _request_id(scope)
+        timings_s: dict[str, float] = {}
+        scope.setdefault("state", {}).update(request_id=request_id, timings_s=timings_s)
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                duration_s = time.perf_counter() - started
+                timings = [f"{part};dur={spent_s * 1e3:.2f}" for part, spent_s in timings_s.items()]
+                timings.append(f"total;dur={duration_s * 1e3:.2f}")
+                message["headers"] = [
+                    *(
+                        header
+                        for header in message.get("headers", ())
+                        if header[0] not in OWN_HEADERS
+                    ),
+                    (b"x-request-id", request_id.encode()),
+                    (b"server-timing", ", ".join(timings).encode()),
+                ]
+                self._count(scope, message["status"], duration_s, timings_s)
+            await send(message)
+
+        tokens = structlog.contextvars.bind_contextvars(request_id=request_id)
+        try:
+            await self._app(scope, receive, send_with_headers)
+        finally:
+            structlog.contextvars.reset_contextvars(**tokens)
+
+    def _count(
+        self, scope: Scope, status: int, duration_s: float, timings_s: Mapping[str, float]
+    ) -> None:
+        # The route template, not the path, to keep the number of labels bounded.
+        route = getattr(scope.get("route"), "path", "unmatched")
+        method = scope["method"] if scope["method"] in KNOWN_METHODS else "OTHER"
+        self._counter(method, route, str(status)).inc()
+        self._histogram(method, route).observe(duration_s)
+        for part, spent_s in timings_s.items():
+            self._part_histogram(route, part).observe(spent_s)
+
+
+def _request_id(scope: Scope) -> str:
+    """The caller's, if it is a valid one, or a new one."""
+    for name, value in scope["headers"]:
+        if name == b"x-request-id":
+            given = value.decode("latin-1")
+            return given if REQUEST_ID.fullmatch(given) else secrets.token_hex(16)
+    return secrets.token_hex(16)
+
+
+@contextmanager
+def timed(request: Request, part: str) -> Iterator[None]:
+    """Time a part of a request (`queue`, `device`, `encode`, …) for its Server-Timing header."""
+    started = time.perf_counter()
+    try:
+        yield
+    finally:
+        timings_s: dict[str, float] = request.state.timings_s
+        timings_s[part] = timings_s.get(part, 0.0) + time.perf_counter() - started

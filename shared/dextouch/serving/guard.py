@@ -7,7 +7,6 @@ page at all.
 
 import hashlib
 import hmac
-import ipaddress
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -29,12 +28,11 @@ from starlette.types import Message as AsgiMessage
 
 from dextouch.errors import AccessDeniedError, DexTouchError
 from dextouch.frozen_model import FrozenModel
+from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
 
 logger = structlog.get_logger(__name__)
 
-HOST_NAME = re.compile(r"[a-z0-9_.-]+")
 HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9_.-]+))(?::\d{1,5})?")
-ORIGIN = re.compile(r"(https?)://(?:([a-z0-9_.-]+)|\[([0-9a-f:.]+)\])(?::([0-9]{1,5}))?")
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 # By which a page of another site is recognised.
 SENDER_HEADERS = (b"host", b"origin", b"sec-fetch-site")
@@ -56,40 +54,6 @@ EndpointT = TypeVar("EndpointT", bound=Callable[..., object])
 # Whether a request without a key comes from a signed-in browser.
 Admits = Callable[[HTTPConnection], bool]
 Refuse = Callable[[Request, DexTouchError | HTTPException], Response]
-
-
-def canonical_host(text: str) -> str:
-    """A host name as browsers write it: in lower case, IPv6 addresses short, without brackets."""
-    name = text.lower()
-    if HOST_NAME.fullmatch(name):
-        return name
-    try:
-        return str(ipaddress.IPv6Address(name))
-    except ValueError:
-        raise ValueError(
-            f"got {text!r}, expected a name or an address without its port (every port is "
-            "answered), IPv6 without brackets"
-        ) from None
-
-
-def canonical_origin(text: str) -> str:
-    """An origin as browsers write it: in lower case, without the default port of its scheme."""
-    parts = ORIGIN.fullmatch(text.lower())
-    if parts is None or int(parts[4] or 0) > 65535:
-        raise ValueError(
-            f"got {text!r}, expected http(s)://HOST or http(s)://HOST:PORT without a path"
-        )
-    scheme, name, address, port = parts.groups()
-    host = f"[{canonical_host(address)}]" if address else name
-    is_default = port is None or (scheme, int(port)) in {("http", 80), ("https", 443)}
-    return f"{scheme}://{host}" if is_default else f"{scheme}://{host}:{int(port)}"
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach a socket bound to `host`."""
-    with suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost"
 
 
 @dataclass(frozen=True)

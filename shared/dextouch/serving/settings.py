@@ -16,7 +16,8 @@ from pydantic_settings import BaseSettings, CliApp, CliSettingsSource, SettingsC
 from dextouch.command_line import CommandParser
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import first_problems
-from dextouch.serving.guard import ApiKey, canonical_host, canonical_origin, is_loopback
+from dextouch.serving.guard import ApiKey
+from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
 from dextouch.serving.logs import configure_logging
 
 # Keep-alive, so that a policy may take this long between two chunks.

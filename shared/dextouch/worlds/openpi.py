@@ -30,7 +30,7 @@ from dextouch.schemas import (
 )
 from dextouch.serving import MAX_WEBSOCKET_BYTES
 from dextouch.streams import pack_openpi, unpack, unpack_openpi
-from dextouch.worlds.answers import Answer
+from dextouch.worlds.records import Answer
 from dextouch.worlds.rollouts import RolloutService
 
 SCOPE: Final = "rollout"

@@ -1,15 +1,28 @@
-"""Persistent record of a rollout: progress, the world's snapshot, and the last response."""
+"""Persistent record of a rollout and the responses of its service.
 
+A record holds the progress, the world's snapshot, and the newest response.
+"""
+
+import asyncio
 import hashlib
 import secrets
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from typing import Any, Final
 
 import msgpack
+import numpy as np
 
-from dextouch.errors import LimitExceededError, NotFoundError, StorageError, UnavailableError
-from dextouch.schemas import RolloutInfo
+from dextouch.errors import (
+    ConflictError,
+    LimitExceededError,
+    NotFoundError,
+    StorageError,
+    UnavailableError,
+)
+from dextouch.schemas import Observation, ReturnSelector, RolloutInfo, answer_parts
 from dextouch.serving import StateStore, Versioned
 
 KEY_PREFIX = "rollout:"
@@ -18,6 +31,10 @@ RECORD_FORMAT = 2
 PLACE_TTL_S = 600.0
 # Of an id, the beginning that all rollouts of one API key share.
 OWNER_LETTERS = 8
+# More images are encoded as JPEG beside the event loop; JPEG takes some 15 ms for a megabyte.
+MAX_INLINE_IMAGE_BYTES: Final = 2**16
+
+AnswerParts = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -40,6 +57,25 @@ class RolloutRecord:
         info = self.info.model_dump(mode="json")
         fields = (RECORD_FORMAT, info, self.request_sha256, len(self.payload), self.snapshot)
         return msgpack.packb(fields)
+
+    def replay(self, chunk: int, request_sha256: str) -> "Answer | None":
+        """The stored response if the request is a repetition; None if the chunk is the next one.
+
+        Raises:
+            ConflictError: another chunk, or the newest one with another body.
+        """
+        info = self.info
+        if chunk == info.next_chunk:
+            return None
+        is_newest = chunk == info.next_chunk - 1
+        if is_newest and self.request_sha256 == request_sha256:
+            return Answer(self.payload, replayed=True)
+        why = "again with another body" if is_newest else "out of turn"
+        raise ConflictError(
+            f"rollout {info.id}: got chunk {chunk} {why}, expected chunk {info.next_chunk}",
+            expected=info.next_chunk,
+            got=chunk,
+        )
 
     @staticmethod
     def from_stored(stored: Versioned) -> "RolloutRecord":
@@ -140,3 +176,37 @@ def _unknown(rollout_id: str) -> NotFoundError:
     return NotFoundError(
         f"rollout {rollout_id!r}: unknown, deleted or expired; start a new one", got=rollout_id
     )
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An encoded response; `replayed` if it was computed for an earlier, equal request.
+
+    `parts` are its fields and arrays; None where only the bytes are known. `spent_s` are the times
+    in queue, device, encoder and store; empty where nothing was computed.
+    """
+
+    payload: bytes
+    parts: AnswerParts | None = None
+    replayed: bool = False
+    spent_s: Mapping[str, float] = field(default_factory=dict)
+
+
+async def parts_of(
+    rollout: RolloutInfo,
+    seen: Observation,
+    selector: ReturnSelector,
+    **told: Any,  # noqa: ANN401 - see answer_parts
+) -> AnswerParts:
+    """Fields and arrays of a response, from a thread where encoding the images takes long."""
+    num_bytes = sum(images.nbytes for images in seen.images.values())
+    make = partial(answer_parts, rollout, seen, selector=selector, **told)
+    if selector.images == "raw" or num_bytes <= MAX_INLINE_IMAGE_BYTES:
+        return make()
+    return await asyncio.to_thread(make)
+
+
+@lru_cache(maxsize=64)
+def selector_bytes(selector: ReturnSelector) -> bytes:
+    """A selector as it enters the hash of a request."""
+    return selector.model_dump_json().encode()

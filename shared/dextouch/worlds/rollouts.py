@@ -38,9 +38,15 @@ from dextouch.schemas import (
 )
 from dextouch.serving import StateStore
 from dextouch.streams import pack
-from dextouch.worlds.answers import Answer, parts_of, selector_bytes
 from dextouch.worlds.batcher import StepJob, WorldWorker, batch_histogram
-from dextouch.worlds.records import RecordStore, RolloutRecord, new_rollout_id
+from dextouch.worlds.records import (
+    Answer,
+    RecordStore,
+    RolloutRecord,
+    new_rollout_id,
+    parts_of,
+    selector_bytes,
+)
 from dextouch.worlds.warm_up import first_chunk_s
 from dextouch.worlds.world import (
     StartedRollout,
@@ -197,7 +203,7 @@ class RolloutService:
             asked = hashlib.sha256(selector_bytes(selector))
             asked.update(np.ascontiguousarray(checked, dtype="<f8").data)
             sha256 = asked.hexdigest()
-            replayed = _replay(record, chunk, sha256)
+            replayed = record.replay(chunk, sha256)
             if replayed is not None:
                 logger.info("chunk_replayed", rollout_id=rollout_id, chunk=chunk)
                 return replayed
@@ -214,7 +220,7 @@ class RolloutService:
                 raise await self._end(record, error) from error
             except ConflictError:
                 # Another process was faster: its response is valid if the request was the same.
-                replayed = _replay(await self._records.read(rollout_id), chunk, sha256)
+                replayed = (await self._records.read(rollout_id)).replay(chunk, sha256)
                 if replayed is None:
                     raise
                 return replayed
@@ -381,20 +387,4 @@ def _over(info: RolloutInfo) -> EndedError:
         reason=str(info.ended),
         last_chunk=last_chunk,
         last_step=info.last_step,
-    )
-
-
-def _replay(record: RolloutRecord, chunk: int, request_sha256: str) -> Answer | None:
-    """The stored response if the request is a repetition; None if the chunk is the next one."""
-    info = record.info
-    if chunk == info.next_chunk:
-        return None
-    is_newest = chunk == info.next_chunk - 1
-    if is_newest and record.request_sha256 == request_sha256:
-        return Answer(record.payload, replayed=True)
-    why = "again with another body" if is_newest else "out of turn"
-    raise ConflictError(
-        f"rollout {info.id}: got chunk {chunk} {why}, expected chunk {info.next_chunk}",
-        expected=info.next_chunk,
-        got=chunk,
     )

@@ -1,19 +1,25 @@
-"""Application that serves worlds over HTTP: the routes of /v1/rollouts (docs/rollout_api.md)."""
+"""Routes of /v1/rollouts (docs/rollout_api.md), and a direct way to the route of chunks.
+
+A chunk of a small world takes less time than FastAPI needs to find its route and to solve its
+parameters. The shortcut answers requests whose query the route has already accepted once, with a
+binary body; all others are left to the route, which stays the reference for both.
+"""
 
 import base64
 import json
-from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager
-from functools import partial
-from typing import Annotated, Any
+import re
+import time
+from typing import Annotated, Any, Final
 
 import numpy as np
-from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from jaxtyping import Shaped
-from pydantic import Field, model_validator
+from pydantic import Field
 from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Receive, Scope, Send
 
-from dextouch.errors import ShapeError
+from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import ACTION_DIM
 from dextouch.schemas import (
@@ -33,30 +39,15 @@ from dextouch.serving import (
     KIB,
     MSGPACK,
     OCTETS,
+    AccessControl,
     RequireScope,
-    ServiceSettings,
-    configure_logging,
-    create_service_app,
     media_type,
-    open_state,
-    run,
-    run_workers,
-    server_options,
     takes,
     timed,
 )
 from dextouch.streams import unpack
-from dextouch.worlds.answers import Answer
-from dextouch.worlds.chunk_shortcut import (
-    REPLAYED_HEADER,
-    SCOPE,
-    ChunkShortcut,
-    actions_from,
-    wants_json,
-)
-from dextouch.worlds.openpi import openpi_router
-from dextouch.worlds.rollouts import Reopen, RolloutLimits, RolloutService
-from dextouch.worlds.world import World
+from dextouch.worlds.records import Answer
+from dextouch.worlds.rollouts import RolloutService
 
 MAX_BODY_BYTES = 2**28
 # Room for 1000 rows of float64, or some hundred rows as JSON.
@@ -65,6 +56,14 @@ MAX_CHUNK_BYTES = 2**20
 MAX_ROWS = 4096
 # Bodies above it are decoded in a thread, so that others need not wait.
 MAX_INLINE_BYTES = 64 * KIB
+
+SCOPE: Final = "rollout"
+REPLAYED_HEADER: Final = "dextouch-replayed"
+DTYPES: Final = ("float32", "float64")
+_PATH: Final = re.compile(r"/v1/rollouts/([^/]+)/chunks/([0-9]{1,9})")
+_DTYPE_OF: Final = {f"{OCTETS}; dtype={dtype}".encode(): dtype for dtype in DTYPES}
+_MAX_QUERIES: Final = 64
+_MAX_QUERY_BYTES: Final = 256
 
 
 class ActionsBody(FrozenModel):
@@ -85,123 +84,57 @@ Selector = Annotated[ReturnSelector, Query()]
 Owner = Annotated[str, Depends(RequireScope(SCOPE))]
 
 
-class WorldServiceSettings(ServiceSettings):
-    """Settings of a service of worlds; subclass to add those of a world."""
+class ChunkShortcut:
+    """Shortcut to the route of chunks of one rollout service (see `create_service_app`)."""
 
-    state_url: str = Field(
-        default="memory://",
-        description="store of rollouts: memory:// or redis://HOST:PORT/DB",
-    )
-    limits: RolloutLimits = RolloutLimits()
-    workers: int = Field(
-        default=1, ge=1, le=64, description="processes on one port; more than one needs redis://"
-    )
-    drain_s: float = Field(
-        default=0.0,
-        ge=0,
-        le=600,
-        description="seconds after SIGTERM without new rollouts and not ready, before the port is "
-        "closed (of one process)",
-    )
+    def __init__(self, service: RolloutService) -> None:
+        self._service = service
+        # What the route made of a query.
+        self._selectors: dict[bytes, tuple[ReturnSelector, Any]] = {}
 
-    @model_validator(mode="after")
-    def _workers_share_their_state(self) -> "WorldServiceSettings":
-        if self.workers > 1 and self.state_url == "memory://":
-            raise ValueError(
-                f"workers: got {self.workers} with state_url memory://, which each of them would "
-                "have for itself; set state_url to redis://HOST:PORT/DB"
-            )
-        return self
+    def learn(self, request: Request, selector: ReturnSelector) -> None:
+        """Note what the route made of the query of a request."""
+        query = request.scope["query_string"]
+        if len(query) <= _MAX_QUERY_BYTES and len(self._selectors) < _MAX_QUERIES:
+            self._selectors[query] = selector, request.scope["route"]
 
+    def __call__(self, scope: Scope) -> ASGIApp | None:
+        """The application that answers a request; None if its route is to do so."""
+        learned = self._selectors.get(scope["query_string"])
+        place = _PATH.fullmatch(scope["path"])
+        if learned is None or place is None or scope["method"] != "POST":
+            return None
+        # Of several headers of one name the first counts, as in Starlette.
+        headers = dict(scope["headers"][::-1])
+        dtype = _DTYPE_OF.get(headers.get(b"content-type", b""))
+        if dtype is None or wants_json(headers.get(b"accept", b"").decode("latin-1")):
+            return None
+        selector, scope["route"] = learned
+        rollout_id, chunk = place[1], int(place[2])
 
-def create_world_app(
-    worlds: Mapping[str, World[Any]],
-    settings: WorldServiceSettings,
-    *,
-    name: str = "worlds",
-    reopen: Reopen | None = None,
-    warm_up: bool = False,
-) -> FastAPI:
-    """Create the application; its shutdown ends the worlds' threads.
+        async def step(scope: Scope, receive: Receive, send: Send) -> None:
+            access: AccessControl = scope["app"].state.access
+            access.check(headers.get(b"authorization", b"").decode("latin-1"), SCOPE)
+            body = await _body(receive)
+            spent_s: dict[str, float] = scope["state"]["timings_s"]
+            began_s = time.perf_counter()
+            try:
+                actions = actions_from(body, dtype)
+            finally:
+                spent_s["decode"] = time.perf_counter() - began_s
+            answer = await self._service.step(rollout_id, chunk, actions, selector)
+            spent_s |= answer.spent_s
+            size = str(len(answer.payload)).encode()
+            replayed = b"true" if answer.replayed else b"false"
+            shown = [
+                (REPLAYED_HEADER.encode(), replayed),
+                (b"content-length", size),
+                (b"content-type", MSGPACK.encode()),
+            ]
+            await send({"type": "http.response.start", "status": 200, "headers": shown})
+            await send({"type": "http.response.body", "body": answer.payload})
 
-    Args:
-        worlds: by name.
-        settings: of the service.
-        name: of the service.
-        reopen: opens a world by name and digest, for rollouts that began in an earlier one.
-        warm_up: compute a first chunk of each world before the application is ready.
-
-    Returns:
-        The application; `app.state.drain()` refuses new rollouts and makes it not ready.
-    """
-    store = open_state(settings.state_url)
-    service = RolloutService(worlds, store, settings.limits, reopen=reopen)
-    shortcut = ChunkShortcut(service)
-
-    @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        if warm_up:
-            await service.warm_up()
-        yield
-        service.close()
-        await store.close()
-
-    async def readiness() -> list[str]:
-        await store.ping()
-        return ["shutdown"] if service.is_draining else []
-
-    app = create_service_app(
-        name=name,
-        settings=settings,
-        routers=[rollout_router(service, shortcut), openpi_router(service)],
-        lifespan=lifespan,
-        readiness=readiness,
-    )
-    app.state.shortcut = shortcut
-    app.state.drain = service.drain
-    app.state.registry.register(service.batches)
-    return app
-
-
-def serve_worlds(
-    open_worlds: Callable[[], Mapping[str, World[Any]]],
-    settings: WorldServiceSettings,
-    *,
-    name: str = "worlds",
-    reopen: Reopen | None = None,
-) -> None:
-    """Serve worlds until SIGINT or SIGTERM, with as many processes as the settings say.
-
-    Args:
-        open_worlds: picklable; called in each process.
-        settings: of the service.
-        name: of the service.
-        reopen: see create_world_app; picklable, too.
-    """
-    configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
-    create_app = partial(create_serving_app, open_worlds, settings, name, reopen)
-    if settings.workers == 1:
-        app = create_app()
-        run(app, settings, drain=app.state.drain, drain_s=settings.drain_s)
-        return
-    run_workers(
-        create_app,
-        host=settings.host,
-        port=settings.port,
-        num_workers=settings.workers,
-        options=server_options(settings, grace_s=settings.shutdown_grace_s),
-    )
-
-
-def create_serving_app(
-    open_worlds: Callable[[], Mapping[str, World[Any]]],
-    settings: WorldServiceSettings,
-    name: str,
-    reopen: Reopen | None = None,
-) -> FastAPI:
-    """The application of one of several processes, which computes a first chunk in each world."""
-    configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
-    return create_world_app(open_worlds(), settings, name=name, reopen=reopen, warm_up=True)
+        return step
 
 
 def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRouter:
@@ -319,3 +252,40 @@ def _as_json(payload: bytes) -> bytes:
         for name, array in arrays.items()
     }
     return json.dumps({"fields": fields, "arrays": shown}).encode()
+
+
+async def _body(receive: Receive) -> bytes:
+    parts, more = [], True
+    while more:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnect
+        parts.append(message.get("body", b""))
+        more = message.get("more_body", False)
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+def wants_json(accepted: str) -> bool:
+    """Whether a response is to be JSON rather than a packing."""
+    return JSON in accepted and MSGPACK not in accepted
+
+
+def actions_from(body: bytes, dtype: str) -> Shaped[np.ndarray, "..."]:
+    """Actions [K, 67] of a binary body.
+
+    Raises:
+        InvalidInputError: an unknown dtype.
+        ShapeError: no whole rows.
+    """
+    if dtype not in DTYPES:
+        raise InvalidInputError(
+            f"chunk: got dtype {dtype!r}, expected the header "
+            f"'Content-Type: {OCTETS}; dtype=float32' or float64"
+        )
+    row_bytes = ACTION_DIM * np.dtype(dtype).itemsize
+    if not body or len(body) % row_bytes:
+        raise ShapeError(
+            f"chunk: got {len(body)} bytes, expected a multiple of {row_bytes} "
+            f"([K, {ACTION_DIM}] {dtype}, little endian)"
+        )
+    return np.frombuffer(body, np.dtype(dtype).newbyteorder("<")).reshape(-1, ACTION_DIM)

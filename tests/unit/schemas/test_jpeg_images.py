@@ -8,7 +8,7 @@ from PIL import Image
 
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError
 from dextouch.schemas import ReturnSelector, decode_answer
-from dextouch.schemas.jpeg_images import with_jpeg_images, with_raw_images
+from dextouch.schemas.jpeg_images import decode_images, encode_images
 from dextouch.streams import unpack
 from tests.unit.schemas.test_rollout_codec import INFO, encode_answer
 from tests.unit.worlds.fakes import observation
@@ -29,10 +29,10 @@ def files_of(arrays, camera="camera_head"):
 
 def test_another_decoder_reads_the_same_images():
     images = smooth(3)
-    arrays = with_jpeg_images({"image/camera_head": images, "tactile_kpa": np.zeros(2)})
+    arrays = encode_images({"image/camera_head": images, "tactile_kpa": np.zeros(2)})
     assert set(arrays) == {"jpeg/camera_head", "jpeg_bytes/camera_head", "tactile_kpa"}
     by_pillow = np.stack([np.asarray(Image.open(io.BytesIO(file))) for file in files_of(arrays)])
-    ours = with_raw_images(arrays, max_bytes=10**6, where="answer")["image/camera_head"]
+    ours = decode_images(arrays, max_bytes=10**6, where="answer")["image/camera_head"]
     assert ours.shape == images.shape
     assert np.abs(ours.astype(int) - by_pillow).max() <= 2
     # The files of Pillow show colours of slopes within a few levels of what was sent.
@@ -45,7 +45,7 @@ def test_a_jpeg_of_another_encoder_is_read():
     Image.fromarray(image).save(file, "JPEG", quality=95, subsampling=0)
     data = np.frombuffer(file.getvalue(), np.uint8)
     arrays = {"jpeg/c": data, "jpeg_bytes/c": np.array([len(data)], np.int32)}
-    got = with_raw_images(arrays, max_bytes=10**6, where="answer")["image/c"]
+    got = decode_images(arrays, max_bytes=10**6, where="answer")["image/c"]
     assert np.abs(got[0].astype(int) - image).max() <= 6
 
 
@@ -79,16 +79,16 @@ def test_raw_is_the_default_and_leaves_no_trace_in_hashes_of_requests():
     ],
 )  # fmt: skip
 def test_damaged_images_are_refused(changed, error, says):
-    arrays = with_jpeg_images({"image/c": smooth(2)}) | changed
+    arrays = encode_images({"image/c": smooth(2)}) | changed
     arrays = {name: array for name, array in arrays.items() if array is not None}
     with pytest.raises(error, match=says):
-        with_raw_images(arrays, max_bytes=10**6, where="answer")
+        decode_images(arrays, max_bytes=10**6, where="answer")
 
 
 def test_images_of_two_sizes_and_huge_ones_are_refused():
-    one, other = (with_jpeg_images({"image/c": images}) for images in (smooth(1), smooth(1, 32)))
+    one, other = (encode_images({"image/c": images}) for images in (smooth(1), smooth(1, 32)))
     mixed = {name: np.concatenate([one[name], other[name]]) for name in one}
     with pytest.raises(InvalidInputError, match="expected one size"):
-        with_raw_images(mixed, max_bytes=10**6, where="answer")
+        decode_images(mixed, max_bytes=10**6, where="answer")
     with pytest.raises(LimitExceededError, match="2880 bytes when decoded"):
-        with_raw_images(one, max_bytes=2879, where="answer")
+        decode_images(one, max_bytes=2879, where="answer")

@@ -9,7 +9,7 @@ from pydantic import SecretStr
 
 from dextouch.serving.guard import ApiKey
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from dextouch.worlds.chunk_shortcut import ChunkShortcut
+from dextouch.worlds.routes import ChunkShortcut
 from tests.unit.worlds.fakes import SumWorld, actions
 
 START = {"world": "sum", "task": "stand_bottle", "seed": 3, "instruction": "stand it"}
@@ -34,7 +34,7 @@ class Counted(ChunkShortcut):
 @pytest.fixture
 async def served(monkeypatch):
     """An application whose shortcut has seen all queries, and its client."""
-    monkeypatch.setattr("dextouch.worlds.routes.ChunkShortcut", Counted)
+    monkeypatch.setattr("dextouch.worlds.app.ChunkShortcut", Counted)
     app = create_world_app({"sum": SumWorld()}, WorldServiceSettings(max_body_bytes=2**20))
     transport = ASGITransport(app, raise_app_exceptions=False)
     async with (

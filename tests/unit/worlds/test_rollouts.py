@@ -19,7 +19,7 @@ from dextouch.errors import (
 )
 from dextouch.schemas import MAX_SEED, ReturnSelector, RolloutStart, jpeg_images
 from dextouch.serving.state import MemoryState
-from dextouch.worlds import answers
+from dextouch.worlds import records
 from dextouch.worlds.rollouts import chunk_seed
 from tests.unit.worlds.begun import ALL, START, begin, decoded, service
 from tests.unit.worlds.fakes import (
@@ -258,7 +258,7 @@ async def test_many_jpeg_images_are_encoded_beside_the_event_loop(monkeypatch):
     selector = ReturnSelector(images="jpeg")
     await made.step(rollout_id, 0, actions(4), selector)
     assert set(threads) == {threading.get_ident()}
-    monkeypatch.setattr(answers, "MAX_INLINE_IMAGE_BYTES", 100)
+    monkeypatch.setattr(records, "MAX_INLINE_IMAGE_BYTES", 100)
     threads.clear()
     answer = decoded(await made.step(rollout_id, 1, actions(4), selector))
     assert threads

@@ -1,0 +1,142 @@
+"""Application that serves worlds over HTTP, in one process or several."""
+
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from functools import partial
+from typing import Any
+
+from fastapi import FastAPI
+from pydantic import Field, model_validator
+
+from dextouch.serving import (
+    ServiceSettings,
+    configure_logging,
+    create_service_app,
+    open_state,
+    run,
+    run_workers,
+    server_options,
+)
+from dextouch.worlds.openpi import openpi_router
+from dextouch.worlds.rollouts import Reopen, RolloutLimits, RolloutService
+from dextouch.worlds.routes import ChunkShortcut, rollout_router
+from dextouch.worlds.world import World
+
+
+class WorldServiceSettings(ServiceSettings):
+    """Settings of a service of worlds; subclass to add those of a world."""
+
+    state_url: str = Field(
+        default="memory://",
+        description="store of rollouts: memory:// or redis://HOST:PORT/DB",
+    )
+    limits: RolloutLimits = RolloutLimits()
+    workers: int = Field(
+        default=1, ge=1, le=64, description="processes on one port; more than one needs redis://"
+    )
+    drain_s: float = Field(
+        default=0.0,
+        ge=0,
+        le=600,
+        description="seconds after SIGTERM without new rollouts and not ready, before the port is "
+        "closed (of one process)",
+    )
+
+    @model_validator(mode="after")
+    def _workers_share_their_state(self) -> "WorldServiceSettings":
+        if self.workers > 1 and self.state_url == "memory://":
+            raise ValueError(
+                f"workers: got {self.workers} with state_url memory://, which each of them would "
+                "have for itself; set state_url to redis://HOST:PORT/DB"
+            )
+        return self
+
+
+def create_world_app(
+    worlds: Mapping[str, World[Any]],
+    settings: WorldServiceSettings,
+    *,
+    name: str = "worlds",
+    reopen: Reopen | None = None,
+    warm_up: bool = False,
+) -> FastAPI:
+    """Create the application; its shutdown ends the worlds' threads.
+
+    Args:
+        worlds: by name.
+        settings: of the service.
+        name: of the service.
+        reopen: opens a world by name and digest, for rollouts that began in an earlier one.
+        warm_up: compute a first chunk of each world before the application is ready.
+
+    Returns:
+        The application; `app.state.drain()` refuses new rollouts and makes it not ready.
+    """
+    store = open_state(settings.state_url)
+    service = RolloutService(worlds, store, settings.limits, reopen=reopen)
+    shortcut = ChunkShortcut(service)
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        if warm_up:
+            await service.warm_up()
+        yield
+        service.close()
+        await store.close()
+
+    async def readiness() -> list[str]:
+        await store.ping()
+        return ["shutdown"] if service.is_draining else []
+
+    app = create_service_app(
+        name=name,
+        settings=settings,
+        routers=[rollout_router(service, shortcut), openpi_router(service)],
+        lifespan=lifespan,
+        readiness=readiness,
+    )
+    app.state.shortcut = shortcut
+    app.state.drain = service.drain
+    app.state.registry.register(service.batches)
+    return app
+
+
+def serve_worlds(
+    open_worlds: Callable[[], Mapping[str, World[Any]]],
+    settings: WorldServiceSettings,
+    *,
+    name: str = "worlds",
+    reopen: Reopen | None = None,
+) -> None:
+    """Serve worlds until SIGINT or SIGTERM, with as many processes as the settings say.
+
+    Args:
+        open_worlds: picklable; called in each process.
+        settings: of the service.
+        name: of the service.
+        reopen: see create_world_app; picklable, too.
+    """
+    configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
+    create_app = partial(create_serving_app, open_worlds, settings, name, reopen)
+    if settings.workers == 1:
+        app = create_app()
+        run(app, settings, drain=app.state.drain, drain_s=settings.drain_s)
+        return
+    run_workers(
+        create_app,
+        host=settings.host,
+        port=settings.port,
+        num_workers=settings.workers,
+        options=server_options(settings, grace_s=settings.shutdown_grace_s),
+    )
+
+
+def create_serving_app(
+    open_worlds: Callable[[], Mapping[str, World[Any]]],
+    settings: WorldServiceSettings,
+    name: str,
+    reopen: Reopen | None = None,
+) -> FastAPI:
+    """The application of one of several processes, which computes a first chunk in each world."""
+    configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
+    return create_world_app(open_worlds(), settings, name=name, reopen=reopen, warm_up=True)
