@@ -1,5 +1,6 @@
 """Settings of world model training and serving, from flags and environment variables."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from pydantic import Field
@@ -262,24 +263,29 @@ def command_line(settings: TrainSettings) -> str:
             "state_every_cpu_s",
         },
     )
-    flags = [f"--episodes={_last_name(settings.episodes)}"]
+    flags = [f"--episodes={last_name(settings.episodes)}"]
     if settings.heldout is not None:
-        flags.append(f"--heldout={_last_name(settings.heldout)}")
+        flags.append(f"--heldout={last_name(settings.heldout)}")
     if settings.init is not None:
         flags.append(f"--init={settings.init.name}")
+    return " ".join(["dextouch train world-model", *flags, *flags_of(given)])
+
+
+def flags_of(given: Mapping[str, object], prefix: str = "") -> list[str]:
+    """Flags of a command for these settings; names of nested ones are joined by dots."""
+    flags: list[str] = []
     for name, value in given.items():
-        if isinstance(value, bool):
-            flags.append(f"--{_dashed(name)}" if value else f"--no-{_dashed(name)}")
-            continue
-        fields = value.items() if isinstance(value, dict) else [("", value)]
-        words = [(f"{name}.{field}" if field else name, number) for field, number in fields]
-        flags += [f"--{_dashed(word)}={number}" for word, number in words]
-    return " ".join(["dextouch train world-model", *flags])
+        flag = prefix + name.replace("_", "-")
+        if isinstance(value, Mapping):
+            flags += flags_of(value, f"{flag}.")
+        elif isinstance(value, bool):
+            flags.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            values = value if isinstance(value, list) else [value]
+            flags += [f"--{flag}={one}" for one in values]
+    return flags
 
 
-def _dashed(name: str) -> str:
-    return name.replace("_", "-")
-
-
-def _last_name(url: str) -> str:
+def last_name(url: str) -> str:
+    """Last component of a path or URL."""
     return url.rstrip("/").rsplit("/", 1)[-1]

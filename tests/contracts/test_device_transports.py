@@ -3,7 +3,7 @@
 import pytest
 
 from dextouch.errors import DeviceError
-from services.acquisition.mocks.ports import HID_RING_REPORTS, HidPort, PtyPort, SocketPort
+from services.acquisition.mocks.ports import HidPort, PtyPort, SocketPort
 
 PORTS = {"serial": PtyPort, "hid": HidPort, "socket": SocketPort}
 UNIT = bytes(range(64))
@@ -98,7 +98,7 @@ def test_hid_ring_drops_the_newest():
     port.plug()
     port.transport.open()
     taken = [port.send(bytes([number]) * 64) for number in range(80)]
-    assert taken == [True] * HID_RING_REPORTS + [False] * (80 - HID_RING_REPORTS)
+    assert taken == [True] * HidPort.max_reports + [False] * (80 - HidPort.max_reports)
     assert [port.transport.read()[0] for _ in range(63)] == list(range(63))
     assert port.transport.read() == b""
 
@@ -106,7 +106,7 @@ def test_hid_ring_drops_the_newest():
 def test_hid_write_counts_one_more():
     port = HidPort("mock", answer=lambda report: [report])
     port.plug()
-    assert port.device.write(UNIT) == 65
+    assert port.write(UNIT) == 65
     port.transport.open()
     port.transport.write(UNIT)
     assert port.transport.read() == UNIT

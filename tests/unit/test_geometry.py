@@ -164,6 +164,7 @@ def test_the_error_of_transforms_that_are_not_rigid():
     moved[3, 0] = 0.5
     assert transforms.rigid_error(stretched) == pytest.approx(0.0201)
     assert transforms.rigid_error(np.stack([T, moved])) == 0.5
+    assert transforms.rigid_error(np.zeros((0, 4, 4))) == 0.0
     for entry, value in (((0, 0), np.nan), ((0, 3), np.inf), ((2, 2), -1.0)):
         wrong = np.eye(4)
         wrong[entry] = value

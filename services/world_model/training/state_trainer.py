@@ -7,7 +7,6 @@ run resumes with the missing ones.
 import hashlib
 import multiprocessing
 import time
-from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +26,7 @@ from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.touch_codec import TouchCodec
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.training import RendererProgress, train_renderer
-from services.world_model.settings import StateTrainSettings
+from services.world_model.settings import StateTrainSettings, flags_of, last_name
 from services.world_model.state_checkpoints import (
     StateBounds,
     StateMetadata,
@@ -340,17 +339,5 @@ def _command(settings: StateTrainSettings) -> str:
     """Command that repeats a run; stores are given by their last path component."""
     left_out = {"output", "episodes", "jobs", "json_path"}
     given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
-    flags = [f"--episodes={url.rstrip('/').rsplit('/', 1)[-1]}" for url in settings.episodes]
-    return " ".join(["dextouch train state", *flags, *_flags("", given)])
-
-
-def _flags(prefix: str, given: Mapping[str, object]) -> list[str]:
-    found: list[str] = []
-    for name, value in given.items():
-        if isinstance(value, dict):
-            found += _flags(f"{prefix}{name}.", value)
-        elif isinstance(value, list):
-            found += [f"--{prefix}{name}={one}" for one in value]
-        else:
-            found.append(f"--{prefix}{name}={value}")
-    return found
+    flags = [f"--episodes={last_name(url)}" for url in settings.episodes]
+    return " ".join(["dextouch train state", *flags, *flags_of(given)])

@@ -39,14 +39,14 @@ def rigid_error(T: np.ndarray) -> float:
     """How far transforms [..., 4, 4] are from rigid ones: 0 for rotations with the row 0 0 0 1.
 
     The largest difference of RᵀR from the identity and of the last row; infinite for reflections
-    and where a value is not finite.
+    and where a value is not finite, 0 for no transforms.
     """
     T = np.asarray(T, dtype=np.float64)
     R = T[..., :3, :3]
     if not np.isfinite(T).all() or (np.linalg.det(R) < 0).any():
         return math.inf
-    off = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max()
-    return float(max(off, np.abs(T[..., 3, :] - [0.0, 0.0, 0.0, 1.0]).max()))
+    off = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(initial=0.0)
+    return float(np.abs(T[..., 3, :] - [0.0, 0.0, 0.0, 1.0]).max(initial=off))
 
 
 def apply(T_a_b: np.ndarray, points_b: np.ndarray) -> Float64[np.ndarray, "*batch 3"]:

@@ -11,7 +11,7 @@ from dextouch.serving.workers import DrainingServer
 
 def server(drains, drain_s, *, has_drain=True):
     drain = (lambda: drains.append(True)) if has_drain else None
-    return DrainingServer(uvicorn.Config(FastAPI()), drain=drain, drain_s=drain_s)
+    return DrainingServer(uvicorn.Config(FastAPI(), log_config=None), drain=drain, drain_s=drain_s)
 
 
 async def test_it_ends_after_its_time():

@@ -19,7 +19,7 @@ def test_train_then_show(toy_store, tmp_path, capsys):
         "network.tactile_width": 16, "network.num_layers": 1, "network.num_heads": 1,
         "network.codec_channels": 8, "windows.fit_windows": 8, "optimizer.batch": 2,
     }  # fmt: skip
-    arguments = [f"--{name}={value}" for name, value in flags.items()]
+    arguments = [f"--{name.replace('_', '-')}={value}" for name, value in flags.items()]
     assert run_train([*arguments]) == 0
     written = json.loads(report.read_text())
     assert written["steps"] == 3

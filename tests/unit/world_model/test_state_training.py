@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pydantic_settings import CliApp
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
+from dextouch.serving import load_settings
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore
 from services.world_model.dynamics.features import command_features
@@ -328,7 +328,7 @@ def test_the_command_in_a_checkpoint_can_be_typed_again():
     command = _command(settings)
     assert command.startswith("dextouch train state --episodes=takes --episodes=more ")
     assert "/" not in command
-    again = CliApp.run(TrainStateCommand, cli_args=command.split()[3:])
+    again = load_settings(TrainStateCommand, command.split()[3:])
     assert again.core.num_steps == 7
     assert again.core.weights.touch == 0.0
     assert again.tasks == ("press",)

@@ -187,7 +187,7 @@ def test_the_command_line_streams(toy_store, tmp_path, capsys):
         "network.codec_channels": 8, "windows.fit_windows": 8, "optimizer.batch": 2,
         "loader_workers": 0,
     }  # fmt: skip
-    arguments = [f"--{name}={value}" for name, value in flags.items()]
+    arguments = [f"--{name.replace('_', '-')}={value}" for name, value in flags.items()]
     assert run_train(["--streaming", *arguments]) == 0
     assert json.loads(report.read_text())["steps"] == 2
     command = read_checkpoint(output).metadata.command
