@@ -113,6 +113,14 @@ def test_a_damaged_index_costs_no_sample(store, folder, truth, name, place):
     check_salvaged(store, truth, {})
 
 
+@pytest.mark.parametrize("place", [-1, -20])
+def test_a_damaged_index_and_chunk_cost_that_chunk(store, folder, truth, place):
+    damage_chunk(folder, VIDEO, 1)
+    flip(shard_of(folder, VIDEO), place)
+    repair_group(store.root, "episode", ID)
+    check_salvaged(store, truth, {VIDEO: list(range(GOP_IMAGES, 2 * GOP_IMAGES))})
+
+
 @pytest.mark.parametrize(("name", "kept"), [(TOUCH, TOUCH_ROWS), (VIDEO, GOP_IMAGES), (STILLS, 1)])
 def test_of_a_truncated_file_the_front_is_kept(store, folder, truth, name, kept):
     index = store.open(ID)._contents.shard(name).check_index()

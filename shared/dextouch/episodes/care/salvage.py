@@ -33,7 +33,12 @@ from dextouch.episodes.format import (
 from dextouch.episodes.group_contents import hashed_bytes
 from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.episodes.journal import part_path, scan_rows
-from dextouch.episodes.shards import CRC_BYTES, ShardReader, decode_rows
+from dextouch.episodes.shards import (
+    CRC_BYTES,
+    INDEX_ENTRY_BYTES,
+    ShardReader,
+    decode_rows,
+)
 from dextouch.episodes.sources import LocalFile, LocalGroup
 from dextouch.episodes.spool_log import body_at, body_of, find_records, open_log, read_batch
 from dextouch.episodes.staged_group import new_stage
@@ -294,26 +299,35 @@ def _spooled(
 
 
 def _salvaged_index(source: LocalFile, entry: ArrayEntry) -> np.ndarray:
-    """(offset, length) of each storage chunk of a shard, (0, 0) of those that are lost.
+    """(offset, length) of each intact storage chunk of a shard, (0, 0) of the others.
 
-    Without a right index, storage chunks are found one after the other by their own headers, up to
-    the first damaged one.
+    Offsets come from the index where it is right, otherwise from the end of the chunk before, since
+    storage chunks are contiguous, and lengths then from the chunks' own headers.
     """
     num_chunks = -(-entry.shape[0] // entry.chunk_rows)
     if num_chunks > _MAX_CHUNKS:
         raise CorruptDataError(
             f"shard: got {num_chunks} storage chunks to look for, expected at most {_MAX_CHUNKS}"
         )
-    with suppress(CorruptDataError):
-        return ShardReader(source, entry, what="shard").check_index()
-    data, end = bytes(source.read(0, source.size() or 0)), 0
-    index = np.zeros((num_chunks, 2), dtype=np.uint64)
-    for number in range(num_chunks):
-        length = _chunk_bytes(data, end, entry)
-        if not length:
-            break
-        index[number], end = (end, length), end + length
-    return index
+    data = bytes(source.read(0, source.size() or 0))
+    limit = len(data) - num_chunks * INDEX_ENTRY_BYTES - CRC_BYTES
+    places = [[0, 0]] * num_chunks
+    if limit >= 0:
+        places = np.frombuffer(data, "<u8", 2 * num_chunks, limit).reshape(-1, 2).tolist()
+    found, sure, end, stuck, follows = [], 0, 0, -1, True
+    for offset, length in places:
+        place, is_inside = (offset, length), offset + length <= limit
+        # Behind a chunk that was found lies the next one: a cut index names others.
+        is_right = is_inside and (offset == sure if follows else offset > sure)
+        if not is_right or not _is_intact(data[offset : offset + length]):
+            place = (end, _chunk_bytes(data, end, entry) if end != stuck else 0)
+        follows = place[1] > 0
+        if follows:
+            sure = end = sum(place)
+        else:
+            place, stuck, end = (0, 0), end, max(end, offset + length if is_inside else 0)
+        found.append(place)
+    return np.array(found, dtype=np.uint64).reshape(-1, 2)
 
 
 def _is_intact(chunk: bytes) -> bool:
