@@ -69,7 +69,9 @@ class Service:
         self.start()
 
     def start(self):
+        # More chunks than a rollout takes on a fast machine.
         own = ("--digests", self.digests, "--port", self.port, "--state-url", self.redis_url)
+        own += ("--limits.max-chunks", 10**6)
         command = [sys.executable, "-m", "tests.system.sum_service", *own, *self.flags]
         environment = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'shared'}"}
         with self.log_path.open("ab") as log:
