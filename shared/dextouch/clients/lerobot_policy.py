@@ -23,7 +23,7 @@ from dextouch.hands.actions import ACTION_DIM
 from dextouch.schemas import Observation
 from dextouch.streams import pack_openpi, unpack_openpi
 
-# Features of exported datasets (docs/lerobot_export.md).
+# Features of exported datasets (docs/bridges.md).
 STATE: Final = "observation.state"
 TACTILE: Final = "observation.tactile"
 IMAGES: Final = "observation.images."
