@@ -12,7 +12,7 @@ from dextouch.errors import InvalidInputError
 from services.world_model.checkpoints import Checkpoint, paper_form_checkpoint, read_checkpoint
 from services.world_model.network.flow_matching import add_noise, sample, shift_time
 from services.world_model.network.inputs import PredictionRequest, build_inputs
-from services.world_model.network.model import JointWorldModel
+from services.world_model.network.model import JointWorldModel, stack_noise
 from services.world_model.world import ModelWorld
 
 STAGE = StageCells("world-model")
@@ -102,8 +102,7 @@ def _device(check: Check) -> None:
     )
     inputs = build_inputs([request, request], model.config)
     noise = model.noise(17, torch.Generator().manual_seed(0))
-    twice = type(noise)(noise.video.repeat(2, 1, 1, 1), noise.tactile.repeat(2, 1, 1, 1))
-    future = model.predict(inputs, twice)
+    future = model.predict(inputs, stack_noise([noise, noise]))
     px = model.config.image_px
     check.true("images on the weights' device", future.images.device.type == "meta")
     check.true("images of 16 steps", tuple(future.images.shape) == (2, 16, px, px, 3))

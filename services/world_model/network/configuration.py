@@ -1,5 +1,7 @@
 """Network configuration: shape and sampling of the joint model, stored in its checkpoint."""
 
+from typing import Literal
+
 from pydantic import Field, model_validator
 
 from dextouch.frozen_model import FrozenModel
@@ -12,7 +14,23 @@ class NetworkConfig(FrozenModel):
     patch_px: int = Field(default=8, description="side of a visual patch")
     max_steps: int = Field(default=17, ge=5, description="longest window: 1 + 4k steps")
     codec_channels: int = Field(default=48, ge=1, le=768, description="latents per visual patch")
-    palm_channels: int = Field(default=48, ge=1, le=240, description="latents per palm pad")
+    tokenizer: Literal["principal_axes", "split_hands", "grid"] = Field(
+        default="principal_axes",
+        description="tactile tokenizer; the learned ones need --tokenizer",
+    )
+    tactile_tokens: Literal["hand", "pad"] = Field(
+        default="hand", description="tactile tokens: one per hand, or with split_hands one per pad"
+    )
+    palm_channels: int = Field(
+        default=48, ge=1, le=240, description="latents per palm pad of principal_axes"
+    )
+    tactile_channels: int = Field(
+        default=192,
+        ge=6,
+        le=1920,
+        multiple_of=6,
+        description="latents per hand of split_hands and grid",
+    )
     video_width: int = Field(default=96, ge=8, description="width of the visual expert")
     tactile_width: int = Field(default=96, ge=8, description="width of the tactile expert")
     num_layers: int = Field(default=3, ge=1, description="layers of each expert")
@@ -39,6 +57,11 @@ class NetworkConfig(FrozenModel):
     def _sizes_fit(self) -> "NetworkConfig":
         if (self.max_steps - 1) % FRAMES_PER_LATENT:
             raise ValueError(f"max_steps: got {self.max_steps}, expected 1 + 4k")
+        if self.tactile_tokens == "pad" and self.tokenizer != "split_hands":
+            raise ValueError(
+                f"tactile_tokens: got pad with the tokenizer {self.tokenizer}, expected hand; "
+                "only split_hands has a token for each pad"
+            )
         if self.image_px % (2 * self.patch_px):
             raise ValueError(
                 f"image_px: got {self.image_px}, expected a multiple of {2 * self.patch_px} "

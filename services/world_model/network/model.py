@@ -21,7 +21,7 @@ from services.world_model.network.configuration import NetworkConfig, num_latent
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.joint_attention import JointLayer, clean_mask
 from services.world_model.network.tactile_expert import TactileExpert
-from services.world_model.network.tactile_tokenizer import TactileTokenizer
+from services.world_model.network.tokenizer_choice import build_tokenizer
 from services.world_model.network.video_expert import VideoExpert
 from services.world_model.network.visual_codec import VisualCodec, to_unit
 
@@ -33,7 +33,7 @@ class JointLatents:
     """Latents of both streams."""
 
     video: Float32[Tensor, "batch latents tokens channels"]
-    tactile: Float32[Tensor, "batch time 2 tactile_channels"]
+    tactile: Float32[Tensor, "batch time 2 tactile_tokens tactile_channels"]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class FirstLatents:
     """Clean latents of the first step of both streams: the context and the anchor."""
 
     video: Float32[Tensor, "batch tokens channels"]
-    tactile: Float32[Tensor, "batch 2 tactile_channels"]
+    tactile: Float32[Tensor, "batch 2 tactile_tokens tactile_channels"]
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,16 @@ class JointWorldModel(nn.Module):
         super().__init__()
         self.config = config
         self.codec = VisualCodec(config)
-        self.tokenizer = TactileTokenizer(config)
+        self.tokenizer = build_tokenizer(config).requires_grad_(requires_grad=False)
         self.normalizer = ActionNormalizer()
         self.register_buffer("video_residual_std", torch.ones(()))
         self.register_buffer("tactile_residual_std", torch.ones(()))
         self.video_condition = VideoCondition(config)
         self.tactile_condition = TactileCondition(config)
         self.video = VideoExpert(config)
-        self.tactile = TactileExpert(config, self.tokenizer.channels)
+        self.tactile = TactileExpert(
+            config, num_tokens=self.tokenizer.num_tokens, channels=self.tokenizer.channels
+        )
         self.layers = nn.ModuleList(
             JointLayer(VideoExpert.block(config), TactileExpert.block(config))
             for _ in range(config.num_layers)
@@ -123,14 +125,15 @@ class JointWorldModel(nn.Module):
         """Mask by which clean tokens (first latent frame and touch) attend to each other only."""
         per_latent = self.config.tokens_per_latent
         is_clean_video = torch.arange(num_latents(num_steps) * per_latent) < per_latent
-        is_clean_tactile = torch.arange(2 * num_steps) < 2
+        per_step = 2 * self.tokenizer.num_tokens
+        is_clean_tactile = torch.arange(num_steps * per_step) < per_step
         return clean_mask(torch.cat([is_clean_video, is_clean_tactile]))
 
     def noise(self, num_steps: int, generator: torch.Generator) -> JointLatents:
         """Noise for one chunk of one rollout; stack several for a batch."""
         config = self.config
         video = (num_latents(num_steps), config.tokens_per_latent, config.video_channels)
-        tactile = (num_steps, 2, self.tokenizer.channels)
+        tactile = (num_steps, 2, self.tokenizer.num_tokens, self.tokenizer.channels)
         return JointLatents(
             torch.randn(1, *video, generator=generator),
             torch.randn(1, *tactile, generator=generator),

@@ -16,17 +16,20 @@ from services.world_model.network.joint_attention import (
 
 
 class TactileExpert(nn.Module):
-    """Tactile stream: one token per hand and step; the first step is clean."""
+    """Tactile stream: the tokens of each step and hand, one or one per pad; the first is clean."""
 
-    def __init__(self, config: NetworkConfig, channels: int) -> None:
+    def __init__(self, config: NetworkConfig, *, num_tokens: int, channels: int) -> None:
         super().__init__()
         width = config.tactile_width
+        self._num_tokens = num_tokens
         self.embed = nn.Linear(2 * channels, width)
         self.hands = nn.Parameter(0.02 * torch.randn(2, width))
         self.steps = nn.Parameter(0.02 * torch.randn(config.max_steps, 1, width))
         self.modulate = nn.Sequential(nn.SiLU(), zero_linear(width, NUM_MODULATIONS * width))
         self.modulate_out = nn.Sequential(nn.SiLU(), zero_linear(width, 2 * width))
         self.predict = zero_linear(width, channels)
+        # A single token per hand needs no embedding of its pad.
+        self.pads = nn.Parameter(0.02 * torch.randn(num_tokens, width)) if num_tokens > 1 else None
 
     @staticmethod
     def block(config: NetworkConfig) -> ExpertBlock:
@@ -40,20 +43,31 @@ class TactileExpert(nn.Module):
 
     def start(
         self,
-        noisy: Float32[Tensor, "batch time 2 channels"],
-        first: Float32[Tensor, "batch 2 channels"],
+        noisy: Float32[Tensor, "batch time 2 tokens channels"],
+        first: Float32[Tensor, "batch 2 tokens channels"],
         condition: Float32[Tensor, "batch time 2 width"],
     ) -> Stream:
         """Tokens before the first layer; `noisy` is a residual, its first step zero."""
         both = torch.cat([noisy, first[:, None].expand_as(noisy)], dim=-1)
-        tokens = self.embed(both) + self.hands + self.steps[: noisy.shape[1]] + condition
-        modulation = split_axis(self.modulate(condition), -1, (NUM_MODULATIONS, -1))
-        return Stream(tokens.flatten(1, 2), modulation.flatten(1, 2))
+        steps = self.steps[: noisy.shape[1]]
+        # In this order, so that sums with one token per hand are those of older releases.
+        tokens = self.embed(both) + self.hands[:, None] + steps[:, None] + condition[..., None, :]
+        if self.pads is not None:
+            tokens = tokens + self.pads
+        modulation = self._for_each_token(self.modulate(condition))
+        modulation = split_axis(modulation, -1, (NUM_MODULATIONS, -1))
+        return Stream(tokens.flatten(1, 3), modulation.flatten(1, 3))
 
     def finish(
         self, stream: Stream, condition: Float32[Tensor, "batch time 2 width"]
-    ) -> Float32[Tensor, "batch time 2 channels"]:
+    ) -> Float32[Tensor, "batch time 2 tokens channels"]:
         """Predict the clean residual."""
-        tokens = split_axis(stream.tokens, 1, (condition.shape[1], 2))
-        shift, scale = self.modulate_out(condition).chunk(2, dim=-1)
+        tokens = split_axis(stream.tokens, 1, (condition.shape[1], 2, self._num_tokens))
+        shift, scale = self._for_each_token(self.modulate_out(condition)).chunk(2, dim=-1)
         return self.predict(modulated_norm(tokens, shift, scale))
+
+    def _for_each_token(
+        self, of_hand: Float32[Tensor, "batch time 2 width"]
+    ) -> Float32[Tensor, "batch time 2 tokens width"]:
+        """Repeat what all tokens of a hand share."""
+        return of_hand[..., None, :].expand(-1, -1, -1, self._num_tokens, -1)

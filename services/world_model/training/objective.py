@@ -50,9 +50,9 @@ def losses(
     )
     guess = model(inputs, first, noisy, t)
     video = (guess.video - target.video)[:, 1:].square().mean()
-    valid = (batch.tactile_valid & batch.tactile_valid[:, :1])[:, 1:, :, None].float()
+    valid = (batch.tactile_valid & batch.tactile_valid[:, :1])[:, 1:, :, None, None].float()
     error = (guess.tactile - target.tactile)[:, 1:].square() * valid
-    tactile = error.sum() / (valid.sum() * error.shape[-1]).clamp_min(1.0)
+    tactile = error.sum() / (valid.sum() * error.shape[-2:].numel()).clamp_min(1.0)
     return Losses(video, tactile)
 
 

@@ -6,7 +6,7 @@ import torch
 
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.principal_axes import principal_axes, root_scale
-from services.world_model.network.tactile_tokenizer import TactileTokenizer
+from services.world_model.network.principal_axes_tokenizer import PrincipalAxesTokenizer
 from services.world_model.network.visual_codec import VisualCodec, to_uint8, to_unit
 
 
@@ -78,7 +78,7 @@ def test_scales_stay_finite_without_any_signal():
 
 @pytest.fixture
 def tokenizer():
-    tokenizer = TactileTokenizer(NetworkConfig(palm_channels=240))
+    tokenizer = PrincipalAxesTokenizer(NetworkConfig(palm_channels=240))
     touch = 30 * torch.rand(64, 2, 320, generator=torch.Generator().manual_seed(1))
     tokenizer.fit(touch * (touch > 15))
     return tokenizer
@@ -100,7 +100,7 @@ def test_silent_and_saturated_touch_survive(tokenizer, pressure_kpa):
 def test_no_touch_is_the_zero_latent_and_suction_counts_as_none(tokenizer):
     assert (tokenizer.encode(torch.zeros(3, 320)) == 0).all()
     assert (tokenizer.encode(torch.full((3, 320), -2.0)) == 0).all()
-    assert (tokenizer.decode(torch.full((3, 320), -9.0)) >= 0).all()
+    assert (tokenizer.decode(torch.full((3, 1, 320), -9.0)) >= 0).all()
 
 
 def test_all_tips_share_one_encoder(tokenizer):
@@ -109,19 +109,19 @@ def test_all_tips_share_one_encoder(tokenizer):
         touch[finger, 16 * finger : 16 * (finger + 1)] = torch.arange(16.0)
     latents = tokenizer.encode(touch)
     for finger in range(5):
-        own = latents[finger, 16 * finger : 16 * (finger + 1)]
-        assert torch.equal(own, latents[0, :16])
+        own = latents[finger, 0, 16 * finger : 16 * (finger + 1)]
+        assert torch.equal(own, latents[0, 0, :16])
 
 
 def test_a_glove_that_never_felt_anything_can_be_fitted():
-    tokenizer = TactileTokenizer(NetworkConfig())
+    tokenizer = PrincipalAxesTokenizer(NetworkConfig())
     tokenizer.fit(torch.zeros(8, 2, 320))
     assert torch.isfinite(tokenizer.encode(torch.ones(2, 320))).all()
 
 
 def test_latents_below_zero_are_no_pressure(tiny_config):
-    tokenizer = TactileTokenizer(tiny_config)
-    latents = torch.zeros(2, tokenizer.channels)
-    latents[0, :80] = -3.0
-    latents[1, 80:] = -3.0
+    tokenizer = PrincipalAxesTokenizer(tiny_config)
+    latents = torch.zeros(2, 1, tokenizer.channels)
+    latents[0, 0, :80] = -3.0
+    latents[1, 0, 80:] = -3.0
     assert tokenizer.decode(latents).abs().max() == 0.0

@@ -1,0 +1,16 @@
+"""Tactile tokenizer of a network configuration."""
+
+from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.grid_tokenizer import GridTokenizer
+from services.world_model.network.principal_axes_tokenizer import PrincipalAxesTokenizer
+from services.world_model.network.split_hands import SplitHandsTokenizer
+from services.world_model.network.tactile_tokenizer import TactileTokenizer
+
+
+def build_tokenizer(config: NetworkConfig) -> TactileTokenizer:
+    """The tokenizer that the configuration names, with initial weights."""
+    if config.tokenizer == "split_hands":
+        return SplitHandsTokenizer(config)
+    if config.tokenizer == "grid":
+        return GridTokenizer(config)
+    return PrincipalAxesTokenizer(config)
