@@ -29,7 +29,7 @@ from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE, EARLY_POLICY
-from services.twin.tasks import TASK_NAMES
+from services.twin.tasks import EVALUATED
 
 PACKAGES = ("numpy", "torch", "mujoco")
 _SERVO = "colour servo=services.evaluation.policies.colour_servo:ColourServo"
@@ -65,7 +65,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="checkpoint of a world model trained without touch, as a baseline (none); once "
         "for all worlds, or once for each",
     )
-    parser.add_argument("--tasks", nargs="+", default=list(TASK_NAMES), help="(all of the twin)")
+    parser.add_argument("--tasks", nargs="+", default=list(EVALUATED), help="(%(default)s)")
     parser.add_argument(
         "--starts", type=int, help=f"starts per task ({_USUAL_STARTS}; quick {_QUICK_STARTS})"
     )

@@ -39,7 +39,7 @@ from services.twin.hands import DOMAINS, Domain
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import STREAM_CHOICES, PlayedActions, StreamChoice, TakeOptions
-from services.twin.tasks import TASK_NAMES
+from services.twin.tasks import EVALUATED, TASK_NAMES
 from services.twin.world import TwinWorld
 
 CAMERAS = ("camera_head",)
@@ -58,7 +58,7 @@ class Scope:
     last three.
     """
 
-    tasks: tuple[str, ...] = TASK_NAMES
+    tasks: tuple[str, ...] = EVALUATED
     domains: tuple[Domain, ...] = ("robot",)
     image_every: int = 1
     streams: StreamChoice = "training"
@@ -286,8 +286,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--store", required=True, help="folder of the episode store")
     add("--first", type=int, default=0, help="first seed (%(default)s)")
     add("--count", type=int, default=130, help="seeds per task (%(default)s)")
-    tasks = "comma-separated (default: all)"
-    add("--tasks", type=comma_separated, default=TASK_NAMES, help=tasks)
+    tasks = f"comma-separated (default: {','.join(EVALUATED)})"
+    add("--tasks", type=comma_separated, default=EVALUATED, help=tasks)
     add("--domains", type=comma_separated, default=("robot",), help="robot,human (robot)")
     mixes = parser.add_mutually_exclusive_group()
     kinds = "kinds of takes (%(default)s)"

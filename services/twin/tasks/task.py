@@ -69,7 +69,10 @@ class Task(Protocol):
         ...
 
     def succeeded(self, simulation: Simulation) -> bool:
-        """Whether the task is done now: objects in pose, at rest, and no hand touching them."""
+        """Whether the task is done now: objects in pose and at rest.
+
+        No hand touches them, unless the task is to hold them.
+        """
         ...
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:

@@ -11,7 +11,16 @@ from services.twin.tasks import TASK_NAMES, get_task
 SEED = 3
 
 
-@pytest.fixture(scope="module", params=TASK_NAMES)
+# Tasks that share their code with another one are recorded by the slow run only.
+ALIKE = ("lift_empty_can", "move_can_right")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(name, marks=[pytest.mark.slow] if name in ALIKE else []) for name in TASK_NAMES
+    ],
+)
 def stage(request):
     return Stage(request.param, "robot", TwinSettings())
 
