@@ -20,6 +20,7 @@ _PACKAGES = {
     "prometheus_client jinja2 websockets",
     "align": "scipy numba",
     "model": "torch safetensors PIL",
+    "full": "diffusers transformers",
     "twin": "mujoco",
     "gym": "gymnasium",
     "export": "pyarrow mcap foxglove_schemas_protobuf numcodecs",
@@ -83,11 +84,13 @@ def examine() -> list[Finding]:
         findings.append(Finding(f"{package} ({purpose})", answer, ok=there, do=hint))
     free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
     redis = shutil.which("redis-server") or "no: rollouts are kept in memory"
+    full = "yes" if importlib.util.find_spec("diffusers") else f"no: {install_hint('diffusers')}"
     libusb = ctypes.util.find_library("usb-1.0") or "no: trackers by link usb need it"
     findings += [
         Finding("free disk", f"{free_gb:.1f} GB", ok=free_gb > 2, do="free at least 2 GB"),
         Finding("redis-server (optional)", redis),
         Finding("libusb (optional)", libusb),
+        Finding("diffusers (optional, the full-size world model)", full),
     ]
     for pattern in ("ttyACM*", "ttyUSB*", "hidraw*", "video*"):
         found = [_with_access(path) for path in sorted(Path("/dev").glob(pattern))]

@@ -1,0 +1,174 @@
+"""Strict loading of pretrained weights from a local folder into networks built without memory.
+
+Files are safetensors in the original or in diffusers' layout, whole or sharded. Names, shapes and
+the memory needed are checked from the files' headers before any weight is read. Nothing is ever
+downloaded.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from safetensors import SafetensorError, safe_open
+from torch import Tensor, nn
+
+from dextouch.errors import (
+    CorruptDataError,
+    InvalidInputError,
+    NotFoundError,
+)
+from services.networks.memory import check_memory, memory_of
+from services.networks.weight_files import refuse_non_finite
+from services.world_model.wan.renaming import Layout, Rules, renamed
+
+_INDEX_SUFFIX: Final = ".safetensors.index.json"
+_CONVERT: Final = (
+    "load the .pth file with torch.load(..., weights_only=True) once and store it with "
+    "safetensors.torch.save_file"
+)
+
+
+@dataclass(frozen=True)
+class StoredWeights:
+    """Weight files of one network; `shapes` by the names in the files."""
+
+    files: tuple[Path, ...]
+    shapes: Mapping[str, tuple[int, ...]]
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of the files."""
+        return sum(file.stat().st_size for file in self.files)
+
+
+def find_weights(folder: Path, *, stem: str, where: str) -> StoredWeights:
+    """Find the weights of a network in a folder and read their headers.
+
+    Args:
+        folder: local folder.
+        stem: beginning of the file names, such as `diffusion_pytorch_model`.
+        where: context for error messages.
+
+    Raises:
+        NotFoundError: no such folder or file, or a shard is missing.
+        CorruptDataError: a damaged index or header, or a tensor in two files.
+        InvalidInputError: only pickled weights.
+    """
+    files = _files(folder, stem, where)
+    shapes: dict[str, tuple[int, ...]] = {}
+    for file in files:
+        try:
+            with safe_open(file, framework="pt") as opened:
+                for name in opened.keys():  # noqa: SIM118
+                    if name in shapes:
+                        raise CorruptDataError(f"{where}: {name} is in more than one file")
+                    shapes[name] = tuple(opened.get_slice(name).get_shape())
+        except SafetensorError as error:
+            raise CorruptDataError(
+                f"{where}: {file.name} is not a safetensors file ({error}); copy it again"
+            ) from error
+    return StoredWeights(files, shapes)
+
+
+def load_weights(
+    network: nn.Module,
+    stored: StoredWeights,
+    rules: Rules,
+    *,
+    where: str,
+    max_bytes: int | None = None,
+) -> None:
+    """Load a network in place, in the precision of its parameters; it may be on the meta device.
+
+    Args:
+        network: its parameters are replaced; non-persistent buffers stay as they are.
+        stored: from `find_weights`.
+        rules: names of its tensors in both layouts.
+        where: context for error messages.
+        max_bytes: limit of memory for the weights; None for the memory that is available.
+
+    Raises:
+        InvalidInputError: missing or unexpected tensors, or wrong shapes.
+        LimitExceededError: the network needs more memory.
+        NonFiniteError: weights that are NaN or infinite.
+    """
+    expected = network.state_dict()
+    names = _checked_names(stored, expected, rules, where)
+    check_memory(memory_of(expected), where=where, max_bytes=max_bytes)
+    tensors: dict[str, Tensor] = {}
+    with ExitStack() as stack:
+        for file in stored.files:
+            opened = stack.enter_context(safe_open(file, framework="pt"))
+            for name in opened.keys():  # noqa: SIM118
+                tensor = opened.get_tensor(name)
+                refuse_non_finite({name: tensor}, where)
+                tensors[names[name]] = tensor.to(expected[names[name]].dtype)
+    network.load_state_dict(tensors, assign=True)
+
+
+def layout_of(stored: StoredWeights, expected: Mapping[str, Any], rules: Rules) -> Layout:
+    """Layout that shares more names with the files."""
+    original = set(renamed(expected, rules, to="original").values())
+    more = len(original & stored.shapes.keys()) > len(expected.keys() & stored.shapes.keys())
+    return "original" if more else "diffusers"
+
+
+def _files(folder: Path, stem: str, where: str) -> tuple[Path, ...]:
+    if not folder.is_dir():
+        raise NotFoundError(f"{where}: no folder {folder}; give the folder of the downloaded model")
+    index = folder / f"{stem}{_INDEX_SUFFIX}"
+    if index.is_file():
+        shards = _shards(index, where)
+        absent = [name for name in shards if not (folder / name).is_file()]
+        if absent:
+            raise NotFoundError(
+                f"{where}: {len(absent)} of {len(shards)} files are missing in {folder} "
+                f"({absent[0]}); copy the whole model"
+            )
+        return tuple(folder / name for name in shards)
+    found = sorted(folder.glob(f"{stem}*.safetensors"))
+    if found:
+        return tuple(found)
+    if pickled := sorted(folder.glob("*.pth")):
+        raise InvalidInputError(
+            f"{where}: {pickled[0].name} is a pickle, which can run code when it is read; expected "
+            f"{stem}*.safetensors: {_CONVERT}, or use the diffusers layout of the model"
+        )
+    raise NotFoundError(f"{where}: no {stem}*.safetensors in {folder}; copy the whole model")
+
+
+def _shards(index: Path, where: str) -> Sequence[str]:
+    try:
+        files = sorted(set(json.loads(index.read_text())["weight_map"].values()))
+    except (json.JSONDecodeError, KeyError, AttributeError, TypeError) as error:
+        raise CorruptDataError(f"{where}: {index.name} is unreadable ({error!r})") from error
+    if any(Path(name).name != name for name in files):
+        raise CorruptDataError(f"{where}: {index.name} names files outside its folder")
+    return files
+
+
+def _checked_names(
+    stored: StoredWeights, expected: Mapping[str, Tensor], rules: Rules, where: str
+) -> dict[str, str]:
+    """Name in the network of each stored tensor, after all were compared."""
+    names = {name: name for name in expected}
+    if layout_of(stored, expected, rules) == "original":
+        names = {theirs: ours for ours, theirs in renamed(expected, rules, to="original").items()}
+    missing = sorted(names.keys() - stored.shapes.keys())
+    foreign = sorted(stored.shapes.keys() - names.keys())
+    if missing or foreign:
+        raise InvalidInputError(
+            f"{where}: {len(missing)} tensors missing {missing[:3]}, {len(foreign)} unexpected "
+            f"{foreign[:3]}; expected exactly the {len(names)} of its configuration"
+        )
+    for name, shape in stored.shapes.items():
+        wanted = tuple(expected[names[name]].shape)
+        if shape != wanted:
+            raise InvalidInputError(
+                f"{where}: {name} has shape {shape}, expected {wanted}; the folder holds a model "
+                "of another size"
+            )
+    return names

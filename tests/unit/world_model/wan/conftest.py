@@ -1,0 +1,37 @@
+"""Tiny Wan2.2 networks with random weights: every part of the full size, small enough for tests."""
+
+import pytest
+import torch
+from diffusers import AutoencoderKLWan, WanTransformer3DModel
+
+from services.world_model.wan.configuration import WanConfig
+
+LAYERS, HEADS, HEAD_WIDTH = 2, 2, 12
+
+
+@pytest.fixture(scope="session")
+def wan_config():
+    return WanConfig(
+        ffn_width=32, time_width=16, text_width=32, text_tokens=12, vae_width=3,
+        vae_decoder_width=4, vae_blocks=1, precision="float32",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def transformer(wan_config):
+    """Random everywhere; diffusers starts biases and norms at zero and one."""
+    sizes = wan_config.transformer_sizes(num_layers=LAYERS, num_heads=HEADS, head_width=HEAD_WIDTH)
+    return shaken(WanTransformer3DModel(**sizes), seed=0)
+
+
+@pytest.fixture(scope="session")
+def autoencoder(wan_config):
+    return shaken(AutoencoderKLWan(**wan_config.autoencoder_sizes()), seed=1)
+
+
+def shaken(network, seed):
+    torch.manual_seed(seed)
+    network.eval().requires_grad_(requires_grad=False)
+    for parameter in network.parameters():
+        parameter.add_(0.1 * torch.randn(parameter.shape))
+    return network

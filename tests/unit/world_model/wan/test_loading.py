@@ -1,0 +1,156 @@
+"""Loading pretrained weights from local folders."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from dextouch.errors import (
+    CorruptDataError,
+    InvalidInputError,
+    LimitExceededError,
+    NonFiniteError,
+    NotFoundError,
+)
+from services.networks import memory
+from services.world_model.wan.configuration import WanConfig
+from services.world_model.wan.loading import find_weights, load_weights
+from services.world_model.wan.networks import empty_autoencoder, empty_transformer
+from services.world_model.wan.renaming import (
+    TRANSFORMER_RULES,
+    autoencoder_rules,
+    renamed,
+)
+
+STEM = "diffusion_pytorch_model"
+
+
+TINY = {"num_layers": 2, "num_heads": 2, "head_width": 12}
+
+
+@pytest.fixture
+def empty(wan_config):
+    return empty_transformer(wan_config, **TINY)
+
+
+def _store(folder, network, rules=None):
+    tensors = network.state_dict()
+    if rules is not None:
+        names = renamed(tensors, rules, to="original")
+        tensors = {names[name]: tensor for name, tensor in tensors.items()}
+    folder.mkdir(exist_ok=True)
+    save_file(tensors, folder / f"{STEM}.safetensors")
+    return folder
+
+
+def _load(network, folder, **options):
+    load_weights(
+        network,
+        find_weights(folder, stem=STEM, where="video expert"),
+        TRANSFORMER_RULES,
+        where="video expert",
+        **options,
+    )
+
+
+@pytest.mark.parametrize("rules", [None, TRANSFORMER_RULES], ids=["diffusers", "original"])
+def test_both_layouts_load_strictly_without_a_random_start(tmp_path, transformer, empty, rules):
+    _load(empty, _store(tmp_path, transformer, rules))
+    loaded = empty.state_dict()
+    assert all(torch.equal(loaded[n], t) for n, t in transformer.state_dict().items())
+
+
+def test_the_autoencoder_loads_from_its_original_names(tmp_path, autoencoder, wan_config):
+    rules = autoencoder_rules(wan_config.vae_blocks)
+    _store(tmp_path, autoencoder, rules)
+    empty = empty_autoencoder(wan_config)
+    load_weights(empty, find_weights(tmp_path, stem=STEM, where="vae"), rules, where="vae")
+    loaded = empty.state_dict()
+    assert all(torch.equal(loaded[n], t) for n, t in autoencoder.state_dict().items())
+
+
+def test_shards_written_by_diffusers_load(tmp_path, transformer, empty):
+    transformer.save_pretrained(tmp_path, max_shard_size="50KB")
+    assert len(list(tmp_path.glob("*.safetensors"))) > 2
+    _load(empty, tmp_path)
+    assert torch.equal(empty.proj_out.weight, transformer.proj_out.weight)
+    next(iter(tmp_path.glob("*-00002-*"))).unlink()
+    with pytest.raises(NotFoundError, match=r"1 of .* files are missing"):
+        find_weights(tmp_path, stem=STEM, where="video expert")
+
+
+def test_weights_take_the_precision_of_the_network_but_norms_and_times_stay_float32(
+    tmp_path, transformer, wan_config
+):
+    empty = empty_transformer(wan_config.model_copy(update={"precision": "bfloat16"}), **TINY)
+    _load(empty, _store(tmp_path, transformer))
+    # Checked in the published checkpoint as loaded by diffusers with torch_dtype=bfloat16.
+    kept = {name for name, tensor in empty.state_dict().items() if tensor.dtype == torch.float32}
+    time = "condition_embedder.time_embedder.linear_"
+    assert kept == {
+        "scale_shift_table",
+        *(f"{time}{n}.{part}" for n in (1, 2) for part in ("weight", "bias")),
+        *(f"blocks.{n}.scale_shift_table" for n in (0, 1)),
+        *(f"blocks.{n}.norm2.{part}" for n in (0, 1) for part in ("weight", "bias")),
+    }
+    assert empty.blocks[0].attn1.to_q.weight.dtype == torch.bfloat16
+
+
+def test_what_does_not_belong_to_the_network_is_named(tmp_path, transformer, wan_config):
+    _store(tmp_path, transformer)
+    deeper = empty_transformer(wan_config, **TINY | {"num_layers": 3})
+    wider = empty_transformer(wan_config.model_copy(update={"ffn_width": 48}), **TINY)
+    with pytest.raises(InvalidInputError, match=r"27 tensors missing \['blocks\.2"):
+        _load(deeper, tmp_path)
+    with pytest.raises(InvalidInputError, match=r"ffn\.net\.\S+ has shape \(.*expected \("):
+        _load(wider, tmp_path)
+
+
+def test_weights_that_do_not_fit_are_refused_before_they_are_read(
+    tmp_path, transformer, empty, monkeypatch
+):
+    _store(tmp_path, transformer)
+    needed = sum(4 * tensor.numel() for tensor in transformer.state_dict().values())
+    with pytest.raises(LimitExceededError, match="GB of memory"):
+        _load(empty, tmp_path, max_bytes=needed - 1)
+    assert empty.proj_out.weight.is_meta
+    monkeypatch.setattr(memory, "available_memory", lambda: needed - 1)
+    with pytest.raises(LimitExceededError, match="GB of memory"):
+        _load(empty, tmp_path)
+    _load(empty, tmp_path, max_bytes=needed)
+    assert not empty.proj_out.weight.is_meta
+
+
+def test_the_full_size_needs_ten_gigabytes():
+    network = empty_transformer(WanConfig(), num_layers=30, num_heads=24, head_width=128)
+    # Two bytes each, and two more for time embedding (256 + 3072 + 2) x 3072, thirty affine norms
+    # 2 x 3072, thirty tables 6 x 3072 and the last 2 x 3072.
+    kept = (256 + 3072 + 2 + 30 * 2 + 30 * 6 + 2) * 3072
+    assert memory.memory_of(network.state_dict()) == 2 * 4_999_787_712 + 2 * kept
+
+
+def test_damaged_pickled_and_absent_files_are_told_apart(tmp_path, transformer, empty):
+    with pytest.raises(NotFoundError, match="no folder"):
+        find_weights(tmp_path / "none", stem=STEM, where="video expert")
+    with pytest.raises(NotFoundError, match=r"no diffusion_pytorch_model\*\.safetensors"):
+        find_weights(tmp_path, stem=STEM, where="video expert")
+    (tmp_path / "Wan2.2_VAE.pth").write_bytes(b"pickle")
+    with pytest.raises(InvalidInputError, match="can run code"):
+        find_weights(tmp_path, stem=STEM, where="video expert")
+    (tmp_path / f"{STEM}.safetensors").write_bytes(b"\x00" * 64)
+    with pytest.raises(CorruptDataError, match="not a safetensors file"):
+        find_weights(tmp_path, stem=STEM, where="video expert")
+    index = tmp_path / f"{STEM}.safetensors.index.json"
+    index.write_text(json.dumps({"weight_map": {"a": "../elsewhere.safetensors"}}))
+    with pytest.raises(CorruptDataError, match="outside its folder"):
+        find_weights(tmp_path, stem=STEM, where="video expert")
+    index.write_text("[]")
+    with pytest.raises(CorruptDataError, match="unreadable"):
+        find_weights(tmp_path, stem=STEM, where="video expert")
+    index.unlink()
+    broken = {name: tensor.clone() for name, tensor in transformer.state_dict().items()}
+    broken["proj_out.bias"][3] = float("nan")
+    save_file(broken, tmp_path / f"{STEM}.safetensors")
+    with pytest.raises(NonFiniteError, match=r"proj_out\.bias"):
+        _load(empty, tmp_path)
