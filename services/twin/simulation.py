@@ -161,6 +161,13 @@ class Simulation:
             touching[hand[met], thing[met]] = True
         return touching
 
+    def hand_contacts_m(self, object_index: int) -> Float64[np.ndarray, "contacts 3"]:
+        """World positions of the contacts between the hands and one of the task's objects."""
+        geoms = self.data.contact.geom[: self.data.ncon]
+        with_hand = (self.scene.geom_hand[geoms] >= 0).any(axis=1)
+        with_object = (self.scene.geom_object[geoms] == object_index).any(axis=1)
+        return np.array(self.data.contact.pos[: self.data.ncon][with_hand & with_object])
+
     def hand_touches(self, object_index: int) -> bool:
         """Whether any part of a hand is in contact with one object."""
         return bool(self.hand_contacts()[:, object_index].any())

@@ -21,7 +21,8 @@ from services.twin.tasks.task import REST_SPEED
 
 Goal = Literal["up", "left", "right"]
 
-_RADIUS_M, _HALF_LENGTH_M, _BAND_HALF_M = 0.025, 0.075, 0.012
+CAN_RADIUS_M: Final = 0.025
+_HALF_LENGTH_M, _BAND_HALF_M = 0.075, 0.012
 # Grasp height above the can's centre, to keep the hand clear of the table.
 _GRIP_M: Final = 0.025
 _MAT_HALF_M: Final = (0.055, 0.055, 0.0005)
@@ -31,9 +32,9 @@ _COLOURS: Final = {
     "mat_left": "0.34 0.16 0.62 1",
     "mat_right": "0.10 0.52 0.30 1",
 }
-_GRASPS: Final[dict[Domain, CylinderGrasp]] = {
-    "robot": CylinderGrasp(_RADIUS_M, 0.035, -0.095, 0.45, 0.40, 0.0, 0.2),
-    "human": CylinderGrasp(_RADIUS_M, 0.039, -0.105, 0.45, 0.40, 0.0, 0.2),
+CAN_GRASPS: Final[dict[Domain, CylinderGrasp]] = {
+    "robot": CylinderGrasp(CAN_RADIUS_M, 0.035, -0.095, 0.45, 0.40, 0.0, 0.2),
+    "human": CylinderGrasp(CAN_RADIUS_M, 0.039, -0.105, 0.45, 0.40, 0.0, 0.2),
 }
 _SQUEEZE_N: Final = 8.0
 _OPEN_M: Final = 0.022
@@ -43,9 +44,22 @@ _PUSH_M: Final = 0.004
 # Success: height of the raised can and its lean; distance from the mat's centre, so that the whole
 # can stands on the mat.
 _LIFTED_M, _RAISED_M, _MIN_UPRIGHT = 0.03, 0.08, 0.90
-_ASIDE_M: Final = _MAT_HALF_M[0] - _RADIUS_M
+_ASIDE_M: Final = _MAT_HALF_M[0] - CAN_RADIUS_M
 _OVER_M, _STANDING_M, _STANDING_UPRIGHT = 0.06, 0.006, 0.985
 _MATS: Final[dict[Goal, int]] = {"left": 1, "right": 2}
+
+
+def can_mjcf(half_length_m: float, mass_kg: float) -> str:
+    """A can with a band near its top; its frame is in its middle, z up."""
+    band_z = half_length_m - 2 * _BAND_HALF_M
+    return (
+        '<body name="can"><freejoint/><geom name="can_wall" class="object" type="cylinder" '
+        f'mass="{mass_kg!r}" size="{numbers((CAN_RADIUS_M, half_length_m))}" '
+        f'rgba="{_COLOURS["can"]}"/><geom name="can_band" class="object" type="cylinder" '
+        f'contype="0" conaffinity="0" mass="0" pos="0 0 {band_z!r}" '
+        f'size="{numbers((CAN_RADIUS_M + 0.0005, _BAND_HALF_M))}" rgba="{_COLOURS["band"]}"/>'
+        "</body>"
+    )
 
 
 @dataclass(frozen=True)
@@ -76,15 +90,7 @@ class CanTask:
             f'pos="0 0 {_MAT_HALF_M[2]!r}" rgba="{_COLOURS[name]}"/></body>'
             for name in self.object_names[1:]
         )
-        band_z = _HALF_LENGTH_M - 2 * _BAND_HALF_M
-        return (
-            '<body name="can"><freejoint/><geom name="can_wall" class="object" type="cylinder" '
-            f'mass="{self.mass_kg!r}" size="{numbers((_RADIUS_M, _HALF_LENGTH_M))}" '
-            f'rgba="{_COLOURS["can"]}"/><geom name="can_band" class="object" type="cylinder" '
-            f'contype="0" conaffinity="0" mass="0" pos="0 0 {band_z!r}" '
-            f'size="{numbers((_RADIUS_M + 0.0005, _BAND_HALF_M))}" rgba="{_COLOURS["band"]}"/>'
-            f"</body>{mats}"
-        )
+        return can_mjcf(_HALF_LENGTH_M, self.mass_kg) + mats
 
     def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "3 7"]:
         """Can in the middle, ±3 cm; mats behind it on the left and on the right, ±2 cm."""
@@ -104,7 +110,7 @@ class CanTask:
         noise: tuple[WaypointNoise, WaypointNoise],
     ) -> list[Waypoint]:
         """Approach, close, lift as in every task of the four; then hold, or carry and set down."""
-        grasp = _GRASPS[domain]
+        grasp = CAN_GRASPS[domain]
         open_hand = opened(grasp, domain, gap_m=_OPEN_M)
         press = pressing(grasp, domain, force_n=_SQUEEZE_N)
         R_axis = grasp.axis_rotation()

@@ -8,6 +8,7 @@ from services.twin.tasks.insert_peg import InsertPeg
 from services.twin.tasks.open_drawer import OpenDrawer
 from services.twin.tasks.place_phone import PlacePhone
 from services.twin.tasks.place_shoes import PlaceShoes
+from services.twin.tasks.regrasp_can import RegraspCan
 from services.twin.tasks.stack_bowls import StackBowls
 from services.twin.tasks.stand_bottle import StandBottle
 from services.twin.tasks.task import Task
@@ -22,6 +23,7 @@ _TASKS: Final[dict[str, Task]] = {
         PlacePhone(),
         OpenDrawer(),
         *CAN_TASKS,
+        RegraspCan(),
     )
 }
 TASK_NAMES: Final = tuple(_TASKS)
