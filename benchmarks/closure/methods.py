@@ -6,18 +6,10 @@ from typing import Final, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from benchmarks.closure.touch_anchor import anchored_joints, touch_shares
 from benchmarks.closure.touch_commands import (
     HandCommands,
     HandServos,
     commands_from_touch,
-)
-from benchmarks.closure.wrist_transfer import (
-    MatchedPoints,
-    constant_offset_m,
-    matched_points,
-    shifted_wrist,
-    touch_offsets_m,
 )
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import HandTrajectory
@@ -25,6 +17,14 @@ from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile import pad_forces_n
 from dextouch.tactile.layout import SIDES, Side
 from services.alignment.retargeting import HandRetargeter
+from services.alignment.retargeting.touch_anchor import anchored_joints, touch_shares
+from services.alignment.retargeting.wrist_transfer import (
+    MatchedPoints,
+    constant_offset_m,
+    matched_points,
+    shifted_wrist,
+    touch_offsets_m,
+)
 from services.alignment.synchronization.resampling import (
     GridPlacement,
     grid_times_ns,

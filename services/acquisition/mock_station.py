@@ -87,6 +87,7 @@ def build_mocks(
     seed: int,
     clock: StationClock,
     links: MockLinks | None = None,
+    unit_seed: int | None = None,
 ) -> list[MockPair]:
     """The mock devices that a set of streams needs.
 
@@ -96,6 +97,7 @@ def build_mocks(
         seed: of noise, calibration and faults.
         clock: of the station.
         links: how the devices are connected, and their protocols.
+        unit_seed: of the devices' own offsets and gains; default: the seed.
 
     Raises:
         InvalidInputError: two streams of one name, or none that any device sends.
@@ -105,7 +107,9 @@ def build_mocks(
         raise InvalidInputError("mock station: two streams of the same name")
 
     def place(name: str, stream: str) -> MockPlace:
-        return MockPlace(name, named[stream], faults.of(name), seed, clock, links.trackers)
+        return MockPlace(
+            name, named[stream], faults.of(name), seed, clock, links.trackers, unit_seed
+        )
 
     pairs = []
     for side in SIDES:
@@ -187,6 +191,8 @@ class MockStation:
         calibration: matrices beyond the gloves' and the path delays (such as `K_head`).
         links: how the devices are connected, and their protocols.
         safety: of the spool.
+        unit_seed: of the devices' own offsets and gains, and of what the station knows of path
+            delays; stations with one value have the same devices. Default: the seed.
     """
 
     def __init__(  # noqa: PLR0913 - all but the first four have a sensible default
@@ -201,8 +207,12 @@ class MockStation:
         calibration: Mapping[str, Matrix] | None = None,
         links: MockLinks | None = None,
         safety: SpoolSafety | None = None,
+        unit_seed: int | None = None,
     ) -> None:
-        self.pairs = build_mocks(streams, faults=faults, seed=seed, clock=clock, links=links)
+        unit_seed = seed if unit_seed is None else unit_seed
+        self.pairs = build_mocks(
+            streams, faults=faults, seed=seed, clock=clock, links=links, unit_seed=unit_seed
+        )
         self._clock = clock
         self._seed = seed
         # One round of all streams: the last sample and one period of its stream.
@@ -212,7 +222,7 @@ class MockStation:
             drivers=[pair.driver for pair in self.pairs],
             spool_root=spool_root,
             clock=clock,
-            calibration={**_known_of(self.pairs, seed), **(calibration or {})},
+            calibration={**_known_of(self.pairs, unit_seed), **(calibration or {})},
             safety=safety,
         )
         self._players: list[tuple[threading.Thread, Waiter]] = []

@@ -1,12 +1,19 @@
 """Options of an alignment, such as the rate of its action grid."""
 
+from typing import Literal
+
 from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
 
+WristChoice = Literal["tracked", "touch"]
+
 
 class AlignmentOptions(FrozenModel):
-    """Options of one alignment; they are part of the episode's identity."""
+    """Options of one alignment; they are part of the episode's identity.
+
+    A `wrist` as tracked is not written, so that ids of episodes of earlier versions remain.
+    """
 
     model_rate_hz: float = Field(default=15.0, gt=0, le=1000, description="rate of the model grid")
     max_gap_ms: float = Field(
@@ -17,6 +24,12 @@ class AlignmentOptions(FrozenModel):
     )
     min_num_steps: int = Field(
         default=17, ge=2, description="shortest gap-free interval that becomes an episode"
+    )
+    wrist: WristChoice = Field(
+        default="tracked",
+        exclude_if=lambda wrist: wrist == "tracked",
+        description="poses of human wrists and fingertips: as tracked, or moved so that the "
+        "robot's hand touches where the person's did",
     )
 
     @property

@@ -4,6 +4,9 @@ The data set covers the factors that decide success: errors of a few millimetres
 stop or never start, retreats, pushes, slipping grasps, wandering hands, and actions of another
 scene. `--mix` selects their shares. With `--policy` every episode is a rollout of that policy in
 the twin instead. Interrupted runs resume: existing episodes are kept.
+
+Human takes are recorded like those of a person: the twin's hands are played to mock devices, whose
+packets go through the drivers, the recorder and alignment to actions of the robot.
 """
 
 import argparse
@@ -19,7 +22,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any, Final, Literal, TypeVar, get_args
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -27,14 +30,15 @@ from pydantic import TypeAdapter, ValidationError
 from dextouch.clients import Policy, PolicyStart
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.errors import ConflictError, DeviceError, InvalidInputError, UnknownNameError
 from dextouch.schemas import RolloutStart
+from dextouch.serving import configure_logging
 from services.evaluation.policies.asking import action_chunk, ask
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.progress import Progress
 from services.twin.data_mix import MIXES, Mix, options_of
 from services.twin.demonstrators import NUM_GRID_STEPS
-from services.twin.episodes import episode_id, record, write_episode
+from services.twin.episodes import TruthEpisode, episode_id, record, write_episode
 from services.twin.hands import DOMAINS, Domain
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
@@ -45,6 +49,9 @@ from services.twin.world import TwinWorld
 CAMERAS = ("camera_head",)
 DEFAULT_MIX = "evaluator"
 MAX_LABEL = 32
+# How a take becomes an episode: written as it is, or by devices, drivers, recorder and alignment.
+TakePath = Literal["direct", "devices"]
+TAKE_PATHS: Final[tuple[TakePath, ...]] = get_args(TakePath)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -55,13 +62,19 @@ class Scope:
     """Tasks, domains, images and streams to record.
 
     Images are recorded at the grid steps (15 Hz) that are multiples of `image_every`, and at the
-    last three.
+    last three. Without a `path` robots are written directly and humans by devices: the actions of a
+    human take that is written directly are the joint angles of a human hand.
     """
 
     tasks: tuple[str, ...] = EVALUATED
     domains: tuple[Domain, ...] = ("robot",)
     image_every: int = 1
     streams: StreamChoice = "training"
+    path: TakePath | None = None
+
+    def path_of(self, domain: Domain) -> TakePath:
+        """The path of the takes of a domain."""
+        return self.path or ("devices" if domain == "human" else "direct")
 
     def __post_init__(self) -> None:
         for task in self.tasks:
@@ -103,12 +116,14 @@ class Order:
     options: TakeOptions
     store: str
     policy: PolicyChoice | None = None
+    path: TakePath = "direct"
 
     @property
     def episode_id(self) -> str:
         """Id of the episode, known before it is recorded."""
         played = None if self.policy is None else self.policy.label
-        return episode_id(self.task, self.domain, self.seed, self.options, played=played)
+        name = episode_id(self.task, self.domain, self.seed, self.options, played=played)
+        return name if self.path == "direct" else f"{name}-{self.path}"
 
 
 @dataclass(frozen=True)
@@ -163,19 +178,38 @@ def _played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
     return PlayedActions(choice.label, np.concatenate(rows), command)
 
 
+def _recorded(order: Order, options: TakeOptions) -> TruthEpisode:
+    stage = stage_of(order.task, order.domain)
+    if order.policy is None:
+        return record(stage, order.seed, options)
+    played = _played_by(order.policy, stage, order.seed)
+    return record(stage, order.seed, options, played=played)
+
+
+def _write_directly(order: Order) -> TruthEpisode:
+    episode = _recorded(order, order.options)
+    write_episode(EpisodeStore(order.store), episode)
+    return episode
+
+
+def _write_by_devices(order: Order) -> TruthEpisode:
+    # Loads the compiled solver of retargeting.
+    from services.cli.device_takes import device_options, write_through_devices
+
+    episode = _recorded(order, device_options(order.options))
+    write_through_devices(
+        EpisodeStore(order.store), episode, episode_id=order.episode_id, options=order.options
+    )
+    return episode
+
+
 def make_episode(order: Order) -> Answer:
     """Record one episode and write it to its store."""
-    stage = stage_of(order.task, order.domain)
     try:
-        if order.policy is None:
-            episode = record(stage, order.seed, order.options)
-        else:
-            played = _played_by(order.policy, stage, order.seed)
-            episode = record(stage, order.seed, order.options, played=played)
-        write_episode(EpisodeStore(order.store), episode)
+        episode = _write_directly(order) if order.path == "direct" else _write_by_devices(order)
     except ConflictError:
         return Answer(order.episode_id)
-    except InvalidInputError as error:
+    except (InvalidInputError, DeviceError) as error:
         return Answer(order.episode_id, refusal=error.message)
     return Answer(order.episode_id, bool(episode.attributes.success))
 
@@ -200,8 +234,8 @@ def make_training_data(
         policy: policy that acts instead of the scripts; `mix` is then ignored.
 
     Returns:
-        Numbers of episodes `made`, `kept` and `refused` (the physics diverged, or the policy
-        failed), and of those made, how many `succeeded`.
+        Numbers of episodes `made`, `kept` and `refused` (the physics diverged, the policy failed,
+        or the take could not be aligned), and of those made, how many `succeeded`.
 
     Raises:
         InvalidInputError: no seeds, tasks or domains, or a policy with human hands.
@@ -224,7 +258,10 @@ def make_training_data(
             options = replace(
                 made, images=CAMERAS, image_every=scope.image_every, streams=scope.streams
             )
-            orders += [Order(task, one, seed, options, store, policy) for one in scope.domains]
+            orders += [
+                Order(task, domain, seed, options, store, policy, scope.path_of(domain))
+                for domain in scope.domains
+            ]
     missing = [order for order in orders if order.episode_id not in present]
     counts = {"made": 0, "kept": len(orders) - len(missing), "succeeded": 0, "refused": 0}
     started_s = time.monotonic()
@@ -256,12 +293,21 @@ def in_processes(
     with ExitStack() as stack:
         # Spawned, not forked: threads and locks of the caller must not be copied half-way.
         pool = stack.enter_context(
-            ProcessPoolExecutor(min(num_jobs, len(items)), multiprocessing.get_context("spawn"))
+            ProcessPoolExecutor(
+                min(num_jobs, len(items)),
+                multiprocessing.get_context("spawn"),
+                initializer=log_warnings,
+            )
         )
         # If the caller stops, pending items are cancelled.
         stack.callback(pool.shutdown, wait=False, cancel_futures=True)
         for future in as_completed([pool.submit(function, item) for item in items]):
             yield future.result()
+
+
+def log_warnings() -> None:
+    """Log no more than warnings: a take has a dozen events."""
+    configure_logging(service="train_data", log_format="auto", level="warning")
 
 
 def comma_separated(text: str) -> tuple[str, ...]:
@@ -289,6 +335,8 @@ def _parser() -> argparse.ArgumentParser:
     tasks = f"comma-separated (default: {','.join(EVALUATED)})"
     add("--tasks", type=comma_separated, default=EVALUATED, help=tasks)
     add("--domains", type=comma_separated, default=("robot",), help="robot,human (robot)")
+    path = "write takes as they are, or by devices and alignment (robot: direct, human: devices)"
+    add("--path", choices=TAKE_PATHS, help=path)
     mixes = parser.add_mutually_exclusive_group()
     kinds = "kinds of takes (%(default)s)"
     mixes.add_argument("--mix", choices=list(MIXES), default=DEFAULT_MIX, help=kinds)
@@ -313,7 +361,10 @@ def main(argv: Sequence[str]) -> int:
     arguments = _parser().parse_args(list(argv))
     seeds = range(arguments.first, arguments.first + max(0, arguments.count))
     mix = MIXES[arguments.mix].changed(miss=arguments.miss_fraction, still=arguments.still_fraction)
-    scope = Scope(arguments.tasks, arguments.domains, arguments.images, arguments.streams)
+    scope = Scope(
+        arguments.tasks, arguments.domains, arguments.images, arguments.streams, arguments.path
+    )
+    log_warnings()
     policy = arguments.policy and PolicyChoice.parse(arguments.policy, arguments.policy_arguments)
     counts = make_training_data(
         arguments.store, seeds, mix, num_jobs=arguments.jobs, scope=scope, policy=policy

@@ -3,21 +3,21 @@
 import numpy as np
 import pytest
 
-from benchmarks.closure.touch_anchor import (
-    TouchAnchorOptions,
-    anchored_joints,
-    fingertip_jacobians,
-    touch_shares,
-)
 from benchmarks.closure.touch_commands import (
     HandServos,
     commands_from_touch,
     pressing_forces_n,
 )
-from benchmarks.closure.wrist_transfer import MatchedPoints, robot_places_m
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert, transform
 from dextouch.hands.robot_hand import RobotHand
+from services.alignment.retargeting.touch_anchor import (
+    TouchAnchorOptions,
+    anchored_joints,
+    fingertip_jacobians,
+    touch_shares,
+)
+from services.alignment.retargeting.wrist_transfer import MatchedPoints, robot_places_m
 
 SIDES = ("left", "right")
 SERVOS = HandServos(finger_nm_rad=1.2, wrist_n_m=700.0, wrist_nm_rad=15.0)

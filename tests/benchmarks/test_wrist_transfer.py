@@ -5,7 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.closure.wrist_transfer import (
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry import apply, transform
+from dextouch.geometry.rotations import rotation_from_vector
+from dextouch.hands import NODE_INDEX
+from dextouch.hands.robot_hand import RobotHand
+from services.alignment.retargeting import HandRetargeter
+from services.alignment.retargeting.wrist_transfer import (
     MatchedPoints,
     WristTransferOptions,
     constant_offset_m,
@@ -14,12 +20,6 @@ from benchmarks.closure.wrist_transfer import (
     shifted_wrist,
     touch_offsets_m,
 )
-from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from dextouch.geometry import apply, transform
-from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.hands import NODE_INDEX
-from dextouch.hands.robot_hand import RobotHand
-from services.alignment.retargeting import HandRetargeter
 from services.twin.hands import HumanHand
 
 NUM = 40

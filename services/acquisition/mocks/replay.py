@@ -99,6 +99,8 @@ class MockPlace:
         seed: of everything random.
         clock: of the station.
         link: of a tracker.
+        unit_seed: of the offsets and gains of this very device, the same in every take; None: the
+            seed.
     """
 
     name: str
@@ -107,6 +109,7 @@ class MockPlace:
     seed: int
     clock: StationClock
     link: Literal["hid", "bridge"] = "hid"
+    unit_seed: int | None = None
 
     @property
     def side(self) -> Side:

@@ -9,10 +9,12 @@ from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
 from dextouch.streams import StreamDescriptor
+from dextouch.tactile import pad_forces_n
 from services.alignment.options import AlignmentOptions
 from services.alignment.synchronization.grid_actions import (
     COMMANDED_STREAMS,
     REQUIRED,
+    TOUCH_STREAMS,
     GridActions,
     GriddedStreams,
     make_actions,
@@ -84,7 +86,7 @@ def build_episode(
     stretch = _find_stretch(recording, streams, options, on_progress)
     on_progress(progress_within("retargeting", 0.0))
     source, gridded = recording.attributes, stretch.gridded
-    actions = make_actions(gridded, source.domain, source.calibration)
+    actions = make_actions(gridded, source.domain, source.calibration, wrist=options.wrist)
     on_progress(progress_within("writing", 0.0))
     grid_ns = gridded.grid_ns - gridded.grid_ns[0]
     written = [
@@ -114,11 +116,16 @@ def _find_stretch(
     """Load the streams that actions are made of and choose the longest stretch that all share."""
     attributes = recording.attributes
     where = f"recording {attributes.recording_id!r}"
-    names = [n for n in (*REQUIRED[attributes.domain], *COMMANDED_STREAMS) if n in streams]
+    wanted = [*REQUIRED[attributes.domain], *COMMANDED_STREAMS]
+    if attributes.domain == "human" and options.wrist == "touch":
+        wanted += TOUCH_STREAMS
+    names = [name for name in wanted if name in streams]
     parts = {}
     for number, name in enumerate(names):
         on_progress(progress_within("placing", number / len(names), name))
-        parts[name] = _seen(streams[name].load())
+        # Pressures of an hour do not fit in memory, the forces of its pads do.
+        of = pad_forces_n if name in TOUCH_STREAMS else np.asarray
+        parts[name] = _seen(streams[name].load(of))
     empty = [name for name, stream in parts.items() if len(stream.t_ns) < 2]
     if empty:
         raise InvalidInputError(f"{where}: streams {empty} hold fewer than two usable samples")

@@ -2,17 +2,21 @@
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
 from dextouch.hands.actions import AnchorPoses, HandTrajectory, actions_from_poses
+from dextouch.hands.robot_hand import RobotHand
 from dextouch.schemas import Domain, Matrix
 from dextouch.tactile.layout import SIDES, Side
+from services.alignment.options import WristChoice
 from services.alignment.retargeting import HandRetargeter, RetargetResult, RetargetStatus
 from services.alignment.retargeting.hand_profile import calibrated_profile
+from services.alignment.retargeting.touch_transfer import transfer_by_touch
 from services.alignment.retargeting.wrist_frame import hand_axes_check
+from services.alignment.retargeting.wrist_transfer import NUM_PADS
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import (
     GridPlacement,
@@ -26,6 +30,7 @@ NS_PER_S = 1e9
 MAX_CHECKED = 2000
 POSE_STREAMS = ("wrist_left", "wrist_right", "head")
 COMMANDED_STREAMS = ("joints_commanded", "wrist_left_commanded", "wrist_right_commanded")
+TOUCH_STREAMS = ("tactile_left", "tactile_right")
 REQUIRED: Mapping[Domain, tuple[str, ...]] = {
     "human": (*POSE_STREAMS, "keypoints_left", "keypoints_right"),
     "robot": (*POSE_STREAMS, "joints_measured"),
@@ -34,7 +39,10 @@ REQUIRED: Mapping[Domain, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class GriddedStreams:
-    """Streams that actions are computed from, and the placement of the grid among their samples."""
+    """Streams that actions are computed from, and the placement of the grid among their samples.
+
+    The values of `TOUCH_STREAMS`, if there are any, are the forces (N) of the hand's pads.
+    """
 
     grid_ns: Int64[np.ndarray, " n"]
     streams: Mapping[str, LoadedStream]
@@ -49,8 +57,8 @@ class GriddedStreams:
         """Transforms of a pose stream at the steps."""
         return poses_on_grid(self.streams[name].values, self.at[name])
 
-    def vectors(self, name: str) -> Float64[np.ndarray, "n 40"]:
-        """Joint angles (rad) of a stream at the steps."""
+    def vectors(self, name: str) -> Float64[np.ndarray, "n ..."]:
+        """Values of a stream, such as joint angles (rad), at the steps."""
         return vectors_on_grid(self.streams[name].values, self.at[name])
 
 
@@ -78,11 +86,16 @@ def place_streams(
 
 
 def make_actions(
-    gridded: GriddedStreams, domain: Domain, calibration: Mapping[str, Matrix]
+    gridded: GriddedStreams,
+    domain: Domain,
+    calibration: Mapping[str, Matrix],
+    *,
+    wrist: WristChoice = "tracked",
 ) -> GridActions:
     """Measured and, where recorded, commanded actions, all relative to the measured first step.
 
-    Human hands are retargeted, a robot's joints taken as they are.
+    Human hands are retargeted, a robot's joints taken as they are. `wrist` says where the robot's
+    wrists are that stand for human ones.
     """
     left, right, head = (gridded.poses(name) for name in POSE_STREAMS)
     if domain == "human":
@@ -91,6 +104,9 @@ def make_actions(
         joints_rad, quality = gridded.vectors("joints_measured"), {}
     by_side = np.split(joints_rad, 2, axis=1)
     trajectory = HandTrajectory(left, right, by_side[0], by_side[1], head)
+    if domain == "human" and wrist == "touch":
+        trajectory, offsets = _moved_by_touch(gridded, trajectory)
+        quality |= offsets
     anchor = trajectory.anchor(0)
     commanded = None
     if all(name in gridded.streams for name in COMMANDED_STREAMS):
@@ -100,6 +116,34 @@ def make_actions(
         wanted = HandTrajectory(left, right, by_side[0], by_side[1], head)
         commanded = actions_from_poses(wanted, anchor)
     return GridActions(anchor, actions_from_poses(trajectory, anchor), commanded, quality)
+
+
+def _moved_by_touch(
+    gridded: GriddedStreams, tracked: HandTrajectory
+) -> tuple[HandTrajectory, dict[str, float]]:
+    """The trajectory with wrists and touching fingertips moved, and each wrist's mean offset."""
+    t_s = (gridded.grid_ns - gridded.grid_ns[0]).astype(np.float64) / NS_PER_S
+    moved: dict[str, np.ndarray] = {}
+    figures: dict[str, float] = {}
+    for side in SIDES:
+        name = f"tactile_{side}"
+        forces = np.zeros((len(t_s), NUM_PADS))
+        if name in gridded.streams:
+            # Beyond the first or last sample, forces are extrapolated.
+            forces = np.maximum(gridded.vectors(name), 0.0)
+        hand = transfer_by_touch(
+            RobotHand(side),
+            getattr(tracked, f"Ts_world_wrist_{side}"),
+            getattr(tracked, f"joints_{side}_rad"),
+            keypoints_m=gridded.vectors(f"keypoints_{side}"),
+            pad_forces_n=forces,
+            t_s=t_s,
+        )
+        moved |= {f"Ts_world_wrist_{side}": hand.Ts_world_wrist}
+        moved |= {f"joints_{side}_rad": hand.joints_rad}
+        offset_mm = np.linalg.norm(hand.offset_m, axis=1).mean() * 1e3
+        figures[f"retargeting_{side}_wrist_offset_mm"] = float(offset_mm)
+    return replace(tracked, **moved), figures
 
 
 def retarget_hands(

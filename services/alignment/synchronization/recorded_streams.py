@@ -105,11 +105,14 @@ class DatedStream:
                 raw = raw[part - start]
             yield Block(t_ns[low : low + rows], self.convert(raw))
 
-    def load(self) -> LoadedStream:
-        """All samples at once: for the streams that actions are made of."""
-        pieces = [piece.values for piece in self.pieces()]
+    def load(self, of: Conversion = np.asarray) -> LoadedStream:
+        """All samples at once, or a function `of` them: for the streams that actions are made of.
+
+        The descriptor remains that of the samples.
+        """
+        pieces = [of(piece.values) for piece in self.pieces()]
         empty = np.empty((0, *self.descriptor.shape), dtype=self.descriptor.numpy_dtype())
-        values = np.concatenate(pieces) if pieces else empty
+        values = np.concatenate(pieces) if pieces else of(empty)
         return LoadedStream(self.descriptor, self.t_ns, values)
 
 

@@ -9,6 +9,7 @@ from services.acquisition.devices.tactile_glove.mock import GloveCalibration
 from services.acquisition.mock_station import LATENCY_SIGMA_MS
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
+from services.cli import mock_takes
 from services.cli.demo import recording
 from tests.unit.bridges.takes import write_episode
 
@@ -18,7 +19,7 @@ SEED = 3
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     streams = pattern_streams(1.0)
-    return recording.measure_gloves(streams, tmp_path_factory.mktemp("spool"), seed=SEED)
+    return mock_takes.measure_gloves(streams, tmp_path_factory.mktemp("spool"), seed=SEED)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -31,7 +32,7 @@ def test_tare_and_gain_are_close_to_the_gloves_own_but_measured(measured, side):
     assert 0 < np.abs(tare - truth.tare_counts).max() <= 0.5
     errors = gain[wired] / truth.gain_counts_per_kpa[wired] - 1
     # The pressures were known to 1 %, and are the same for all taxels.
-    assert 0 < abs(errors.mean()) <= 3 * recording.PRESSURE_SIGMA
+    assert 0 < abs(errors.mean()) <= 3 * mock_takes.PRESSURE_SIGMA
     assert errors.std() <= 0.002
 
 
@@ -48,7 +49,7 @@ def test_path_delays_are_measured_and_not_what_the_script_states(measured, side)
 
 def test_without_gloves_nothing_is_measured(tmp_path):
     streams = [s for s in pattern_streams(1.0) if s.descriptor.kind != "tactile"]
-    assert recording.measure_gloves(streams, tmp_path, seed=SEED) == {}
+    assert mock_takes.measure_gloves(streams, tmp_path, seed=SEED) == {}
 
 
 def test_the_take_carries_what_was_measured_and_not_the_gloves_own(tmp_path, monkeypatch):

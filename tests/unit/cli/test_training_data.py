@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError, UnknownNameError
-from services.cli import training_data
+from dextouch.errors import ClockFitError, InvalidInputError, UnknownNameError
+from services.cli import device_takes, training_data
 from services.cli.training_data import PolicyChoice, Scope, make_training_data
 from services.twin.data_mix import MIXES, Mix, options_of
 
@@ -129,16 +129,39 @@ def test_an_episode_that_cannot_be_made_is_told_and_the_others_go_on(tmp_path, c
     assert "0 made, 0 kept, 0 succeeded, 2 refused" in told
 
 
-def test_human_hands_and_named_tasks(tmp_path, capsys):
+def test_human_hands_pass_the_devices_unless_written_directly(tmp_path, capsys):
     summary = tmp_path / "counts.json"
     argv = ["--tasks", "stack_bowls", "--domains", "human", "--exact", "--images", "20"]
-    store = ["--store", str(tmp_path / "store"), "--count", "1", "--json", str(summary)]
-    assert training_data.main([*argv, *store]) == 0
+    argv += ["--store", str(tmp_path / "store"), "--count", "1", "--json", str(summary)]
+    assert training_data.main([*argv, "--jobs", "1"]) == 0
     assert json.loads(summary.read_text())["made"] == 1
-    (name,) = EpisodeStore(tmp_path / "store").list()
-    assert name == "twin-stack_bowls-human-000000-i20-training"
-    assert "action_commanded" not in EpisodeStore(tmp_path / "store").open(name).streams
+    assert training_data.main([*argv, "--path", "direct"]) == 0
+    store = EpisodeStore(tmp_path / "store")
+    direct, devices = (store.open(name) for name in store.list())
+    assert direct.attributes.episode_id == "twin-stack_bowls-human-000000-i20-training"
+    assert devices.attributes.episode_id == f"{direct.attributes.episode_id}-devices"
+    assert set(devices.streams) == set(direct.streams)
+    assert "action_commanded" not in devices.streams
+    # Joint angles of a human hand, and of the robot's hand that does the same.
+    q_human, q_robot = (one.read("action").values[:, 18:58] for one in (direct, devices))
+    assert np.abs(q_human - q_robot[: len(q_human)]).max() > 0.1
+    # A second run keeps both.
+    assert training_data.main([*argv, "--path", "devices"]) == 0
+    assert json.loads(summary.read_text()) == {"made": 0, "kept": 1, "succeeded": 0, "refused": 0}
     capsys.readouterr()
+
+
+def test_a_human_take_that_cannot_be_aligned_is_told(tmp_path, capsys, monkeypatch):
+    def refuse(*_, **__):
+        raise ClockFitError("stream 'head': stamps fit no clock")
+
+    monkeypatch.setattr(device_takes, "build_episode", refuse)
+    argv = ["--store", str(tmp_path), "--count", "1", "--tasks", "open_drawer", "--exact"]
+    assert training_data.main([*argv, "--domains", "human", "--jobs", "1"]) == 1
+    told = capsys.readouterr().out
+    assert "stamps fit no clock" in told
+    assert "1 refused" in told
+    assert EpisodeStore(tmp_path).list() == []
 
 
 def test_unknown_tasks_and_policies_for_human_hands_are_refused(tmp_path, capsys):

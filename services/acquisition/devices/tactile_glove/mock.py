@@ -131,7 +131,8 @@ def mock_glove(
         worn_side: which hand it says it is, if it is the wrong one.
     """
     name, side = place.name, place.side
-    glove = calibration or GloveCalibration.seeded(side, place.seed)
+    unit_seed = place.seed if place.unit_seed is None else place.unit_seed
+    glove = calibration or GloveCalibration.seeded(side, unit_seed)
     told: Side = worn_side or side
     source = TactileGloveSource(
         place.stream,

@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from benchmarks.closure.wrist_transfer import MatchedPoints
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
+from services.alignment.retargeting.wrist_transfer import MatchedPoints
 
 # A few steps converge to micrometres; unreachable positions take more.
 _ITERATIONS: Final = 15
