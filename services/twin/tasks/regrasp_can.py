@@ -24,7 +24,7 @@ _WALL_COLOUR: Final = "0.16 0.20 0.34 1"
 _HIGH_M, _LOW_M = 0.165, 0.095
 _SQUEEZE_N: Final = 8.0
 _OPEN_M: Final = 0.022
-_LIFT_M: Final = 0.105
+_LIFT_M: Final = 0.120
 _PUSH_M: Final = 0.003
 # The can is set down on this side of the stand.
 _ASIDE_M: Final = np.array([-0.15, -0.01, 0.0])
