@@ -4,7 +4,7 @@ from torch import nn
 
 class WanTransformer3DModel(nn.Module):
     patch_embedding: nn.Conv3d
-    condition_embedder: nn.Module
+    condition_embedder: Any
     blocks: nn.ModuleList
     norm_out: nn.Module
     proj_out: nn.Linear

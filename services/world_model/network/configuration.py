@@ -5,12 +5,21 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from dextouch.frozen_model import FrozenModel
+from services.world_model.wan.configuration import (
+    LATENT_CHANNELS,
+    SPATIAL_FACTOR,
+    WanConfig,
+)
 
 
 class NetworkConfig(FrozenModel):
     """Shape and sampling of the joint model; stored in every checkpoint."""
 
-    image_px: int = Field(default=64, ge=16, le=256, description="side of the square head image")
+    video_expert: Literal["tiny", "wan"] = Field(
+        default="tiny",
+        description="video expert and codec: small ones, or Wan2.2 from --wan.folder",
+    )
+    image_px: int = Field(default=64, ge=16, le=1024, description="side of the square head image")
     patch_px: int = Field(default=8, description="side of a visual patch")
     max_steps: int = Field(default=17, ge=5, description="longest window: 1 + 4k steps")
     codec_channels: int = Field(default=48, ge=1, le=768, description="latents per visual patch")
@@ -52,6 +61,7 @@ class NetworkConfig(FrozenModel):
     )
     sampling_steps: int = Field(default=2, ge=1, le=64, description="Euler steps per chunk")
     model_rate_hz: float = Field(default=15.0, gt=0, description="steps per second")
+    wan: WanConfig | None = Field(default=None, description="sizes of Wan2.2 for its video expert")
 
     @model_validator(mode="after")
     def _sizes_fit(self) -> "NetworkConfig":
@@ -67,6 +77,28 @@ class NetworkConfig(FrozenModel):
                 f"image_px: got {self.image_px}, expected a multiple of {2 * self.patch_px} "
                 "(tokens of two patches by two)"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _wan_fits(self) -> "NetworkConfig":
+        if (self.video_expert == "wan") != (self.wan is not None):
+            raise ValueError(
+                f"wan: got {'sizes' if self.wan else 'none'} with video_expert "
+                f"{self.video_expert}, expected them for wan only"
+            )
+        expected = {
+            "patch_px": SPATIAL_FACTOR,
+            "codec_channels": LATENT_CHANNELS,
+            "video_width": self.num_heads * self.head_width,
+            "use_pose_raster": False,
+        }
+        others = {
+            name: (getattr(self, name), value)
+            for name, value in expected.items()
+            if getattr(self, name) != value
+        }
+        if self.wan is not None and others:
+            raise ValueError(f"video_expert wan: got other sizes (got, expected): {others}")
         return self
 
     @property

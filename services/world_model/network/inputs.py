@@ -6,6 +6,7 @@ tensors, so that training and serving treat a window identically.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -74,6 +75,7 @@ class ModelInputs:
     raster: Float32[Tensor, "batch time 2 cells cells"]
     commanded: Float32[Tensor, " batch"]
     words: Int64[Tensor, "batch max_words"]
+    instructions: tuple[str, ...]
 
     @property
     def num_steps(self) -> int:
@@ -85,7 +87,11 @@ class ModelInputs:
 
     def to(self, device: torch.device) -> "ModelInputs":
         """Copy to a device."""
-        return ModelInputs(**{name: tensor.to(device) for name, tensor in vars(self).items()})
+        moved: dict[str, Any] = {
+            name: value.to(device) if isinstance(value, Tensor) else value
+            for name, value in vars(self).items()
+        }
+        return ModelInputs(**moved)
 
 
 def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -> ModelInputs:
@@ -115,6 +121,7 @@ def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -
         raster=torch.from_numpy(raster),
         commanded=torch.tensor([float(_is_commanded(r.action_kind)) for r in requests]),
         words=torch.stack([hash_words(r.instruction, config.num_word_buckets) for r in requests]),
+        instructions=tuple(r.instruction for r in requests),
     )
 
 

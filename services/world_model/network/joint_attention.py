@@ -4,24 +4,32 @@ Mixture-of-Transformers: each stream has its own projections, norms, modulation 
 network; only the attention is shared, over the tokens of both.
 """
 
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor, nn
 from torch.nn import functional
 
 from services.world_model.network.axes import split_axis
+from services.world_model.network.rotary import rotate
 
 NUM_MODULATIONS = 6
 
 
 @dataclass(frozen=True)
 class Stream:
-    """Tokens of one expert with the modulation of each: shift, scale and gate, twice."""
+    """Tokens of one expert with their modulation: shift, scale and gate, twice.
 
-    tokens: Float32[Tensor, "batch tokens width"]
-    modulation: Float32[Tensor, "batch tokens 6 width"]
+    `modulation` is that of each token, or of each latent frame for the pretrained video expert,
+    whose tokens also attend to `text`. `turn` has the angles of rotary positions, where used.
+    """
+
+    tokens: Float[Tensor, "batch tokens width"]
+    modulation: Float[Tensor, "batch groups 6 width"]
+    turn: Float32[Tensor, "tokens angles"] | None = None
+    text: Float[Tensor, "batch words width"] | None = None
 
 
 def clean_mask(
@@ -34,13 +42,31 @@ def clean_mask(
     return ~is_clean[:, None] | is_clean[None, :]
 
 
-class ExpertBlock(nn.Module):
+class Block(nn.Module, ABC):
     """One expert's part of a layer, before and after the shared attention."""
+
+    @abstractmethod
+    def queries_keys_values(
+        self, stream: Stream
+    ) -> tuple[
+        Float[Tensor, "batch heads tokens head_width"],
+        Float[Tensor, "batch heads tokens head_width"],
+        Float[Tensor, "batch heads tokens head_width"],
+    ]:
+        """Queries, keys and values for the shared attention."""
+
+    @abstractmethod
+    def finish(self, stream: Stream, attended: Float[Tensor, "batch tokens inner"]) -> Stream:
+        """Add the output of the attention, then that of the feed-forward network."""
+
+
+class ExpertBlock(Block):
+    """Block of an expert that is trained from scratch."""
 
     def __init__(self, *, width: int, num_heads: int, head_width: int, ffn_ratio: int) -> None:
         super().__init__()
         inner = num_heads * head_width
-        self.num_heads = num_heads
+        self.num_heads, self.head_width = num_heads, head_width
         self.to_qkv = nn.Linear(width, 3 * inner)
         self.to_out = nn.Linear(inner, width)
         # Normalized queries and keys bound the attention logits.
@@ -56,29 +82,33 @@ class ExpertBlock(nn.Module):
     def queries_keys_values(
         self, stream: Stream
     ) -> tuple[
-        Float32[Tensor, "batch heads tokens head_width"],
-        Float32[Tensor, "batch heads tokens head_width"],
-        Float32[Tensor, "batch heads tokens head_width"],
+        Float[Tensor, "batch heads tokens head_width"],
+        Float[Tensor, "batch heads tokens head_width"],
+        Float[Tensor, "batch heads tokens head_width"],
     ]:
         """Queries, keys and values for the shared attention."""
         shift, scale, *_ = (stream.modulation + self.modulation).unbind(dim=2)
         normed = modulated_norm(stream.tokens, shift, scale)
-        heads = split_axis(self.to_qkv(normed), -1, (3, self.num_heads, -1))
+        heads = split_axis(self.to_qkv(normed), -1, (3, self.num_heads, self.head_width))
         query, key, value = heads.permute(2, 0, 3, 1, 4)
-        return self.query_norm(query), self.key_norm(key), value
+        query, key = self.query_norm(query), self.key_norm(key)
+        if stream.turn is None:
+            return query, key, value
+        return rotate(query, stream.turn), rotate(key, stream.turn), value
 
-    def finish(self, stream: Stream, attended: Float32[Tensor, "batch tokens inner"]) -> Stream:
+    def finish(self, stream: Stream, attended: Float[Tensor, "batch tokens inner"]) -> Stream:
         """Add the output of the attention, then that of the feed-forward network."""
         _, _, gate, ffn_shift, ffn_scale, ffn_gate = (stream.modulation + self.modulation).unbind(2)
+        attended = attended.to(stream.tokens.dtype)
         tokens = stream.tokens + (1.0 + gate) * self.to_out(attended)
         normed = modulated_norm(tokens, ffn_shift, ffn_scale)
-        return Stream(tokens + (1.0 + ffn_gate) * self.ffn(normed), stream.modulation)
+        return replace(stream, tokens=tokens + (1.0 + ffn_gate) * self.ffn(normed))
 
 
 class JointLayer(nn.Module):
     """One layer: two expert blocks around one attention."""
 
-    def __init__(self, video: ExpertBlock, tactile: ExpertBlock) -> None:
+    def __init__(self, video: Block, tactile: Block) -> None:
         super().__init__()
         self.video = video
         self.tactile = tactile
@@ -92,7 +122,8 @@ class JointLayer(nn.Module):
             self.tactile.queries_keys_values(tactile),
             strict=True,
         )
-        query, key, value = (torch.cat(pair, dim=2) for pair in parts)
+        # The pretrained expert may have less precise weights than the tactile one.
+        query, key, value = (torch.cat([a, b.to(a.dtype)], dim=2) for a, b in parts)
         attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
         attended = attended.transpose(1, 2).flatten(2)
         num_video = video.tokens.shape[1]
@@ -103,10 +134,10 @@ class JointLayer(nn.Module):
 
 
 def modulated_norm(
-    tokens: Float32[Tensor, "*batch width"],
-    shift: Float32[Tensor, "*batch width"],
-    scale: Float32[Tensor, "*batch width"],
-) -> Float32[Tensor, "*batch width"]:
+    tokens: Float[Tensor, "*batch width"],
+    shift: Float[Tensor, "*batch width"],
+    scale: Float[Tensor, "*batch width"],
+) -> Float[Tensor, "*batch width"]:
     """Layer norm without learned weights, then scale and shift by the condition (AdaLN)."""
     return functional.layer_norm(tokens, tokens.shape[-1:]) * (1.0 + scale) + shift
 

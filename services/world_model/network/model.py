@@ -12,18 +12,14 @@ from torch import Tensor, nn
 
 from dextouch.errors import InvalidInputError
 from services.world_model.network import flow_matching
-from services.world_model.network.conditioning import (
-    ActionNormalizer,
-    TactileCondition,
-    VideoCondition,
-)
+from services.world_model.network.conditioning import ActionNormalizer, TactileCondition
 from services.world_model.network.configuration import NetworkConfig, num_latents
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.joint_attention import JointLayer, clean_mask
 from services.world_model.network.tactile_expert import TactileExpert
 from services.world_model.network.tokenizer_choice import build_tokenizer
-from services.world_model.network.video_expert import VideoExpert
-from services.world_model.network.visual_codec import VisualCodec, to_unit
+from services.world_model.network.video_side import video_side
+from services.world_model.network.visual_codec import to_unit
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -61,20 +57,21 @@ class JointWorldModel(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        self.codec = VisualCodec(config)
+        side = video_side(config)
+        self.codec = side.codec()
         self.tokenizer = build_tokenizer(config).requires_grad_(requires_grad=False)
         self.normalizer = ActionNormalizer()
         self.register_buffer("video_residual_std", torch.ones(()))
         self.register_buffer("tactile_residual_std", torch.ones(()))
-        self.video_condition = VideoCondition(config)
+        self.video_condition = side.condition()
         self.tactile_condition = TactileCondition(config)
-        self.video = VideoExpert(config)
+        self.video = side.expert()
         self.tactile = TactileExpert(
             config, num_tokens=self.tokenizer.num_tokens, channels=self.tokenizer.channels
         )
         self.layers = nn.ModuleList(
-            JointLayer(VideoExpert.block(config), TactileExpert.block(config))
-            for _ in range(config.num_layers)
+            JointLayer(side.block(index), TactileExpert.block(config))
+            for index in range(config.num_layers)
         )
 
     def first_latents(self, inputs: ModelInputs) -> FirstLatents:
@@ -193,16 +190,10 @@ class JointWorldModel(nn.Module):
     def decode(
         self, first: FirstLatents, residuals: JointLatents, *, all_images: bool = True
     ) -> Prediction:
-        """Decode images and pressures after the first step.
-
-        The last latent is decoded separately, so that its images are bit-identical whether or not
-        the others are decoded.
-        """
+        """Images and pressures after the first step; of the images maybe the last four only."""
         video = first.video[:, None] + self.video_residual_std * _first_zero(residuals.video)
         tactile = first.tactile[:, None] + self.tactile_residual_std * residuals.tactile[:, 1:]
-        images = self.codec.decode(video[:, [0, -1]])[:, 1:]
-        if all_images and video.shape[1] > 2:
-            images = torch.cat([self.codec.decode(video[:, :-1])[:, 1:], images], dim=1)
+        images = self.codec.decode_future(video, all_images=all_images)
         return Prediction(images, self.tokenizer.decode(tactile))
 
 

@@ -13,6 +13,7 @@ from services.world_model.network.joint_attention import (
     modulated_norm,
     zero_linear,
 )
+from services.world_model.network.rotary import angles, tactile_positions
 
 
 class TactileExpert(nn.Module):
@@ -22,6 +23,8 @@ class TactileExpert(nn.Module):
         super().__init__()
         width = config.tactile_width
         self._num_tokens = num_tokens
+        # Rotary positions in the time of the pretrained video expert, which has them.
+        self._head_width = None if config.wan is None else config.head_width
         self.embed = nn.Linear(2 * channels, width)
         self.hands = nn.Parameter(0.02 * torch.randn(2, width))
         self.steps = nn.Parameter(0.02 * torch.randn(config.max_steps, 1, width))
@@ -56,7 +59,11 @@ class TactileExpert(nn.Module):
             tokens = tokens + self.pads
         modulation = self._for_each_token(self.modulate(condition))
         modulation = split_axis(modulation, -1, (NUM_MODULATIONS, -1))
-        return Stream(tokens.flatten(1, 3), modulation.flatten(1, 3))
+        turn = None
+        if self._head_width is not None:
+            positions = tactile_positions(noisy.shape[1], 2 * self._num_tokens)
+            turn = angles(positions, self._head_width).to(noisy.device)
+        return Stream(tokens.flatten(1, 3), modulation.flatten(1, 3), turn=turn)
 
     def finish(
         self, stream: Stream, condition: Float32[Tensor, "batch time 2 width"]

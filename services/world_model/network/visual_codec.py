@@ -72,6 +72,19 @@ class VisualCodec(nn.Module):
         first = images[:, 0].mean(dim=1, keepdim=True)
         return torch.cat([first, images[:, 1:].flatten(1, 2)], dim=1).clamp(0.0, 1.0)
 
+    def decode_future(
+        self, latents: Float32[Tensor, "batch latents tokens channels"], *, all_images: bool
+    ) -> Float32[Tensor, "batch shown px px 3"]:
+        """Images after the first, or those of the last latent only.
+
+        The last latent is decoded separately, so that its images are bit-identical whether or not
+        the others are decoded.
+        """
+        images = self.decode(latents[:, [0, -1]])[:, 1:]
+        if all_images and latents.shape[1] > 2:
+            images = torch.cat([self.decode(latents[:, :-1])[:, 1:], images], dim=1)
+        return images
+
     def _patches(
         self, images: Float32[Tensor, "batch time px px 3"]
     ) -> Float32[Tensor, "batch latents rows cols values"]:

@@ -27,9 +27,9 @@ def empty_transformer(
 
 
 def empty_autoencoder(config: WanConfig) -> "AutoencoderKLWan":
-    """Video autoencoder on the meta device, in the precision of the configuration."""
+    """Video autoencoder on the meta device; always float32, as it is published."""
     from diffusers import AutoencoderKLWan
 
     with torch.device("meta"):
         autoencoder = AutoencoderKLWan(**config.autoencoder_sizes())
-    return autoencoder.to(config.dtype).eval()
+    return autoencoder.eval()

@@ -83,7 +83,9 @@ def test_loader_and_server_give_identical_tensors(world, toy_episode, monkeypatc
         world.step(state, episode.actions[kind][1:17], seed=0)
         for name, tensor in vars(loader).items():
             served = getattr(seen[-1], name)
-            if name in {"hands", "raster"} and kind == "commanded":
+            if name == "instructions":
+                assert served == tensor == (episode.instruction,)
+            elif name in {"hands", "raster"} and kind == "commanded":
                 # Row 0's joints: the loader knows the command, a start the measured reading;
                 # neither is conditioned on (c_0 = 0).
                 assert torch.equal(tensor[:, 1:], served[:, 1:]), (kind, name)

@@ -4,6 +4,7 @@ import pytest
 import torch
 from diffusers import AutoencoderKLWan, WanTransformer3DModel
 
+from services.world_model.network.configuration import NetworkConfig
 from services.world_model.wan.configuration import WanConfig
 
 LAYERS, HEADS, HEAD_WIDTH = 2, 2, 12
@@ -35,3 +36,13 @@ def shaken(network, seed):
     for parameter in network.parameters():
         parameter.add_(0.1 * torch.randn(parameter.shape))
     return network
+
+
+@pytest.fixture(scope="session")
+def full_config(wan_config):
+    """The architecture of the full size, tiny."""
+    return NetworkConfig(
+        video_expert="wan", wan=wan_config, image_px=64, patch_px=16, codec_channels=48,
+        video_width=HEADS * HEAD_WIDTH, num_heads=HEADS, head_width=HEAD_WIDTH, num_layers=LAYERS,
+        tactile_width=16, ffn_ratio=2, use_pose_raster=False,
+    )  # fmt: skip

@@ -1,0 +1,169 @@
+"""Text features of instructions: computed once each by the UMT5 encoder, then kept.
+
+Features are kept in memory, in the checkpoint and, if a folder is given, on disk, so that serving
+known instructions needs no text encoder.
+"""
+
+import hashlib
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import save_file
+from torch import Tensor
+
+from dextouch.errors import CorruptDataError, NotFoundError
+from services.networks.weight_files import read_tensors
+from services.world_model.wan.configuration import WanConfig
+
+ENCODER_FOLDER: Final = "text_encoder"
+TOKENIZER_FOLDER: Final = "tokenizer"
+_KEY: Final = "features"
+
+
+class TextEncoder:
+    """UMT5 encoder and its tokenizer from a local folder in diffusers' layout.
+
+    Raises:
+        NotFoundError: the folder lacks one of the two.
+    """
+
+    def __init__(self, folder: Path, config: WanConfig) -> None:
+        from transformers import AutoTokenizer, UMT5EncoderModel
+
+        for name in (ENCODER_FOLDER, TOKENIZER_FOLDER):
+            if not (folder / name).is_dir():
+                raise NotFoundError(
+                    f"text encoder: no folder {name} in {folder}; copy the whole model in the "
+                    "diffusers layout"
+                )
+        self._config = config
+        self._tokenizer: Any = AutoTokenizer.from_pretrained(
+            str(folder / TOKENIZER_FOLDER), local_files_only=True
+        )
+        self._encoder: Any = UMT5EncoderModel.from_pretrained(
+            str(folder / ENCODER_FOLDER),
+            local_files_only=True,
+            use_safetensors=True,
+            dtype=config.dtype,
+        ).eval()
+
+    @torch.no_grad()
+    def encode(self, text: str) -> Float[Tensor, "words width"]:
+        """Features of the text's words and end mark, at most `text_tokens` of them."""
+        words = self._tokenizer(
+            [text],
+            max_length=self._config.text_tokens,
+            truncation=True,
+            return_attention_mask=True,
+            return_tensors="pt",
+        )
+        features: Tensor = self._encoder(words.input_ids, words.attention_mask).last_hidden_state
+        return features[0]
+
+
+class TextFeatures:
+    """Features by instruction, from memory, from disk or from the encoder, in this order.
+
+    Args:
+        config: sizes of the features.
+        folder: folder of the pretrained model; None if only known instructions are needed.
+        cache: folder in which features are kept as safetensors; None for memory only.
+    """
+
+    def __init__(
+        self, config: WanConfig, *, folder: Path | None = None, cache: Path | None = None
+    ) -> None:
+        self._config = config
+        self._folder, self._cache = folder, cache
+        self._encoder: TextEncoder | None = None
+        self._known: dict[str, Tensor] = {}
+
+    def stack(self, texts: Sequence[str]) -> Float[Tensor, "batch words width"]:
+        """Features of several texts, padded with zeros to `text_tokens`, as Wan2.2 expects.
+
+        Raises:
+            NotFoundError: an unknown text and no encoder.
+        """
+        padded = torch.zeros(
+            len(texts),
+            self._config.text_tokens,
+            self._config.text_width,
+            dtype=self._config.dtype,
+        )
+        for row, text in zip(padded, texts, strict=True):
+            features = self.of(text)
+            row[: len(features)] = features
+        return padded
+
+    def of(self, text: str) -> Float[Tensor, "words width"]:
+        """Features of one text.
+
+        Raises:
+            NotFoundError: an unknown text and no encoder.
+            CorruptDataError: a damaged file in the cache.
+        """
+        key = key_of(text)
+        if key not in self._known:
+            self._known[key] = self._stored(key, text).to(self._config.dtype)
+        return self._known[key]
+
+    @property
+    def known(self) -> Mapping[str, Tensor]:
+        """Features in memory, by the key of their text."""
+        return self._known
+
+    def learn(self, known: Mapping[str, Tensor]) -> None:
+        """Add features, such as those of a checkpoint.
+
+        Raises:
+            CorruptDataError: features of another width.
+        """
+        for key, features in known.items():
+            self._known[key] = self._checked(features, f"text features {key}")
+
+    def _stored(self, key: str, text: str) -> Tensor:
+        file = None if self._cache is None else self._cache / f"{key}.safetensors"
+        if file is not None and file.is_file():
+            where = f"text features {file.name}"
+            tensors, _ = read_tensors(file, where)
+            return self._checked(tensors.get(_KEY, torch.empty(0)), where)
+        features = self._encode(text)
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            partial = file.with_name(file.name + ".partial")
+            save_file({_KEY: features.contiguous()}, partial)
+            partial.replace(file)
+        return features
+
+    def _encode(self, text: str) -> Tensor:
+        if self._encoder is None:
+            if self._folder is None:
+                raise NotFoundError(
+                    f"instruction {text!r}: the checkpoint has no features of it; give the folder "
+                    "of the pretrained model, which has the text encoder, with --wan.folder"
+                )
+            self._encoder = TextEncoder(self._folder, self._config)
+        return self._encoder.encode(cleaned(text))
+
+    def _checked(self, features: Tensor, where: str) -> Tensor:
+        width, longest = self._config.text_width, self._config.text_tokens
+        if features.ndim != 2 or features.shape[1] != width or len(features) > longest:
+            raise CorruptDataError(
+                f"{where}: got shape {tuple(features.shape)}, expected at most {longest} rows of "
+                f"{width}; remove the file, or use the cache of this model"
+            )
+        return features.to(self._config.dtype)
+
+
+def cleaned(text: str) -> str:
+    """Text without HTML entities and repeated spaces, as Wan2.2 is given it."""
+    return " ".join(html.unescape(html.unescape(text)).split())
+
+
+def key_of(text: str) -> str:
+    """Key of a text's features: SHA-256 of the cleaned text."""
+    return hashlib.sha256(cleaned(text).encode()).hexdigest()
