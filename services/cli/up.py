@@ -213,7 +213,9 @@ def _world_model(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
     from services.world_model.world import open_world
 
     settings = WorldModelSettings()
-    world = open_world(settings.checkpoint, sampling_steps=settings.sampling_steps)
+    world = open_world(
+        settings.checkpoint, sampling_steps=settings.sampling_steps, sampler=settings.sampler
+    )
     return create_world_app({settings.world_name: world}, settings, name="world_model")
 
 

@@ -87,7 +87,9 @@ def open_worlds(settings: WorldModelSettings) -> dict[str, World[Any]]:
     import torch
 
     torch.set_num_threads(settings.num_threads)
-    world = open_world(settings.checkpoint, sampling_steps=settings.sampling_steps)
+    world = open_world(
+        settings.checkpoint, sampling_steps=settings.sampling_steps, sampler=settings.sampler
+    )
     return {settings.world_name: world}
 
 
@@ -95,8 +97,11 @@ def open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> World[A
     """The world of the checkpoint with this digest beside the one that is served."""
     for path, found in list_checkpoints(settings.checkpoint.parent).items():
         if found == digest:
-            sampled = None if is_state_checkpoint(path) else settings.sampling_steps
-            return open_world(path, sampling_steps=sampled)
+            if is_state_checkpoint(path):
+                return open_world(path)
+            return open_world(
+                path, sampling_steps=settings.sampling_steps, sampler=settings.sampler
+            )
     return None
 
 

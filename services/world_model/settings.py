@@ -26,6 +26,7 @@ from services.networks.training_settings import (
 )
 from services.world_model.checkpoints import PRETRAINED, default_checkpoint
 from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.solvers import Sampler
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.precision import has_fast_bfloat16
 from services.world_model.rendering.training import RendererTraining
@@ -240,7 +241,10 @@ class WorldModelSettings(WorldServiceSettings):
         default="world_model", min_length=1, max_length=64, description="name of the served world"
     )
     sampling_steps: int | None = Field(
-        default=None, ge=1, le=64, description="Euler steps of a flow-matching checkpoint"
+        default=None, ge=1, le=64, description="network calls per chunk of a flow-matching model"
+    )
+    sampler: Sampler | None = Field(
+        default=None, description="solver of a flow-matching model (default: the checkpoint's)"
     )
     num_threads: int = Field(default=1, ge=1, description="threads of torch")
 

@@ -32,6 +32,7 @@ from dextouch.worlds import StartedRollout, SteppedRollout
 from services.world_model.checkpoints import Checkpoint, default_checkpoint, read_checkpoint
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Precision, Prediction, stack_noise
+from services.world_model.network.solvers import Sampler
 from services.world_model.network.visual_codec import to_uint8
 from services.world_model.starts import CAMERA, observed_start
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
@@ -60,7 +61,8 @@ class ModelWorld:
 
     Args:
         checkpoint: loaded, from `read_checkpoint`.
-        sampling_steps: Euler steps; None uses the checkpoint's.
+        sampling_steps: network calls per chunk; None uses the checkpoint's.
+        sampler: solver of the flow; None uses the checkpoint's.
         precision: of the experts' matrix products; codecs are always float32.
     """
 
@@ -69,11 +71,12 @@ class ModelWorld:
         checkpoint: Checkpoint,
         *,
         sampling_steps: int | None = None,
+        sampler: Sampler | None = None,
         precision: Precision = "float32",
     ) -> None:
         self._model = checkpoint.model
         self._digest = checkpoint.digest
-        self._sampling_steps = sampling_steps
+        self._sampling_steps, self._sampler = sampling_steps, sampler
         self._precision: Precision = precision
         config, metadata = checkpoint.metadata.network, checkpoint.metadata
         self._description = WorldDescription(
@@ -167,6 +170,7 @@ class ModelWorld:
             inputs,
             noise,
             sampling_steps=self._sampling_steps,
+            sampler=self._sampler,
             all_images=wanted,
             precision=self._precision,
         )
@@ -246,24 +250,29 @@ class ModelWorld:
 
 
 def open_world(
-    path: Path | None = None, *, sampling_steps: int | None = None
+    path: Path | None = None,
+    *,
+    sampling_steps: int | None = None,
+    sampler: Sampler | None = None,
 ) -> ModelWorld | StateWorld:
     """Open the world of a checkpoint file of either kind; default: the package's own.
 
     Args:
         path: safetensors file; None for the one that ships with the package.
-        sampling_steps: Euler steps of a flow-matching model; a state model has none.
+        sampling_steps: network calls per chunk of a flow-matching model; a state model has none.
+        sampler: solver of a flow-matching model.
 
     Raises:
-        InvalidInputError: sampling steps for a state model.
+        InvalidInputError: sampling steps or a sampler for a state model.
     """
     file = path if path is not None else default_checkpoint()
     if not is_state_checkpoint(file):
-        return ModelWorld(read_checkpoint(file), sampling_steps=sampling_steps)
-    if sampling_steps is not None:
+        checkpoint = read_checkpoint(file)
+        return ModelWorld(checkpoint, sampling_steps=sampling_steps, sampler=sampler)
+    if sampling_steps is not None or sampler is not None:
         raise InvalidInputError(
-            f"state model {file.name}: got {sampling_steps} sampling steps, expected none: it "
-            "predicts without sampling"
+            f"state model {file.name}: got {sampling_steps} sampling steps and the sampler "
+            f"{sampler}, expected none: it predicts without sampling"
         )
     return StateWorld(read_state_checkpoint(file))
 

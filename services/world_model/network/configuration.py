@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from dextouch.frozen_model import FrozenModel
+from services.world_model.network.solvers import Sampler
 from services.world_model.wan.configuration import (
     LATENT_CHANNELS,
     SPATIAL_FACTOR,
@@ -59,7 +60,11 @@ class NetworkConfig(FrozenModel):
     sampling_time_shift: float = Field(
         default=3.0, ge=1.0, description="shift of flow-matching times in sampling"
     )
-    sampling_steps: int = Field(default=2, ge=1, le=64, description="Euler steps per chunk")
+    sampling_steps: int = Field(default=2, ge=1, le=64, description="network calls per chunk")
+    sampler: Sampler = Field(
+        default="euler",
+        description="solver of the flow: unipc needs fewer steps for the same accuracy",
+    )
     model_rate_hz: float = Field(default=15.0, gt=0, description="steps per second")
     wan: WanConfig | None = Field(default=None, description="sizes of Wan2.2 for its video expert")
 

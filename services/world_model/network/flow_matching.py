@@ -1,7 +1,7 @@
-"""Flow matching (Lipman et al. 2023): noisy latents for training and Euler steps for sampling.
+"""Flow matching (Lipman et al. 2023): noisy latents for training, and sampling.
 
 Straight paths: x_t = (1 - t) x_0 + t ε, t from 0 (data) to 1 (noise). The network predicts x_0; the
-velocity is (x_t - x_0) / t, so that the last Euler step returns its prediction exactly.
+velocity is (x_t - x_0) / t, so that the last step of either solver returns its prediction exactly.
 """
 
 from collections.abc import Callable
@@ -11,6 +11,7 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError
+from services.world_model.network.solvers import SOLVERS, Sampler
 
 # Lower bound of training times: velocities divide by them.
 MIN_TIME = 1e-3
@@ -45,25 +46,26 @@ def sample(
     *,
     num_steps: int,
     shift: float,
+    sampler: Sampler = "euler",
 ) -> tuple[Float32[Tensor, "batch ..."], Float32[Tensor, "batch ..."]]:
-    """Integrate from noise to data with Euler's method, for both streams at once.
+    """Integrate from noise to data, for both streams at once.
 
     Args:
         denoise: maps noisy video, noisy touch and times [batch] to predictions of the clean ones.
         noise: initial noise of both streams.
         num_steps: network calls, at least one; with one the sample is the first prediction.
         shift: shift of the time grid.
+        sampler: solver, the same for both streams.
     """
     if num_steps < 1:
         raise InvalidInputError(f"sampling: got {num_steps} steps, expected at least 1")
     video, tactile = noise
+    of_video, of_tactile = SOLVERS[sampler](), SOLVERS[sampler]()
     times = shift_time(torch.linspace(1.0, 0.0, num_steps + 1), shift)
     for t, t_next in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
         guess_video, guess_tactile = denoise(
             video, tactile, torch.full((len(video),), t, device=video.device)
         )
-        # x + (t' - t) (x - x_0) / t, written so that t' = 0 gives x_0 without rounding.
-        keep = t_next / t
-        video = keep * video + (1.0 - keep) * guess_video
-        tactile = keep * tactile + (1.0 - keep) * guess_tactile
+        video = of_video.step(video, guess_video, t, t_next)
+        tactile = of_tactile.step(tactile, guess_tactile, t, t_next)
     return video, tactile

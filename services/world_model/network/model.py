@@ -16,6 +16,7 @@ from services.world_model.network.conditioning import ActionNormalizer, TactileC
 from services.world_model.network.configuration import NetworkConfig, num_latents
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.joint_attention import JointLayer, clean_mask
+from services.world_model.network.solvers import Sampler
 from services.world_model.network.tactile_expert import TactileExpert
 from services.world_model.network.tokenizer_choice import build_tokenizer
 from services.world_model.network.video_side import video_side
@@ -143,6 +144,7 @@ class JointWorldModel(nn.Module):
         noise: JointLatents,
         *,
         sampling_steps: int | None = None,
+        sampler: Sampler | None = None,
         all_images: bool = True,
         precision: Precision = "float32",
     ) -> Prediction:
@@ -151,7 +153,8 @@ class JointWorldModel(nn.Module):
         Args:
             inputs: from `build_inputs`.
             noise: one per request, from `noise`; like the inputs it may be on any device.
-            sampling_steps: Euler steps; None uses the configuration's.
+            sampling_steps: network calls; None uses the configuration's.
+            sampler: solver of the flow; None uses the configuration's.
             all_images: decode every image, or only those of the last latent.
             precision: of the experts' matrix products (autocast); codecs always use float32.
 
@@ -172,6 +175,7 @@ class JointWorldModel(nn.Module):
             (noise.video.to(device), noise.tactile.to(device)),
             num_steps=sampling_steps or self.config.sampling_steps,
             shift=self.config.sampling_time_shift,
+            sampler=sampler or self.config.sampler,
         )
         future = self.decode(first, JointLatents(video, tactile), all_images=all_images)
         touch = self.tokenizer.bounded(future.tactile_kpa, inputs.first_tactile_kpa)
