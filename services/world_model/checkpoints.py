@@ -8,6 +8,7 @@ from pathlib import Path
 from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
+from dextouch.schemas import Domain
 from services.networks.weight_files import (
     half_weights,
     load_strictly,
@@ -25,12 +26,30 @@ PRETRAINED = Path(__file__).parent / "pretrained"
 STATE_MODEL, PAPER_FORM = "state.safetensors", "tiny.safetensors"
 
 
+class TrainingSet(FrozenModel):
+    """Episodes of one domain that a model was trained on, or that it was evaluated on (held out).
+
+    `tasks` has the number of episodes of each task, `data_hash` is `combined_hash` of their
+    content. `window_share` is the share of windows from the set, None where it follows from the
+    number of episodes. `checkpoint` is the digest of the ancestor that was trained on the set, None
+    for the checkpoint's own training.
+    """
+
+    domain: Domain
+    heldout: bool = False
+    tasks: dict[str, int]
+    data_hash: str
+    window_share: float | None = None
+    checkpoint: str | None = None
+
+
 class CheckpointMetadata(FrozenModel):
     """Provenance and measured accuracy of a model, stored in its checkpoint.
 
     `initialized_from` is the digest of the checkpoint that the weights were initialized from; its
     training episodes count as training episodes here, too. None is not written, so that older
-    releases can read the file.
+    releases can read the file. `sets` are the episodes by domain, those of ancestors included; it
+    is empty in files of older releases.
     """
 
     format_version: int = FORMAT_VERSION
@@ -46,6 +65,7 @@ class CheckpointMetadata(FrozenModel):
     data_hash: str
     heldout_episode_ids: tuple[str, ...] = ()
     initialized_from: str | None = Field(default=None, exclude_if=not_)
+    sets: tuple[TrainingSet, ...] = Field(default=(), exclude_if=not_)
     metrics: dict[str, float] = Field(default={})
 
 

@@ -62,9 +62,30 @@ class WindowSettings(FrozenModel):
 
 
 class TrainSettings(FrozenModel):
-    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
+    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first.
+
+    With `human` stores, only robot episodes are taken from `episodes` and `heldout`, and only human
+    ones from `human`.
+    """
 
     episodes: str = Field(description="URL or folder of the episode store to train on")
+    human: tuple[str, ...] = Field(
+        default=(), description="stores (folder or file:// URL) with human episodes to mix in"
+    )
+    human_share: float = Field(
+        default=0.5, ge=0, le=1, description="share of training windows from human episodes"
+    )
+    robot_episodes: int | None = Field(
+        default=None,
+        ge=1,
+        description="number of episodes of `episodes` to train on, by hash; more contain fewer",
+    )
+    human_episodes: int | None = Field(
+        default=None, ge=0, description="number of human episodes, in the same way"
+    )
+    disjoint_tasks: CliImplicitFlag[bool] = Field(
+        default=True, description="refuse human episodes of tasks that robots have, too"
+    )
     splits: Splits = ()
     heldout: str | None = Field(
         default=None, description="store to evaluate on; default: a tenth of `episodes`, by hash"
@@ -110,6 +131,11 @@ class TrainSettings(FrozenModel):
     windows: WindowSettings = Field(
         default=WindowSettings(), description="sampling of training windows"
     )
+
+    @property
+    def share_of_human(self) -> float | None:
+        """Share of windows from human episodes; None where domains are not told apart."""
+        return self.human_share if self.human else None
 
 
 class ReaderSettings(FrozenModel):
@@ -261,6 +287,7 @@ def command_line(settings: TrainSettings) -> str:
             "output",
             "json_path",
             "episodes",
+            "human",
             "heldout",
             "init",
             "resume",
@@ -268,6 +295,7 @@ def command_line(settings: TrainSettings) -> str:
         },
     )
     flags = [f"--episodes={last_name(settings.episodes)}"]
+    flags += [f"--human={last_name(url)}" for url in settings.human]
     if settings.heldout is not None:
         flags.append(f"--heldout={last_name(settings.heldout)}")
     if settings.init is not None:

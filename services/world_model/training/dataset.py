@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
-from dextouch.schemas import ActionKind
+from dextouch.schemas import ActionKind, Domain
 from services.world_model.network.inputs import PredictionRequest
 
 
@@ -55,6 +55,16 @@ class TrainingEpisode(Protocol):
         ...
 
     @property
+    def domain(self) -> Domain:
+        """Whether a person or a robot acts."""
+        ...
+
+    @property
+    def model_rate_hz(self) -> float:
+        """Rate of the steps."""
+        ...
+
+    @property
     def action_kinds(self) -> tuple[ActionKind, ...]:
         """Available kinds of actions."""
         ...
@@ -87,6 +97,7 @@ class EpisodeArrays:
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"]
     model_rate_hz: float
+    domain: Domain = "robot"
 
     def __len__(self) -> int:
         return len(self.tactile_kpa)
@@ -210,13 +221,15 @@ def stack_windows(windows: Sequence[Window]) -> WindowBatch:
 
 
 class WindowSampler:
-    """Samples windows uniformly over episodes and starts.
+    """Samples windows uniformly over starts, and over the episodes of each domain.
 
     Args:
         episodes: at least one, each at least `max_steps` long.
         rng: source of all randomness.
         commanded_fraction: share of commanded windows, from episodes with commanded actions.
         chained_fraction: share of commanded windows that are anchored like a later chunk.
+        human_share: share of windows from human episodes, if there are human and robot ones; None:
+            every episode is equally likely.
     """
 
     def __init__(
@@ -227,6 +240,7 @@ class WindowSampler:
         max_steps: int,
         commanded_fraction: float = 0.5,
         chained_fraction: float = 0.3,
+        human_share: float | None = None,
     ) -> None:
         short = [e.episode_id for e in episodes if len(e) < max_steps]
         if not episodes or short:
@@ -238,6 +252,11 @@ class WindowSampler:
         self._rng = rng
         self._commanded_fraction = commanded_fraction
         self._chained_fraction = chained_fraction
+        of: dict[Domain, list[int]] = {"human": [], "robot": []}
+        for index, episode in enumerate(episodes):
+            of[episode.domain].append(index)
+        self._human, self._robot = of["human"], of["robot"]
+        self._human_share = human_share if self._human and self._robot else None
 
     def draw(self, batch: int, num_steps: int) -> WindowBatch:
         """A batch of random windows."""
@@ -251,8 +270,15 @@ class WindowSampler:
         """The windows at these places."""
         return stack_windows([self._episodes[p.episode_index].cut(p) for p in places])
 
+    def _episode_index(self) -> int:
+        if self._human_share is None:
+            return int(self._rng.integers(len(self._episodes)))
+        is_human = self._rng.random() < self._human_share
+        chosen = self._human if is_human else self._robot
+        return chosen[int(self._rng.integers(len(chosen)))]
+
     def _place(self, num_steps: int) -> Place:
-        index = int(self._rng.integers(len(self._episodes)))
+        index = self._episode_index()
         episode = self._episodes[index]
         start = int(self._rng.integers(len(episode) - num_steps + 1))
         is_commanded = self._rng.random() < self._commanded_fraction

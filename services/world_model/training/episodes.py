@@ -1,5 +1,6 @@
 """Episodes of a store as arrays on the model grid, and their split by hash."""
 
+import hashlib
 from collections.abc import Collection, Sequence
 from typing import TypeVar
 
@@ -8,33 +9,38 @@ from jaxtyping import Float64
 
 from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import ActionKind
+from dextouch.schemas import ActionKind, Domain
 from services.world_model.starts import CAMERA
 from services.world_model.training.dataset import EpisodeArrays, TrainingEpisode
 
 E = TypeVar("E", bound=TrainingEpisode)
 
 
-def load_episodes(url: str, *, splits: Collection[Split] = ()) -> list[EpisodeArrays]:
-    """All episodes of a store, read once into memory.
+def load_episodes(
+    url: str, *, splits: Collection[Split] = (), domain: Domain | None = None
+) -> list[EpisodeArrays]:
+    """Episodes of a store, read once into memory: those of the given splits and domain.
 
     Raises:
         InvalidInputError: the store is empty, mixes model rates, or lacks the image of a step.
         UnknownNameError: an episode without the head camera.
     """
     store = EpisodeStore(url)
-    episodes = [read_episode(store.open(one)) for one in training_ids(store, splits)]
+    episodes = [read_episode(store.open(one)) for one in training_ids(store, splits, domain)]
     check_rates({episode.model_rate_hz for episode in episodes}, url)
     return episodes
 
 
-def training_ids(store: EpisodeStore, splits: Collection[Split] = ()) -> list[str]:
-    """Ids of the episodes to train on: those of the given splits (default: all), none imagined."""
+def training_ids(
+    store: EpisodeStore, splits: Collection[Split] = (), domain: Domain | None = None
+) -> list[str]:
+    """Ids of the episodes of these splits and this domain (default: all), but imagined ones."""
     return [
         episode_id
         for episode_id in store.list()
         if (about := store.open(episode_id).attributes).origin != "imagined"
         and is_in(about, splits)
+        and domain in {None, about.domain}
     ]
 
 
@@ -46,7 +52,8 @@ def check_rates(rates_hz: set[float], url: str) -> None:
     """
     if not rates_hz:
         raise InvalidInputError(
-            f"episodes: the store {url} is empty; record some first (dextouch twin record)"
+            f"episodes: the store {url} has none, or none of the domain and splits asked for; "
+            "record some first (dextouch train data)"
         )
     if len(rates_hz) > 1:
         raise InvalidInputError(
@@ -80,6 +87,7 @@ def read_episode(reader: EpisodeReader) -> EpisodeArrays:
         anchor=measured.anchor,
         K_head=measured.K_head,
         model_rate_hz=attributes.model_rate_hz,
+        domain=attributes.domain,
     )
 
 
@@ -100,3 +108,27 @@ def split_by_hash(episodes: Sequence[E], *, heldout_percent: int) -> tuple[list[
             f"{len(episodes)}, expected at least one each; add episodes or a held-out store"
         )
     return trained, heldout
+
+
+def subset_by_hash(episodes: Sequence[E], count: int | None, *, what: str) -> list[E]:
+    """A number of episodes chosen by their content, in their order; None for all.
+
+    A larger subset of the same episodes contains every smaller one.
+
+    Raises:
+        InvalidInputError: there are fewer; `what` names them.
+    """
+    if count is None:
+        return list(episodes)
+    if count > len(episodes):
+        raise InvalidInputError(
+            f"training: got {count} as the number of {what} episodes, expected at most the "
+            f"{len(episodes)} there are; record more, or ask for fewer"
+        )
+
+    def place(index: int) -> str:
+        content = episodes[index].content_hash()
+        return hashlib.sha256(f"subset/{content}".encode()).hexdigest()
+
+    chosen = sorted(range(len(episodes)), key=place)[:count]
+    return [episodes[index] for index in sorted(chosen)]

@@ -1,35 +1,68 @@
-"""Training and held-out episodes, and the checks that keep them disjoint."""
+"""Training and held-out episodes of both domains, and the checks that keep them disjoint."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 from dextouch.errors import InvalidInputError
-from services.world_model.checkpoints import Checkpoint
+from dextouch.schemas import Domain
+from services.world_model.checkpoints import Checkpoint, TrainingSet
 from services.world_model.settings import TrainSettings
-from services.world_model.training.dataset import EpisodeArrays, TrainingEpisode
-from services.world_model.training.episodes import load_episodes, split_by_hash
+from services.world_model.training.dataset import (
+    EpisodeArrays,
+    TrainingEpisode,
+    combined_hash,
+)
+from services.world_model.training.episodes import (
+    check_rates,
+    load_episodes,
+    split_by_hash,
+    subset_by_hash,
+)
 from services.world_model.training.streaming import index_episodes
 
 
 def load_split(
     settings: TrainSettings,
 ) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
-    """Training and held-out episodes of the settings' stores; held-out ones are in memory."""
-    if settings.streaming:
-        return _stream_split(settings)
-    episodes = load_episodes(settings.episodes, splits=settings.splits)
-    if settings.heldout is None:
-        return split_by_hash(episodes, heldout_percent=settings.heldout_percent)
-    return episodes, load_episodes(settings.heldout)
+    """Training and held-out episodes of the settings' stores; held-out ones are in memory.
+
+    Robot episodes are split before a subset of them is taken, so that every subset has the same
+    held-out episodes. These are never human if human stores are given.
+    """
+    trained, heldout = _load_robot(settings)
+    trained = subset_by_hash(trained, settings.robot_episodes, what="robot")
+    together = [*trained, *_load_human(settings)]
+    if settings.human:
+        rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
+        check_rates(rates_hz, ", ".join([settings.episodes, *settings.human]))
+    return together, heldout
 
 
-def _stream_split(
+def _load_robot(
     settings: TrainSettings,
 ) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
-    episodes = index_episodes(settings.episodes, splits=settings.splits)
+    domain: Domain | None = "robot" if settings.human else None
+    url, splits = settings.episodes, settings.splits
+    if settings.streaming:
+        stored = index_episodes(url, splits=splits, domain=domain)
+        if settings.heldout is not None:
+            return stored, load_episodes(settings.heldout, domain=domain)
+        trained, heldout = split_by_hash(stored, heldout_percent=settings.heldout_percent)
+        return trained, [episode.load() for episode in heldout]
+    episodes = load_episodes(url, splits=splits, domain=domain)
     if settings.heldout is not None:
-        return episodes, load_episodes(settings.heldout)
-    trained, heldout = split_by_hash(episodes, heldout_percent=settings.heldout_percent)
-    return trained, [episode.load() for episode in heldout]
+        return episodes, load_episodes(settings.heldout, domain=domain)
+    return split_by_hash(episodes, heldout_percent=settings.heldout_percent)
+
+
+def _load_human(settings: TrainSettings) -> Sequence[TrainingEpisode]:
+    if settings.human_episodes == 0:
+        return []
+    read = index_episodes if settings.streaming else load_episodes
+    found: list[TrainingEpisode] = []
+    for url in settings.human:
+        found += read(url, splits=settings.splits, domain="human")
+    return subset_by_hash(found, settings.human_episodes, what="human")
 
 
 def check_not_learned(heldout: Sequence[TrainingEpisode], ancestor: Checkpoint) -> None:
@@ -59,3 +92,64 @@ def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[Trainin
             "or same task and seed); expected disjoint sets",
             episodes=both,
         )
+
+
+def check_tasks(
+    trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode], settings: TrainSettings
+) -> None:
+    """Raise if a task is both human and robot (`disjoint_tasks`)."""
+    if not (settings.human and settings.disjoint_tasks):
+        return
+    tasks: dict[Domain, set[str]] = {"human": set(), "robot": set()}
+    for episode in (*trained, *heldout):
+        tasks[episode.domain].add(episode.task)
+    both = sorted(tasks["human"] & tasks["robot"])
+    if both:
+        raise InvalidInputError(
+            f"training: tasks {both} are in the human and in the robot episodes, expected disjoint "
+            "sets; use other stores, or allow it with --no-disjoint-tasks",
+            tasks=both,
+        )
+
+
+def training_sets(
+    trained: Sequence[TrainingEpisode],
+    heldout: Sequence[TrainingEpisode],
+    *,
+    human_share: float | None,
+    ancestor: Checkpoint | None,
+) -> tuple[TrainingSet, ...]:
+    """The episodes of a run by domain, after those of its ancestors."""
+    found: list[TrainingSet] = []
+    if ancestor is not None:
+        found += [
+            one if one.checkpoint else one.model_copy(update={"checkpoint": ancestor.digest})
+            for one in ancestor.metadata.sets
+        ]
+    domains = sorted({episode.domain for episode in trained})
+    shares: dict[Domain, float] = {}
+    if human_share is not None and len(domains) > 1:
+        shares = {"human": human_share, "robot": 1 - human_share}
+    for domain in domains:
+        mine = [episode for episode in trained if episode.domain == domain]
+        found.append(_set_of(mine, domain, window_share=shares.get(domain)))
+    for domain in sorted({episode.domain for episode in heldout}):
+        mine = [episode for episode in heldout if episode.domain == domain]
+        found.append(_set_of(mine, domain, heldout=True))
+    return tuple(found)
+
+
+def _set_of(
+    episodes: Sequence[TrainingEpisode],
+    domain: Domain,
+    *,
+    heldout: bool = False,
+    window_share: float | None = None,
+) -> TrainingSet:
+    return TrainingSet(
+        domain=domain,
+        heldout=heldout,
+        tasks=dict(sorted(Counter(episode.task for episode in episodes).items())),
+        data_hash=combined_hash([episode.content_hash() for episode in episodes]),
+        window_share=window_share,
+    )

@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from dextouch.episodes import EpisodeReader, EpisodeStore, Split
 from dextouch.hands.actions import poses_from_actions, reanchor
-from dextouch.schemas import ActionKind
+from dextouch.schemas import ActionKind, Domain
 from services.world_model.network.inputs import PredictionRequest
 from services.world_model.starts import CAMERA
 from services.world_model.training.dataset import (
@@ -50,6 +50,8 @@ class StoredEpisode:
     num_steps: int
     action_kinds: tuple[ActionKind, ...]
     content_sha256: str
+    domain: Domain
+    model_rate_hz: float
 
     def __len__(self) -> int:
         return self.num_steps
@@ -90,8 +92,12 @@ class StoredEpisode:
         return Window(request, images, read.tactile_kpa, read.tactile_valid)
 
 
-def index_episodes(url: str, *, splits: Collection[Split] = ()) -> list[StoredEpisode]:
+def index_episodes(
+    url: str, *, splits: Collection[Split] = (), domain: Domain | None = None
+) -> list[StoredEpisode]:
     """Index the episodes of a store, except imagined ones; each is read once to be hashed.
+
+    Only those of the given splits and domain are indexed.
 
     Raises:
         InvalidInputError: the store is empty, mixes model rates, or lacks the image of a step.
@@ -99,11 +105,10 @@ def index_episodes(url: str, *, splits: Collection[Split] = ()) -> list[StoredEp
     """
     # The episode of an id may have changed since it was last read.
     _reader.cache_clear()
-    episodes, rates_hz = [], set()
-    for episode_id in training_ids(EpisodeStore(url), splits):
+    episodes: list[StoredEpisode] = []
+    for episode_id in training_ids(EpisodeStore(url), splits, domain):
         # Uses the cached readers, so that processes forked later inherit them open.
         arrays = read_episode(_reader(url, episode_id))
-        rates_hz.add(arrays.model_rate_hz)
         episodes.append(
             StoredEpisode(
                 url=url,
@@ -113,9 +118,11 @@ def index_episodes(url: str, *, splits: Collection[Split] = ()) -> list[StoredEp
                 num_steps=len(arrays),
                 action_kinds=arrays.action_kinds,
                 content_sha256=fingerprint(arrays),
+                domain=arrays.domain,
+                model_rate_hz=arrays.model_rate_hz,
             )
         )
-    check_rates(rates_hz, url)
+    check_rates({episode.model_rate_hz for episode in episodes}, url)
     return episodes
 
 

@@ -39,7 +39,13 @@ from services.world_model.training.dataset import (
 )
 from services.world_model.training.evaluation import evaluate_prediction
 from services.world_model.training.objective import losses
-from services.world_model.training.splits import check_disjoint, check_not_learned, load_split
+from services.world_model.training.splits import (
+    check_disjoint,
+    check_not_learned,
+    check_tasks,
+    load_split,
+    training_sets,
+)
 from services.world_model.training.streaming import read_batches
 from services.world_model.training.training_state import (
     RunFacts,
@@ -104,6 +110,7 @@ def train_on(
 ) -> TrainingReport:
     """`train` with episodes that are already split."""
     check_disjoint(trained, heldout)
+    check_tasks(trained, heldout, settings)
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else read_checkpoint(settings.init)
     prints = {episode.content_hash() for episode in trained}
@@ -128,6 +135,9 @@ def train_on(
         data_hash=combined_hash(sorted(prints)),
         heldout_episode_ids=tuple(sorted(episode.episode_id for episode in heldout)),
         initialized_from=None if ancestor is None else ancestor.digest,
+        sets=training_sets(
+            trained, heldout, human_share=settings.share_of_human, ancestor=ancestor
+        ),
     )
     write_checkpoint(settings.output, run.averaged, metadata)
     # Evaluate the weights as stored, then store them again with the results.
@@ -210,6 +220,7 @@ class TrainingRun:
             max_steps=settings.network.max_steps,
             commanded_fraction=windows.commanded_fraction,
             chained_fraction=windows.chained_fraction,
+            human_share=settings.share_of_human,
         )
         options = OptimizerOptions(
             learning_rate=settings.optimizer.learning_rate,

@@ -24,8 +24,8 @@ METADATA_KEY: Final = "dextouch_training_state"
 SUFFIX: Final = ".resume"
 # Settings that may change when a run resumes.
 _FREE_SETTINGS: Final = {
-    "episodes", "heldout", "output", "json_path", "resume", "state_every_cpu_s", "init",
-    "streaming", "loader_workers", "num_threads",
+    "episodes", "human", "heldout", "output", "json_path", "resume", "state_every_cpu_s", "init",
+    "streaming", "loader_workers", "num_threads", "disjoint_tasks",
 }  # fmt: skip
 
 
@@ -88,10 +88,12 @@ def read_state(path: Path, identity: Mapping[str, JsonValue]) -> TrainingState:
     except (CorruptDataError, ValidationError) as error:
         raise CorruptDataError(f"{where}: unreadable ({error}); remove it to start over") from error
     expected = json.loads(json.dumps(dict(identity)))
+    # Settings that are newer than the state have their defaults.
+    saved = {**TrainSettings(episodes="").model_dump(mode="json"), **facts.identity}
     names = facts.identity.keys() | expected.keys()
-    others = sorted(n for n in names if facts.identity.get(n) != expected.get(n))
+    others = sorted(n for n in names if saved.get(n) != expected.get(n))
     if others:
-        was = {name: facts.identity.get(name) for name in others}
+        was = {name: saved.get(name) for name in others}
         now = {name: expected.get(name) for name in others}
         raise ConflictError(
             f"{where}: saved by a run with {was}, got {now}; use the settings and episodes of that "

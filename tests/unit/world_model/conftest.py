@@ -2,6 +2,7 @@
 
 import shutil
 from copy import deepcopy
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -155,13 +156,14 @@ def write_episode(store, episode, image_every=1):
         "tactile_right": ("tactile", episode.tactile_kpa[:, 1], "kPa"),
         "camera_head": ("image", episode.images, "rgb8"),
         "action": ("robot_state", episode.actions["measured"], "action67"),
-        "action_commanded": ("robot_state", episode.actions["commanded"], "action67"),
     }
+    if "commanded" in episode.actions:
+        streams["action_commanded"] = ("robot_state", episode.actions["commanded"], "action67")
     attributes = EpisodeAttributes(
         episode_id=episode.episode_id,
         task=episode.task,
         instruction=episode.instruction,
-        domain="robot",
+        domain=episode.domain,
         origin="twin",
         seed=episode.seed,
         model_rate_hz=episode.model_rate_hz,
@@ -178,6 +180,28 @@ def write_episode(store, episode, image_every=1):
             )  # fmt: skip
             every = image_every if kind == "image" else 1
             writer.append(name, values=values[::every], t_ref_ns=stamps[::every])
+
+
+def human_episode(seed, task="fold_cloth"):
+    """A toy episode of a person: another task, measured actions only."""
+    episode = make_episode(seed)
+    return replace(
+        episode,
+        episode_id=f"human-{seed}",
+        task=task,
+        domain="human",
+        actions={"measured": episode.actions["measured"]},
+    )
+
+
+@pytest.fixture
+def human_store(tmp_path):
+    """A store with five episodes of people and one of a robot, which is never read."""
+    store = EpisodeStore(tmp_path / "human")
+    for seed in range(100, 105):
+        write_episode(store, human_episode(seed))
+    write_episode(store, make_episode(50))
+    return store
 
 
 @pytest.fixture(scope="session")

@@ -103,7 +103,7 @@ def test_the_split_depends_on_content_alone(toy_episode):
 
 
 def test_an_empty_store_is_refused(tmp_path):
-    with pytest.raises(InvalidInputError, match="is empty"):
+    with pytest.raises(InvalidInputError, match="has none"):
         load_episodes(str(tmp_path))
 
 

@@ -134,7 +134,7 @@ def test_only_the_models_camera_is_decoded(stored, monkeypatch):
 def test_what_does_not_exist_is_refused(stored, tmp_path):
     with pytest.raises(InvalidInputError, match="steps 30"):
         stored[0].cut(Place(0, 30, 17))
-    with pytest.raises(InvalidInputError, match="is empty"):
+    with pytest.raises(InvalidInputError, match="has none"):
         index_episodes(str(tmp_path / "empty"))
 
 

@@ -1,0 +1,159 @@
+"""Human and robot episodes are mixed in the share asked for, and their tasks are kept apart."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dextouch.errors import InvalidInputError
+from services.world_model.checkpoints import read_checkpoint
+from services.world_model.training.dataset import WindowSampler, combined_hash
+from services.world_model.training.episodes import subset_by_hash
+from services.world_model.training.splits import check_tasks, load_split
+from services.world_model.training.trainer import train
+from tests.unit.world_model.conftest import human_episode, make_episode
+
+CHILD = Path(__file__).with_name("killed_training.py")
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def settings(toy_store, human_store, train_settings):
+    return train_settings.model_copy(
+        update={
+            "human": (str(human_store.root),),
+            "heldout_percent": 50,
+            "human_share": 0.5,
+            "human_episodes": 3,
+            "max_steps": 22,
+            "cpu_budget_s": 1e6,
+        }
+    )
+
+
+def sampler(episodes, share, seed=0):
+    return WindowSampler(episodes, np.random.default_rng(seed), max_steps=17, human_share=share)
+
+
+def test_windows_come_from_both_domains_in_the_share_asked_for():
+    episodes = [make_episode(0), human_episode(100), *(make_episode(seed) for seed in (1, 2))]
+    episodes += [human_episode(101)]
+    num = 6000
+    for share in (0.0, 0.3, 1.0):
+        places = sampler(episodes, share).places(num, 17)
+        counts = np.bincount([place.episode_index for place in places], minlength=5)
+        # Two human episodes share theirs evenly, three robot ones the rest.
+        robot, human = (1 - share) / 3, share / 2
+        expected = np.array([robot, human, robot, robot, human])
+        deviation = np.sqrt(num * expected * (1 - expected))
+        assert (np.abs(counts - num * expected) <= 4 * deviation).all(), (share, counts)
+        # People command nothing.
+        kinds = {episodes[p.episode_index].domain for p in places if p.action_kind == "commanded"}
+        assert kinds <= {"robot"}
+
+
+def test_without_a_share_or_a_second_domain_every_episode_is_as_likely_as_ever():
+    robots = [make_episode(seed) for seed in range(3)]
+    drawn = sampler([*robots, human_episode(100)], None, seed=5).places(50, 9)
+    rng = np.random.default_rng(5)
+    for place in drawn:
+        assert place.episode_index == rng.integers(4)
+        assert place.start == rng.integers(41 - 9 + 1)
+        rng.random(2)
+    assert sampler(robots, 0.5, seed=5).places(50, 9) == sampler(robots, None, seed=5).places(50, 9)
+
+
+def test_larger_subsets_contain_smaller_ones_in_any_order():
+    episodes = [make_episode(seed) for seed in range(9)]
+    subsets = [
+        {e.episode_id for e in subset_by_hash(some, count, what="robot")}
+        for some in (episodes, episodes[::-1])
+        for count in (1, 3, 8)
+    ]
+    assert subsets[:3] == subsets[3:]
+    assert subsets[0] < subsets[1] < subsets[2]
+    # What is added or removed elsewhere changes nothing about the rest.
+    fewer = {e.episode_id for e in subset_by_hash(episodes[:7], 3, what="robot")}
+    assert fewer >= subsets[1] & {e.episode_id for e in episodes[:7]}
+    assert subset_by_hash(episodes, None, what="robot") == episodes
+    assert subset_by_hash(episodes, 0, what="human") == []
+    with pytest.raises(InvalidInputError, match="got 10 as the number of robot"):
+        subset_by_hash(episodes, 10, what="robot")
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+def test_subsets_of_both_domains_leave_the_held_out_robots_as_they_are(settings, streaming):
+    settings = settings.model_copy(update={"streaming": streaming})
+    plain = settings.model_copy(update={"human": (), "human_episodes": None})
+    robots, heldout = load_split(plain)
+    trained, same = load_split(settings.model_copy(update={"robot_episodes": 2}))
+    assert [e.episode_id for e in same] == [e.episode_id for e in heldout]
+    assert {e.domain for e in heldout} == {"robot"}
+    of = {d: [e.episode_id for e in trained if e.domain == d] for d in ("robot", "human")}
+    assert (len(of["robot"]), len(of["human"])) == (2, 3)
+    assert set(of["robot"]) < {e.episode_id for e in robots}
+    more, _ = load_split(settings.model_copy(update={"human_episodes": 4}))
+    assert set(of["human"]) < {e.episode_id for e in more}
+    none, _ = load_split(settings.model_copy(update={"human_episodes": 0}))
+    assert [e.episode_id for e in none] == [e.episode_id for e in robots]
+    # The held-out store may have human episodes, too; they are not evaluated on.
+    given = settings.model_copy(update={"heldout": settings.human[0]})
+    assert [e.episode_id for e in load_split(given)[1]] == ["toy-50"]
+
+
+def test_tasks_that_people_and_robots_share_are_refused_unless_allowed(settings):
+    robots, heldout = [make_episode(0)], [make_episode(1)]
+    people = [human_episode(100), human_episode(101, task="push_box")]
+    check_tasks([*robots, people[0]], heldout, settings)
+    with pytest.raises(InvalidInputError, match=r"tasks \['push_box'\].*--no-disjoint-tasks"):
+        check_tasks([*robots, *people], heldout, settings)
+    with pytest.raises(InvalidInputError, match="push_box"):
+        check_tasks(people, heldout, settings)
+    allowed = settings.model_copy(update={"disjoint_tasks": False})
+    check_tasks([*robots, *people], heldout, allowed)
+
+
+def test_a_killed_run_of_both_domains_goes_on_and_proves_what_it_was_trained_on(settings, tmp_path):
+    expected = train(settings)
+    output = tmp_path / "killed" / "model.safetensors"
+    killed = settings.model_copy(
+        update={
+            "output": output, "state_every_cpu_s": 0.0, "resume": True,
+            "streaming": True, "loader_workers": 1,
+        }
+    )  # fmt: skip
+    (tmp_path / "settings.json").write_text(killed.model_dump_json())
+    path = os.pathsep.join([str(ROOT), str(ROOT / "shared")])
+    ended = subprocess.run(
+        [sys.executable, str(CHILD), str(tmp_path / "settings.json")],
+        env={**os.environ, "PYTHONPATH": path},
+        check=False,
+    )
+    assert ended.returncode == -signal.SIGKILL
+    steps = []
+    report = train(killed, lambda progress: steps.append(progress.step))
+    assert steps == [20, 22]
+    losses = [(entry.step, entry.loss_video, entry.loss_tactile) for entry in report.log]
+    np.testing.assert_allclose(
+        losses, [(e.step, e.loss_video, e.loss_tactile) for e in expected.log], rtol=1e-4
+    )
+    trained, heldout = load_split(settings)
+    metadata = read_checkpoint(report.checkpoint).metadata
+    found = {(one.domain, one.heldout): one for one in metadata.sets}
+    for (domain, held), episodes in {
+        ("robot", False): [e for e in trained if e.domain == "robot"],
+        ("human", False): [e for e in trained if e.domain == "human"],
+        ("robot", True): heldout,
+    }.items():
+        one = found.pop((domain, held))
+        task = "fold_cloth" if domain == "human" else "push_box"
+        assert one.tasks == {task: len(episodes)}
+        assert one.data_hash == combined_hash([e.content_hash() for e in episodes])
+        assert one.window_share == (None if held else 0.5)
+    assert not found
+    assert "--human=human" in metadata.command
+    assert "--human-episodes=3" in metadata.command
