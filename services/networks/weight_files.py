@@ -10,7 +10,7 @@ from typing import TypeVar
 import torch
 from pydantic import BaseModel, ValidationError
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from dextouch.errors import (
@@ -54,15 +54,20 @@ def write_weights(path: Path, tensors: Mapping[str, Tensor], history: BaseModel,
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], notes: dict[str, str]) -> str:
     """Write tensors with texts as metadata; as `write_weights`."""
-    data = save({name: tensor.contiguous() for name, tensor in tensors.items()}, notes)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        file.write(data)
-        file.flush()
+    save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, partial, notes)
+    with partial.open("rb") as file:
         os.fsync(file.fileno())
+    digest = digest_of(partial)
     partial.replace(path)
-    return hashlib.sha256(data).hexdigest()
+    return digest
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file of any size."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_weights(
@@ -94,7 +99,7 @@ def read_weights(
     tensors, notes = read_tensors(path, where)
     parsed = _history(notes.get(key), history, key, where)
     refuse_non_finite(tensors, where)
-    return tensors, parsed, hashlib.sha256(path.read_bytes()).hexdigest()
+    return tensors, parsed, digest_of(path)
 
 
 def read_tensors(path: Path, where: str) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -129,11 +134,16 @@ def _history(text: str | None, history: type[History], key: str, where: str) -> 
 
 def holds(path: Path, key: str) -> bool:
     """Whether a file declares this kind of model; False if it is not a safetensors file."""
+    return key in notes_of(path)
+
+
+def notes_of(path: Path) -> dict[str, str]:
+    """Metadata of a file, without reading its tensors; empty if it is not a safetensors file."""
     try:
         with safe_open(path, framework="pt") as file:
-            return key in (file.metadata() or {})
+            return file.metadata() or {}
     except (SafetensorError, OSError):
-        return False
+        return {}
 
 
 def load_strictly(
@@ -176,7 +186,13 @@ def load_strictly(
                 f"{'floating point' if kinds[1] else wanted.dtype} {tuple(wanted.shape)}"
             )
     for prefix, model in models.items():
-        model.load_state_dict({name: found[prefix + name] for name in model.state_dict()})
+        own = {name: found[prefix + name] for name in model.state_dict()}
+        # Weights of a network that was built without memory are taken over, not copied.
+        if any(weight.is_meta for weight in model.state_dict().values()):
+            own = {name: tensor.to(expected[prefix + name].dtype) for name, tensor in own.items()}
+            model.load_state_dict(own, assign=True)
+        else:
+            model.load_state_dict(own)
         model.eval().requires_grad_(requires_grad=False)
 
 

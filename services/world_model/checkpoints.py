@@ -1,18 +1,24 @@
 """Checkpoints of the joint flow-matching model, and the default checkpoint of the package."""
 
-import hashlib
+import sys
 from dataclasses import dataclass
 from operator import not_
 from pathlib import Path
+from typing import Final
 
 from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Domain
+from services.networks.memory import available_memory
 from services.networks.weight_files import (
+    MAX_FILE_BYTES,
+    digest_of,
     half_weights,
     load_strictly,
+    notes_of,
     read_weights,
+    refuse_non_finite,
     write_weights,
 )
 from services.world_model.network.configuration import NetworkConfig
@@ -22,6 +28,7 @@ FORMAT_VERSION = 1
 METADATA_KEY = "dextouch_world_model"
 # Statistics missing from files of older releases; the network's defaults are used instead.
 LATER_STATISTICS = ("tokenizer.peak_kpa",)
+_TEXT: Final = "text_features."
 PRETRAINED = Path(__file__).parent / "pretrained"
 STATE_MODEL, PAPER_FORM = "state.safetensors", "tiny.safetensors"
 
@@ -79,29 +86,55 @@ class Checkpoint:
 
 
 def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMetadata) -> str:
-    """Write the file atomically and return its digest."""
-    return write_weights(path, half_weights(model), metadata, METADATA_KEY)
+    """Write the file atomically and return its digest.
+
+    The full size keeps the precision of its weights, and comes with the text features of its
+    instructions, so that the text encoder is not needed to serve them.
+    """
+    if model.text_features is None:
+        return write_weights(path, half_weights(model), metadata, METADATA_KEY)
+    known = model.text_features.known
+    tensors = {**model.state_dict(), **{_TEXT + key: value for key, value in known.items()}}
+    refuse_non_finite(tensors, "weights to be written")
+    return write_weights(path, tensors, metadata, METADATA_KEY)
 
 
-def read_checkpoint(path: Path) -> Checkpoint:
-    """Load a checkpoint strictly, in float32 and evaluation mode.
+def read_checkpoint(path: Path, *, max_bytes: int | None = None) -> Checkpoint:
+    """Load a checkpoint strictly, in evaluation mode.
+
+    Args:
+        path: file to read.
+        max_bytes: largest size of the file; by default 64 MiB, and for the full size the memory
+            that is available.
 
     Raises:
         NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
         InvalidInputError: unsupported format version; missing or unexpected tensors, wrong shapes.
     """
-    tensors, metadata, digest = read_weights(path, CheckpointMetadata, METADATA_KEY)
+    limit = _largest(path) if max_bytes is None else max_bytes
+    tensors, metadata, digest = read_weights(
+        path, CheckpointMetadata, METADATA_KEY, max_bytes=limit
+    )
     model = JointWorldModel(metadata.network)
+    if model.text_features is not None:
+        keys = [name for name in tensors if name.startswith(_TEXT)]
+        model.text_features.learn({key.removeprefix(_TEXT): tensors.pop(key) for key in keys})
     load_strictly({"": model}, tensors, where=f"checkpoint {path.name}", later=LATER_STATISTICS)
     return Checkpoint(model, metadata, digest)
 
 
+def _largest(path: Path) -> int:
+    """Largest size of a file of its kind, as its metadata declare it."""
+    text = notes_of(path).get(METADATA_KEY, "")
+    if '"video_expert":"wan"' not in text:
+        return MAX_FILE_BYTES
+    available = available_memory()
+    return sys.maxsize if available is None else available
+
+
 def list_checkpoints(folder: Path) -> dict[Path, str]:
     """Every checkpoint file of a folder with its digest."""
-    return {
-        path: hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.glob("*.safetensors"))
-    }
+    return {path: digest_of(path) for path in sorted(folder.glob("*.safetensors"))}
 
 
 def default_checkpoint() -> Path:

@@ -21,6 +21,8 @@ from services.world_model.network.tactile_expert import TactileExpert
 from services.world_model.network.tokenizer_choice import build_tokenizer
 from services.world_model.network.video_side import video_side
 from services.world_model.network.visual_codec import to_unit
+from services.world_model.network.wan_video import WanVideoCondition
+from services.world_model.wan.text import TextFeatures
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -74,6 +76,12 @@ class JointWorldModel(nn.Module):
             JointLayer(side.block(index), TactileExpert.block(config))
             for index in range(config.num_layers)
         )
+
+    @property
+    def text_features(self) -> TextFeatures | None:
+        """Features of instructions for the pretrained video expert."""
+        condition = self.video_condition
+        return condition.text_features if isinstance(condition, WanVideoCondition) else None
 
     def first_latents(self, inputs: ModelInputs) -> FirstLatents:
         """Latents of the first image and the first touch."""

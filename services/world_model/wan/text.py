@@ -66,21 +66,23 @@ class TextEncoder:
 
 
 class TextFeatures:
-    """Features by instruction, from memory, from disk or from the encoder, in this order.
+    """Features by instruction, from memory, from disk or from the encoder, in this order."""
 
-    Args:
-        config: sizes of the features.
-        folder: folder of the pretrained model; None if only known instructions are needed.
-        cache: folder in which features are kept as safetensors; None for memory only.
-    """
-
-    def __init__(
-        self, config: WanConfig, *, folder: Path | None = None, cache: Path | None = None
-    ) -> None:
+    def __init__(self, config: WanConfig) -> None:
         self._config = config
-        self._folder, self._cache = folder, cache
+        self._folder: Path | None = None
+        self._cache: Path | None = None
         self._encoder: TextEncoder | None = None
         self._known: dict[str, Tensor] = {}
+
+    def use(self, folder: Path | None, cache: Path | None = None) -> None:
+        """Choose where unknown texts are looked up.
+
+        Args:
+            folder: folder of the pretrained model with its text encoder.
+            cache: folder in which features are kept as safetensors; None for memory only.
+        """
+        self._folder, self._cache, self._encoder = folder, cache, None
 
     def stack(self, texts: Sequence[str]) -> Float[Tensor, "batch words width"]:
         """Features of several texts, padded with zeros to `text_tokens`, as Wan2.2 expects.
@@ -110,6 +112,10 @@ class TextFeatures:
         if key not in self._known:
             self._known[key] = self._stored(key, text).to(self._config.dtype)
         return self._known[key]
+
+    def __deepcopy__(self, _: object) -> "TextFeatures":
+        """Itself: copies of a model share their features."""
+        return self
 
     @property
     def known(self) -> Mapping[str, Tensor]:

@@ -3,6 +3,11 @@
 import pytest
 import torch
 from diffusers import AutoencoderKLWan, WanTransformer3DModel
+from tokenizers import Tokenizer
+from tokenizers.models import WordLevel
+from tokenizers.pre_tokenizers import Whitespace
+from tokenizers.processors import TemplateProcessing
+from transformers import PreTrainedTokenizerFast, UMT5Config, UMT5EncoderModel
 
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.wan.configuration import WanConfig
@@ -46,3 +51,34 @@ def full_config(wan_config):
         video_width=HEADS * HEAD_WIDTH, num_heads=HEADS, head_width=HEAD_WIDTH, num_layers=LAYERS,
         tactile_width=16, ffn_ratio=2, use_pose_raster=False,
     )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def text_encoder(wan_config):
+    torch.manual_seed(2)
+    sizes = UMT5Config(
+        vocab_size=32, d_model=wan_config.text_width, d_kv=8, d_ff=16, num_layers=2, num_heads=4,
+        dropout_rate=0.0,
+    )  # fmt: skip
+    return UMT5EncoderModel(sizes).eval().requires_grad_(requires_grad=False)
+
+
+@pytest.fixture(scope="session")
+def pretrained_folder(tmp_path_factory, transformer, autoencoder, text_encoder):
+    """A folder in the layout of the published model, written by the libraries themselves."""
+    folder = tmp_path_factory.mktemp("pretrained")
+    transformer.save_pretrained(folder / "transformer")
+    autoencoder.save_pretrained(folder / "vae")
+    text_encoder.save_pretrained(folder / "text_encoder")
+    save_tokenizer(folder / "tokenizer")
+    return folder
+
+
+def save_tokenizer(folder):
+    marks = {"pad_token": "<pad>", "eos_token": "</s>", "unk_token": "<unk>"}
+    words = [*marks.values(), "push", "the", "box", "with", "both", "hands", "stand"]
+    numbers = {word: number for number, word in enumerate(words)}
+    tokenizer = Tokenizer(WordLevel(numbers, unk_token=marks["unk_token"]))
+    tokenizer.pre_tokenizer = Whitespace()
+    tokenizer.post_processor = TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])
+    PreTrainedTokenizerFast(tokenizer_object=tokenizer, **marks).save_pretrained(folder)
