@@ -42,6 +42,10 @@ COMMANDS = {
     "align serve": Command("serve alignment over HTTP", "alignment.app:main"),
     "train": Command("train the world model, a policy or the success probe"),
     "train data": Command("record training episodes in the twin", "cli.training_data:main"),
+    "train tokenizer": Command(
+        "train a tactile tokenizer for the paper's form of the world model",
+        "cli.train_tokenizer:main",
+    ),
     "train world-model": Command(
         "train the flow-matching world model, in the paper's form",
         "world_model.command_line:run_train",

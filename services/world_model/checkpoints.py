@@ -54,9 +54,10 @@ class CheckpointMetadata(FrozenModel):
     """Provenance and measured accuracy of a model, stored in its checkpoint.
 
     `initialized_from` is the digest of the checkpoint that the weights were initialized from; its
-    training episodes count as training episodes here, too. None is not written, so that older
-    releases can read the file. `sets` are the episodes by domain, those of ancestors included; it
-    is empty in files of older releases.
+    training episodes count as training episodes here, too. `tokenizer_digest` is that of the
+    pretrained tokenizer's file. None is not written, so that older releases can read the file.
+    `sets` are the episodes by domain, those of ancestors included; it is empty in files of older
+    releases.
     """
 
     format_version: int = FORMAT_VERSION
@@ -73,6 +74,7 @@ class CheckpointMetadata(FrozenModel):
     heldout_episode_ids: tuple[str, ...] = ()
     initialized_from: str | None = Field(default=None, exclude_if=not_)
     sets: tuple[TrainingSet, ...] = Field(default=(), exclude_if=not_)
+    tokenizer_digest: str | None = Field(default=None, exclude_if=not_)
     metrics: dict[str, float] = Field(default={})
 
 

@@ -19,6 +19,7 @@ from services.world_model.settings import (
     WorldModelSettings,
 )
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
+from services.world_model.tokenizer_files import is_tokenizer, read_tokenizer
 from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
 from services.world_model.world import open_world
 
@@ -116,7 +117,11 @@ def run_show(arguments: list[str]) -> int:
 
 
 def _history(file: Path) -> dict[str, Any]:
-    """Metadata of a checkpoint of either kind."""
+    """Metadata of a checkpoint of either kind, or of a tactile tokenizer."""
+    if is_tokenizer(file):
+        stored = read_tokenizer(file)
+        about = stored.metadata.model_dump(mode="json", exclude={"train_scenes"})
+        return {"file": file.name, "digest": stored.digest, "form": "tactile tokenizer", **about}
     if is_state_checkpoint(file):
         state = read_state_checkpoint(file)
         history = {"form": "state model", **state.metadata.model_dump(mode="json")}

@@ -117,6 +117,9 @@ class TrainSettings(FrozenModel):
         default=None,
         description="checkpoint to initialize from; its network settings must be equal",
     )
+    tokenizer: Path | None = Field(
+        default=None, description="tactile tokenizer of `dextouch train tokenizer`, kept frozen"
+    )
     resume: CliImplicitFlag[bool] = Field(
         default=False,
         description="resume an interrupted run of this output, if there is one",
@@ -290,6 +293,7 @@ def command_line(settings: TrainSettings) -> str:
             "human",
             "heldout",
             "init",
+            "tokenizer",
             "resume",
             "state_every_cpu_s",
         },
@@ -300,6 +304,8 @@ def command_line(settings: TrainSettings) -> str:
         flags.append(f"--heldout={last_name(settings.heldout)}")
     if settings.init is not None:
         flags.append(f"--init={settings.init.name}")
+    if settings.tokenizer is not None:
+        flags.append(f"--tokenizer={settings.tokenizer.name}")
     return " ".join(["dextouch train world-model", *flags, *flags_of(given)])
 
 

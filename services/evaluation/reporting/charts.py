@@ -1,7 +1,7 @@
-"""Small SVG charts that take their colours from the page."""
+"""Small SVG charts that take their colours from the page, and pictures that stand alone."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,10 @@ from markupsafe import Markup, escape
 MAX_POINTS = 600
 NUM_STYLES = 8
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 10, 36
+_PALETTE = (
+    "#3658a7", "#d0652b", "#2d8a6d", "#a4407f", "#8a7a1c", "#4b96b8", "#7b5bb5", "#6b6f76",
+)  # fmt: skip
+_KEY_PX = 24
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,33 @@ def agreement_chart(points: Sequence[Point], *, size: int = 300) -> Markup:
             f"imagined {point.imagined:.2f}</title></circle></g>"
         )
     return _svg(body, axes, "imagined over real success of each policy")
+
+
+def stand_alone(
+    charts: Sequence[Markup], keys: Mapping[str, int], *, width: int = 560, height: int = 240
+) -> str:
+    """One SVG file of charts of one size side by side, with its own colours and a key of styles."""
+    total = width * len(charts)
+    style = (
+        ".grid{stroke:#e4e5e0}.axis{stroke:#6a7280}text{fill:#4b5563;font:11px sans-serif}"
+        ".curve{fill:none;stroke-width:1.6;stroke-linejoin:round}"
+    )
+    style += "".join(f".curve.s{k}{{stroke:{colour}}}" for k, colour in enumerate(_PALETTE))
+    body: list[str] = [
+        str(chart).replace("<svg ", f'<svg x="{k * width}" width="{width}" height="{height}" ', 1)
+        for k, chart in enumerate(charts)
+    ]
+    for k, (label, chosen) in enumerate(keys.items()):
+        x, y = _LEFT + k * (total - _LEFT) // len(keys), height + _KEY_PX // 2
+        body.append(
+            f'<path class="curve s{chosen % NUM_STYLES}" d="M{x} {y}h20"/>'
+            f'<text x="{x + 26}" y="{y + 4}">{escape(label)}</text>'
+        )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {total} {height + _KEY_PX}" '
+        f'width="{total}" height="{height + _KEY_PX}"><style>{style}</style>'
+        f'<rect width="100%" height="100%" fill="white"/>{"".join(body)}</svg>\n'
+    )
 
 
 def _range(values: np.ndarray, *, margin: float) -> tuple[float, float]:

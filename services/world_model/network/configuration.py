@@ -12,6 +12,8 @@ from services.world_model.wan.configuration import (
     WanConfig,
 )
 
+TokenizerName = Literal["principal_axes", "split_hands", "grid"]
+
 
 class NetworkConfig(FrozenModel):
     """Shape and sampling of the joint model; stored in every checkpoint."""
@@ -24,7 +26,7 @@ class NetworkConfig(FrozenModel):
     patch_px: int = Field(default=8, description="side of a visual patch")
     max_steps: int = Field(default=17, ge=5, description="longest window: 1 + 4k steps")
     codec_channels: int = Field(default=48, ge=1, le=768, description="latents per visual patch")
-    tokenizer: Literal["principal_axes", "split_hands", "grid"] = Field(
+    tokenizer: TokenizerName = Field(
         default="principal_axes",
         description="tactile tokenizer; the learned ones need --tokenizer",
     )

@@ -41,8 +41,9 @@ class GridTokenizer(LearnedTokenizer):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
+        # Of the sizes with as many weights as Split-Hands, the most accurate one.
         shape = MapShape(
-            *CANVAS_SHAPE, num_maps=1, channels=config.tactile_channels, width=24, hidden=128,
+            *CANVAS_SHAPE, num_maps=1, channels=config.tactile_channels, width=24, hidden=90,
             num_halvings=2,
         )  # fmt: skip
         self.encoder, self.decoder = MapEncoder(shape), MapDecoder(shape)

@@ -36,15 +36,16 @@ class MapShape:
     hidden: int
     num_halvings: int
 
-    def after(self, num_halvings: int) -> tuple[int, int]:
-        """Rows and columns after some halvings, rounded up."""
-        cells = 2**num_halvings
+    @property
+    def lowest(self) -> tuple[int, int]:
+        """Rows and columns at the lowest resolution, rounded up."""
+        cells = 2**self.num_halvings
         return -(-self.rows // cells), -(-self.columns // cells)
 
     @property
     def num_features(self) -> int:
         """Values of a map at the lowest resolution."""
-        rows, columns = self.after(self.num_halvings)
+        rows, columns = self.lowest
         return self.width * rows * columns
 
 
@@ -100,7 +101,8 @@ class MapDecoder(nn.Module):
         )
         # The last doubling of the resolution writes four cells per feature.
         factor = 2 if shape.num_halvings else 1
-        self.position = nn.Parameter(torch.zeros(shape.width, *shape.after(factor - 1)))
+        rows, columns = (n * 2**shape.num_halvings // factor for n in shape.lowest)
+        self.position = nn.Parameter(torch.zeros(shape.width, rows, columns))
         self.last = nn.Sequential(_convolution(shape.width, factor**2), nn.PixelShuffle(factor))
 
     def forward(
@@ -109,8 +111,8 @@ class MapDecoder(nn.Module):
         """Maps of the latents; values may be below zero."""
         shape = self._shape
         hidden = functional.gelu(self.from_latents(latents) * (1.0 + self.identity))
-        lowest = (shape.width, *shape.after(shape.num_halvings))
-        features = self.deeper(split_axis(self.to_features(hidden).flatten(0, 1), 1, lowest))
+        flat = self.to_features(hidden).flatten(0, 1)
+        features = self.deeper(split_axis(flat, 1, (shape.width, *shape.lowest)))
         maps = self.last(features * (1.0 + self.position))[:, 0, : shape.rows, : shape.columns]
         return split_axis(maps, 0, latents.shape[:2])
 

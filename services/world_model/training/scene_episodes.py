@@ -179,7 +179,12 @@ def _object_poses(
 
 def place_of_scene(episode: SceneEpisode) -> float:
     """Hash of task and seed as a number in 0 … 1; adding episodes does not change it."""
-    digest = hashlib.sha256(f"{episode.task}/{episode.seed}".encode()).digest()
+    return place_of_name(f"{episode.task}/{episode.seed}")
+
+
+def place_of_name(scene: str) -> float:
+    """`place_of_scene` of a scene by its name, TASK/SEED."""
+    digest = hashlib.sha256(scene.encode()).digest()
     return int.from_bytes(digest[:8], "big") / 2**64
 
 

@@ -28,7 +28,9 @@ from services.world_model.checkpoints import (
 )
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
+from services.world_model.network.tactile_tokenizer import TactileTokenizer
 from services.world_model.settings import TrainSettings, command_line
+from services.world_model.tokenizer_files import StoredTokenizer
 from services.world_model.training.dataset import (
     EpisodeArrays,
     Place,
@@ -38,6 +40,7 @@ from services.world_model.training.dataset import (
     combined_hash,
 )
 from services.world_model.training.evaluation import evaluate_prediction
+from services.world_model.training.frozen_tokenizer import check_unseen, with_tokenizer
 from services.world_model.training.objective import losses
 from services.world_model.training.splits import (
     check_disjoint,
@@ -111,6 +114,9 @@ def train_on(
     """`train` with episodes that are already split."""
     check_disjoint(trained, heldout)
     check_tasks(trained, heldout, settings)
+    settings, tokenizer = with_tokenizer(settings)
+    if tokenizer is not None:
+        check_unseen(heldout, tokenizer)
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else read_checkpoint(settings.init)
     prints = {episode.content_hash() for episode in trained}
@@ -121,7 +127,7 @@ def train_on(
         prints |= set(ancestor.metadata.train_fingerprints)
         names |= set(ancestor.metadata.train_episode_ids)
     run = TrainingRun(trained, settings)
-    log = _run_or_resume(run, ancestor, on_progress)
+    log = _run_or_resume(run, ancestor, tokenizer, on_progress)
     metadata = CheckpointMetadata(
         name=settings.name,
         network=settings.network,
@@ -138,6 +144,7 @@ def train_on(
         sets=training_sets(
             trained, heldout, human_share=settings.share_of_human, ancestor=ancestor
         ),
+        tokenizer_digest=_tokenizer_digest(ancestor, tokenizer),
     )
     write_checkpoint(settings.output, run.averaged, metadata)
     # Evaluate the weights as stored, then store them again with the results.
@@ -164,8 +171,17 @@ def train_on(
     )
 
 
+def _tokenizer_digest(ancestor: Checkpoint | None, tokenizer: StoredTokenizer | None) -> str | None:
+    if tokenizer is not None:
+        return tokenizer.digest
+    return None if ancestor is None else ancestor.metadata.tokenizer_digest
+
+
 def _run_or_resume(
-    run: "TrainingRun", ancestor: Checkpoint | None, on_progress: OnProgress | None
+    run: "TrainingRun",
+    ancestor: Checkpoint | None,
+    tokenizer: StoredTokenizer | None,
+    on_progress: OnProgress | None,
 ) -> list[TrainingProgress]:
     """Run from the start or resume an interrupted run; saves its state regularly."""
     settings = run.settings
@@ -174,13 +190,14 @@ def _run_or_resume(
         settings,
         data_hash=combined_hash([episode.content_hash() for episode in run.episodes]),
         init_digest=None if ancestor is None else ancestor.digest,
+        tokenizer_digest=None if tokenizer is None else tokenizer.digest,
     )
     if settings.resume and path.exists():
         run.restore(read_state(path, identity))
     elif ancestor is not None:
         run.start_from(ancestor)
     else:
-        run.fit_codecs()
+        run.fit_codecs(None if tokenizer is None else tokenizer.tokenizer)
     kept_cpu_s = run.budget.cpu_s
 
     def keep(now: TrainingRun) -> None:
@@ -233,12 +250,20 @@ class TrainingRun:
         self.loop = OptimizerLoop(self.model, options, self.budget)
 
     @torch.no_grad()
-    def fit_codecs(self) -> None:
-        """Fit everything in closed form: codecs, action statistics, residual scales."""
+    def fit_codecs(self, tokenizer: TactileTokenizer | None = None) -> None:
+        """Fit everything in closed form: codecs, action statistics, residual scales.
+
+        Args:
+            tokenizer: pretrained tokenizer to use instead of fitting one.
+        """
         model, config = self.model, self.settings.network
         batch = self._sampler.draw(self.settings.windows.fit_windows, config.max_steps)
         model.codec.fit(batch.images)
-        model.tokenizer.fit(batch.tactile_kpa.flatten(0, 1))
+        if tokenizer is None:
+            model.tokenizer.fit(batch.tactile_kpa.flatten(0, 1))
+        else:
+            model.tokenizer.load_state_dict(tokenizer.state_dict())
+            model.tokenizer.peak_kpa.clamp_min_(batch.tactile_kpa.max())
         model.normalizer.fit(build_inputs(batch.requests, config).hands)
         residuals = model.residuals(batch.images, batch.tactile_kpa)
         model.video_residual_std.copy_(residuals.video[:, 1:].std().clamp_min(1e-3))

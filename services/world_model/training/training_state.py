@@ -25,7 +25,7 @@ SUFFIX: Final = ".resume"
 # Settings that may change when a run resumes.
 _FREE_SETTINGS: Final = {
     "episodes", "human", "heldout", "output", "json_path", "resume", "state_every_cpu_s", "init",
-    "streaming", "loader_workers", "num_threads", "disjoint_tasks",
+    "tokenizer", "streaming", "loader_workers", "num_threads", "disjoint_tasks",
 }  # fmt: skip
 
 
@@ -62,11 +62,16 @@ def state_path(output: Path) -> Path:
 
 
 def identity_of(
-    settings: TrainSettings, *, data_hash: str, init_digest: str | None
+    settings: TrainSettings,
+    *,
+    data_hash: str,
+    init_digest: str | None,
+    tokenizer_digest: str | None = None,
 ) -> dict[str, JsonValue]:
     """Settings and data that must not change when a run resumes."""
     kept: dict[str, JsonValue] = settings.model_dump(mode="json", exclude=_FREE_SETTINGS)
-    return {**kept, "data_hash": data_hash, "init_digest": init_digest}
+    digests = {"init_digest": init_digest, "tokenizer_digest": tokenizer_digest}
+    return {**kept, "data_hash": data_hash, **digests}
 
 
 def write_state(path: Path, state: TrainingState) -> None:

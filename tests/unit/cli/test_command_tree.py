@@ -23,7 +23,7 @@ store delete, store list, store migrate, store purge, store repair, store restor
 store show, store verify,
 study report, study run,
 train data, train direct-judge, train imagined, train policy, train probe, train state,
-train world-model,
+train tokenizer, train world-model,
 twin record, twin serve, up
 """
 NAMES = [" ".join(name.split()) for name in COMMANDS.split(",")]

@@ -1,0 +1,46 @@
+"""Pretrained tactile tokenizer of a training run, which stays frozen while the experts train."""
+
+from collections.abc import Sequence
+
+from dextouch.errors import InvalidInputError
+from services.world_model.settings import TrainSettings
+from services.world_model.tokenizer_files import StoredTokenizer, read_tokenizer
+from services.world_model.training.dataset import TrainingEpisode
+from services.world_model.training.tactile_hands import scene_of
+
+
+def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokenizer | None]:
+    """The settings with the network of `--tokenizer`, and that tokenizer if one is given.
+
+    Raises:
+        InvalidInputError: a learned tokenizer without a file or an initial checkpoint that holds
+            it, or both of these.
+        ConflictError: the network settings name another tokenizer than the file.
+    """
+    if settings.tokenizer is None:
+        if settings.network.tokenizer != "principal_axes" and settings.init is None:
+            raise InvalidInputError(
+                f"training: the tokenizer {settings.network.tokenizer} is learned; train it first "
+                "(dextouch train tokenizer) and give its file as --tokenizer"
+            )
+        return settings, None
+    if settings.init is not None:
+        raise InvalidInputError(
+            "training: got --init and --tokenizer, expected one of them; the initial checkpoint "
+            "holds the tokenizer that its latents come from"
+        )
+    stored = read_tokenizer(settings.tokenizer)
+    network = stored.metadata.network(settings.network)
+    return settings.model_copy(update={"network": network}), stored
+
+
+def check_unseen(heldout: Sequence[TrainingEpisode], stored: StoredTokenizer) -> None:
+    """Raise if the tokenizer was trained on the scene of a held-out episode."""
+    seen = set(stored.metadata.train_scenes)
+    both = [episode.episode_id for episode in heldout if scene_of(episode) in seen]
+    if both:
+        raise InvalidInputError(
+            f"training: the tokenizer was trained on the scenes of {len(both)} held-out episodes "
+            f"{both[:3]}; give a --heldout store that it has not seen",
+            episodes=both,
+        )

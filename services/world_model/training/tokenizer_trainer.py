@@ -1,0 +1,206 @@
+"""Pretraining of tactile tokenizers on the touch of single hands, before any world model."""
+
+import copy
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from dextouch.errors import InvalidInputError
+from dextouch.metrics import tactile as tactile_metrics
+from dextouch.tactile import CONTACT_THRESHOLD_KPA
+from services.networks.optimizer import (
+    Budget,
+    OptimizerLoop,
+    OptimizerOptions,
+    half_cosine,
+    update_average,
+)
+from services.world_model.network.learned_tokenizer import LearnedTokenizer
+from services.world_model.network.tactile_tokenizer import TactileTokenizer, root_pressure
+from services.world_model.network.tokenizer_choice import build_tokenizer
+from services.world_model.tokenizer_files import (
+    Reconstruction,
+    TokenizerMetadata,
+    read_tokenizer,
+    write_tokenizer,
+)
+from services.world_model.tokenizer_settings import TrainTokenizerSettings
+from services.world_model.training.tactile_hands import TactileHands, load_hands
+
+MIN_LEARNING_RATE_SHARE = 0.01
+_EVALUATION_BATCH = 1000
+_TIMING_ROUNDS = 5
+OnEvaluation = Callable[[float, Reconstruction], None]
+
+
+@dataclass(frozen=True)
+class TokenizerReport:
+    """Result of a run; times are medians of encoding and decoding on this machine."""
+
+    checkpoint: Path
+    metadata: TokenizerMetadata
+    digest: str
+    ms_per_1000_hands: float
+
+
+def train_tokenizer(
+    settings: TrainTokenizerSettings, on_evaluation: OnEvaluation | None = None
+) -> TokenizerReport:
+    """Train a tokenizer, evaluate it on held-out scenes and write it.
+
+    Args:
+        settings: data, tokenizer and limits of the run.
+        on_evaluation: called with the completed share and each new point of the curve.
+
+    Raises:
+        InvalidInputError: no scene to train on or none held out, or no touch at all.
+    """
+    torch.set_num_threads(settings.num_threads)
+    training, heldout = load_hands(
+        settings.episodes, splits=settings.splits, heldout_share=settings.heldout_share
+    )
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        tokenizer = build_tokenizer(settings.network())
+    tokenizer.fit(torch.from_numpy(training.tactile_kpa)[:, None].expand(-1, 2, -1))
+    budget = Budget(settings.cpu_budget_s, settings.max_steps)
+    curve: list[Reconstruction] = []
+
+    def evaluate(current: TactileTokenizer) -> None:
+        with budget.paused():
+            curve.append(reconstruction(current, heldout, budget))
+            if on_evaluation is not None:
+                on_evaluation(min(budget.share(), 1.0), curve[-1])
+
+    if isinstance(tokenizer, LearnedTokenizer):
+        tokenizer = _learn(tokenizer, training, settings, budget, evaluate)
+    metadata = TokenizerMetadata(
+        tokenizer=settings.tokenizer,
+        palm_channels=settings.palm_channels,
+        tactile_channels=settings.tactile_channels,
+        command=settings.command(),
+        seed=settings.seed,
+        training_steps=budget.step,
+        training_cpu_s=round(budget.cpu_s, 1),
+        num_parameters=sum(p.numel() for p in tokenizer.parameters()),
+        num_training_hands=len(training.tactile_kpa),
+        num_heldout_hands=len(heldout.tactile_kpa),
+        train_scenes=training.scenes,
+        data_hash=training.data_hash(),
+        curve=(
+            Reconstruction(step=0, cpu_s=0, mse_kpa2=0, mae_kpa=0, contact_iou=0, contact_f1=0),
+        ),
+    )
+    write_tokenizer(settings.output, tokenizer, metadata)
+    # Evaluate the weights as stored, then store them again with the curve.
+    stored = read_tokenizer(settings.output).tokenizer
+    evaluate(stored)
+    metadata = metadata.model_copy(update={"curve": tuple(curve)})
+    digest = write_tokenizer(settings.output, stored, metadata)
+    return TokenizerReport(settings.output, metadata, digest, _ms_per_1000_hands(stored, heldout))
+
+
+def _learn(
+    tokenizer: LearnedTokenizer,
+    training: TactileHands,
+    settings: TrainTokenizerSettings,
+    budget: Budget,
+    evaluate: Callable[[TactileTokenizer], None],
+) -> LearnedTokenizer:
+    """The moving average of the weights after training, evaluated at equal shares of the run."""
+    # Untouched hands are exact with any weights.
+    touched = torch.from_numpy(training.tactile_kpa[(training.tactile_kpa > 0).any(axis=1)])
+    if len(touched) == 0:
+        raise InvalidInputError(
+            f"tokenizer: got {len(training.tactile_kpa)} hands to train on that touch nothing, "
+            "expected some pressure; add episodes"
+        )
+    generator = torch.Generator().manual_seed(settings.seed + 1)
+    averaged = copy.deepcopy(tokenizer).eval().requires_grad_(requires_grad=False)
+    given = settings.optimizer
+    options = OptimizerOptions(
+        learning_rate=given.learning_rate,
+        weight_decay=given.weight_decay,
+        max_gradient_norm=given.max_gradient_norm,
+        warmup_steps=given.warmup_steps,
+        schedule=partial(half_cosine, least=MIN_LEARNING_RATE_SHARE),
+    )
+
+    def loss() -> Tensor:
+        drawn = torch.randint(len(touched), (given.batch,), generator=generator)
+        return reconstruction_loss(
+            tokenizer, touched[drawn], contact_weight=settings.contact_weight
+        )
+
+    evaluate(averaged)
+    num_evaluated = 0
+    for _ in OptimizerLoop(tokenizer, options, budget).run(loss):
+        update_average(averaged, tokenizer, decay=given.ema_decay, num_updates=budget.step - 1)
+        if (
+            num_evaluated + 1
+            <= budget.share() * settings.num_evaluations
+            < settings.num_evaluations
+        ):
+            evaluate(averaged)
+            num_evaluated += 1
+    return averaged
+
+
+def reconstruction_loss(
+    tokenizer: LearnedTokenizer,
+    tactile_kpa: Float32[Tensor, "hands 320"],
+    *,
+    contact_weight: float,
+) -> Float32[Tensor, ""]:
+    """Weighted mean squared error of root pressures (kPa).
+
+    Taxels in contact have the weight `contact_weight`, the others, which are many more, 1. Roots
+    weight light touch like strong touch.
+    """
+    error = tokenizer.roots(tokenizer.encode(tactile_kpa)) - root_pressure(tactile_kpa)
+    weights = torch.where(tactile_kpa >= CONTACT_THRESHOLD_KPA, contact_weight, 1.0)
+    return (weights * error.square()).sum() / weights.sum()
+
+
+def reconstruction(
+    tokenizer: TactileTokenizer, hands: TactileHands, budget: Budget
+) -> Reconstruction:
+    """Accuracy of a tokenizer on hands, at this point of a run."""
+    decoded = [
+        _through(tokenizer, hands.tactile_kpa[begin : begin + _EVALUATION_BATCH])
+        for begin in range(0, len(hands.tactile_kpa), _EVALUATION_BATCH)
+    ]
+    predicted, true = np.concatenate(decoded), hands.tactile_kpa
+    return Reconstruction(
+        step=budget.step,
+        cpu_s=round(budget.cpu_s, 2),
+        mse_kpa2=tactile_metrics.mse(predicted_kpa=predicted, true_kpa=true),
+        mae_kpa=tactile_metrics.mae(predicted_kpa=predicted, true_kpa=true),
+        contact_iou=tactile_metrics.contact_iou(predicted_kpa=predicted, true_kpa=true),
+        contact_f1=tactile_metrics.contact_f1(predicted_kpa=predicted, true_kpa=true),
+    )
+
+
+@torch.no_grad()
+def _through(
+    tokenizer: TactileTokenizer, tactile_kpa: Float32[np.ndarray, "hands 320"]
+) -> Float32[np.ndarray, "hands 320"]:
+    return tokenizer.decode(tokenizer.encode(torch.from_numpy(tactile_kpa))).numpy()
+
+
+def _ms_per_1000_hands(tokenizer: TactileTokenizer, hands: TactileHands) -> float:
+    """Median CPU time of encoding and decoding a batch of 1000 hands."""
+    batch = np.resize(hands.tactile_kpa, (1000, hands.tactile_kpa.shape[1]))
+    times_ms = []
+    for _ in range(_TIMING_ROUNDS):
+        begin_s = time.process_time()
+        _through(tokenizer, batch)
+        times_ms.append(1000 * (time.process_time() - begin_s))
+    return float(np.median(times_ms))
