@@ -50,6 +50,10 @@ COMMANDS = {
         "train the flow-matching world model, in the paper's form",
         "world_model.command_line:run_train",
     ),
+    "train adapt": Command(
+        "adapt a world model in the paper's form to new tasks",
+        "world_model.command_line:run_adapt",
+    ),
     "train state": Command(
         "train a state model, the default form of the world model",
         "world_model.command_line:run_train_state",

@@ -13,8 +13,10 @@ from dextouch.serving import load_settings
 from dextouch.worlds import World, serve_worlds
 from services.world_model.checkpoints import list_checkpoints, read_checkpoint
 from services.world_model.settings import (
+    AdaptCommand,
     ShowCommand,
     TrainCommand,
+    TrainSettings,
     TrainStateCommand,
     WorldModelSettings,
 )
@@ -27,6 +29,17 @@ from services.world_model.world import open_world
 def run_train(arguments: list[str]) -> int:
     """Train with a progress bar; print the report and optionally write it to a file."""
     settings = load_settings(TrainCommand, arguments)
+    return _train(settings, settings.json_path)
+
+
+def run_adapt(arguments: list[str]) -> int:
+    """Adapt a checkpoint to new tasks; print the report and optionally write it to a file."""
+    settings = load_settings(AdaptCommand, arguments)
+    network = read_checkpoint(settings.init).metadata.network
+    return _train(settings.training(network), settings.json_path)
+
+
+def _train(settings: TrainSettings, json_path: Path | None) -> int:
     columns = (
         TextColumn("training"),
         BarColumn(),
@@ -48,7 +61,7 @@ def run_train(arguments: list[str]) -> int:
 
         report = train(settings, on_progress)
     print(_table(report))
-    write_result(settings.json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
+    write_result(json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
     return 0
 
 

@@ -44,6 +44,13 @@ class OptimizerSettings(FrozenModel):
     tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac (equation 5)")
 
 
+class AdaptOptimizerSettings(OptimizerSettings):
+    """Settings of the optimizer with a tenth of the learning rate from random weights."""
+
+    learning_rate: LearningRate = 2e-4
+    warmup_steps: WarmupSteps = 20
+
+
 class WindowSettings(FrozenModel):
     """Sampling of training windows."""
 
@@ -61,7 +68,7 @@ class WindowSettings(FrozenModel):
     fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
 
 
-class TrainSettings(FrozenModel):
+class RunSettings(FrozenModel):
     """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first.
 
     With `human` stores, only robot episodes are taken from `episodes` and `heldout`, and only human
@@ -85,6 +92,9 @@ class TrainSettings(FrozenModel):
     )
     disjoint_tasks: CliImplicitFlag[bool] = Field(
         default=True, description="refuse human episodes of tasks that robots have, too"
+    )
+    new_tasks: CliImplicitFlag[bool] = Field(
+        default=False, description="refuse tasks that the initial checkpoint was trained on"
     )
     splits: Splits = ()
     heldout: str | None = Field(
@@ -113,13 +123,6 @@ class TrainSettings(FrozenModel):
     loader_workers: int = Field(
         default=0, ge=0, le=64, description="reader processes of --streaming; 0: this process"
     )
-    init: Path | None = Field(
-        default=None,
-        description="checkpoint to initialize from; its network settings must be equal",
-    )
-    tokenizer: Path | None = Field(
-        default=None, description="tactile tokenizer of `dextouch train tokenizer`, kept frozen"
-    )
     resume: CliImplicitFlag[bool] = Field(
         default=False,
         description="resume an interrupted run of this output, if there is one",
@@ -127,7 +130,6 @@ class TrainSettings(FrozenModel):
     state_every_cpu_s: float = Field(
         default=60.0, ge=0, description="CPU seconds between states saved for --resume"
     )
-    network: NetworkConfig = Field(default=NetworkConfig(), description="shape of the network")
     optimizer: OptimizerSettings = Field(
         default=OptimizerSettings(), description="settings of the optimizer"
     )
@@ -139,6 +141,49 @@ class TrainSettings(FrozenModel):
     def share_of_human(self) -> float | None:
         """Share of windows from human episodes; None where domains are not told apart."""
         return self.human_share if self.human else None
+
+
+class TrainSettings(RunSettings):
+    """Training of a network, from random weights or from those of a checkpoint."""
+
+    init: Path | None = Field(
+        default=None,
+        description="checkpoint to initialize from; its network settings must be equal",
+    )
+    tokenizer: Path | None = Field(
+        default=None, description="tactile tokenizer of `dextouch train tokenizer`, kept frozen"
+    )
+    network: NetworkConfig = Field(default=NetworkConfig(), description="shape of the network")
+
+
+class AdaptSettings(RunSettings):
+    """Adaptation of a trained model to new tasks.
+
+    The network, its codecs and its normalizers are those of the checkpoint; human and robot
+    episodes may be of the same tasks, but not of those that the checkpoint was trained on.
+    """
+
+    init: Path = Field(description="checkpoint to adapt")
+    output: Path = Field(
+        default=Path("runs/world_model/adapted.safetensors"), description="checkpoint to write"
+    )
+    name: str = Field(default="adapted", description="model name in the checkpoint")
+    cpu_budget_s: CpuBudget = 300.0
+    disjoint_tasks: CliImplicitFlag[bool] = Field(
+        default=False, description="refuse human episodes of tasks that robots have, too"
+    )
+    new_tasks: CliImplicitFlag[bool] = Field(
+        default=True, description="refuse tasks that the initial checkpoint was trained on"
+    )
+    optimizer: AdaptOptimizerSettings = Field(
+        default=AdaptOptimizerSettings(), description="settings of the optimizer"
+    )
+
+    def training(self, network: NetworkConfig) -> TrainSettings:
+        """The same run as training of a network from its checkpoint."""
+        given = {name: getattr(self, name) for name in RunSettings.model_fields}
+        given |= {"optimizer": OptimizerSettings(**self.optimizer.model_dump())}
+        return TrainSettings(**given, init=self.init, network=network)
 
 
 class ReaderSettings(FrozenModel):
@@ -237,6 +282,18 @@ class TrainCommand(BaseSettings, TrainSettings):
     """
 
     model_config = service_config("world_model_train", "dextouch train world-model")
+
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
+
+
+class AdaptCommand(BaseSettings, AdaptSettings):
+    """Adapt a world model in the paper's form to new tasks, from robot and human episodes.
+
+    Example:
+      dextouch train adapt --init runs/mixed.safetensors --episodes runs/new --robot-episodes 200
+    """
+
+    model_config = service_config("world_model_adapt", "dextouch train adapt")
 
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 

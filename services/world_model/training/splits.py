@@ -95,16 +95,27 @@ def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[Trainin
 
 
 def check_tasks(
-    trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode], settings: TrainSettings
+    trained: Sequence[TrainingEpisode],
+    heldout: Sequence[TrainingEpisode],
+    settings: TrainSettings,
+    ancestor: Checkpoint | None = None,
 ) -> None:
-    """Raise if a task is both human and robot (`disjoint_tasks`)."""
-    if not (settings.human and settings.disjoint_tasks):
-        return
+    """Raise if a task is both human and robot (`disjoint_tasks`), or not new (`new_tasks`)."""
     tasks: dict[Domain, set[str]] = {"human": set(), "robot": set()}
     for episode in (*trained, *heldout):
         tasks[episode.domain].add(episode.task)
+    if settings.new_tasks and ancestor is not None:
+        learned = set(ancestor.metadata.tasks)
+        learned |= {task for one in ancestor.metadata.sets if not one.heldout for task in one.tasks}
+        known = sorted(learned & (tasks["human"] | tasks["robot"]))
+        if known:
+            raise InvalidInputError(
+                f"training: the initial checkpoint {ancestor.metadata.name!r} was trained on tasks "
+                f"{known}, expected new ones; use other stores, or allow it with --no-new-tasks",
+                tasks=known,
+            )
     both = sorted(tasks["human"] & tasks["robot"])
-    if both:
+    if settings.human and settings.disjoint_tasks and both:
         raise InvalidInputError(
             f"training: tasks {both} are in the human and in the robot episodes, expected disjoint "
             "sets; use other stores, or allow it with --no-disjoint-tasks",

@@ -113,12 +113,12 @@ def train_on(
 ) -> TrainingReport:
     """`train` with episodes that are already split."""
     check_disjoint(trained, heldout)
-    check_tasks(trained, heldout, settings)
     settings, tokenizer = with_tokenizer(settings)
     if tokenizer is not None:
         check_unseen(heldout, tokenizer)
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else read_checkpoint(settings.init)
+    check_tasks(trained, heldout, settings, ancestor)
     prints = {episode.content_hash() for episode in trained}
     names = {episode.episode_id for episode in trained}
     if ancestor is not None:

@@ -25,7 +25,7 @@ SUFFIX: Final = ".resume"
 # Settings that may change when a run resumes.
 _FREE_SETTINGS: Final = {
     "episodes", "human", "heldout", "output", "json_path", "resume", "state_every_cpu_s", "init",
-    "tokenizer", "streaming", "loader_workers", "num_threads", "disjoint_tasks",
+    "tokenizer", "streaming", "loader_workers", "num_threads", "disjoint_tasks", "new_tasks",
 }  # fmt: skip
 
 

@@ -22,7 +22,7 @@ station calibrate show, station calibrate wrist, station serve,
 store delete, store list, store migrate, store purge, store repair, store restore, store serve,
 store show, store verify,
 study report, study run,
-train data, train direct-judge, train imagined, train policy, train probe, train state,
+train adapt, train data, train direct-judge, train imagined, train policy, train probe, train state,
 train tokenizer, train world-model,
 twin record, twin serve, up
 """

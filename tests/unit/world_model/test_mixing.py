@@ -1,21 +1,29 @@
 """Human and robot episodes are mixed in the share asked for, and their tasks are kept apart."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
+from dextouch.serving import load_settings
 from services.world_model.checkpoints import read_checkpoint
+from services.world_model.command_line import run_adapt
+from services.world_model.network.configuration import NetworkConfig
+from services.world_model.settings import AdaptCommand, TrainCommand, command_line
 from services.world_model.training.dataset import WindowSampler, combined_hash
 from services.world_model.training.episodes import subset_by_hash
 from services.world_model.training.splits import check_tasks, load_split
 from services.world_model.training.trainer import train
-from tests.unit.world_model.conftest import human_episode, make_episode
+from tests.unit.world_model.conftest import human_episode, make_episode, write_episode
 
 CHILD = Path(__file__).with_name("killed_training.py")
 ROOT = Path(__file__).parents[3]
@@ -157,3 +165,66 @@ def test_a_killed_run_of_both_domains_goes_on_and_proves_what_it_was_trained_on(
     assert not found
     assert "--human=human" in metadata.command
     assert "--human-episodes=3" in metadata.command
+
+
+def test_an_adapted_checkpoint_has_new_tasks_the_ancestors_codecs_and_its_history(
+    settings, tmp_path, capsys
+):
+    first = train(settings.model_copy(update={"max_steps": 1}))
+    ancestor = read_checkpoint(first.checkpoint)
+    new, people = EpisodeStore(tmp_path / "new"), EpisodeStore(tmp_path / "new_human")
+    for seed in range(200, 204):
+        write_episode(new, replace(make_episode(seed), episode_id=f"r{seed}", task="pour"))
+    for seed in range(210, 213):
+        write_episode(people, human_episode(seed, task="pour"))
+    output, summary = tmp_path / "adapted.safetensors", tmp_path / "report.json"
+    argv = [
+        f"--init={first.checkpoint}", f"--output={output}", f"--json={summary}", "--max-steps=2",
+        "--human-episodes=2", "--heldout-percent=50", "--optimizer.batch=2",
+    ]  # fmt: skip
+    mixed = [f"--episodes={new.root}", f"--human={people.root}"]
+    assert run_adapt([*argv, *mixed]) == 0
+    capsys.readouterr()
+    assert json.loads(summary.read_text())["steps"] == 2
+    adapted = read_checkpoint(output)
+    assert adapted.metadata.network == settings.network
+    assert adapted.metadata.initialized_from == first.digest
+    assert "--init=model.safetensors" in adapted.metadata.command
+    # A tenth of the usual rate, though another setting of the optimizer was given.
+    assert "--optimizer.learning-rate=0.0002" in adapted.metadata.command
+    learned = {name for name, _ in ancestor.model.named_parameters()}
+    moved = adapted.model.state_dict()
+    changed = {
+        name
+        for name, tensor in ancestor.model.state_dict().items()
+        if not torch.equal(tensor, moved[name])
+    }
+    assert changed
+    assert changed <= learned
+    assert [(one.checkpoint, one.domain, one.tasks) for one in adapted.metadata.sets[:3]] == [
+        (first.digest, one.domain, one.tasks) for one in ancestor.metadata.sets
+    ]
+    own = [one for one in adapted.metadata.sets if one.checkpoint is None]
+    assert [(one.domain, one.heldout) for one in own] == [
+        ("human", False), ("robot", False), ("robot", True)
+    ]  # fmt: skip
+    assert all(one.tasks.keys() == {"pour"} for one in own)
+    with pytest.raises(InvalidInputError, match=r"'tiny' was trained on tasks \['push_box'\]"):
+        run_adapt([*argv, f"--episodes={settings.episodes}", f"--human={people.root}"])
+    with pytest.raises(InvalidInputError, match=r"\['fold_cloth'\].*--no-new-tasks"):
+        run_adapt([*argv, f"--episodes={new.root}", f"--human={settings.human[0]}"])
+
+
+def test_the_settings_of_an_adaptation_are_those_of_a_training():
+    flags = [
+        "--init=a.safetensors",
+        "--episodes=new",
+        "--robot-episodes=200",
+        "--optimizer.batch=4",
+    ]
+    settings = load_settings(AdaptCommand, flags)
+    network = NetworkConfig(video_width=16)
+    training = settings.training(network)
+    words = command_line(training).split()
+    again = load_settings(TrainCommand, [*words[3:], "--output", str(settings.output)])
+    assert again.model_dump(include=set(training.model_fields_set)) == training.model_dump()
