@@ -26,6 +26,7 @@ KEEP_ALIVE_S = 75
 MAX_WEBSOCKET_BYTES = 2**16
 # Defaults that say nothing to a user of the command line.
 _NO_DEFAULT = re.compile(r"\s*\((default: (null|\(\)|\{\})|default factory: [^)]*)\)$")
+_NO_GROUP_DEFAULT = "default: null (undefined)"
 _PLACEHOLDERS = {"int": "N", "float": "X", "Path": "PATH"}
 _LIST = re.compile(r"tuple\[(.+),\.\.\.\]")
 
@@ -136,6 +137,7 @@ def load_settings(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
             prog=cls.model_config.get("cli_prog_name"), description=inspect.getdoc(cls)
         ),
         add_argument_method=_add_argument,
+        add_argument_group_method=_add_argument_group,
         cli_kebab_case="no_enums",
         cli_implicit_flags=True,
         cli_avoid_json=True,
@@ -159,6 +161,14 @@ def _add_argument(
     if options.get("help") not in (None, argparse.SUPPRESS):
         options["help"] = _NO_DEFAULT.sub("", options["help"])
     context.add_argument(*flags, **options)
+
+
+def _add_argument_group(
+    parser: argparse.ArgumentParser, *, title: str, description: str | None
+) -> argparse._ArgumentGroup:
+    """Add a group of settings to a parser, without the default of groups that may be absent."""
+    described = (description or "").removeprefix(_NO_GROUP_DEFAULT).strip()
+    return parser.add_argument_group(title, described or None)
 
 
 def _placeholder(kind: str, flag: str) -> str:
