@@ -18,7 +18,7 @@ from dextouch.serving import load_settings
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.command_line import run_adapt
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.settings import AdaptCommand, TrainCommand, command_line
+from services.world_model.settings import AdaptCommand, TrainCommand, TrainSettings, command_line
 from services.world_model.training.dataset import WindowSampler, combined_hash
 from services.world_model.training.episodes import subset_by_hash
 from services.world_model.training.splits import check_tasks, load_split
@@ -227,4 +227,4 @@ def test_the_settings_of_an_adaptation_are_those_of_a_training():
     training = settings.training(network)
     words = command_line(training).split()
     again = load_settings(TrainCommand, [*words[3:], "--output", str(settings.output)])
-    assert again.model_dump(include=set(training.model_fields_set)) == training.model_dump()
+    assert again.model_dump(include=set(TrainSettings.model_fields)) == training.model_dump()
