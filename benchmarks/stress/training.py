@@ -79,7 +79,7 @@ def _ends(check: Check) -> None:
     run = _run(_episode())
     batch = _batch_of(_episode(), 4)
     inputs = build_inputs(batch.requests, run.settings.network)
-    target = run.model.residuals(batch.images, batch.tactile_kpa)
+    target = run.model.targets(batch.images, batch.tactile_kpa)
     for t in (MIN_TIME, 1.0):
         guess = run.model(inputs, run.model.first_latents(inputs), target, torch.full((4,), t))
         loss = (guess.video - target.video).square().mean()
@@ -115,7 +115,7 @@ def _batch(check: Check) -> None:
     model = run.model.eval()
     batch = _batch_of(_episode(), 4)
     inputs = build_inputs(batch.requests, run.settings.network)
-    target = model.residuals(batch.images, batch.tactile_kpa)
+    target = model.targets(batch.images, batch.tactile_kpa)
     t = torch.tensor([0.1, 0.4, 0.7, 1.0])
     with torch.no_grad():
         together = model(inputs, model.first_latents(inputs), target, t)

@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, Literal
 
 from pydantic import Field
-from pydantic_settings import BaseSettings, CliImplicitFlag
+from pydantic.fields import FieldInfo
+from pydantic_settings import BaseSettings, CliImplicitFlag, PydanticBaseSettingsSource
 
 from dextouch.command_line import JSON_HELP
 from dextouch.frozen_model import FrozenModel
@@ -27,6 +29,7 @@ from services.networks.training_settings import (
 from services.world_model.checkpoints import PRETRAINED, default_checkpoint
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.solvers import Sampler
+from services.world_model.presets import PRESETS, preset_settings
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.precision import has_fast_bfloat16
 from services.world_model.rendering.training import RendererTraining
@@ -42,6 +45,10 @@ class OptimizerSettings(FrozenModel):
     max_gradient_norm: MaxGradientNorm = 1.0
     ema_decay: AverageDecay = 0.995
     tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac (equation 5)")
+    touch_loss: Literal["all", "contact_or_changing"] = Field(
+        default="all",
+        description="tactile tokens that count in the loss: all, or those in contact or changing",
+    )
 
 
 class AdaptOptimizerSettings(OptimizerSettings):
@@ -104,6 +111,10 @@ class RunSettings(FrozenModel):
         default=Path("runs/world_model/tiny.safetensors"), description="checkpoint to write"
     )
     name: str = Field(default="tiny", description="model name in the checkpoint")
+    preset: str | None = Field(
+        default=None,
+        description=f"named settings that other flags override: {', '.join(PRESETS)}",
+    )
     seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
     cpu_budget_s: CpuBudget = 1000.0
     max_steps: MaxSteps = None
@@ -274,16 +285,46 @@ class TrainStateCommand(BaseSettings, StateTrainSettings):
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
+class PresetSource(PydanticBaseSettingsSource):
+    """Settings of the preset that a source of higher priority names."""
+
+    def get_field_value(self, field: FieldInfo, field_name: str) -> tuple[None, str, bool]:
+        """Unused: all values come at once, from `__call__`."""
+        return None, field_name, False
+
+    def __call__(self) -> dict[str, Any]:
+        """Values of the preset; none without one."""
+        name = self.current_state.get("preset")
+        return preset_settings(name) if isinstance(name, str) else {}
+
+
 class TrainCommand(BaseSettings, TrainSettings):
-    """Train the joint visuo-tactile flow-matching model on windows of episodes.
+    r"""Train the joint visuo-tactile flow-matching model on windows of episodes.
 
     Example:
       dextouch train world-model --episodes runs/episodes --output runs/tiny.safetensors
+
+    In the paper's design, whose tokenizer is trained first:
+      dextouch train tokenizer --episodes runs/episodes --output runs/tokenizer.safetensors
+      dextouch train world-model --preset paper --tokenizer runs/tokenizer.safetensors \
+        --episodes runs/episodes --output runs/paper.safetensors
     """
 
     model_config = service_config("world_model_train", "dextouch train world-model")
 
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Flags, then the environment, then the preset that either of them names."""
+        return init_settings, env_settings, PresetSource(settings_cls)
 
 
 class AdaptCommand(BaseSettings, AdaptSettings):

@@ -91,6 +91,7 @@ class ModelWorld:
             action_kinds=ACTION_KINDS,
             starts_from=("observation",),
             max_chunk_steps=config.max_steps - 1,
+            predicts_touch=config.use_touch,
         )
 
     @property
@@ -254,6 +255,7 @@ def open_world(
     *,
     sampling_steps: int | None = None,
     sampler: Sampler | None = None,
+    needs_touch: bool = True,
 ) -> ModelWorld | StateWorld:
     """Open the world of a checkpoint file of either kind; default: the package's own.
 
@@ -261,13 +263,20 @@ def open_world(
         path: safetensors file; None for the one that ships with the package.
         sampling_steps: network calls per chunk of a flow-matching model; a state model has none.
         sampler: solver of a flow-matching model.
+        needs_touch: refuse a model that does not predict touch, in which policies feel nothing.
 
     Raises:
-        InvalidInputError: sampling steps or a sampler for a state model.
+        InvalidInputError: sampling steps or a sampler for a state model, or no touch where it is
+            needed.
     """
     file = path if path is not None else default_checkpoint()
     if not is_state_checkpoint(file):
         checkpoint = read_checkpoint(file)
+        if needs_touch and not checkpoint.metadata.network.use_touch:
+            raise InvalidInputError(
+                f"world model {file.name}: got one that predicts images alone, expected touch, "
+                "too; only `dextouch evaluate prediction` accepts it"
+            )
         return ModelWorld(checkpoint, sampling_steps=sampling_steps, sampler=sampler)
     if sampling_steps is not None or sampler is not None:
         raise InvalidInputError(

@@ -1,4 +1,7 @@
-"""Condition vectors of the experts: flow time, actions, instruction, action kind and scene.
+"""Conditions of the experts: flow time, actions, instruction, action kind and scene.
+
+They are vectors that modulate the experts (AdaLN); with `action_conditioning` "cross_attention" the
+actions are tokens instead, which the experts attend to.
 
 Dual rate (equation 4 of the paper): video latent j is conditioned on a[4j-3 … 4j], tactile step t
 on a_t, and index 0 on zeros.
@@ -11,10 +14,11 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor, nn
 
+from services.world_model.network.action_attention import ActionTokens
 from services.world_model.network.axes import split_axis
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
 from services.world_model.network.inputs import ModelInputs
-from services.world_model.network.instruction import InstructionEncoder
+from services.world_model.network.instruction import InstructionEncoder, SubwordEncoder
 from services.world_model.network.mirroring import CAMERA_DIM, HAND_DIM
 
 TIME_WIDTH = 64
@@ -87,14 +91,31 @@ class TimeEmbedding(nn.Module):
         return self.project(torch.cat([angles.cos(), angles.sin()], dim=-1))
 
 
+@dataclass(frozen=True)
+class Condition:
+    """What a group of tokens (a latent frame, or a step and hand) depends on.
+
+    `vector` modulates the layer norms; `actions` are tokens for cross-attention, if that is how
+    actions enter, flat over the groups.
+    """
+
+    vector: Float32[Tensor, "batch *groups width"]
+    actions: Float32[Tensor, "batch groups keys width"] | None = None
+
+
 class VideoCondition(nn.Module):
-    """Condition vector of every latent frame."""
+    """Condition of every latent frame."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         width = config.video_width
-        # Both hands and the camera for each of the four steps of a latent frame.
-        self.actions = two_layers(FRAMES_PER_LATENT * ACTION_WIDTH, 2 * width, width)
+        self.actions: nn.Sequential | None = None
+        self.action_tokens: ActionTokens | None = None
+        if config.action_conditioning == "cross_attention":
+            self.action_tokens = ActionTokens(num_steps=FRAMES_PER_LATENT, width=width)
+        else:
+            # Both hands and the camera for each of the four steps of a latent frame.
+            self.actions = two_layers(FRAMES_PER_LATENT * ACTION_WIDTH, 2 * width, width)
         self.time = TimeEmbedding(width)
         self.static = StaticCondition(config, width)
 
@@ -103,23 +124,33 @@ class VideoCondition(nn.Module):
         inputs: ModelInputs,
         features: ActionFeatures,
         t: Float32[Tensor, "batch latents"],
-    ) -> Float32[Tensor, "batch latents width"]:
-        """Condition vectors; t is zero where the latent is clean."""
-        right_view = features.per_hand[:, 1:, 1]
-        groups = split_axis(right_view, 1, (-1, FRAMES_PER_LATENT)).flatten(2)
-        actions = after_first(self.actions(groups))
-        return self.time(t) + actions + self.static(inputs)[:, None]
+    ) -> Condition:
+        """Conditions; t is zero where the latent is clean."""
+        vector, tokens, actions = self.time(t), None, _of_latents(features)
+        if self.actions is not None:
+            vector = vector + after_first(self.actions(actions.flatten(2)))
+        if self.action_tokens is not None:
+            tokens = after_first(self.action_tokens(actions))
+        return Condition(vector + self.static(inputs)[:, None], tokens)
 
 
 class TactileCondition(nn.Module):
-    """Condition vector of every step and hand."""
+    """Condition of every step and hand."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         width = config.tactile_width
-        self.actions = two_layers(ACTION_WIDTH, 2 * width, width)
-        self.layout = two_layers(2 * CAMERA_DIM, width, width)
-        self.scene = SceneEncoder(width)
+        self.actions: nn.Sequential | None = None
+        self.action_tokens: ActionTokens | None = None
+        if config.action_conditioning == "cross_attention":
+            self.action_tokens = ActionTokens(num_steps=1, width=width)
+        else:
+            self.actions = two_layers(ACTION_WIDTH, 2 * width, width)
+        self.layout: nn.Sequential | None = None
+        self.scene: SceneEncoder | None = None
+        if config.use_scene_encoder:
+            self.layout = two_layers(2 * CAMERA_DIM, width, width)
+            self.scene = SceneEncoder(width)
         self.time = TimeEmbedding(width)
         self.static = StaticCondition(config, width)
 
@@ -128,13 +159,17 @@ class TactileCondition(nn.Module):
         inputs: ModelInputs,
         features: ActionFeatures,
         t: Float32[Tensor, "batch time"],
-    ) -> Float32[Tensor, "batch time 2 width"]:
-        """Condition vectors; t is zero where the step is clean."""
-        actions = after_first(self.actions(features.per_hand[:, 1:]))
-        scene = self.scene(inputs) + self.layout(features.layout)
-        return (
-            self.time(t)[:, :, None] + actions + scene[:, None] + self.static(inputs)[:, None, None]
-        )
+    ) -> Condition:
+        """Conditions; t is zero where the step is clean."""
+        vector, tokens = self.time(t)[:, :, None].expand(-1, -1, 2, -1), None
+        if self.actions is not None:
+            vector = vector + after_first(self.actions(features.per_hand[:, 1:]))
+        if self.action_tokens is not None:
+            tokens = after_first(self.action_tokens(features.per_hand[:, 1:, :, None]))
+            tokens = tokens.flatten(1, 2)
+        if self.scene is not None and self.layout is not None:
+            vector = vector + (self.scene(inputs) + self.layout(features.layout))[:, None]
+        return Condition(vector + self.static(inputs)[:, None, None], tokens)
 
 
 class StaticCondition(nn.Module):
@@ -142,9 +177,13 @@ class StaticCondition(nn.Module):
 
     def __init__(self, config: NetworkConfig, width: int) -> None:
         super().__init__()
-        self.instruction = InstructionEncoder(
-            num_buckets=config.num_word_buckets, word_width=config.word_width, width=width
-        )
+        self.instruction: InstructionEncoder | SubwordEncoder
+        if config.instruction_encoder == "subwords":
+            self.instruction = SubwordEncoder(word_width=config.word_width, width=width)
+        else:
+            self.instruction = InstructionEncoder(
+                num_buckets=config.num_word_buckets, word_width=config.word_width, width=width
+            )
         self.commanded = nn.Parameter(torch.zeros(width))
 
     def forward(self, inputs: ModelInputs) -> Float32[Tensor, "batch width"]:
@@ -195,6 +234,11 @@ def after_first(
 ) -> Float32[Tensor, "batch time ..."]:
     """Prepend zeros for index 0, which has no action (c_0 = 0)."""
     return torch.cat([torch.zeros_like(condition[:, :1]), condition], dim=1)
+
+
+def _of_latents(features: ActionFeatures) -> Float32[Tensor, "batch latents 4 67"]:
+    """Actions of each latent frame after the first, as the right hand sees them."""
+    return split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT))
 
 
 def _bounded(features: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:

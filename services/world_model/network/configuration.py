@@ -51,10 +51,43 @@ class NetworkConfig(FrozenModel):
     ffn_ratio: int = Field(
         default=3, ge=1, description="feed-forward width relative to the expert's width"
     )
-    num_word_buckets: int = Field(default=64, ge=2, description="hash buckets for words")
+    instruction_encoder: Literal["hashed_words", "subwords"] = Field(
+        default="hashed_words",
+        description="instructions as the mean of hashed words, or as weighted parts of words",
+    )
+    num_word_buckets: int = Field(
+        default=64, ge=2, description="hash buckets for words of hashed_words"
+    )
     word_width: int = Field(default=16, ge=1, description="width of a word embedding")
+    use_touch: bool = Field(
+        default=True, description="predict touch; without it the tactile expert is left out"
+    )
+    action_conditioning: Literal["adaln", "cross_attention"] = Field(
+        default="adaln",
+        description="actions enter by the modulation of layer norms, or by cross-attention",
+    )
+    add_condition_to_tokens: bool = Field(
+        default=True, description="add the conditions to the tokens, too"
+    )
     use_pose_raster: bool = Field(
         default=True, description="condition on a raster of the projected hands, too"
+    )
+    use_scene_encoder: bool = Field(
+        default=True,
+        description="condition touch on an encoding of the first image and the hands' places, too",
+    )
+    prediction: Literal["clean", "velocity"] = Field(
+        default="clean",
+        description="what the network predicts and the loss compares: the clean latents, or the "
+        "flow's velocity",
+    )
+    video_target: Literal["residual", "plain"] = Field(
+        default="residual",
+        description="video latents: residuals from the first one, or the latents themselves",
+    )
+    tactile_target: Literal["residual", "plain"] = Field(
+        default="residual",
+        description="tactile latents: residuals from the first ones, or the latents themselves",
     )
     training_time_shift: float = Field(
         default=5.0, ge=1.0, description="shift of flow-matching times in training"
@@ -79,6 +112,8 @@ class NetworkConfig(FrozenModel):
                 f"tactile_tokens: got pad with the tokenizer {self.tokenizer}, expected hand; "
                 "only split_hands has a token for each pad"
             )
+        if not self.use_touch and self.tokenizer != "principal_axes":
+            raise ValueError(f"tokenizer: got {self.tokenizer} without touch, expected the default")
         if self.image_px % (2 * self.patch_px):
             raise ValueError(
                 f"image_px: got {self.image_px}, expected a multiple of {2 * self.patch_px} "

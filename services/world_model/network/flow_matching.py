@@ -1,7 +1,8 @@
 """Flow matching (Lipman et al. 2023): noisy latents for training, and sampling.
 
-Straight paths: x_t = (1 - t) x_0 + t ε, t from 0 (data) to 1 (noise). The network predicts x_0; the
-velocity is (x_t - x_0) / t, so that the last step of either solver returns its prediction exactly.
+Straight paths: x_t = (1 - t) x_0 + t ε, t from 0 (data) to 1 (noise). The network predicts x_0, or
+the velocity v = ε - x_0 = (x_t - x_0) / t, whose squared error is that of x_0 over t². The last
+step of either solver returns the predicted x_0 exactly.
 """
 
 from collections.abc import Callable
@@ -38,6 +39,22 @@ def add_noise(
     """x_t = (1 - t) x_0 + t ε; exact at both ends."""
     spread = t.view(-1, *[1] * (clean.ndim - 1))
     return (1.0 - spread) * clean + spread * noise
+
+
+def velocity(
+    clean: Float32[Tensor, "batch ..."], noise: Float32[Tensor, "batch ..."]
+) -> Float32[Tensor, "batch ..."]:
+    """Velocity of the straight path from data to noise: ε - x_0."""
+    return noise - clean
+
+
+def clean_from_velocity(
+    noisy: Float32[Tensor, "batch ..."],
+    velocity: Float32[Tensor, "batch ..."],
+    t: Float32[Tensor, " batch"],
+) -> Float32[Tensor, "batch ..."]:
+    """x_0 = x_t - t v."""
+    return noisy - t.view(-1, *[1] * (noisy.ndim - 1)) * velocity
 
 
 def sample(

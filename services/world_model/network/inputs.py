@@ -27,7 +27,7 @@ from dextouch.hands.actions import (
 from dextouch.schemas import ActionKind
 from dextouch.tactile.layout import NUM_TAXELS
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
-from services.world_model.network.instruction import hash_words
+from services.world_model.network.instruction import instruction_ids
 from services.world_model.network.mirroring import (
     MIRROR_CAMERA,
     MIRROR_WRIST,
@@ -74,7 +74,7 @@ class ModelInputs:
     layout: Float32[Tensor, "batch 2 9"]
     raster: Float32[Tensor, "batch time 2 cells cells"]
     commanded: Float32[Tensor, " batch"]
-    words: Int64[Tensor, "batch max_words"]
+    words: Int64[Tensor, "batch ids"]
     instructions: tuple[str, ...]
 
     @property
@@ -120,8 +120,14 @@ def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -
         layout=_float_tensor(_hand_layout(anchors)),
         raster=torch.from_numpy(raster),
         commanded=torch.tensor([float(_is_commanded(r.action_kind)) for r in requests]),
-        words=torch.stack([hash_words(r.instruction, config.num_word_buckets) for r in requests]),
+        words=torch.stack([_instruction_ids(r.instruction, config) for r in requests]),
         instructions=tuple(r.instruction for r in requests),
+    )
+
+
+def _instruction_ids(instruction: str, config: NetworkConfig) -> Int64[Tensor, " ids"]:
+    return instruction_ids(
+        instruction, config.instruction_encoder, num_buckets=config.num_word_buckets
     )
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Float32
 from torch import Tensor, nn
 from torch.nn import functional
 
+from services.world_model.network.action_attention import ActionAttention
 from services.world_model.network.axes import split_axis
 from services.world_model.network.rotary import rotate
 
@@ -23,13 +24,15 @@ class Stream:
     """Tokens of one expert with their modulation: shift, scale and gate, twice.
 
     `modulation` is that of each token, or of each latent frame for the pretrained video expert,
-    whose tokens also attend to `text`. `turn` has the angles of rotary positions, where used.
+    whose tokens also attend to `text`. `turn` has the angles of rotary positions, where used, and
+    `actions` the action tokens of each group of tokens, for cross-attention.
     """
 
     tokens: Float[Tensor, "batch tokens width"]
     modulation: Float[Tensor, "batch groups 6 width"]
     turn: Float32[Tensor, "tokens angles"] | None = None
     text: Float[Tensor, "batch words width"] | None = None
+    actions: Float[Tensor, "batch parts keys width"] | None = None
 
 
 def clean_mask(
@@ -63,7 +66,15 @@ class Block(nn.Module, ABC):
 class ExpertBlock(Block):
     """Block of an expert that is trained from scratch."""
 
-    def __init__(self, *, width: int, num_heads: int, head_width: int, ffn_ratio: int) -> None:
+    def __init__(
+        self,
+        *,
+        width: int,
+        num_heads: int,
+        head_width: int,
+        ffn_ratio: int,
+        attends_to_actions: bool = False,
+    ) -> None:
         super().__init__()
         inner = num_heads * head_width
         self.num_heads, self.head_width = num_heads, head_width
@@ -78,6 +89,11 @@ class ExpertBlock(Block):
             nn.Linear(ffn_ratio * width, width),
         )
         self.modulation = nn.Parameter(torch.zeros(NUM_MODULATIONS, width))
+        self.action_attention = (
+            ActionAttention(width=width, num_heads=num_heads, head_width=head_width)
+            if attends_to_actions
+            else None
+        )
 
     def queries_keys_values(
         self, stream: Stream
@@ -97,40 +113,40 @@ class ExpertBlock(Block):
         return rotate(query, stream.turn), rotate(key, stream.turn), value
 
     def finish(self, stream: Stream, attended: Float[Tensor, "batch tokens inner"]) -> Stream:
-        """Add the output of the attention, then that of the feed-forward network."""
+        """Add the output of the attention, of that to actions, and of the feed-forward network."""
         _, _, gate, ffn_shift, ffn_scale, ffn_gate = (stream.modulation + self.modulation).unbind(2)
         attended = attended.to(stream.tokens.dtype)
         tokens = stream.tokens + (1.0 + gate) * self.to_out(attended)
+        if self.action_attention is not None and stream.actions is not None:
+            tokens = tokens + self.action_attention(tokens, stream.actions)
         normed = modulated_norm(tokens, ffn_shift, ffn_scale)
         return replace(stream, tokens=tokens + (1.0 + ffn_gate) * self.ffn(normed))
 
 
 class JointLayer(nn.Module):
-    """One layer: two expert blocks around one attention."""
+    """One layer: two expert blocks around one attention, or the video block alone."""
 
-    def __init__(self, video: Block, tactile: Block) -> None:
+    def __init__(self, video: Block, tactile: Block | None) -> None:
         super().__init__()
         self.video = video
         self.tactile = tactile
 
     def forward(
-        self, video: Stream, tactile: Stream, mask: Bool[Tensor, "tokens tokens"]
-    ) -> tuple[Stream, Stream]:
+        self, video: Stream, tactile: Stream | None, mask: Bool[Tensor, "tokens tokens"]
+    ) -> tuple[Stream, Stream | None]:
         """Update both streams through the shared attention."""
-        parts = zip(
-            self.video.queries_keys_values(video),
-            self.tactile.queries_keys_values(tactile),
-            strict=True,
-        )
-        # The pretrained expert may have less precise weights than the tactile one.
-        query, key, value = (torch.cat([a, b.to(a.dtype)], dim=2) for a, b in parts)
+        query, key, value = self.video.queries_keys_values(video)
+        if self.tactile is not None and tactile is not None:
+            parts = zip((query, key, value), self.tactile.queries_keys_values(tactile), strict=True)
+            # The pretrained expert may have less precise weights than the tactile one.
+            query, key, value = (torch.cat([a, b.to(a.dtype)], dim=2) for a, b in parts)
         attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
         attended = attended.transpose(1, 2).flatten(2)
         num_video = video.tokens.shape[1]
-        return (
-            self.video.finish(video, attended[:, :num_video]),
-            self.tactile.finish(tactile, attended[:, num_video:]),
-        )
+        seen = self.video.finish(video, attended[:, :num_video])
+        if self.tactile is None or tactile is None:
+            return seen, None
+        return seen, self.tactile.finish(tactile, attended[:, num_video:])
 
 
 def modulated_norm(

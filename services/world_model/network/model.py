@@ -52,7 +52,7 @@ class Prediction:
 
 
 class JointWorldModel(nn.Module):
-    """Video and tactile expert on anchored residual latents, with their frozen codecs."""
+    """Video and tactile expert on latents, with their frozen codecs."""
 
     video_residual_std: Tensor
     tactile_residual_std: Tensor
@@ -67,13 +67,15 @@ class JointWorldModel(nn.Module):
         self.register_buffer("video_residual_std", torch.ones(()))
         self.register_buffer("tactile_residual_std", torch.ones(()))
         self.video_condition = side.condition()
-        self.tactile_condition = TactileCondition(config)
+        self.tactile_condition = TactileCondition(config) if config.use_touch else None
         self.video = side.expert()
-        self.tactile = TactileExpert(
-            config, num_tokens=self.tokenizer.num_tokens, channels=self.tokenizer.channels
-        )
+        self.tactile: TactileExpert | None = None
+        if config.use_touch:
+            self.tactile = TactileExpert(
+                config, num_tokens=self.tokenizer.num_tokens, channels=self.tokenizer.channels
+            )
         self.layers = nn.ModuleList(
-            JointLayer(side.block(index), TactileExpert.block(config))
+            JointLayer(side.block(index), TactileExpert.block(config) if config.use_touch else None)
             for index in range(config.num_layers)
         )
 
@@ -90,17 +92,21 @@ class JointWorldModel(nn.Module):
             self.codec.encode(images)[:, 0], self.tokenizer.encode(inputs.first_tactile_kpa)
         )
 
-    def residuals(
+    def targets(
         self,
         images: UInt8[Tensor, "batch time px px 3"],
         tactile_kpa: Float32[Tensor, "batch time 2 320"],
     ) -> JointLatents:
-        """Anchored residuals of recorded windows in units of their deviation; training target."""
+        """Clean latents of recorded windows, which the flow ends at, in units of their deviation.
+
+        Residuals from the first latents, or the latents themselves, as the configuration says.
+        """
         video, tactile = self.codec.encode(to_unit(images)), self.tokenizer.encode(tactile_kpa)
-        return JointLatents(
-            (video - video[:, :1]) / self.video_residual_std,
-            (tactile - tactile[:, :1]) / self.tactile_residual_std,
-        )
+        if self.config.video_target == "residual":
+            video = video - video[:, :1]
+        if self.config.tactile_target == "residual":
+            tactile = tactile - tactile[:, :1]
+        return JointLatents(video / self.video_residual_std, tactile / self.tactile_residual_std)
 
     def forward(
         self,
@@ -109,17 +115,22 @@ class JointWorldModel(nn.Module):
         noisy: JointLatents,
         t: Float32[Tensor, " batch"],
     ) -> JointLatents:
-        """Predict the clean residuals from noisy ones at time t (the first step is clean)."""
-        features = self.normalizer(inputs)
+        """Predict clean latents, or velocities, from noisy ones at time t (the first are clean).
+
+        Without touch the tactile latents are returned as they came.
+        """
+        features, noisy = self.normalizer(inputs), self.with_clean_first(noisy, first)
         video_condition = self.video_condition(inputs, features, _time_of_each(t, noisy.video))
+        video = self.video.start(noisy.video, first.video, video_condition, inputs.raster)
+        mask = self.attention_mask(inputs.num_steps).to(t.device)
+        if self.tactile is None or self.tactile_condition is None:
+            for layer in self.layers:
+                video, _ = layer(video, None, mask)
+            return JointLatents(self.video.finish(video, video_condition), noisy.tactile)
         tactile_condition = self.tactile_condition(
             inputs, features, _time_of_each(t, noisy.tactile)
         )
-        video = self.video.start(
-            _first_zero(noisy.video), first.video, video_condition, inputs.raster
-        )
-        tactile = self.tactile.start(_first_zero(noisy.tactile), first.tactile, tactile_condition)
-        mask = self.attention_mask(inputs.num_steps).to(t.device)
+        tactile = self.tactile.start(noisy.tactile, first.tactile, tactile_condition)
         for layer in self.layers:
             video, tactile = layer(video, tactile, mask)
         return JointLatents(
@@ -127,10 +138,24 @@ class JointWorldModel(nn.Module):
             self.tactile.finish(tactile, tactile_condition),
         )
 
+    def with_clean_first(self, noisy: JointLatents, first: FirstLatents) -> JointLatents:
+        """Latents whose first ones are clean: zero for residuals, `first` for plain ones."""
+        video, tactile = torch.zeros_like(first.video), torch.zeros_like(first.tactile)
+        if self.config.video_target == "plain":
+            video = first.video / self.video_residual_std
+        if self.config.tactile_target == "plain":
+            tactile = first.tactile / self.tactile_residual_std
+        return JointLatents(
+            torch.cat([video[:, None], noisy.video[:, 1:]], dim=1),
+            torch.cat([tactile[:, None], noisy.tactile[:, 1:]], dim=1),
+        )
+
     def attention_mask(self, num_steps: int) -> Bool[Tensor, "tokens tokens"]:
         """Mask by which clean tokens (first latent frame and touch) attend to each other only."""
         per_latent = self.config.tokens_per_latent
         is_clean_video = torch.arange(num_latents(num_steps) * per_latent) < per_latent
+        if not self.config.use_touch:
+            return clean_mask(is_clean_video)
         per_step = 2 * self.tokenizer.num_tokens
         is_clean_tactile = torch.arange(num_steps * per_step) < per_step
         return clean_mask(torch.cat([is_clean_video, is_clean_tactile]))
@@ -176,7 +201,13 @@ class JointWorldModel(nn.Module):
         def denoise(video: Tensor, tactile: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
             with _products_in(precision, video.device.type):
                 guess = self(inputs, first, JointLatents(video, tactile), t)
-            return guess.video.float(), guess.tactile.float()
+            found = guess.video.float(), guess.tactile.float()
+            if self.config.prediction == "clean":
+                return found
+            return (
+                flow_matching.clean_from_velocity(video, found[0], t),
+                flow_matching.clean_from_velocity(tactile, found[1], t),
+            )
 
         video, tactile = flow_matching.sample(
             denoise,
@@ -200,11 +231,21 @@ class JointWorldModel(nn.Module):
         return self.video_residual_std.device
 
     def decode(
-        self, first: FirstLatents, residuals: JointLatents, *, all_images: bool = True
+        self, first: FirstLatents, clean: JointLatents, *, all_images: bool = True
     ) -> Prediction:
-        """Images and pressures after the first step; of the images maybe the last four only."""
-        video = first.video[:, None] + self.video_residual_std * _first_zero(residuals.video)
-        tactile = first.tactile[:, None] + self.tactile_residual_std * residuals.tactile[:, 1:]
+        """Images and pressures after the first step; of the images maybe the last four only.
+
+        Without touch all pressures are zero.
+        """
+        clean = self.with_clean_first(clean, first)
+        video = self.video_residual_std * clean.video
+        if self.config.video_target == "residual":
+            video = first.video[:, None] + video
+        tactile = self.tactile_residual_std * clean.tactile[:, 1:]
+        if self.config.tactile_target == "residual":
+            tactile = first.tactile[:, None] + tactile
+        if not self.config.use_touch:
+            tactile = torch.zeros_like(tactile)
         images = self.codec.decode_future(video, all_images=all_images)
         return Prediction(images, self.tokenizer.decode(tactile))
 
@@ -233,7 +274,3 @@ def _time_of_each(t: Tensor, latents: Tensor) -> Tensor:
     times = t[:, None].repeat(1, latents.shape[1])
     times[:, 0] = 0.0
     return times
-
-
-def _first_zero(latents: Tensor) -> Tensor:
-    return torch.cat([torch.zeros_like(latents[:, :1]), latents[:, 1:]], dim=1)

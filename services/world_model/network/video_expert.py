@@ -5,6 +5,7 @@ from jaxtyping import Float32
 from torch import Tensor, nn
 
 from services.world_model.network.axes import split_axis
+from services.world_model.network.conditioning import Condition
 from services.world_model.network.configuration import (
     FRAMES_PER_LATENT,
     RASTER_CELLS_PER_TOKEN,
@@ -27,8 +28,11 @@ class VideoExpert(nn.Module):
         width = config.video_width
         self.tokens_across = config.tokens_across
         self.use_pose_raster = config.use_pose_raster
+        self.add_condition = config.add_condition_to_tokens
+        self.is_anchored = config.video_target == "residual"
         raster_width = 2 * FRAMES_PER_LATENT * RASTER_CELLS_PER_TOKEN**2
-        self.embed = nn.Linear(2 * config.video_channels, width)
+        # Residuals come with the latent that they are relative to.
+        self.embed = nn.Linear((1 + self.is_anchored) * config.video_channels, width)
         self.embed_raster = nn.Linear(raster_width, width, bias=False)
         self.places = nn.Parameter(0.02 * torch.randn(config.tokens_per_latent, width))
         self.frames = nn.Parameter(0.02 * torch.randn(config.max_latents, 1, width))
@@ -44,32 +48,39 @@ class VideoExpert(nn.Module):
             num_heads=config.num_heads,
             head_width=config.head_width,
             ffn_ratio=config.ffn_ratio,
+            attends_to_actions=config.action_conditioning == "cross_attention",
         )
 
     def start(
         self,
         noisy: Float32[Tensor, "batch latents tokens channels"],
         first: Float32[Tensor, "batch tokens channels"],
-        condition: Float32[Tensor, "batch latents width"],
+        condition: Condition,
         raster: Float32[Tensor, "batch time 2 cells cells"],
     ) -> Stream:
-        """Tokens before the first layer; `noisy` is a residual, its first frame zero."""
+        """Tokens before the first layer.
+
+        `noisy` are residuals, the first one zero, or plain latents, the first one clean.
+        """
         num_latents = noisy.shape[1]
-        both = torch.cat([noisy, first[:, None].expand_as(noisy)], dim=-1)
-        tokens = self.embed(both) + self.places + self.frames[:num_latents] + condition[:, :, None]
+        if self.is_anchored:
+            noisy = torch.cat([noisy, first[:, None].expand_as(noisy)], dim=-1)
+        tokens = self.embed(noisy) + self.places + self.frames[:num_latents]
+        if self.add_condition:
+            tokens = tokens + condition.vector[:, :, None]
         if self.use_pose_raster:
             tokens = tokens + self.embed_raster(self.raster_tokens(raster))
-        modulation = split_axis(self.modulate(condition), -1, (NUM_MODULATIONS, -1))
+        modulation = split_axis(self.modulate(condition.vector), -1, (NUM_MODULATIONS, -1))
         per_token = modulation.repeat_interleave(noisy.shape[2], dim=1)
-        return Stream(tokens.flatten(1, 2), per_token)
+        return Stream(tokens.flatten(1, 2), per_token, actions=condition.actions)
 
     def finish(
-        self, stream: Stream, condition: Float32[Tensor, "batch latents width"]
+        self, stream: Stream, condition: Condition
     ) -> Float32[Tensor, "batch latents tokens channels"]:
-        """Predict the clean residual."""
-        tokens = split_axis(stream.tokens, 1, (condition.shape[1], -1))
+        """Predict the clean latents, or the velocity, as the configuration says."""
+        tokens = split_axis(stream.tokens, 1, (condition.vector.shape[1], -1))
         shift, scale = (
-            self.modulate_out(condition)[:, :, None]
+            self.modulate_out(condition.vector)[:, :, None]
             .expand(-1, -1, tokens.shape[2], -1)
             .chunk(2, dim=-1)
         )

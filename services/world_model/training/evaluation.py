@@ -56,7 +56,7 @@ def evaluate_prediction(
 
     Returns:
         psnr (dB, mean over images), tactile_mse (kPa²) and contact_f1, each also for the baselines
-        named by the suffix, and num_windows.
+        named by the suffix, and num_windows; psnr alone for a model without touch.
 
         - _copy repeats the first step; tactile_mse_zero predicts no touch.
         - _codec encodes and decodes the ground truth: the upper bound for the model.
@@ -104,6 +104,8 @@ def evaluate_prediction(
     for suffix, head_moves in (("_hold", False), ("_hands_still", True)):
         still = [_standing_still(request, head_moves=head_moves) for request in requests]
         figures |= _figures(predict_all(model, still, seed=seed), truth, suffix)
+    if not model.config.use_touch:
+        figures = {name: value for name, value in figures.items() if name.startswith("psnr")}
     return {**figures, "num_windows": float(len(windows))}
 
 

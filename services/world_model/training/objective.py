@@ -1,20 +1,28 @@
 """Training losses: flow matching of video and tactile latents."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from services.world_model.network.flow_matching import add_noise, training_times
+from dextouch.tactile.contact import CONTACT_THRESHOLD_KPA
+from dextouch.tactile.layout import NUM_TIP_TAXELS
+from services.world_model.network.axes import split_axis
+from services.world_model.network.flow_matching import add_noise, training_times, velocity
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.model import FirstLatents, JointLatents, JointWorldModel
 from services.world_model.training.dataset import WindowBatch
 
+TouchLoss = Literal["all", "contact_or_changing"]
+# A taxel that differs by this much from the step before is changing.
+CHANGE_KPA = 0.5
+
 
 @dataclass(frozen=True)
 class Losses:
-    """Mean squared errors of the predicted residuals, in units of their variance."""
+    """Mean squared errors of the prediction, in units of the latents' variance."""
 
     video: Float32[Tensor, ""]
     tactile: Float32[Tensor, ""]
@@ -27,11 +35,9 @@ def losses(
     *,
     generator: torch.Generator,
     context_noise: float = 0.0,
+    touch_loss: TouchLoss = "all",
 ) -> Losses:
-    """x_0-prediction errors at random times, with equal weight for every tactile token.
-
-    The paper weights only tokens in contact or changing, so that idle pads are never trained. With
-    equal weights the model also learns to predict the absence of contact.
+    """Errors of the prediction at random times.
 
     Args:
         model: the network.
@@ -40,20 +46,53 @@ def losses(
         generator: source of times and noise.
         context_noise: relative deviation of noise on the first latents, which makes the model
             robust to starting from its own output.
+        touch_loss: tactile tokens that count: all of them, so that the model also learns to predict
+            the absence of contact, or only those in contact or changing, as in the paper.
     """
-    target = model.residuals(batch.images, batch.tactile_kpa)
+    clean = model.targets(batch.images, batch.tactile_kpa)
     first = _with_noise(model.first_latents(inputs), context_noise, generator)
     t = training_times(len(inputs), shift=model.config.training_time_shift, generator=generator)
-    noisy = JointLatents(
-        add_noise(target.video, torch.randn(target.video.shape, generator=generator), t),
-        add_noise(target.tactile, torch.randn(target.tactile.shape, generator=generator), t),
+    noise = JointLatents(
+        torch.randn(clean.video.shape, generator=generator),
+        torch.randn(clean.tactile.shape, generator=generator),
     )
+    noisy = JointLatents(
+        add_noise(clean.video, noise.video, t), add_noise(clean.tactile, noise.tactile, t)
+    )
+    target = clean
+    if model.config.prediction == "velocity":
+        target = JointLatents(
+            velocity(clean.video, noise.video), velocity(clean.tactile, noise.tactile)
+        )
     guess = model(inputs, first, noisy, t)
     video = (guess.video - target.video)[:, 1:].square().mean()
-    valid = (batch.tactile_valid & batch.tactile_valid[:, :1])[:, 1:, :, None, None].float()
-    error = (guess.tactile - target.tactile)[:, 1:].square() * valid
-    tactile = error.sum() / (valid.sum() * error.shape[-2:].numel()).clamp_min(1.0)
+    if not model.config.use_touch:
+        return Losses(video, torch.zeros(()))
+    counted = (batch.tactile_valid & batch.tactile_valid[:, :1])[:, 1:, :, None]
+    if touch_loss == "contact_or_changing":
+        tokens = contact_or_changing(batch.tactile_kpa, clean.tactile.shape[3])
+        counted = counted & tokens[:, 1:]
+    weights = counted[..., None].float().expand(-1, -1, -1, clean.tactile.shape[3], -1)
+    error = (guess.tactile - target.tactile)[:, 1:].square() * weights
+    tactile = error.sum() / (weights.sum() * error.shape[-1]).clamp_min(1.0)
     return Losses(video, tactile)
+
+
+def contact_or_changing(
+    tactile_kpa: Float32[Tensor, "batch time 2 320"], num_tokens: int
+) -> Bool[Tensor, "batch time 2 tokens"]:
+    """Tokens with a taxel in contact, at this or the first step, or changing since the last step.
+
+    In contact: at least 2 kPa; changing: by at least 0.5 kPa. With six tokens these are those of
+    the five fingertips and the palm, with one that of the whole hand.
+    """
+    before = torch.cat([tactile_kpa[:, :1], tactile_kpa[:, :-1]], dim=1)
+    contact = tactile_kpa >= CONTACT_THRESHOLD_KPA
+    taxels = contact | contact[:, :1] | ((tactile_kpa - before).abs() >= CHANGE_KPA)
+    if num_tokens == 1:
+        return taxels.any(dim=-1, keepdim=True)
+    tips = split_axis(taxels[..., :NUM_TIP_TAXELS], -1, (num_tokens - 1, -1)).any(dim=-1)
+    return torch.cat([tips, taxels[..., NUM_TIP_TAXELS:].any(dim=-1, keepdim=True)], dim=-1)
 
 
 def _with_noise(

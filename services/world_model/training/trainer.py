@@ -265,9 +265,10 @@ class TrainingRun:
             model.tokenizer.load_state_dict(tokenizer.state_dict())
             model.tokenizer.peak_kpa.clamp_min_(batch.tactile_kpa.max())
         model.normalizer.fit(build_inputs(batch.requests, config).hands)
-        residuals = model.residuals(batch.images, batch.tactile_kpa)
-        model.video_residual_std.copy_(residuals.video[:, 1:].std().clamp_min(1e-3))
-        model.tactile_residual_std.copy_(residuals.tactile[:, 1:].std().clamp_min(1e-3))
+        targets = model.targets(batch.images, batch.tactile_kpa)
+        model.video_residual_std.copy_(targets.video[:, 1:].std().clamp_min(1e-3))
+        if config.use_touch:
+            model.tactile_residual_std.copy_(targets.tactile[:, 1:].std().clamp_min(1e-3))
         self.averaged.load_state_dict(model.state_dict())
 
     def start_from(self, checkpoint: Checkpoint) -> None:
@@ -354,6 +355,7 @@ class TrainingRun:
             batch,
             generator=self._generator,
             context_noise=self.settings.windows.context_noise,
+            touch_loss=settings.touch_loss,
         )
         total = loss.video + settings.tactile_weight * loss.tactile
         self.loop.learn(total, video=loss.video, touch=loss.tactile)

@@ -15,7 +15,7 @@ class WorldDescription(FrozenModel):
     """Capabilities of a world, exchanged before a rollout.
 
     `object_names` lists, by task, the objects whose poses are in its observations; empty for a
-    world without object poses.
+    world without object poses. Touch is zero in observations of a world that does not predict it.
     """
 
     name: str
@@ -32,6 +32,7 @@ class WorldDescription(FrozenModel):
     max_chunk_steps: int = 64
     knows_success: bool = False
     object_names: dict[str, tuple[str, ...]] = Field(default={})
+    predicts_touch: bool = Field(default=True, exclude_if=bool)
 
 
 class WorldList(FrozenModel):

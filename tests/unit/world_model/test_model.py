@@ -189,6 +189,6 @@ def test_true_residuals_decode_to_the_truth(tiny_config, toy_episodes):
     model.codec.fit(images)
     model.tokenizer.fit(touch.flatten(0, 1))
     inputs = build_inputs([w.request for w in windows], full)
-    future = model.decode(model.first_latents(inputs), model.residuals(images, touch))
+    future = model.decode(model.first_latents(inputs), model.targets(images, touch))
     torch.testing.assert_close(future.tactile_kpa, touch[:, 1:], rtol=1e-2, atol=1e-2)
     assert (future.images - images[:, 1:] / 255).abs().max() < 0.01

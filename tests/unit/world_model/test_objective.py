@@ -18,7 +18,7 @@ def batch(toy_episodes):
 
 def _loss_of_errors(model, batch, *, video, tactile):
     """The losses when the network misses the truth by exactly these errors."""
-    target = model.residuals(batch.images, batch.tactile_kpa)
+    target = model.targets(batch.images, batch.tactile_kpa)
     guess = JointLatents(target.video + video, target.tactile + tactile)
     model.forward = lambda *_: guess
     inputs = build_inputs(batch.requests, model.config)
@@ -26,7 +26,7 @@ def _loss_of_errors(model, batch, *, video, tactile):
 
 
 def test_only_the_future_counts(tiny_model, batch):
-    target = tiny_model.residuals(batch.images, batch.tactile_kpa)
+    target = tiny_model.targets(batch.images, batch.tactile_kpa)
     video, tactile = torch.zeros_like(target.video), torch.zeros_like(target.tactile)
     video[:, 0], tactile[:, 0] = 5.0, 7.0
     loss = _loss_of_errors(tiny_model, batch, video=video, tactile=tactile)
@@ -35,7 +35,7 @@ def test_only_the_future_counts(tiny_model, batch):
 
 
 def test_each_future_latent_and_step_counts_alike(tiny_model, batch):
-    target = tiny_model.residuals(batch.images, batch.tactile_kpa)
+    target = tiny_model.targets(batch.images, batch.tactile_kpa)
     for latent in (1, 4):
         video, tactile = torch.zeros_like(target.video), torch.zeros_like(target.tactile)
         video[:, latent] = 2.0
@@ -47,7 +47,7 @@ def test_each_future_latent_and_step_counts_alike(tiny_model, batch):
 
 
 def test_touch_that_was_not_measured_does_not_count(tiny_model, batch):
-    target = tiny_model.residuals(batch.images, batch.tactile_kpa)
+    target = tiny_model.targets(batch.images, batch.tactile_kpa)
     video, tactile = torch.zeros_like(target.video), torch.ones_like(target.tactile)
     tactile[:, 3, 0] = 100.0
     batch.tactile_valid[:, 3, 0] = False

@@ -2,7 +2,9 @@
 
 import pytest
 
+from dextouch.errors import UnknownNameError
 from dextouch.serving import load_settings
+from services.world_model.network.configuration import NetworkConfig
 from services.world_model.settings import (
     StateTrainSettings,
     TrainCommand,
@@ -47,3 +49,32 @@ def test_recorded_command_gives_the_same_settings(kind, parser, command, given):
     assert words[:2] == ["dextouch", "train"]
     read = load_settings(parser, words[3:])
     assert read.model_dump(include=set(kind.model_fields)) == settings.model_dump()
+
+
+def test_flags_override_a_preset_and_its_base():
+    flags = ["--episodes", "store", "--preset", "paper-video-only", "--network.sampling-steps", "3"]
+    settings = load_settings(TrainCommand, flags)
+    network = settings.network
+    # Of its own file, of its base, of the base's base, and of the flag.
+    assert (network.use_touch, network.action_conditioning) == (False, "cross_attention")
+    assert (network.video_target, network.sampling_steps) == ("plain", 3)
+    assert settings.optimizer.touch_loss == "contact_or_changing"
+    again = load_settings(TrainCommand, command_line(settings).split()[3:])
+    assert again.network == network
+
+
+def test_a_preset_can_come_from_the_environment(monkeypatch):
+    monkeypatch.setenv("DEXTOUCH_WORLD_MODEL_TRAIN_PRESET", "paper")
+    assert load_settings(TrainCommand, ["--episodes", "store"]).network.prediction == "velocity"
+
+
+def test_unknown_presets_name_the_valid_ones():
+    with pytest.raises(UnknownNameError, match=r"valid: .*paper-video-only"):
+        load_settings(TrainCommand, ["--episodes", "store", "--preset", "papre"])
+
+
+def test_the_default_preset_is_that_of_no_preset():
+    assert load_settings(TrainCommand, ["--episodes", "s"]).network == NetworkConfig()
+    assert load_settings(TrainCommand, ["--episodes", "s", "--preset", "tiny"]).network == (
+        NetworkConfig()
+    )

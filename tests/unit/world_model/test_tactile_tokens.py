@@ -75,7 +75,7 @@ def test_residuals_of_pads_are_anchored_to_the_first_step(tiny_config, toy_episo
     model = _model(tiny_config, "split_hands", "pad", scale=0.0)
     window = cut_window(toy_episodes[0], 0, 9)
     images, touch = (torch.from_numpy(a)[None] for a in (window.images, window.tactile_kpa))
-    residuals = model.residuals(images, touch).tactile
+    residuals = model.targets(images, touch).tactile
     assert (residuals[:, 0] == 0).all()
     for step in range(9):
         change = model.tokenizer.encode(touch[:, step]) - model.tokenizer.encode(touch[:, 0])
@@ -85,7 +85,7 @@ def test_residuals_of_pads_are_anchored_to_the_first_step(tiny_config, toy_episo
 def test_a_hand_that_was_not_measured_costs_no_pad_anything(tiny_config, toy_episodes):
     model = _model(tiny_config, "split_hands", "pad")
     batch = WindowSampler(toy_episodes, np.random.default_rng(0), max_steps=17).draw(2, 9)
-    target = model.residuals(batch.images, batch.tactile_kpa)
+    target = model.targets(batch.images, batch.tactile_kpa)
     wrong = torch.full_like(target.tactile, 2.0)
     wrong[:, 3, 1] = 50.0
     batch.tactile_valid[:, 3, 1] = False

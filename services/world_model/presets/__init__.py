@@ -1,0 +1,34 @@
+"""Presets of `dextouch train world-model`: named settings, one TOML file each."""
+
+import tomllib
+from pathlib import Path
+from typing import Any, Final
+
+from dextouch.errors import UnknownNameError
+
+_FOLDER: Final = Path(__file__).parent
+PRESETS: Final = tuple(sorted(path.stem for path in _FOLDER.glob("*.toml")))
+
+
+def preset_settings(name: str) -> dict[str, Any]:
+    """Settings of a preset, over those of the preset that it names as its `base`.
+
+    Raises:
+        UnknownNameError: no such preset.
+    """
+    if name not in PRESETS:
+        raise UnknownNameError("preset", name, list(PRESETS))
+    own = tomllib.loads((_FOLDER / f"{name}.toml").read_text(encoding="utf-8"))
+    base = own.pop("base", None)
+    return own if base is None else merged(preset_settings(base), own)
+
+
+def merged(settings: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Nested settings in which those of `over` replace others."""
+    both = dict(settings)
+    for key, value in over.items():
+        known = both.get(key)
+        both[key] = (
+            merged(known, value) if isinstance(known, dict) and isinstance(value, dict) else value
+        )
+    return both
