@@ -118,14 +118,16 @@ def test_each_step_conditions_its_own_latent_and_its_own_touch(model, inputs, pa
     # sees no action. Step s therefore moves latent ceil(s / 4), touch s, and nothing else.
     times_video, times_tactile = torch.full((3, 5), 0.5), torch.full((3, 17), 0.5)
     before = model.normalizer(inputs)
-    video = model.video_condition(inputs, before, times_video)
-    tactile = model.tactile_condition(inputs, before, times_tactile)
+    video = model.video_condition(inputs, before, times_video).vector
+    tactile = model.tactile_condition(inputs, before, times_tactile).vector
     for step in range(17):
         changed = getattr(inputs, part).clone()
         changed[:, step] += 0.3
         after = model.normalizer(replace(inputs, **{part: changed}))
-        moved_video = (model.video_condition(inputs, after, times_video) - video).abs()
-        moved_tactile = (model.tactile_condition(inputs, after, times_tactile) - tactile).abs()
+        moved_video = (model.video_condition(inputs, after, times_video).vector - video).abs()
+        moved_tactile = (
+            model.tactile_condition(inputs, after, times_tactile).vector - tactile
+        ).abs()
         latents = [] if step == 0 else [-(-step // 4)]
         assert moved_video.amax((0, 2)).gt(1e-4).nonzero().flatten().tolist() == latents
         steps = [] if step == 0 else [step]
@@ -137,9 +139,9 @@ def test_the_condition_of_index_zero_holds_no_action_term(model, inputs):
     features = model.normalizer(inputs)
     for condition, steps in ((model.video_condition, 5), (model.tactile_condition, 17)):
         t = torch.full((3, steps), 0.5)
-        before = condition(inputs, features, t)
+        before = condition(inputs, features, t).vector
         condition.actions[-1].bias += 1.0
-        change = (condition(inputs, features, t) - before).flatten(2).abs().amax((0, 2))
+        change = (condition(inputs, features, t).vector - before).flatten(2).abs().amax((0, 2))
         assert change[0] == 0.0
         assert change[1:].min() > 0.5
 
