@@ -11,6 +11,7 @@ from services.world_model.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
+from services.world_model.network.conditioning import Condition
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents, JointWorldModel, stack_noise
@@ -60,7 +61,7 @@ def test_every_form_predicts_and_hides_noise_from_clean_tokens(
 def test_pads_of_equal_content_are_told_apart_by_their_embedding(tiny_config):
     expert = _model(tiny_config, "split_hands", "pad").tactile
     noisy, first = torch.ones(1, 5, 2, 6, 8), torch.ones(1, 2, 6, 8)
-    condition = torch.zeros(1, 5, 2, 32)
+    condition = Condition(torch.zeros(1, 5, 2, 32))
     tokens = expert.start(noisy, first, condition).tokens.reshape(5, 2, 6, 32)
     # Tokens are in the order of step, hand and pad, each a sum with its own three embeddings.
     same = expert.embed(torch.ones(16))
