@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from dextouch.tactile.contact import CONTACT_THRESHOLD_KPA
+from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import NUM_TIP_TAXELS
 from services.world_model.network.axes import split_axis
 from services.world_model.network.flow_matching import add_noise, training_times, velocity
