@@ -43,7 +43,7 @@ from services.twin.hands import DOMAINS, Domain
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import STREAM_CHOICES, PlayedActions, StreamChoice, TakeOptions
-from services.twin.tasks import EVALUATED, TASK_NAMES
+from services.twin.tasks import EVALUATED, TASK_NAMES, TASK_SETS, named_tasks
 from services.twin.world import TwinWorld
 
 CAMERAS = ("camera_head",)
@@ -332,8 +332,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--store", required=True, help="folder of the episode store")
     add("--first", type=int, default=0, help="first seed (%(default)s)")
     add("--count", type=int, default=130, help="seeds per task (%(default)s)")
-    tasks = f"comma-separated (default: {','.join(EVALUATED)})"
-    add("--tasks", type=comma_separated, default=EVALUATED, help=tasks)
+    tasks = f"tasks, or sets of tasks: {', '.join(TASK_SETS)} (default: {','.join(EVALUATED)})"
+    add("--tasks", type=comma_separated, default=EVALUATED, metavar="A,B", help=tasks)
     add("--domains", type=comma_separated, default=("robot",), help="robot,human (robot)")
     path = "write takes as they are, or by devices and alignment (robot: direct, human: devices)"
     add("--path", choices=TAKE_PATHS, help=path)
@@ -361,9 +361,8 @@ def main(argv: Sequence[str]) -> int:
     arguments = _parser().parse_args(list(argv))
     seeds = range(arguments.first, arguments.first + max(0, arguments.count))
     mix = MIXES[arguments.mix].changed(miss=arguments.miss_fraction, still=arguments.still_fraction)
-    scope = Scope(
-        arguments.tasks, arguments.domains, arguments.images, arguments.streams, arguments.path
-    )
+    tasks = named_tasks(arguments.tasks)
+    scope = Scope(tasks, arguments.domains, arguments.images, arguments.streams, arguments.path)
     log_warnings()
     policy = arguments.policy and PolicyChoice.parse(arguments.policy, arguments.policy_arguments)
     counts = make_training_data(

@@ -1,5 +1,6 @@
-"""Registry of the twin's tasks by name."""
+"""Registry of the twin's tasks by name, and the sets of tasks that commands take by theirs."""
 
+from collections.abc import Iterable
 from typing import Final
 
 from dextouch.errors import UnknownNameError
@@ -27,6 +28,11 @@ _TASKS: Final[dict[str, Task]] = {
     )
 }
 TASK_NAMES: Final = tuple(_TASKS)
+# The paper's four tasks on which policies are trained and evaluated.
+DOWNSTREAM: Final = ("place_shoes", "place_phone", "stack_bowls", "stand_bottle")
+# Tasks of robot and of human episodes for pretraining: no task is in two of these three sets.
+ROBOT_PRETRAINING: Final = ("insert_peg", "open_drawer")
+HUMAN_PRETRAINING: Final = (*(task.name for task in CAN_TASKS), "regrasp_can")
 # Tasks of the package's checkpoints; commands record and evaluate these by default.
 EVALUATED: Final = (
     "stand_bottle",
@@ -36,6 +42,12 @@ EVALUATED: Final = (
     "place_phone",
     "open_drawer",
 )
+TASK_SETS: Final[dict[str, tuple[str, ...]]] = {
+    "downstream": DOWNSTREAM,
+    "robot-pretraining": ROBOT_PRETRAINING,
+    "human-pretraining": HUMAN_PRETRAINING,
+    "evaluated": EVALUATED,
+}
 
 
 def get_task(name: str) -> Task:
@@ -47,3 +59,17 @@ def get_task(name: str) -> Task:
     if name not in _TASKS:
         raise UnknownNameError("task", name, list(_TASKS))
     return _TASKS[name]
+
+
+def named_tasks(names: Iterable[str]) -> tuple[str, ...]:
+    """Names of tasks, each once, from names of tasks and of `TASK_SETS`.
+
+    Raises:
+        UnknownNameError: a name of neither.
+    """
+    found: dict[str, None] = {}
+    for name in names:
+        if name not in TASK_SETS and name not in _TASKS:
+            raise UnknownNameError("task or set of tasks", name, [*TASK_SETS, *_TASKS])
+        found |= dict.fromkeys(TASK_SETS.get(name, (name,)))
+    return tuple(found)
