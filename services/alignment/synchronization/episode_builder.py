@@ -126,22 +126,23 @@ def _find_stretch(
         # Pressures of an hour do not fit in memory, the forces of its pads do.
         of = pad_forces_n if name in TOUCH_STREAMS else np.asarray
         parts[name] = _seen(streams[name].load(of))
-    empty = [name for name, stream in parts.items() if len(stream.t_ns) < 2]
+    # Touch may be missing for a while.
+    needed = [name for name in parts if name not in TOUCH_STREAMS]
+    empty = [name for name in needed if len(parts[name].t_ns) < 2]
     if empty:
         raise InvalidInputError(f"{where}: streams {empty} hold fewer than two usable samples")
-    first_ns = {name: int(stream.t_ns[0]) for name, stream in parts.items()}
-    last_ns = {name: int(stream.t_ns[-1]) for name, stream in parts.items()}
+    first_ns = {name: int(parts[name].t_ns[0]) for name in needed}
+    last_ns = {name: int(parts[name].t_ns[-1]) for name in needed}
     origin_ns = max(first_ns.values())
     stop_ns = min(
-        last_ns[name] + round(EDGE_PERIODS * stream.descriptor.period_ns())
-        for name, stream in parts.items()
+        last_ns[name] + round(EDGE_PERIODS * parts[name].descriptor.period_ns()) for name in needed
     )
     num_steps = int(max(stop_ns - origin_ns, 0) * 1e-9 * options.model_rate_hz) + 1
     # Relative to the origin from here on: int64 stays exact, floats stay small.
     moved = {name: replace(stream, t_ns=stream.t_ns - origin_ns) for name, stream in parts.items()}
     grid_ns = grid_times_ns(num_steps, options.model_rate_hz)
     gridded = place_streams(moved, grid_ns, max_gap_ns=options.max_gap_ns)
-    valid = {name: place.valid for name, place in gridded.at.items()}
+    valid = {name: gridded.at[name].valid for name in needed}
     first, stop = longest_run(gridded.valid)
     if stop - first < options.min_num_steps:
         bad = {name: int((~mine).sum()) for name, mine in valid.items()}

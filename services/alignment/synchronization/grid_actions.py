@@ -31,6 +31,8 @@ MAX_CHECKED = 2000
 POSE_STREAMS = ("wrist_left", "wrist_right", "head")
 COMMANDED_STREAMS = ("joints_commanded", "wrist_left_commanded", "wrist_right_commanded")
 TOUCH_STREAMS = ("tactile_left", "tactile_right")
+# The influence of touch on wrists and fingertips lasts as long.
+TOUCH_GAP_NS = 300_000_000
 REQUIRED: Mapping[Domain, tuple[str, ...]] = {
     "human": (*POSE_STREAMS, "keypoints_left", "keypoints_right"),
     "robot": (*POSE_STREAMS, "joints_measured"),
@@ -41,7 +43,8 @@ REQUIRED: Mapping[Domain, tuple[str, ...]] = {
 class GriddedStreams:
     """Streams that actions are computed from, and the placement of the grid among their samples.
 
-    The values of `TOUCH_STREAMS`, if there are any, are the forces (N) of the hand's pads.
+    The values of `TOUCH_STREAMS`, if there are any, are the forces (N) of the hand's pads. Steps
+    need not have touch.
     """
 
     grid_ns: Int64[np.ndarray, " n"]
@@ -51,7 +54,8 @@ class GriddedStreams:
     @property
     def valid(self) -> Bool[np.ndarray, " n"]:
         """Steps at which every stream can be read without reaching across a gap."""
-        return np.logical_and.reduce([placement.valid for placement in self.at.values()])
+        needed = [at.valid for name, at in self.at.items() if name not in TOUCH_STREAMS]
+        return np.logical_and.reduce(needed)
 
     def poses(self, name: str) -> Float64[np.ndarray, "n 4 4"]:
         """Transforms of a pose stream at the steps."""
@@ -78,7 +82,10 @@ def place_streams(
     """Find the neighbouring samples of every step in every stream."""
     at = {
         name: place_on_grid(
-            stream.t_ns, grid_ns, period_ns=stream.descriptor.period_ns(), max_gap_ns=max_gap_ns
+            stream.t_ns,
+            grid_ns,
+            period_ns=stream.descriptor.period_ns(),
+            max_gap_ns=max(max_gap_ns, TOUCH_GAP_NS) if name in TOUCH_STREAMS else max_gap_ns,
         )
         for name, stream in streams.items()
     }
@@ -128,9 +135,10 @@ def _moved_by_touch(
     for side in SIDES:
         name = f"tactile_{side}"
         forces = np.zeros((len(t_s), NUM_PADS))
-        if name in gridded.streams:
-            # Beyond the first or last sample, forces are extrapolated.
-            forces = np.maximum(gridded.vectors(name), 0.0)
+        if name in gridded.streams and len(gridded.streams[name].t_ns) > 1:
+            # Where touch is missing, none is known; at the edges forces are extrapolated.
+            felt = np.where(gridded.at[name].valid[:, None], gridded.vectors(name), 0.0)
+            forces = np.maximum(felt, 0.0)
         hand = transfer_by_touch(
             RobotHand(side),
             getattr(tracked, f"Ts_world_wrist_{side}"),
