@@ -72,8 +72,7 @@ class TokenizerMetadata(FrozenModel):
                 "training: the tokenizer's file has other network settings (stored, requested): "
                 f"{others}; leave them out"
             )
-        # Validated again: only some tokenizers have a token for each pad.
-        return NetworkConfig.model_validate(config.model_dump(exclude_unset=True) | ours)
+        return config.model_copy(update=ours)
 
 
 @dataclass(frozen=True)

@@ -107,11 +107,6 @@ class NetworkConfig(FrozenModel):
     def _sizes_fit(self) -> "NetworkConfig":
         if (self.max_steps - 1) % FRAMES_PER_LATENT:
             raise ValueError(f"max_steps: got {self.max_steps}, expected 1 + 4k")
-        if self.tactile_tokens == "pad" and self.tokenizer != "split_hands":
-            raise ValueError(
-                f"tactile_tokens: got pad with the tokenizer {self.tokenizer}, expected hand; "
-                "only split_hands has a token for each pad"
-            )
         if not self.use_touch and self.tokenizer != "principal_axes":
             raise ValueError(f"tokenizer: got {self.tokenizer} without touch, expected the default")
         if self.image_px % (2 * self.patch_px):

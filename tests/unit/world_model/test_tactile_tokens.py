@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from dextouch.errors import InvalidInputError
 from services.world_model.checkpoints import (
     paper_form_checkpoint,
     read_checkpoint,
@@ -15,6 +16,7 @@ from services.world_model.network.conditioning import Condition
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents, JointWorldModel, stack_noise
+from services.world_model.network.tokenizer_choice import build_tokenizer
 from services.world_model.training.dataset import WindowSampler, cut_window
 from services.world_model.training.objective import losses
 
@@ -98,8 +100,8 @@ def test_a_hand_that_was_not_measured_costs_no_pad_anything(tiny_config, toy_epi
 
 @pytest.mark.parametrize("tokenizer", ["principal_axes", "grid"])
 def test_only_split_hands_has_pad_tokens(tokenizer):
-    with pytest.raises(ValueError, match="only split_hands has a token for each pad"):
-        NetworkConfig(tokenizer=tokenizer, tactile_tokens="pad")
+    with pytest.raises(InvalidInputError, match="only split_hands has a token for each pad"):
+        build_tokenizer(NetworkConfig(tokenizer=tokenizer, tactile_tokens="pad"))
 
 
 def test_checkpoints_of_every_form_come_back(tiny_config, metadata, tmp_path):
