@@ -1,11 +1,14 @@
 """Pretrained tactile tokenizer of a training run, which stays frozen while the experts train."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 from dextouch.errors import InvalidInputError
 from services.world_model.settings import TrainSettings
 from services.world_model.tokenizer_files import StoredTokenizer, read_tokenizer
 from services.world_model.training.dataset import TrainingEpisode
+from services.world_model.training.episodes import E
+from services.world_model.training.scene_episodes import place_of_name
 from services.world_model.training.tactile_hands import scene_of
 
 
@@ -14,7 +17,7 @@ def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokeni
 
     Raises:
         InvalidInputError: a learned tokenizer without a file or an initial checkpoint that holds
-            it, or both of these.
+            it, both of these, or a tokenizer for a network without touch.
         ConflictError: the network settings name another tokenizer than the file.
     """
     if settings.tokenizer is None:
@@ -24,6 +27,10 @@ def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokeni
                 "(dextouch train tokenizer) and give its file as --tokenizer"
             )
         return settings, None
+    if not settings.network.use_touch:
+        raise InvalidInputError(
+            "training: got a --tokenizer for a network without touch; leave it out"
+        )
     if settings.init is not None:
         raise InvalidInputError(
             "training: got --init and --tokenizer, expected one of them; the initial checkpoint "
@@ -32,6 +39,31 @@ def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokeni
     stored = read_tokenizer(settings.tokenizer)
     network = stored.metadata.network(settings.network)
     return settings.model_copy(update={"network": network}), stored
+
+
+def split_unseen(
+    episodes: Sequence[E], stored: StoredTokenizer, *, heldout_percent: int
+) -> tuple[list[E], list[E]]:
+    """Training and held-out episodes, the latter of scenes that the tokenizer has not seen.
+
+    Raises:
+        InvalidInputError: either side would be empty.
+    """
+    sizes = Counter(scene_of(episode) for episode in episodes)
+    heldout: set[str] = set()
+    for scene in sorted(sizes.keys() - set(stored.metadata.train_scenes), key=place_of_name):
+        if 100 * sum(sizes[one] for one in heldout) >= heldout_percent * len(episodes):
+            break
+        heldout.add(scene)
+    if not 0 < len(heldout) < len(sizes):
+        raise InvalidInputError(
+            f"split: got {len(heldout)} of {len(sizes)} scenes to hold out that the tokenizer has "
+            "not seen, expected some; give a --heldout store"
+        )
+    return (
+        [episode for episode in episodes if scene_of(episode) not in heldout],
+        [episode for episode in episodes if scene_of(episode) in heldout],
+    )
 
 
 def check_unseen(heldout: Sequence[TrainingEpisode], stored: StoredTokenizer) -> None:

@@ -7,17 +7,20 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import Domain
 from services.world_model.checkpoints import Checkpoint, TrainingSet
 from services.world_model.settings import TrainSettings
+from services.world_model.tokenizer_files import read_tokenizer
 from services.world_model.training.dataset import (
     EpisodeArrays,
     TrainingEpisode,
     combined_hash,
 )
 from services.world_model.training.episodes import (
+    E,
     check_rates,
     load_episodes,
     split_by_hash,
     subset_by_hash,
 )
+from services.world_model.training.frozen_tokenizer import split_unseen
 from services.world_model.training.streaming import index_episodes
 
 
@@ -47,12 +50,19 @@ def _load_robot(
         stored = index_episodes(url, splits=splits, domain=domain)
         if settings.heldout is not None:
             return stored, load_episodes(settings.heldout, domain=domain)
-        trained, heldout = split_by_hash(stored, heldout_percent=settings.heldout_percent)
+        trained, heldout = _split(stored, settings)
         return trained, [episode.load() for episode in heldout]
     episodes = load_episodes(url, splits=splits, domain=domain)
     if settings.heldout is not None:
         return episodes, load_episodes(settings.heldout, domain=domain)
-    return split_by_hash(episodes, heldout_percent=settings.heldout_percent)
+    return _split(episodes, settings)
+
+
+def _split(episodes: Sequence[E], settings: TrainSettings) -> tuple[list[E], list[E]]:
+    if settings.tokenizer is None:
+        return split_by_hash(episodes, heldout_percent=settings.heldout_percent)
+    stored = read_tokenizer(settings.tokenizer)
+    return split_unseen(episodes, stored, heldout_percent=settings.heldout_percent)
 
 
 def _load_human(settings: TrainSettings) -> Sequence[TrainingEpisode]:

@@ -11,6 +11,7 @@ from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.tokenizer_choice import build_tokenizer
 from services.world_model.tokenizer_files import read_tokenizer
 from services.world_model.tokenizer_settings import TrainTokenizerSettings
+from services.world_model.training.splits import load_split
 from services.world_model.training.tactile_hands import TactileHands, load_hands
 from services.world_model.training.tokenizer_trainer import (
     reconstruction,
@@ -177,3 +178,33 @@ def test_training_without_any_touch_is_refused(settings):
     # Only the scenes 0 and 3 remain, in which nothing is touched.
     with pytest.raises(InvalidInputError, match="that touch nothing"):
         train_tokenizer(settings.model_copy(update={"heldout_share": 0.5}))
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+def test_one_store_trains_both_and_other_scenes_are_held_out(settings, train_settings, streaming):
+    trained = train_tokenizer(settings)
+    asked = train_settings.model_copy(
+        update={
+            "network": NetworkConfig(
+                **train_settings.network.model_dump(exclude_unset=True, exclude={"palm_channels"})
+            ),
+            "tokenizer": settings.output,
+            "streaming": streaming,
+            "heldout_percent": 20,
+        }
+    )
+    episodes, heldout = load_split(asked)
+    # The two scenes that the tokenizer has not seen have a third of the episodes.
+    assert {f"push_box/{e.seed}" for e in heldout} == {"push_box/1", "push_box/4"}
+    assert {f"push_box/{e.seed}" for e in episodes} == set(trained.metadata.train_scenes)
+    _, fewer = load_split(asked.model_copy(update={"heldout_percent": 5}))
+    assert [e.seed for e in fewer] == [1]
+    with pytest.raises(InvalidInputError, match="give a --heldout store"):
+        load_split(asked.model_copy(update={"splits": ("A",)}))
+
+
+def test_a_network_without_touch_needs_no_tokenizer(settings, train_settings, toy_episodes):
+    network = train_settings.network.model_copy(update={"use_touch": False})
+    asked = train_settings.model_copy(update={"network": network, "tokenizer": settings.output})
+    with pytest.raises(InvalidInputError, match="without touch"):
+        train_on(toy_episodes[:4], toy_episodes[4:], asked)
