@@ -9,7 +9,7 @@ import torch
 from services.world_model.settings import TrainSettings
 from services.world_model.training.dataset import WindowBatch
 from services.world_model.training.streaming import index_episodes, read_batches
-from services.world_model.training.trainer import TrainingRun
+from services.world_model.training.training_run import TrainingRun
 
 
 class TrainingPace:

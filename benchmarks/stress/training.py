@@ -18,7 +18,7 @@ from services.world_model.settings import OptimizerSettings, TrainSettings, Wind
 from services.world_model.training.dataset import EpisodeArrays, WindowBatch, WindowSampler
 from services.world_model.training.objective import losses
 from services.world_model.training.splits import check_disjoint
-from services.world_model.training.trainer import TrainingRun
+from services.world_model.training.training_run import TrainingRun
 
 STAGE = StageCells("training")
 _PX = 32
@@ -125,7 +125,7 @@ def _batch(check: Check) -> None:
             alone = model(one, model.first_latents(one), part, t[index : index + 1])
             off = float((alone.video[0] - together.video[index]).abs().max())
             check.at_most("guesses differ", off, 1e-4)
-    pair = [losses(model, inputs, batch, generator=torch.Generator().manual_seed(1)) for _ in "ab"]
+    pair = [losses(model, batch, generator=torch.Generator().manual_seed(1)) for _ in "ab"]
     check.equal(
         "the same seed, the same loss",
         pair[0].video.detach().numpy(),

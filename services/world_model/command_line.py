@@ -22,7 +22,9 @@ from services.world_model.settings import (
 )
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.tokenizer_files import is_tokenizer, read_tokenizer
-from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
+from services.world_model.training.distribution import Processes, joined_processes
+from services.world_model.training.trainer import TrainingReport, train
+from services.world_model.training.training_run import TrainingProgress
 from services.world_model.world import open_world
 
 
@@ -40,6 +42,16 @@ def run_adapt(arguments: list[str]) -> int:
 
 
 def _train(settings: TrainSettings, json_path: Path | None) -> int:
+    with joined_processes() as processes:
+        report = _train_together(settings, processes)
+    if report is not None:
+        print(_table(report))
+        write_result(json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
+    return 0
+
+
+def _train_together(settings: TrainSettings, processes: Processes) -> TrainingReport | None:
+    """Train with a progress bar of the first process."""
     columns = (
         TextColumn("training"),
         BarColumn(),
@@ -47,7 +59,7 @@ def _train(settings: TrainSettings, json_path: Path | None) -> int:
         TextColumn("touch {task.fields[tactile]:.3f}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns) as bar:
+    with Progress(*columns, disable=not processes.is_first) as bar:
         task = bar.add_task("training", total=1.0, step=0, video=float("nan"), tactile=float("nan"))
 
         def on_progress(now: TrainingProgress) -> None:
@@ -59,10 +71,7 @@ def _train(settings: TrainSettings, json_path: Path | None) -> int:
                 tactile=now.loss_tactile,
             )
 
-        report = train(settings, on_progress)
-    print(_table(report))
-    write_result(json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
-    return 0
+        return train(settings, on_progress, processes)
 
 
 def run_train_state(arguments: list[str]) -> int:

@@ -11,9 +11,10 @@ from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import NUM_TIP_TAXELS
 from services.world_model.network.axes import split_axis
 from services.world_model.network.flow_matching import add_noise, training_times, velocity
-from services.world_model.network.inputs import ModelInputs
+from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import FirstLatents, JointLatents, JointWorldModel
 from services.world_model.training.dataset import WindowBatch
+from services.world_model.training.distribution import ALONE, Processes
 
 TouchLoss = Literal["all", "contact_or_changing"]
 # A taxel that differs by this much from the step before is changing.
@@ -30,31 +31,34 @@ class Losses:
 
 def losses(
     model: JointWorldModel,
-    inputs: ModelInputs,
     batch: WindowBatch,
     *,
     generator: torch.Generator,
     context_noise: float = 0.0,
     touch_loss: TouchLoss = "all",
+    processes: Processes = ALONE,
 ) -> Losses:
     """Errors of the prediction at random times.
 
     Args:
         model: the network.
-        inputs: from `build_inputs` of the batch's requests.
         batch: the true windows.
         generator: source of times and noise.
         context_noise: relative deviation of noise on the first latents, which makes the model
             robust to starting from its own output.
         touch_loss: tactile tokens that count: all of them, so that the model also learns to predict
             the absence of contact, or only those in contact or changing, as in the paper.
+        processes: processes whose batches together are the whole one; losses are this process's
+            contributions to it, which have the whole one's loss as their mean.
     """
+    inputs = build_inputs(batch.requests, model.config)
     clean = model.targets(batch.images, batch.tactile_kpa)
-    first = _with_noise(model.first_latents(inputs), context_noise, generator)
-    t = training_times(len(inputs), shift=model.config.training_time_shift, generator=generator)
+    first = _with_noise(model.first_latents(inputs), context_noise, generator, processes)
+    num_windows, shift = len(inputs) * processes.count, model.config.training_time_shift
+    t = processes.own(training_times(num_windows, shift=shift, generator=generator))
     noise = JointLatents(
-        torch.randn(clean.video.shape, generator=generator),
-        torch.randn(clean.tactile.shape, generator=generator),
+        processes.randn(clean.video.shape, generator),
+        processes.randn(clean.tactile.shape, generator),
     )
     noisy = JointLatents(
         add_noise(clean.video, noise.video, t), add_noise(clean.tactile, noise.tactile, t)
@@ -74,7 +78,7 @@ def losses(
         counted = counted & tokens[:, 1:]
     weights = counted[..., None].float().expand(-1, -1, -1, clean.tactile.shape[3], -1)
     error = (guess.tactile - target.tactile)[:, 1:].square() * weights
-    tactile = error.sum() / (weights.sum() * error.shape[-1]).clamp_min(1.0)
+    tactile = error.sum() / (processes.mean(weights.sum()) * error.shape[-1]).clamp_min(1.0)
     return Losses(video, tactile)
 
 
@@ -96,15 +100,15 @@ def contact_or_changing(
 
 
 def _with_noise(
-    first: FirstLatents, context_noise: float, generator: torch.Generator
+    first: FirstLatents, context_noise: float, generator: torch.Generator, processes: Processes
 ) -> FirstLatents:
     if context_noise == 0.0:
         return first
 
     def shaken(latents: Tensor) -> Tensor:
         # A random amount for each window, from none to the full share.
-        amount = torch.rand(len(latents), *[1] * (latents.ndim - 1), generator=generator)
-        noise = torch.randn(latents.shape, generator=generator)
-        return latents + context_noise * amount * latents.std() * noise
+        amount = processes.rand([len(latents), *[1] * (latents.ndim - 1)], generator)
+        noise = processes.randn(latents.shape, generator)
+        return latents + context_noise * amount * processes.std(latents) * noise
 
     return FirstLatents(shaken(first.video), shaken(first.tactile))

@@ -89,8 +89,16 @@ def read_state(path: Path, identity: Mapping[str, JsonValue]) -> TrainingState:
     where = f"training state {path.name}"
     try:
         tensors, notes = read_tensors(path, where)
-        facts = RunFacts.model_validate_json(notes.get(METADATA_KEY, ""))
-    except (CorruptDataError, ValidationError) as error:
+    except CorruptDataError as error:
+        raise CorruptDataError(f"{error.message}; remove it to start over") from error
+    return TrainingState(tensors, checked_facts(notes.get(METADATA_KEY, ""), identity, where))
+
+
+def checked_facts(text: str, identity: Mapping[str, JsonValue], where: str) -> RunFacts:
+    """Metadata of a state, if it is one of a run with these settings and data; as `read_state`."""
+    try:
+        facts = RunFacts.model_validate_json(text)
+    except ValidationError as error:
         raise CorruptDataError(f"{where}: unreadable ({error}); remove it to start over") from error
     expected = json.loads(json.dumps(dict(identity)))
     # Settings that are newer than the state have their defaults.
@@ -104,7 +112,7 @@ def read_state(path: Path, identity: Mapping[str, JsonValue]) -> TrainingState:
             f"{where}: saved by a run with {was}, got {now}; use the settings and episodes of that "
             "run, or omit --resume to start over"
         )
-    return TrainingState(tensors, facts)
+    return facts
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
@@ -114,6 +122,16 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
         f"optimizer.{number}.{name}": moment
         for number, moments in kept.items()
         for name, moment in moments.items()
+    }
+
+
+def moments_like(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Tensors of the names and shapes that `optimizer_tensors` returns after a step of AdamW."""
+    weights = [weight for group in optimizer.param_groups for weight in group["params"]]
+    return {
+        f"optimizer.{number}.{name}": like
+        for number, weight in enumerate(weights)
+        for name, like in (("step", torch.zeros(())), ("exp_avg", weight), ("exp_avg_sq", weight))
     }
 
 

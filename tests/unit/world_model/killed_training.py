@@ -6,7 +6,8 @@ import sys
 from pathlib import Path
 
 from services.world_model.settings import TrainSettings
-from services.world_model.training.trainer import TrainingProgress, train
+from services.world_model.training.trainer import train
+from services.world_model.training.training_run import TrainingProgress
 
 
 def die(progress: TrainingProgress) -> None:

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents
 from services.world_model.training.dataset import WindowSampler
 from services.world_model.training.objective import losses
-from services.world_model.training.trainer import TrainingRun
+from services.world_model.training.training_run import TrainingRun
 
 
 @pytest.fixture
@@ -21,8 +20,7 @@ def _loss_of_errors(model, batch, *, video, tactile):
     target = model.targets(batch.images, batch.tactile_kpa)
     guess = JointLatents(target.video + video, target.tactile + tactile)
     model.forward = lambda *_: guess
-    inputs = build_inputs(batch.requests, model.config)
-    return losses(model, inputs, batch, generator=torch.Generator().manual_seed(0))
+    return losses(model, batch, generator=torch.Generator().manual_seed(0))
 
 
 def test_only_the_future_counts(tiny_model, batch):

@@ -51,7 +51,7 @@ def batch(toy_episodes):
 def test_every_option_learns_and_predicts(tiny_config, batch, options):
     model = model_with(tiny_config, **options)
     inputs = build_inputs(batch.requests, model.config)
-    loss = losses(model, inputs, batch, generator=torch.Generator().manual_seed(0))
+    loss = losses(model, batch, generator=torch.Generator().manual_seed(0))
     (loss.video + loss.tactile).backward()
     unused = {name for name, weight in model.named_parameters() if weight.requires_grad}
     unused -= {name for name, weight in model.named_parameters() if weight.grad is not None}
@@ -183,10 +183,9 @@ def test_idle_tokens_do_not_count_in_the_papers_loss(tiny_config, batch):
     wrong = torch.zeros_like(clean.tactile)
     wrong[:, 1:][~counted] = 9.0
     model.forward = lambda *_: JointLatents(clean.video, clean.tactile + wrong)
-    inputs = build_inputs(batch.requests, model.config)
     for touch_loss, is_zero in (("contact_or_changing", True), ("all", False)):
         generator = torch.Generator().manual_seed(0)
-        loss = losses(model, inputs, batch, generator=generator, touch_loss=touch_loss)
+        loss = losses(model, batch, generator=generator, touch_loss=touch_loss)
         assert (loss.tactile == 0) == is_zero
 
 

@@ -22,7 +22,8 @@ from services.world_model.training.streaming import (
     index_episodes,
     read_batches,
 )
-from services.world_model.training.trainer import TrainingRun, train
+from services.world_model.training.trainer import train
+from services.world_model.training.training_run import TrainingRun
 from tests.unit.world_model.conftest import write_episode
 
 PLACES = [

@@ -93,8 +93,7 @@ def test_a_hand_that_was_not_measured_costs_no_pad_anything(tiny_config, toy_epi
     wrong[:, 3, 1] = 50.0
     batch.tactile_valid[:, 3, 1] = False
     model.forward = lambda *_: JointLatents(target.video, target.tactile + wrong)
-    inputs = build_inputs(batch.requests, model.config)
-    loss = losses(model, inputs, batch, generator=torch.Generator().manual_seed(0))
+    loss = losses(model, batch, generator=torch.Generator().manual_seed(0))
     assert loss.tactile.item() == pytest.approx(4.0)
 
 

@@ -10,17 +10,13 @@ from safetensors import safe_open
 
 from dextouch.errors import InvalidInputError
 from services.world_model.checkpoints import METADATA_KEY, read_checkpoint
-from services.world_model.network.inputs import build_inputs
 from services.world_model.training import evaluation
 from services.world_model.training.dataset import cut_window, fingerprint, stack_windows
 from services.world_model.training.evaluation import evaluate_prediction, predict_all
 from services.world_model.training.objective import losses
 from services.world_model.training.splits import check_disjoint
-from services.world_model.training.trainer import (
-    TrainingRun,
-    train,
-    train_on,
-)
+from services.world_model.training.trainer import train, train_on
+from services.world_model.training.training_run import TrainingRun
 
 
 @pytest.fixture
@@ -163,8 +159,7 @@ def test_invalid_touch_is_not_learned_from(tiny_model, toy_episodes):
         windows = [cut_window(episode, 0, 9) for episode in toy_episodes]
         windows = [replace(w, tactile_valid=np.full((9, 2), valid)) for w in windows]
         batch = stack_windows(windows)
-        inputs = build_inputs(batch.requests, tiny_model.config)
-        return losses(tiny_model, inputs, batch, generator=torch.Generator().manual_seed(0))
+        return losses(tiny_model, batch, generator=torch.Generator().manual_seed(0))
 
     assert loss(valid=True).tactile > 0
     assert loss(valid=False).tactile == 0
