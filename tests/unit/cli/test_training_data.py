@@ -8,7 +8,7 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ClockFitError, InvalidInputError, UnknownNameError
-from services.cli import device_takes, training_data
+from services.cli import training_data
 from services.cli.training_data import PolicyChoice, Scope, make_training_data
 from services.twin.data_mix import MIXES, Mix, options_of
 
@@ -152,10 +152,10 @@ def test_human_hands_pass_the_devices_unless_written_directly(tmp_path, capsys):
 
 
 def test_a_human_take_that_cannot_be_aligned_is_told(tmp_path, capsys, monkeypatch):
-    def refuse(*_, **__):
+    def refuse(order):
         raise ClockFitError("stream 'head': stamps fit no clock")
 
-    monkeypatch.setattr(device_takes, "build_episode", refuse)
+    monkeypatch.setattr(training_data, "_write_by_devices", refuse)
     argv = ["--store", str(tmp_path), "--count", "1", "--tasks", "open_drawer", "--exact"]
     assert training_data.main([*argv, "--domains", "human", "--jobs", "1"]) == 1
     told = capsys.readouterr().out

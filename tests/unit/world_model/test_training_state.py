@@ -40,7 +40,11 @@ def assert_same_run(report, expected):
     assert not state_path(report.checkpoint).exists()
 
 
-def test_a_killed_run_goes_on_as_if_nothing_had_happened(toy_store, settings, tmp_path):
+def test_a_killed_run_of_both_domains_goes_on_as_if_nothing_had_happened(
+    toy_store, human_store, settings, tmp_path
+):
+    mixed = {"human": (str(human_store.root),), "human_share": 0.5, "human_episodes": 3}
+    settings = settings.model_copy(update=mixed)
     expected = train(settings)
     output = tmp_path / "killed" / "model.safetensors"
     killed = settings.model_copy(
