@@ -39,7 +39,7 @@ def main(arguments: Sequence[str]) -> int:
     wanted = chosen_sources(source, options)
     # What a killed run left unfinished.
     EpisodeStore(options.store).sweep()
-    refuse_trained_sources(source, wanted, options.checkpoint)
+    refuse_trained_episodes(source, wanted, options.checkpoint, command="generate")
     made = imagine(options, wanted, only_judged=False)
     target = EpisodeStore(options.store)
     num_bytes = sum(target.open(one).verify().num_bytes for one in made)
@@ -84,8 +84,10 @@ def chosen_sources(store: EpisodeStore, options: argparse.Namespace) -> list[str
     return in_turn[: options.count]
 
 
-def refuse_trained_sources(store: EpisodeStore, wanted: Sequence[str], checkpoint: Path) -> None:
-    """Refuse sources that the world model was trained on.
+def refuse_trained_episodes(
+    store: EpisodeStore, wanted: Sequence[str], checkpoint: Path, *, command: str
+) -> None:
+    """Refuse episodes that the world model was trained on.
 
     Raises:
         ConflictError: there is one.
@@ -103,8 +105,8 @@ def refuse_trained_sources(store: EpisodeStore, wanted: Sequence[str], checkpoin
         trained = [one for one in wanted if fingerprint(read_episode(store.open(one))) in prints]
     if trained:
         raise ConflictError(
-            f"generate: {checkpoint.name} was trained on the scenes of {len(trained)} of "
-            f"{len(wanted)} sources, such as {trained[0]!r}; choose another --split or --seeds",
+            f"{command}: {checkpoint.name} was trained on the scenes of {len(trained)} of "
+            f"{len(wanted)} episodes, such as {trained[0]!r}; choose another --split or --seeds",
             episodes=trained,
         )
 

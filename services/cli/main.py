@@ -85,6 +85,9 @@ COMMANDS = {
         "score policies in real and imagined worlds",
         "evaluation.command_line:run_evaluation",
     ),
+    "evaluate prediction": Command(
+        "measure predicted images and touch on held-out episodes", "cli.evaluate_prediction:main"
+    ),
     "study": Command(
         "score policies in several worlds, defined in a file and resumable",
         "cli.study.command:main",

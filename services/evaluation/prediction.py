@@ -1,214 +1,279 @@
-"""Prediction errors of a world on held-out episodes, compared with simple baselines.
+"""Prediction errors of a world on held-out episodes, beside simple baselines.
 
 Only the `World` interface is used, so that all kinds of world models are measured in the same way:
-over whole open-loop rollouts, from the first observed step to the last.
+over windows of one chunk, or over whole open-loop rollouts.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.episodes import EpisodeReader
 from dextouch.errors import InvalidInputError
-from dextouch.hands.actions import CAMERA_HEAD, poses_from_actions
 from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
-from dextouch.schemas import Observation, ReturnSelector, RolloutStart
 from dextouch.worlds import World
-from services.evaluation.camera_warp import warp_over_table
+from services.evaluation.prediction_scenes import (
+    CHUNK_STEPS,
+    Future,
+    Scene,
+    copied,
+    imagine,
+    other_take,
+    reconstructed,
+    standing_still,
+    warped,
+)
+from services.evaluation.progress import Progress
 from services.evaluation.reporting import PredictionPicture
 
-CAMERA: Final = "camera_head"
-CHUNK_STEPS: Final = 16
-_NO_IMAGE = ReturnSelector(cameras=())
-_LAST_STEP = ReturnSelector(cameras=(CAMERA,), steps="last")
+Pairs = Sequence[tuple[Scene, Future]]
+MODEL: Final = "model"
+ALL_TASKS: Final = "all"
+# What every figure stands beside, in the order of tables.
+BASELINES: Final = {
+    "copy": "the first step, repeated",
+    "warp": "the first image, warped by the known motion of the camera over the table",
+    "zero": "no touch at all",
+    "codec": "the truth, encoded and decoded by the model: the limit",
+    "other_take": "the model, given the actions of another take of the task at the same step",
+    "hold": "the model, given actions in which nothing moves",
+    "hands_still": "the model, given actions in which only the head moves",
+}
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A figure of predicted futures; `measure` gets all pairs of a task, or of all tasks."""
+
+    name: str
+    title: str
+    unit: str
+    better: Literal["higher", "lower"]
+    about: str
+    of: Literal["images", "touch"]
+    measure: Callable[[Pairs], float]
+
+
+def _of_images(function: Callable[..., float]) -> Callable[[Pairs], float]:
+    """Mean over images."""
+
+    def measure(pairs: Pairs) -> float:
+        counts = [len(future.images) for _, future in pairs]
+        values = [
+            function(predicted=future.images, true=scene.truth.images) for scene, future in pairs
+        ]
+        return float(np.average(values, weights=counts))
+
+    return measure
+
+
+def _of_touch(function: Callable[..., float]) -> Callable[[Pairs], float]:
+    """Over all steps, hands and taxels together."""
+
+    def measure(pairs: Pairs) -> float:
+        return function(
+            predicted_kpa=np.concatenate([future.tactile_kpa for _, future in pairs]),
+            true_kpa=np.concatenate([scene.truth.tactile_kpa for scene, _ in pairs]),
+        )
+
+    return measure
+
+
+_PEAK = f"{tactile_metrics.PEAK_KPA:g} kPa"
+METRICS: Final = {
+    metric.name: metric
+    for metric in (
+        Metric(
+            "psnr",
+            "PSNR",
+            "dB",
+            "higher",
+            "peak signal-to-noise ratio of 8-bit images, mean over images, at most 100",
+            "images",
+            _of_images(image_metrics.psnr),
+        ),
+        Metric(
+            "ssim",
+            "SSIM",
+            "",
+            "higher",
+            "structural similarity, Gaussian window of 11 px, mean over images; 1 for equal ones",
+            "images",
+            _of_images(image_metrics.ssim),
+        ),
+        Metric(
+            "tactile_psnr",
+            "PSNR of taxels",
+            "dB",
+            "higher",
+            f"of the error over all taxels together, with a peak of {_PEAK}",
+            "touch",
+            _of_touch(tactile_metrics.psnr),
+        ),
+        Metric(
+            "tactile_ssim",
+            "SSIM of taxels",
+            "",
+            "higher",
+            f"windows of 4 by 4 taxels in each pad, range 0 … {_PEAK}; 1 for equal pads",
+            "touch",
+            _of_touch(tactile_metrics.ssim),
+        ),
+        Metric(
+            "tactile_mse",
+            "MSE",
+            "kPa²",
+            "lower",
+            "mean squared error over all taxels",
+            "touch",
+            _of_touch(tactile_metrics.mse),
+        ),
+        Metric(
+            "tactile_mae",
+            "MAE",
+            "kPa",
+            "lower",
+            "mean absolute error over all taxels",
+            "touch",
+            _of_touch(tactile_metrics.mae),
+        ),
+        Metric(
+            "contact_mae",
+            "Contact-MAE",
+            "kPa",
+            "lower",
+            "mean absolute error over taxels in true contact (at least 2 kPa)",
+            "touch",
+            _of_touch(tactile_metrics.contact_mae),
+        ),
+        Metric(
+            "contact_iou",
+            "Contact-IoU",
+            "",
+            "higher",
+            "intersection over union of taxels in contact; 1 if neither side has any",
+            "touch",
+            _of_touch(tactile_metrics.contact_iou),
+        ),
+        Metric(
+            "contact_f1",
+            "Contact-F1",
+            "",
+            "higher",
+            "F1 of taxels in contact; 1 if neither side has any",
+            "touch",
+            _of_touch(tactile_metrics.contact_f1),
+        ),
+    )
+}
+Figures = dict[str, dict[str, float | None]]
 
 
 @dataclass(frozen=True)
 class PredictionResult:
-    """Figures for `report.json`, and the images of one rollout per task."""
+    """Figures by task (`all` for all together), source and metric; None where not available.
 
-    figures: dict[str, Any]
+    The source is `model` or a baseline. `pictures` are of the first scene of every task.
+    """
+
+    by_task: Mapping[str, Figures]
+    num_scenes: int
     pictures: tuple[PredictionPicture, ...]
 
-
-@dataclass(frozen=True)
-class Future:
-    """Images at the ends of chunks, and the touch of every step after the first."""
-
-    images: UInt8[np.ndarray, "chunks h w 3"]
-    tactile_kpa: Float32[np.ndarray, "steps 2 320"]
-
-
-@dataclass(frozen=True)
-class Scene:
-    """Start of an episode, its commanded actions, and the true future."""
-
-    episode_id: str
-    start: RolloutStart
-    actions: Float64[np.ndarray, "steps 67"]
-    truth: Future
-    model_rate_hz: float
+    def flat(self) -> dict[str, float]:
+        """Available figures of all tasks as `metric` and `metric_baseline`."""
+        found = {
+            metric if source == MODEL else f"{metric}_{source}": value
+            for source, figures in self.by_task[ALL_TASKS].items()
+            for metric, value in figures.items()
+            if value is not None
+        }
+        return {**found, "num_rollouts": float(self.num_scenes)}
 
 
-def measure_prediction(world: World[Any], scenes: Sequence[Scene]) -> PredictionResult:
-    """Errors over whole rollouts of scenes that the world was not trained on.
+def measure_prediction(
+    world: World[Any], scenes: Sequence[Scene], *, metrics: Sequence[str] = tuple(METRICS)
+) -> PredictionResult:
+    """Errors of predicted futures of scenes that the world was not trained on.
 
-    Returns:
-        `psnr` (dB, mean over the images at the ends of chunks), `tactile_mse` (kPa²) and
-        `contact_f1`, each also for the baselines named by a suffix, and `num_rollouts`.
-
-        - _copy repeats the first step; tactile_mse_zero predicts no touch.
-        - psnr_warp is the first image, warped by the known camera motion over the table.
-        - _other_take is the world given the actions of another held-out scene of the same task.
-        - _hold is the world given actions in which nothing moves; in _hands_still the head moves.
+    Args:
+        world: to measure.
+        scenes: recorded futures.
+        metrics: names of `METRICS`.
 
     Raises:
         InvalidInputError: no scene.
     """
     if not scenes:
         raise InvalidInputError("prediction: got no scene, expected at least one")
-    still = {"_hold": False, "_hands_still": True}
-    futures = {
-        "": [(one, imagine(world, one, one.actions)) for one in scenes],
-        "_copy": [(one, _copy(one)) for one in scenes],
-        "_other_take": [
-            (one, imagine(world, one, other.actions))
-            for one in scenes
-            if (other := _other(one, scenes)) is not None
-        ],
-    } | {
-        suffix: [(one, imagine(world, one, _still(one, head_moves=head_moves))) for one in scenes]
-        for suffix, head_moves in still.items()
-    }
-    figures: dict[str, float] = {}
-    for suffix, pairs in futures.items():
-        if pairs:
-            figures |= {f"{name}{suffix}": value for name, value in _errors(pairs).items()}
-    warped = [(one, replace(one.truth, images=_warped(one))) for one in scenes]
-    unfelt = np.zeros_like(scenes[0].truth.tactile_kpa)
-    nothing = [(one, replace(one.truth, tactile_kpa=unfelt)) for one in scenes]
-    figures["psnr_warp"] = _errors(warped)["psnr"]
-    figures["tactile_mse_zero"] = _errors(nothing)["tactile_mse"]
-    figures["num_rollouts"] = float(len(scenes))
-    return PredictionResult(figures, _pictures(futures[""]))
-
-
-def read_scene(reader: EpisodeReader) -> Scene:
-    """Convert a stored robot episode to a scene."""
-    about = reader.attributes
-    reader.require_images(CAMERA)
-    window = reader.window(0, reader.num_steps, cameras=(CAMERA,))
-    first = Observation(
-        first_step=0,
-        images={CAMERA: window.images[CAMERA][:1]},
-        tactile_kpa=window.tactile_kpa[:1],
-        action_reached=window.actions[:1],
-        reached_is_measured=True,
-    )
-    start = RolloutStart(
-        about.task,
-        about.seed or 0,
-        about.instruction,
-        observation=first,
-        anchor=window.anchor,
-        K_head=window.K_head,
-    )
-    num_steps = (reader.num_steps - 1) // CHUNK_STEPS * CHUNK_STEPS
-    actions = reader.read("action_commanded").values[1 : num_steps + 1]
-    truth = Future(
-        window.images[CAMERA][CHUNK_STEPS : num_steps + 1 : CHUNK_STEPS],
-        window.tactile_kpa[1 : num_steps + 1],
-    )
-    return Scene(about.episode_id, start, actions, truth, about.model_rate_hz)
-
-
-def imagine(world: World[Any], scene: Scene, actions: Float64[np.ndarray, "steps 67"]) -> Future:
-    """Predict the future of a scene for given actions."""
-    state = world.reset(scene.start).state
-    images, touch = [], []
-    for first in range(0, len(actions), CHUNK_STEPS):
-        chunk, seed = actions[first : first + CHUNK_STEPS], scene.start.seed + first
-        # A world is functional: two calls give touch of all steps and only the last image.
-        felt = world.step(state, chunk, seed=seed, selector=_NO_IMAGE)
-        seen = world.step(state, chunk, seed=seed, selector=_LAST_STEP)
-        images.append(seen.observation.images[CAMERA][-1])
-        touch.append(felt.observation.tactile_kpa)
-        state = felt.state
-    return Future(np.stack(images), np.concatenate(touch))
-
-
-def _other(scene: Scene, scenes: Sequence[Scene]) -> Scene | None:
-    """The next, different scene of the same task."""
-    mine = [one for one in scenes if one.start.task == scene.start.task]
-    at = next(index for index, one in enumerate(mine) if one is scene)
-    turned = mine[at + 1 :] + mine[:at]
-    return next((one for one in turned if one.start.seed != scene.start.seed), None)
-
-
-def _still(scene: Scene, *, head_moves: bool) -> Float64[np.ndarray, "steps 67"]:
-    rows = np.repeat(scene.actions[:1], len(scene.actions), axis=0)
-    if head_moves:
-        rows[:, CAMERA_HEAD] = scene.actions[:, CAMERA_HEAD]
-    return rows
-
-
-def _first(scene: Scene) -> Observation:
-    if scene.start.observation is None:
-        raise InvalidInputError(f"scene {scene.episode_id!r}: begins without an observation")
-    return scene.start.observation
-
-
-def _copy(scene: Scene) -> Future:
-    first, truth = _first(scene), scene.truth
-    return Future(
-        np.repeat(first.images[CAMERA], len(truth.images), axis=0),
-        np.repeat(first.tactile_kpa, len(truth.tactile_kpa), axis=0),
+    found: dict[str, list[tuple[Scene, Future]]] = {name: [] for name in (MODEL, *BASELINES)}
+    with Progress("scenes", len(scenes)) as progress:
+        for scene in scenes:
+            for source, future in _futures(world, scene, scenes).items():
+                if future is not None:
+                    found[source].append((scene, future))
+            progress.advance()
+    tasks = list(dict.fromkeys(scene.start.task for scene in scenes))
+    return PredictionResult(
+        {
+            name: {
+                source: _figures(world, source, pairs, metrics, None if name == ALL_TASKS else name)
+                for source, pairs in found.items()
+            }
+            for name in (ALL_TASKS, *tasks)
+        },
+        len(scenes),
+        _pictures(found[MODEL]),
     )
 
 
-def _warped(scene: Scene) -> UInt8[np.ndarray, "chunks h w 3"]:
-    anchor, K_head = scene.start.anchor, scene.start.K_head
-    if anchor is None or K_head is None:
-        raise InvalidInputError(f"scene {scene.episode_id!r}: begins without camera")
-    cameras = poses_from_actions(scene.actions, anchor).Ts_world_camera_head
-    image, then = _first(scene).images[CAMERA][0], anchor.T_world_camera_head
-    ends = cameras[CHUNK_STEPS - 1 :: CHUNK_STEPS]
-    return np.stack([warp_over_table(image, K_head, then, now) for now in ends])
-
-
-def _errors(pairs: Sequence[tuple[Scene, Future]]) -> dict[str, float]:
-    """Errors of predicted futures, over all scenes together."""
-    touch = {
-        "predicted_kpa": np.stack([future.tactile_kpa for _, future in pairs]),
-        "true_kpa": np.stack([scene.truth.tactile_kpa for scene, _ in pairs]),
-    }
-    decibels = [
-        float(image_metrics.psnr(predicted=future.images, true=scene.truth.images))
-        for scene, future in pairs
-    ]
+def _futures(world: World[Any], scene: Scene, scenes: Sequence[Scene]) -> dict[str, Future | None]:
+    """Predictions of the world and of all baselines; None where a baseline does not apply."""
+    other = other_take(scene, scenes)
+    num_steps = len(scene.actions)
     return {
-        "psnr": float(np.mean(decibels)),
-        "tactile_mse": float(tactile_metrics.mse(**touch)),
-        "contact_f1": float(tactile_metrics.contact_f1(**touch)),
+        MODEL: imagine(world, scene, scene.actions),
+        "copy": copied(scene),
+        "warp": replace(scene.truth, images=warped(scene)),
+        "zero": replace(scene.truth, tactile_kpa=np.zeros_like(scene.truth.tactile_kpa)),
+        "codec": reconstructed(world, scene),
+        "other_take": None if other is None else imagine(world, scene, other.actions[:num_steps]),
+        "hold": imagine(world, scene, standing_still(scene, head_moves=False)),
+        "hands_still": imagine(world, scene, standing_still(scene, head_moves=True)),
     }
 
 
-def _pictures(rollouts: Sequence[tuple[Scene, Future]]) -> tuple[PredictionPicture, ...]:
-    """The first scene of every task."""
+def _figures(
+    world: World[Any], source: str, pairs: Pairs, metrics: Sequence[str], task: str | None
+) -> dict[str, float | None]:
+    mine = [pair for pair in pairs if task in (None, pair[0].start.task)]
+    figures: dict[str, float | None] = {}
+    for name in metrics:
+        metric = METRICS[name]
+        # The warp is of images, zero of touch; a world may not predict touch.
+        absent = source == ("warp" if metric.of == "touch" else "zero")
+        if metric.of == "touch" and source not in ("copy", "zero"):
+            absent = absent or not world.description.predicts_touch
+        value = float("nan") if absent or not mine else metric.measure(mine)
+        figures[name] = value if np.isfinite(value) else None
+    return figures
+
+
+def _pictures(rollouts: Pairs) -> tuple[PredictionPicture, ...]:
+    """The first scene of every task, at the ends of chunks."""
     firsts: dict[str, PredictionPicture] = {}
     for scene, imagined in rollouts:
         if scene.start.task in firsts:
             continue
-        ends = np.arange(CHUNK_STEPS, len(scene.actions) + 1, CHUNK_STEPS)
+        at = [i for i, step in enumerate(imagined.image_steps) if step % CHUNK_STEPS == 0]
+        ends = np.array([imagined.image_steps[i] for i in at])
         firsts[scene.start.task] = PredictionPicture(
             title=f"{scene.start.instruction} A whole rollout, from its first image and touch.",
             times_s=ends / scene.model_rate_hz,
-            true_images=scene.truth.images,
-            predicted_images=imagined.images,
+            true_images=scene.truth.images[at],
+            predicted_images=imagined.images[at],
             true_tactile_kpa=scene.truth.tactile_kpa[ends - 1],
             predicted_tactile_kpa=imagined.tactile_kpa[ends - 1],
         )

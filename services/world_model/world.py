@@ -33,7 +33,7 @@ from services.world_model.checkpoints import Checkpoint, default_checkpoint, rea
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Precision, Prediction, stack_noise
 from services.world_model.network.solvers import Sampler
-from services.world_model.network.visual_codec import to_uint8
+from services.world_model.network.visual_codec import to_uint8, to_unit
 from services.world_model.starts import CAMERA, observed_start
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.state_world import StateWorld
@@ -183,6 +183,20 @@ class ModelWorld:
                 states, chunks, zip(images, touches, strict=True), requested, strict=True
             )
         ]
+
+    @torch.no_grad()
+    def reconstruct(
+        self,
+        images: UInt8[np.ndarray, "steps h w 3"],
+        tactile_kpa: Float32[np.ndarray, "steps 2 320"],
+    ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 320"]]:
+        """Encode and decode images and touch of 1 + 4k steps; gives those after the first."""
+        codec, tokenizer = self._model.codec, self._model.tokenizer
+        seen = codec.decode_future(
+            codec.encode(to_unit(torch.from_numpy(images.copy())[None])), all_images=True
+        )
+        felt = tokenizer.decode(tokenizer.encode(torch.from_numpy(tactile_kpa[1:].copy())))
+        return to_uint8(seen[0]).numpy(), felt.numpy()
 
     def snapshot(self, state: ModelState) -> bytes:
         """Serialize the state for `restore` with the same checkpoint."""

@@ -29,7 +29,8 @@ from services.cli.study.command import refuse_trained
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.command_line import print_scores
-from services.evaluation.prediction import measure_prediction, read_scene
+from services.evaluation.prediction import measure_prediction
+from services.evaluation.prediction_scenes import read_rollout
 from services.evaluation.reporting import (
     ActionPicture,
     EpisodePicture,
@@ -115,7 +116,7 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
             taken = _take(original, folder / "spool", seed, urls, stages)
             takes[original.attributes.domain] = taken
         with stages.stage("predict", "predicting held-out scenes with the world model"):
-            scenes = [read_scene(truths.open(episode_id)) for episode_id in demonstrations]
+            scenes = [read_rollout(truths.open(episode_id)) for episode_id in demonstrations]
             prediction = measure_prediction(models.world_model, scenes)
         with stages.stage("judge", "scoring policies in the twin and in the world model"):
             policies = {**scoring.ladder(plan), "behaviour cloning": models.policy}
@@ -139,7 +140,7 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
             }
             for name, take in takes.items()
         },
-        "world_model": prediction.figures,
+        "world_model": prediction.flat(),
         **scores,
     }
     with stages.stage("report", "drawing the report"):

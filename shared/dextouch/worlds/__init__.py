@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from dextouch.worlds.fixed_batch import FixedBatchWorld as FixedBatchWorld
     from dextouch.worlds.world import BatchWorld as BatchWorld
     from dextouch.worlds.world import QuickWorld as QuickWorld
+    from dextouch.worlds.world import ReconstructingWorld as ReconstructingWorld
     from dextouch.worlds.world import StartedRollout as StartedRollout
     from dextouch.worlds.world import State as State
     from dextouch.worlds.world import SteppedRollout as SteppedRollout

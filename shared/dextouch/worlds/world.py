@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.errors import (
     DegenerateRotationError,
@@ -132,6 +132,23 @@ class BatchWorld(World[State], Protocol[State]):
             actions: chunks of one length.
             seeds: one per rollout.
             selectors: one per rollout; None requests everything.
+        """
+        ...
+
+
+@runtime_checkable
+class ReconstructingWorld(World[State], Protocol[State]):
+    """A world model with codecs, whose own error is the least that its predictions can have."""
+
+    def reconstruct(
+        self,
+        images: UInt8[np.ndarray, "steps h w 3"],
+        tactile_kpa: Float32[np.ndarray, "steps 2 320"],
+    ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 320"]]:
+        """Encode and decode head images and touch of 1 + 4k consecutive steps.
+
+        Returns:
+            Images and touch of the steps after the first.
         """
         ...
 

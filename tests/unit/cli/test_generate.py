@@ -94,7 +94,7 @@ def test_scenes_of_the_world_model_are_refused(generate, truth, capsys):
     status, _ = generate(seeds="4:6")
     assert status == 3
     error = capsys.readouterr().err
-    assert "was trained on the scenes of 1 of 2 sources" in error
+    assert "was trained on the scenes of 1 of 2 episodes" in error
     assert "--split" in error
     assert generate(seeds="4:6", split="A")[0] == 0
 

@@ -10,9 +10,10 @@ from dextouch.geometry import pinhole_matrix, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.schemas import EVERYTHING, Observation, RolloutStart
 from dextouch.worlds import CopyFirstWorld, SteppedRollout
-from services.evaluation.prediction import Future, Scene, measure_prediction
+from services.evaluation.prediction import ALL_TASKS, BASELINES, MODEL, measure_prediction
+from services.evaluation.prediction_scenes import Future, Scene
 
-PX, NUM_STEPS = 8, 32
+PX, NUM_STEPS = 16, 32
 DOWN = np.diag([1.0, -1.0, -1.0])
 ANCHOR = AnchorPoses(
     transform(np.eye(3), np.array([-0.2, 0.0, 0.2])),
@@ -51,7 +52,9 @@ def scene(seed, depth_m):
     start = RolloutStart("press", seed, "press", observation=first, anchor=ANCHOR, K_head=K_head)
     # Ten grey levels off everywhere: 20 log10(255 / 10) dB for a world that copies.
     images = np.full((2, PX, PX, 3), 110, np.uint8)
-    return Scene(f"e{seed}", start, actions, Future(images, felt(actions).astype(np.float32)), 15.0)
+    return Scene(
+        f"e{seed}", start, actions, Future(images, felt(actions).astype(np.float32), (16, 32)), 15.0
+    )
 
 
 def test_figures_of_a_world_that_feels_and_does_not_see():
@@ -59,7 +62,7 @@ def test_figures_of_a_world_that_feels_and_does_not_see():
     found = measure_prediction(
         PressWorld(tasks=("press",), image_height_px=PX, image_width_px=PX), scenes
     )
-    figures, decibels = found.figures, 20 * np.log10(255 / 10)
+    figures, decibels = found.flat(), 20 * np.log10(255 / 10)
     for name in ("psnr", "psnr_copy", "psnr_warp", "psnr_hold"):
         assert figures[name] == pytest.approx(decibels)
     assert figures["tactile_mse"] == pytest.approx(0.0, abs=1e-9)
@@ -76,6 +79,50 @@ def test_figures_of_a_world_that_feels_and_does_not_see():
 
 def test_a_lone_scene_has_no_other_and_no_scene_is_refused():
     world = CopyFirstWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
-    assert "psnr_other_take" not in measure_prediction(world, [scene(1, 0.1)]).figures
+    assert "psnr_other_take" not in measure_prediction(world, [scene(1, 0.1)]).flat()
     with pytest.raises(InvalidInputError, match="no scene"):
         measure_prediction(world, [])
+
+
+def test_every_metric_stands_beside_every_baseline_that_has_it():
+    world = PressWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
+    found = measure_prediction(
+        world, [scene(1, 0.2), scene(2, 0.1)], metrics=("ssim", "tactile_mae")
+    )
+    assert set(found.by_task) == {ALL_TASKS, "press"}
+    figures = found.by_task["press"]
+    assert set(figures) == {MODEL, *BASELINES}
+    assert figures["warp"]["tactile_mae"] is None
+    assert figures["zero"]["ssim"] is None
+    assert figures["codec"] == {"ssim": None, "tactile_mae": None}
+    # Row k is k/32 of 20 and of 10 kPa.
+    truth = 15.0 * np.mean(np.arange(NUM_STEPS) / NUM_STEPS)
+    assert figures["zero"]["tactile_mae"] == pytest.approx(truth, rel=1e-5)
+
+
+class CodingWorld(PressWorld):
+    """Codecs that lose three grey levels and half of the touch."""
+
+    def reconstruct(self, images, tactile_kpa):
+        return images[1:] - np.uint8(3), tactile_kpa[1:] / 2
+
+
+def test_the_limit_of_the_codecs_needs_images_of_all_steps():
+    world = CodingWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
+    sparse = scene(1, 0.2)
+    images = np.full((NUM_STEPS, PX, PX, 3), 110, np.uint8)
+    steps = tuple(range(1, NUM_STEPS + 1))
+    dense = replace(sparse, truth=Future(images, sparse.truth.tactile_kpa, steps))
+    assert "psnr_codec" not in measure_prediction(world, [sparse]).flat()
+    figures = measure_prediction(world, [dense]).flat()
+    assert figures["psnr_codec"] == pytest.approx(20 * np.log10(255 / 3))
+    assert figures["tactile_mae_codec"] == pytest.approx(figures["tactile_mae_zero"] / 2)
+
+
+def test_a_world_without_touch_has_no_figures_of_touch():
+    world = CopyFirstWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
+    world._description = world.description.model_copy(update={"predicts_touch": False})
+    figures = measure_prediction(world, [scene(1, 0.1)]).flat()
+    assert "contact_f1" not in figures
+    assert figures["contact_f1_copy"] == 0.0
+    assert figures["psnr"] > 0

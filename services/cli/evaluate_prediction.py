@@ -1,0 +1,122 @@
+"""Measure how well a world model predicts the images and touch of held-out robot episodes.
+
+Every figure stands beside those of simple baselines: a repeated first step, the first image warped
+by the camera's known motion, no touch, the model's codecs alone, and the model with other actions.
+Windows of one chunk begin at true steps, as in the paper; rollouts continue from predictions.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.errors import NotFoundError, UnknownNameError
+from services.cli.generate import refuse_trained_episodes
+from services.cli.training_data import comma_separated
+from services.evaluation.prediction import (
+    ALL_TASKS,
+    BASELINES,
+    METRICS,
+    MODEL,
+    PredictionResult,
+    measure_prediction,
+)
+from services.evaluation.prediction_scenes import Scene, read_rollout, read_windows
+
+_HORIZONS: dict[str, Callable[[EpisodeReader], list[Scene]]] = {
+    "windows": read_windows,
+    "rollouts": lambda reader: [read_rollout(reader)],
+}
+_EPILOG = """\
+examples:
+  dextouch evaluate prediction --episodes runs/heldout
+  dextouch evaluate prediction --episodes runs/heldout --checkpoint runs/paper.safetensors \\
+    --horizon windows --metrics psnr,contact_f1 --json runs/prediction.json
+"""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run `dextouch evaluate prediction`."""
+    options = _parser().parse_args(list(arguments))
+    from services.world_model.checkpoints import default_checkpoint
+    from services.world_model.world import open_world
+
+    unknown = set(options.metrics) - set(METRICS)
+    if unknown:
+        raise UnknownNameError("metric", sorted(unknown)[0], list(METRICS))
+    store, path = EpisodeStore(options.episodes), options.checkpoint or default_checkpoint()
+    world = open_world(path, sampling_steps=options.sampling_steps, needs_touch=False)
+    wanted = _episodes(store, options.tasks, world.description.tasks)
+    refuse_trained_episodes(store, wanted, path, command="evaluate prediction")
+    result: dict[str, Any] = {"checkpoint": path.name, "digest": world.description.digest}
+    result["metrics"] = {
+        name: {"title": one.title, "unit": one.unit, "better": one.better, "about": one.about}
+        for name, one in METRICS.items()
+        if name in options.metrics
+    }
+    result["baselines"] = dict(BASELINES)
+    for horizon in [options.horizon] if options.horizon else _HORIZONS:
+        scenes = [scene for one in wanted for scene in _HORIZONS[horizon](store.open(one))]
+        found = measure_prediction(world, scenes, metrics=options.metrics)
+        result[horizon] = dict(found.by_task)
+        result[f"num_{horizon}"] = found.num_scenes
+        print(f"\n{horizon}: {found.num_scenes} from {len(wanted)} episodes\n{_table(found)}")
+    write_result(options.json, result, allow_nan=False)
+    return 0
+
+
+def _episodes(store: EpisodeStore, tasks: Sequence[str], known: Sequence[str]) -> list[str]:
+    """Ids of the robot episodes of some tasks (default: all that the model knows).
+
+    Raises:
+        NotFoundError: there is none.
+    """
+    about = {one: store.open(one).attributes for one in sorted(store.list())}
+    wanted = [
+        one
+        for one, it in about.items()
+        if it.domain == "robot" and it.origin != "imagined" and it.task in (tasks or known)
+    ]
+    if not wanted:
+        there = sorted({it.task for it in about.values() if it.domain == "robot"})
+        raise NotFoundError(
+            f"evaluate prediction: no robot episode of {', '.join(tasks or known)} in the store, "
+            f"which has those of {', '.join(there) or 'no task'}"
+        )
+    return wanted
+
+
+def _table(found: PredictionResult) -> str:
+    """Figures of all tasks: a row for each metric, a column for the model and each baseline."""
+    figures = found.by_task[ALL_TASKS]
+    rows = [["", MODEL, *BASELINES]]
+    for name in figures[MODEL]:
+        metric = METRICS[name]
+        arrow = {"higher": "↑", "lower": "↓"}[metric.better]
+        unit = f" ({metric.unit})" if metric.unit else ""
+        values = [figures[source][name] for source in (MODEL, *BASELINES)]
+        cells = ["-" if value is None else f"{value:.3f}" for value in values]
+        rows.append([f"{metric.title}{unit} {arrow}", *cells])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows
+    ]
+    about = [f"{name}: {text}" for name, text in BASELINES.items()]
+    return "\n".join([*lines, "", *about])
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = CommandParser(prog="dextouch evaluate prediction", description=__doc__, epilog=_EPILOG)
+    add = parser.add_argument
+    add("--episodes", required=True, metavar="STORE", help="store of held-out episodes")
+    add("--checkpoint", type=Path, metavar="PATH", help="world model (default: the package's)")
+    add("--tasks", type=comma_separated, default=(), help="comma-separated (default: the model's)")
+    add("--horizon", choices=list(_HORIZONS), help="only windows or only rollouts (default: both)")
+    names = f"comma-separated, of {', '.join(METRICS)} (default: all)"
+    add("--metrics", type=comma_separated, default=tuple(METRICS), help=names)
+    steps = "network calls per chunk of a flow-matching model"
+    add("--sampling-steps", type=int, metavar="N", help=steps)
+    add_json(parser)
+    return parser

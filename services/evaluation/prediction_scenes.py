@@ -1,0 +1,201 @@
+"""Recorded futures that predictions of a world are compared with, and baselines of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from dextouch.episodes import EpisodeReader
+from dextouch.errors import InvalidInputError
+from dextouch.hands.actions import CAMERA_HEAD, AnchorPoses, poses_from_actions
+from dextouch.schemas import ActionKind, Observation, ReturnSelector, RolloutStart
+from dextouch.worlds import ReconstructingWorld, World
+from services.evaluation.camera_warp import warp_over_table
+
+CAMERA: Final = "camera_head"
+CHUNK_STEPS: Final = 16
+_NO_IMAGE = ReturnSelector(cameras=())
+_LAST_STEP = ReturnSelector(cameras=(CAMERA,), steps="last")
+
+
+@dataclass(frozen=True)
+class Future:
+    """Touch of every step after the first, and the images of some of them.
+
+    Steps are counted from 1, the one after the first observation; `image_steps` are those of the
+    images.
+    """
+
+    images: UInt8[np.ndarray, "shown h w 3"]
+    tactile_kpa: Float32[np.ndarray, "steps 2 320"]
+    image_steps: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Start at a step of an episode, its actions from there, and the true future."""
+
+    episode_id: str
+    start: RolloutStart
+    actions: Float64[np.ndarray, "steps 67"]
+    truth: Future
+    model_rate_hz: float
+    first_step: int = field(default=0)
+
+    @property
+    def first(self) -> Observation:
+        """The observed first step."""
+        if self.start.observation is None:
+            raise InvalidInputError(f"scene {self.episode_id!r}: begins without an observation")
+        return self.start.observation
+
+
+def read_rollout(reader: EpisodeReader, *, image_every: int = CHUNK_STEPS) -> Scene:
+    """A whole episode as one scene, up to its last complete chunk.
+
+    Raises:
+        InvalidInputError: an episode shorter than one chunk.
+        UnknownNameError: no head camera.
+    """
+    num_steps = (reader.num_steps - 1) // CHUNK_STEPS * CHUNK_STEPS
+    if num_steps == 0:
+        raise InvalidInputError(
+            f"prediction: episode {reader.attributes.episode_id!r} has {reader.num_steps} steps, "
+            f"expected at least {CHUNK_STEPS + 1}"
+        )
+    return _read(reader, 0, num_steps, image_every=image_every)
+
+
+def read_windows(reader: EpisodeReader) -> list[Scene]:
+    """An episode as consecutive scenes of one chunk, each from the true step before it."""
+    starts = range(0, reader.num_steps - CHUNK_STEPS, CHUNK_STEPS)
+    return [_read(reader, start, CHUNK_STEPS, image_every=1) for start in starts]
+
+
+def _read(reader: EpisodeReader, first_step: int, num_steps: int, *, image_every: int) -> Scene:
+    about = reader.attributes
+    measured = reader.window(first_step, num_steps + 1, cameras=(CAMERA,))
+    actions, kind = measured.actions, _action_kind(reader)
+    if kind == "commanded":
+        actions = reader.window(
+            first_step, num_steps + 1, cameras=(), action_kind="commanded"
+        ).actions
+    own = {int(step) - first_step for step in reader.shown_steps(CAMERA)[0]}
+    shown = tuple(step for step in range(1, num_steps + 1) if step % image_every == 0)
+    shown = tuple(step for step in shown if step in own)
+    if 0 not in own or not shown:
+        raise InvalidInputError(
+            f"prediction: episode {about.episode_id!r} has no image of step {first_step} or of "
+            f"those predicted from it; record it with images (`dextouch train data --images 1`)"
+        )
+    first = Observation(
+        first_step=0,
+        images={CAMERA: measured.images[CAMERA][:1]},
+        tactile_kpa=measured.tactile_kpa[:1],
+        action_reached=measured.actions[:1],
+        reached_is_measured=True,
+    )
+    start = RolloutStart(
+        about.task,
+        about.seed or 0,
+        about.instruction,
+        kind,
+        observation=first,
+        anchor=measured.anchor,
+        K_head=measured.K_head,
+    )
+    truth = Future(measured.images[CAMERA][list(shown)], measured.tactile_kpa[1:], shown)
+    return Scene(about.episode_id, start, actions[1:], truth, about.model_rate_hz, first_step)
+
+
+def _action_kind(reader: EpisodeReader) -> ActionKind:
+    return "commanded" if "action_commanded" in reader.streams else "measured"
+
+
+def imagine(world: World[Any], scene: Scene, actions: Float64[np.ndarray, "steps 67"]) -> Future:
+    """Prediction of a scene's future for given actions, with images of the steps of its truth."""
+    state = world.reset(scene.start).state
+    images, touch = [], []
+    for first in range(0, len(actions), CHUNK_STEPS):
+        chunk, seed = actions[first : first + CHUNK_STEPS], scene.start.seed + first
+        shown = [s - first - 1 for s in scene.truth.image_steps if first < s <= first + len(chunk)]
+        # Only what is compared is rendered; a world is functional, so one state serves two calls.
+        selector = (
+            _NO_IMAGE if shown in ([], [len(chunk) - 1]) else ReturnSelector(cameras=(CAMERA,))
+        )
+        felt = world.step(state, chunk, seed=seed, selector=selector)
+        if selector is not _NO_IMAGE:
+            images.append(felt.observation.images[CAMERA][shown])
+        elif shown:
+            last = world.step(state, chunk, seed=seed, selector=_LAST_STEP)
+            images.append(last.observation.images[CAMERA])
+        touch.append(felt.observation.tactile_kpa)
+        state = felt.state
+    return Future(np.concatenate(images), np.concatenate(touch), scene.truth.image_steps)
+
+
+def other_take(scene: Scene, scenes: Sequence[Scene]) -> Scene | None:
+    """The next scene of the same task, at the same step and as long, with another seed."""
+    key = (scene.start.task, scene.first_step)
+    mine = [one for one in scenes if (one.start.task, one.first_step) == key]
+    at = next(index for index, one in enumerate(mine) if one is scene)
+    for one in mine[at + 1 :] + mine[:at]:
+        if one.start.seed != scene.start.seed and len(one.actions) >= len(scene.actions):
+            return one
+    return None
+
+
+def standing_still(scene: Scene, *, head_moves: bool) -> Float64[np.ndarray, "steps 67"]:
+    """The scene's actions with the first one repeated, optionally except for the head."""
+    rows = np.repeat(scene.actions[:1], len(scene.actions), axis=0)
+    if head_moves:
+        rows[:, CAMERA_HEAD] = scene.actions[:, CAMERA_HEAD]
+    return rows
+
+
+def copied(scene: Scene) -> Future:
+    """The first step, repeated."""
+    first, truth = scene.first, scene.truth
+    return Future(
+        np.repeat(first.images[CAMERA], len(truth.images), axis=0),
+        np.repeat(first.tactile_kpa, len(truth.tactile_kpa), axis=0),
+        truth.image_steps,
+    )
+
+
+def warped(scene: Scene) -> UInt8[np.ndarray, "shown h w 3"]:
+    """The first image, warped by the known motion of the camera as if it showed only the table."""
+    anchor, K_head = scene.start.anchor, scene.start.K_head
+    if anchor is None or K_head is None:
+        raise InvalidInputError(f"scene {scene.episode_id!r}: begins without camera")
+    cameras = poses_from_actions(scene.actions, anchor).Ts_world_camera_head
+    return np.stack(
+        [
+            _warp(scene.first.images[CAMERA][0], K_head, anchor, cameras[step - 1])
+            for step in scene.truth.image_steps
+        ]
+    )
+
+
+def _warp(
+    image: np.ndarray, K_head: np.ndarray, anchor: AnchorPoses, T_world_now: np.ndarray
+) -> UInt8[np.ndarray, "h w 3"]:
+    return warp_over_table(image, K_head, anchor.T_world_camera_head, T_world_now)
+
+
+def reconstructed(world: World[Any], scene: Scene) -> Future | None:
+    """The true future through the world's codecs, the best that it can predict.
+
+    None if the world has no codecs, or the scene lacks images of some steps.
+    """
+    truth = scene.truth
+    if not isinstance(world, ReconstructingWorld):
+        return None
+    if truth.image_steps != tuple(range(1, len(truth.tactile_kpa) + 1)):
+        return None
+    images = np.concatenate([scene.first.images[CAMERA], truth.images])
+    touch = np.concatenate([scene.first.tactile_kpa, truth.tactile_kpa])
+    seen, felt = world.reconstruct(images, touch)
+    return Future(seen, felt, truth.image_steps)
