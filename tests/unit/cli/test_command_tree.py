@@ -14,7 +14,7 @@ from services.cli import main
 
 COMMANDS = """
 align report, align retarget, align run, align serve,
-checkpoint, dashboard, demo, doctor, evaluate, export, generate, import,
+checkpoint, dashboard, demo, doctor, evaluate, evaluate prediction, export, generate, import,
 rate report, rate serve, serve,
 station calibrate camera, station calibrate glove, station calibrate hand-eye,
 station calibrate latency, station calibrate profile, station calibrate robot-base,
@@ -76,7 +76,8 @@ def commands_below(name: str) -> list[str]:
         inner = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
         words = tuple(inner[0].choices) if inner else ()
     if not words:
-        return [name]
+        # A command may have others below it, such as `evaluate prediction`.
+        return [name, *(f"{name} {word}" for word in main.commands_of(name))]
     return [leaf for word in words for leaf in commands_below(f"{name} {word}".strip())]
 
 
