@@ -60,11 +60,8 @@ class TokenizerMetadata(FrozenModel):
         Raises:
             ConflictError: the configuration explicitly names other values.
         """
-        ours = {
-            "tokenizer": self.tokenizer,
-            "palm_channels": self.palm_channels,
-            "tactile_channels": self.tactile_channels,
-        }
+        size = "palm_channels" if self.tokenizer == "principal_axes" else "tactile_channels"
+        ours = {"tokenizer": self.tokenizer, size: getattr(self, size)}
         given = {name: getattr(config, name) for name in config.model_fields_set & ours.keys()}
         others = {name: (ours[name], value) for name, value in given.items() if value != ours[name]}
         if others:

@@ -41,7 +41,7 @@ class GridTokenizer(LearnedTokenizer):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
-        # Of the sizes with as many weights as Split-Hands, the most accurate one.
+        # The most accurate of three sizes with as many weights as Split-Hands.
         shape = MapShape(
             *CANVAS_SHAPE, num_maps=1, channels=config.tactile_channels, width=24, hidden=90,
             num_halvings=2,
