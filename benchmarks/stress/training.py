@@ -14,15 +14,19 @@ from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFinit
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.flow_matching import MIN_TIME, training_times
 from services.world_model.network.inputs import build_inputs
+from services.world_model.network.model import Precision
 from services.world_model.settings import OptimizerSettings, TrainSettings, WindowSettings
 from services.world_model.training.dataset import EpisodeArrays, WindowBatch, WindowSampler
-from services.world_model.training.objective import losses
+from services.world_model.training.objective import LossOptions, losses
 from services.world_model.training.splits import check_disjoint
 from services.world_model.training.training_run import TrainingRun
 
 STAGE = StageCells("training")
 _PX = 32
 _STEPS = 33
+_PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
+# Products of bfloat16 have eight bits.
+_BFLOAT16_LOSS = 0.02
 
 
 @STAGE.cell("rotations", "an action of parallel columns; wrists that turn by π", slow=True)
@@ -133,11 +137,42 @@ def _batch(check: Check) -> None:
     )
 
 
+@STAGE.cell("precision", "losses with matrix products in bfloat16", slow=True)
+def _precision(check: Check) -> None:
+    run = _run(_episode())
+    # Outputs begin at zero, exact in every precision.
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for weight in run.model.parameters():
+            weight.add_(0.05 * torch.randn(weight.shape, generator=generator))
+    batch = _batch_of(_episode(), 4)
+    exact, coarse = (
+        losses(
+            run.model,
+            batch,
+            generator=torch.Generator().manual_seed(1),
+            options=LossOptions(precision=precision),
+        )
+        for precision in _PRECISIONS
+    )
+    off = abs(coarse.video.item() / exact.video.item() - 1.0)
+    check.at_most("loss of images off", off, _BFLOAT16_LOSS)
+    check.finite("loss of touch", coarse.tactile.detach().numpy())
+
+
+@STAGE.cell("device", "losses and gradients on the meta device, where other tensors are found out")
+def _device(check: Check) -> None:
+    run = _run(_episode())
+    batch = _batch_of(_episode(), 4)
+    model = run.model.to("meta")
+    loss = losses(model, batch, generator=torch.Generator().manual_seed(1))
+    torch.autograd.backward(loss.video + loss.tactile)
+    check.true("losses stay there", loss.video.is_meta and loss.tactile.is_meta)
+
+
 STAGE.does_not_apply(
     one_axis="nothing is estimated from motion; see hand-eye",
     clock="windows are cut by steps; see resampling",
-    precision="training is in float32 only: there is no setting for another",
-    device="training is on the CPU only: there is no setting for another",
 )
 
 

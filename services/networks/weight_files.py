@@ -89,10 +89,7 @@ def read_weights(
         NonFiniteError: weights that are NaN or infinite.
     """
     where = f"checkpoint {path.name}"
-    if not path.is_file():
-        raise NotFoundError(
-            f"checkpoint: no file {path.name} in {path.parent}; check the path, or train one first"
-        )
+    _check_exists(path)
     size = path.stat().st_size
     if size > max_bytes:
         raise LimitExceededError(f"{where}: got {size} bytes, expected at most {max_bytes}")
@@ -100,6 +97,19 @@ def read_weights(
     parsed = _history(notes.get(key), history, key, where)
     refuse_non_finite(tensors, where)
     return tensors, parsed, digest_of(path)
+
+
+def read_history(path: Path, history: type[History], key: str) -> History:
+    """History of a file, without its tensors; as `read_weights`."""
+    _check_exists(path)
+    return _history(notes_of(path).get(key), history, key, f"checkpoint {path.name}")
+
+
+def _check_exists(path: Path) -> None:
+    if not path.is_file():
+        raise NotFoundError(
+            f"checkpoint: no file {path.name} in {path.parent}; check the path, or train one first"
+        )
 
 
 def read_tensors(path: Path, where: str) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -17,6 +17,7 @@ from services.networks.weight_files import (
     half_weights,
     load_strictly,
     notes_of,
+    read_history,
     read_weights,
     refuse_non_finite,
     write_weights,
@@ -123,6 +124,17 @@ def read_checkpoint(path: Path, *, max_bytes: int | None = None) -> Checkpoint:
         model.text_features.learn({key.removeprefix(_TEXT): tensors.pop(key) for key in keys})
     load_strictly({"": model}, tensors, where=f"checkpoint {path.name}", later=LATER_STATISTICS)
     return Checkpoint(model, metadata, digest)
+
+
+def read_metadata(path: Path) -> CheckpointMetadata:
+    """Metadata of a checkpoint, without reading its weights.
+
+    Raises:
+        NotFoundError: no such file.
+        CorruptDataError: not a checkpoint of this form, or damaged metadata.
+        InvalidInputError: unsupported format version.
+    """
+    return read_history(path, CheckpointMetadata, METADATA_KEY)
 
 
 def _largest(path: Path) -> int:

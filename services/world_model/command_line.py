@@ -11,7 +11,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from dextouch.command_line import write_result
 from dextouch.serving import load_settings
 from dextouch.worlds import World, serve_worlds
-from services.world_model.checkpoints import list_checkpoints, read_checkpoint
+from services.world_model.checkpoints import list_checkpoints, read_checkpoint, read_metadata
+from services.world_model.plan import plan_table
 from services.world_model.settings import (
     AdaptCommand,
     ShowCommand,
@@ -31,6 +32,9 @@ from services.world_model.world import open_world
 def run_train(arguments: list[str]) -> int:
     """Train with a progress bar; print the report and optionally write it to a file."""
     settings = load_settings(TrainCommand, arguments)
+    if settings.plan:
+        print(plan_table(settings.network))
+        return 0
     return _train(settings, settings.json_path)
 
 
@@ -111,7 +115,10 @@ def open_worlds(settings: WorldModelSettings) -> dict[str, World[Any]]:
 
     torch.set_num_threads(settings.num_threads)
     world = open_world(
-        settings.checkpoint, sampling_steps=settings.sampling_steps, sampler=settings.sampler
+        settings.checkpoint,
+        sampling_steps=settings.sampling_steps,
+        sampler=settings.sampler,
+        placement=settings.placement,
     )
     return {settings.world_name: world}
 
@@ -123,7 +130,10 @@ def open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> World[A
             if is_state_checkpoint(path):
                 return open_world(path)
             return open_world(
-                path, sampling_steps=settings.sampling_steps, sampler=settings.sampler
+                path,
+                sampling_steps=settings.sampling_steps,
+                sampler=settings.sampler,
+                placement=settings.placement,
             )
     return None
 
@@ -132,6 +142,9 @@ def run_show(arguments: list[str]) -> int:
     """Print the metadata of one checkpoint, or of every checkpoint in a folder."""
     settings = load_settings(ShowCommand, arguments)
     path = settings.checkpoint
+    if settings.plan:
+        print(plan_table(read_metadata(path).network))
+        return 0
     found = [_history(file) for file in (list_checkpoints(path) if path.is_dir() else [path])]
     print(json.dumps(found, indent=2))
     write_result(settings.json_path, found)

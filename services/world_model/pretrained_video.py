@@ -5,9 +5,11 @@ from pathlib import Path
 from torch import nn
 
 from dextouch.errors import InvalidInputError
+from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.wan_codec import WanVideoCodec
 from services.world_model.network.wan_video import WanBlock, WanVideoCondition, WanVideoExpert
+from services.world_model.wan.configuration import WanFiles
 from services.world_model.wan.loading import find_weights, load_weights
 from services.world_model.wan.renaming import TRANSFORMER_RULES, autoencoder_rules
 
@@ -15,20 +17,51 @@ _STEM = "diffusion_pytorch_model"
 _ORIGINAL_AUTOENCODER = "Wan2.2_VAE"
 
 
-def load_pretrained(
-    model: JointWorldModel,
-    folder: Path,
-    *,
-    text_cache: Path | None = None,
-    max_bytes: int | None = None,
-) -> None:
+def initial_model(
+    config: NetworkConfig, files: WanFiles, *, filled_later: bool = False
+) -> JointWorldModel:
+    """A new model; that of the full size begins with the pretrained weights of its files.
+
+    Args:
+        config: network to build.
+        files: pretrained networks; unused by the small size.
+        filled_later: a checkpoint replaces all weights, so that files are not needed.
+
+    Raises:
+        InvalidInputError: the full size without a folder.
+        NotFoundError, CorruptDataError, LimitExceededError, NonFiniteError: as `load_weights`.
+    """
+    model = JointWorldModel(config)
+    if model.text_features is None:
+        return model
+    if files.folder is not None:
+        load_pretrained(model, files.folder, max_bytes=files.max_bytes)
+    elif filled_later:
+        for module in model.modules():
+            if any(tensor.is_meta for tensor in module.parameters(recurse=False)):
+                module.to_empty(device="cpu", recurse=False)
+    else:
+        raise InvalidInputError(
+            "pretrained video expert: got no folder; give the local folder of Wan2.2-TI2V-5B "
+            "with --wan.folder, or --init with a checkpoint of the full size"
+        )
+    model.text_features.use(files.folder, files.text_cache)
+    return model
+
+
+def share_texts(source: JointWorldModel, target: JointWorldModel) -> None:
+    """Give a model the text features that another knows."""
+    if source.text_features is not None and target.text_features is not None:
+        target.text_features.learn(source.text_features.known)
+
+
+def load_pretrained(model: JointWorldModel, folder: Path, *, max_bytes: int | None = None) -> None:
     """Load transformer and autoencoder, and use the folder's text encoder when it is needed.
 
     Args:
         model: of the full size; its other parts keep their initial weights.
         folder: Wan2.2-TI2V-5B in diffusers' layout (`transformer`, `vae`, `text_encoder`,
             `tokenizer`), or transformer and autoencoder under their original names.
-        text_cache: folder for text features; None keeps them in memory and in checkpoints.
         max_bytes: limit of memory for each network; None for the memory that is available.
 
     Raises:
@@ -67,7 +100,7 @@ def load_pretrained(
     )
     rules = autoencoder_rules(wan.vae_blocks)
     load_weights(codec.autoencoder, stored, rules, where=where, max_bytes=max_bytes)
-    condition.text_features.use(folder, text_cache)
+    condition.text_features.use(folder)
 
 
 class _Transformer(nn.Module):

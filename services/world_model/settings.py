@@ -1,11 +1,9 @@
 """Settings of world model training and serving, from flags and environment variables."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field
-from pydantic.fields import FieldInfo
 from pydantic_settings import BaseSettings, CliImplicitFlag, PydanticBaseSettingsSource
 
 from dextouch.command_line import JSON_HELP
@@ -16,6 +14,7 @@ from services.networks.training_settings import (
     AverageDecay,
     Batch,
     CpuBudget,
+    Device,
     LearningRate,
     MaxGradientNorm,
     MaxSteps,
@@ -28,11 +27,14 @@ from services.networks.training_settings import (
 )
 from services.world_model.checkpoints import PRETRAINED, default_checkpoint
 from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.model import Precision
 from services.world_model.network.solvers import Sampler
-from services.world_model.presets import PRESETS, preset_settings
+from services.world_model.placement import Placement
+from services.world_model.presets import PRESETS, PresetSource
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.precision import has_fast_bfloat16
 from services.world_model.rendering.training import RendererTraining
+from services.world_model.wan.configuration import WanFiles
 
 
 class OptimizerSettings(FrozenModel):
@@ -45,6 +47,9 @@ class OptimizerSettings(FrozenModel):
     max_gradient_norm: MaxGradientNorm = 1.0
     ema_decay: AverageDecay = 0.995
     tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac (equation 5)")
+    precision: Precision = Field(
+        default="float32", description="of matrix products in training; weights keep theirs"
+    )
     touch_loss: Literal["all", "contact_or_changing"] = Field(
         default="all",
         description="tactile tokens that count in the loss: all, or those in contact or changing",
@@ -119,6 +124,8 @@ class RunSettings(FrozenModel):
     cpu_budget_s: CpuBudget = 1000.0
     max_steps: MaxSteps = None
     num_threads: int = Field(default=1, ge=1, description="threads of torch")
+    device: Device = "cpu"
+    wan: WanFiles = Field(default=WanFiles(), description="files of the pretrained networks")
     heldout_percent: int = Field(
         default=10,
         ge=1,
@@ -285,19 +292,6 @@ class TrainStateCommand(BaseSettings, StateTrainSettings):
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
-class PresetSource(PydanticBaseSettingsSource):
-    """Settings of the preset that a source of higher priority names."""
-
-    def get_field_value(self, field: FieldInfo, field_name: str) -> tuple[None, str, bool]:
-        """Unused: all values come at once, from `__call__`."""
-        return None, field_name, False
-
-    def __call__(self) -> dict[str, Any]:
-        """Values of the preset; none without one."""
-        name = self.current_state.get("preset")
-        return preset_settings(name) if isinstance(name, str) else {}
-
-
 class TrainCommand(BaseSettings, TrainSettings):
     r"""Train the joint visuo-tactile flow-matching model on windows of episodes.
 
@@ -308,11 +302,18 @@ class TrainCommand(BaseSettings, TrainSettings):
       dextouch train tokenizer --episodes runs/episodes --output runs/tokenizer.safetensors
       dextouch train world-model --preset paper --tokenizer runs/tokenizer.safetensors \
         --episodes runs/episodes --output runs/paper.safetensors
+
+    At full size, from a local copy of Wan2.2-TI2V-5B; with --plan to see what it needs:
+      dextouch train world-model --preset wan22-5b --wan.folder models/Wan2.2-TI2V-5B-Diffusers \
+        --tokenizer runs/tokenizer.safetensors --episodes runs/episodes --plan
     """
 
     model_config = service_config("world_model_train", "dextouch train world-model")
 
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
+    plan: CliImplicitFlag[bool] = Field(
+        default=False, description="print memory and FLOPs of the network, and do not train"
+    )
 
     @classmethod
     def settings_customise_sources(
@@ -344,11 +345,16 @@ class ShowCommand(BaseSettings):
 
     Example:
       dextouch checkpoint --checkpoint runs/state.safetensors
+      dextouch checkpoint --checkpoint runs/paper.safetensors --plan
     """
 
     model_config = service_config("world_model_show", "dextouch checkpoint")
 
     checkpoint: Path = Field(default=PRETRAINED, description="checkpoint, or folder of checkpoints")
+    plan: CliImplicitFlag[bool] = Field(
+        default=False,
+        description="print memory and FLOPs per action chunk instead, for the paper's form",
+    )
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
@@ -373,55 +379,7 @@ class WorldModelSettings(WorldServiceSettings):
     sampler: Sampler | None = Field(
         default=None, description="solver of a flow-matching model (default: the checkpoint's)"
     )
-    num_threads: int = Field(default=1, ge=1, description="threads of torch")
-
-
-def command_line(settings: TrainSettings) -> str:
-    """Command that repeats a run: every setting that differs from its default.
-
-    Stores are given by their last path component, since folders differ between machines.
-    """
-    given = settings.model_dump(
-        mode="json",
-        exclude_defaults=True,
-        exclude={
-            "output",
-            "json_path",
-            "episodes",
-            "human",
-            "heldout",
-            "init",
-            "tokenizer",
-            "resume",
-            "state_every_cpu_s",
-        },
+    placement: Placement = Field(
+        default=Placement(), description="device and precision of a flow-matching model"
     )
-    flags = [f"--episodes={last_name(settings.episodes)}"]
-    flags += [f"--human={last_name(url)}" for url in settings.human]
-    if settings.heldout is not None:
-        flags.append(f"--heldout={last_name(settings.heldout)}")
-    if settings.init is not None:
-        flags.append(f"--init={settings.init.name}")
-    if settings.tokenizer is not None:
-        flags.append(f"--tokenizer={settings.tokenizer.name}")
-    return " ".join(["dextouch train world-model", *flags, *flags_of(given)])
-
-
-def flags_of(given: Mapping[str, object], prefix: str = "") -> list[str]:
-    """Flags of a command for these settings; names of nested ones are joined by dots."""
-    flags: list[str] = []
-    for name, value in given.items():
-        flag = prefix + name.replace("_", "-")
-        if isinstance(value, Mapping):
-            flags += flags_of(value, f"{flag}.")
-        elif isinstance(value, bool):
-            flags.append(f"--{flag}" if value else f"--no-{flag}")
-        else:
-            values = value if isinstance(value, list) else [value]
-            flags += [f"--{flag}={one}" for one in values]
-    return flags
-
-
-def last_name(url: str) -> str:
-    """Last component of a path or URL."""
-    return url.rstrip("/").rsplit("/", 1)[-1]
+    num_threads: int = Field(default=1, ge=1, description="threads of torch")

@@ -22,7 +22,7 @@ from services.networks.training_settings import (
     WeightDecay,
 )
 from services.world_model.network.configuration import NetworkConfig, TokenizerName
-from services.world_model.settings import flags_of, last_name
+from services.world_model.recorded_commands import flags_of, last_name
 
 
 class TokenizerOptimizer(FrozenModel):

@@ -34,6 +34,7 @@ from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest,
 from services.world_model.network.model import Precision, Prediction, stack_noise
 from services.world_model.network.solvers import Sampler
 from services.world_model.network.visual_codec import to_uint8, to_unit
+from services.world_model.placement import Placement
 from services.world_model.starts import CAMERA, observed_start
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.state_world import StateWorld
@@ -191,12 +192,13 @@ class ModelWorld:
         tactile_kpa: Float32[np.ndarray, "steps 2 320"],
     ) -> tuple[UInt8[np.ndarray, "later h w 3"], Float32[np.ndarray, "later 2 320"]]:
         """Encode and decode images and touch of 1 + 4k steps; gives those after the first."""
-        codec, tokenizer = self._model.codec, self._model.tokenizer
+        codec, tokenizer, device = self._model.codec, self._model.tokenizer, self._model.device
         seen = codec.decode_future(
-            codec.encode(to_unit(torch.from_numpy(images.copy())[None])), all_images=True
+            codec.encode(to_unit(torch.from_numpy(images.copy())[None].to(device))), all_images=True
         )
-        felt = tokenizer.decode(tokenizer.encode(torch.from_numpy(tactile_kpa[1:].copy())))
-        return to_uint8(seen[0]).numpy(), felt.numpy()
+        touch = torch.from_numpy(tactile_kpa[1:].copy()).to(device)
+        felt = tokenizer.decode(tokenizer.encode(touch))
+        return to_uint8(seen[0]).cpu().numpy(), felt.cpu().numpy()
 
     def snapshot(self, state: ModelState) -> bytes:
         """Serialize the state for `restore` with the same checkpoint."""
@@ -270,6 +272,7 @@ def open_world(
     sampling_steps: int | None = None,
     sampler: Sampler | None = None,
     needs_touch: bool = True,
+    placement: Placement = Placement(),  # noqa: B008 - immutable
 ) -> ModelWorld | StateWorld:
     """Open the world of a checkpoint file of either kind; default: the package's own.
 
@@ -278,6 +281,7 @@ def open_world(
         sampling_steps: network calls per chunk of a flow-matching model; a state model has none.
         sampler: solver of a flow-matching model.
         needs_touch: refuse a model that does not predict touch, in which policies feel nothing.
+        placement: device and precision of a flow-matching model.
 
     Raises:
         InvalidInputError: sampling steps or a sampler for a state model, or no touch where it is
@@ -285,7 +289,7 @@ def open_world(
     """
     file = path if path is not None else default_checkpoint()
     if not is_state_checkpoint(file):
-        checkpoint = read_checkpoint(file)
+        checkpoint = _placed(file, placement)
         if needs_touch and not checkpoint.metadata.network.use_touch:
             raise InvalidInputError(
                 f"world model {file.name}: got one that predicts images alone, expected touch, "
@@ -298,6 +302,18 @@ def open_world(
             f"{sampler}, expected none: it predicts without sampling"
         )
     return StateWorld(read_state_checkpoint(file))
+
+
+def _placed(file: Path, placement: Placement) -> Checkpoint:
+    """The checkpoint on its device and in its precision."""
+    limit = placement.max_file_gb
+    checkpoint = read_checkpoint(file, max_bytes=None if limit is None else int(limit * 1e9))
+    model = checkpoint.model.to(placement.device)
+    if placement.precision == "bfloat16":
+        model.to(torch.bfloat16)
+    if model.text_features is not None:
+        model.text_features.use(placement.text.folder, placement.text.text_cache)
+    return checkpoint
 
 
 def _request(state: ModelState, chunk: np.ndarray) -> PredictionRequest:

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
 from services.world_model.network.action_attention import ActionTokens
@@ -99,8 +99,13 @@ class Condition:
     actions enter, flat over the groups.
     """
 
-    vector: Float32[Tensor, "batch *groups width"]
-    actions: Float32[Tensor, "batch groups keys width"] | None = None
+    vector: Float[Tensor, "batch *groups width"]
+    actions: Float[Tensor, "batch groups keys width"] | None = None
+
+    def to(self, dtype: torch.dtype) -> "Condition":
+        """In the precision of an expert; conditions themselves are computed in float32."""
+        actions = None if self.actions is None else self.actions.to(dtype)
+        return Condition(self.vector.to(dtype), actions)
 
 
 class VideoCondition(nn.Module):

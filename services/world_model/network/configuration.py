@@ -128,6 +128,9 @@ class NetworkConfig(FrozenModel):
             "codec_channels": LATENT_CHANNELS,
             "video_width": self.num_heads * self.head_width,
             "use_pose_raster": False,
+            "action_conditioning": "adaln",
+            "prediction": "velocity",
+            "video_target": "plain",
         }
         others = {
             name: (getattr(self, name), value)

@@ -1,7 +1,7 @@
 """Joint model of future images and pressures: two experts with shared attention."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor, nn
 
-from dextouch.errors import InvalidInputError
 from services.world_model.network import flow_matching
 from services.world_model.network.conditioning import ActionNormalizer, TactileCondition
 from services.world_model.network.configuration import NetworkConfig, num_latents
@@ -22,9 +21,14 @@ from services.world_model.network.tokenizer_choice import build_tokenizer
 from services.world_model.network.video_side import video_side
 from services.world_model.network.visual_codec import to_unit
 from services.world_model.network.wan_video import WanVideoCondition
+from services.world_model.wan.configuration import FLOAT32_PARTS
 from services.world_model.wan.text import TextFeatures
 
 Precision = Literal["float32", "bfloat16"]
+_EXACT_PARTS = (
+    "codec.", "tokenizer.", "normalizer.", "video_condition.", "tactile_condition.",
+    "video_residual_std", "tactile_residual_std",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,21 @@ class JointWorldModel(nn.Module):
         condition = self.video_condition
         return condition.text_features if isinstance(condition, WanVideoCondition) else None
 
+    @property
+    def device(self) -> torch.device:
+        """Device of the weights."""
+        return self.video_residual_std.device
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "JointWorldModel":  # noqa: FBT001, FBT002
+        """Move or convert the weights; codecs, conditions and norms keep their precision."""
+        tensors = (*self.named_parameters(), *self.named_buffers())
+        kept = {name: tensor.data for name, tensor in tensors if _keeps_precision(name)}
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        for name, tensor in (*self.named_parameters(), *self.named_buffers()):
+            if name in kept and tensor.dtype != kept[name].dtype:
+                tensor.data = kept[name].to(tensor.device)
+        return self
+
     def first_latents(self, inputs: ModelInputs) -> FirstLatents:
         """Latents of the first image and the first touch."""
         images = to_unit(inputs.first_image)[:, None]
@@ -101,12 +120,19 @@ class JointWorldModel(nn.Module):
 
         Residuals from the first latents, or the latents themselves, as the configuration says.
         """
-        video, tactile = self.codec.encode(to_unit(images)), self.tokenizer.encode(tactile_kpa)
+        video = self.codec.encode(to_unit(images))
         if self.config.video_target == "residual":
             video = video - video[:, :1]
+        return JointLatents(video / self.video_residual_std, self.tactile_targets(tactile_kpa))
+
+    def tactile_targets(
+        self, tactile_kpa: Float32[Tensor, "batch time 2 320"]
+    ) -> Float32[Tensor, "batch time 2 tactile_tokens tactile_channels"]:
+        """Clean tactile latents; as `targets`."""
+        tactile = self.tokenizer.encode(tactile_kpa)
         if self.config.tactile_target == "residual":
             tactile = tactile - tactile[:, :1]
-        return JointLatents(video / self.video_residual_std, tactile / self.tactile_residual_std)
+        return tactile / self.tactile_residual_std
 
     def forward(
         self,
@@ -190,16 +216,13 @@ class JointWorldModel(nn.Module):
             sampler: solver of the flow; None uses the configuration's.
             all_images: decode every image, or only those of the last latent.
             precision: of the experts' matrix products (autocast); codecs always use float32.
-
-        Raises:
-            InvalidInputError: the weights are not float32.
         """
-        device = self._checked_device()
+        device = self.device
         inputs = inputs.to(device)
         first = self.first_latents(inputs)
 
         def denoise(video: Tensor, tactile: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-            with _products_in(precision, video.device.type):
+            with products_in(precision, video.device.type):
                 guess = self(inputs, first, JointLatents(video, tactile), t)
             found = guess.video.float(), guess.tactile.float()
             if self.config.prediction == "clean":
@@ -219,16 +242,6 @@ class JointWorldModel(nn.Module):
         future = self.decode(first, JointLatents(video, tactile), all_images=all_images)
         touch = self.tokenizer.bounded(future.tactile_kpa, inputs.first_tactile_kpa)
         return Prediction(future.images, touch)
-
-    def _checked_device(self) -> torch.device:
-        """Device of the weights; raises unless all of them are float32."""
-        others = {weight.dtype for weight in self.parameters()} - {torch.float32}
-        if others:
-            raise InvalidInputError(
-                f"world model: got weights of {', '.join(sorted(map(str, others)))}, expected "
-                "float32; use precision='bfloat16' for matrix products in bfloat16"
-            )
-        return self.video_residual_std.device
 
     def decode(
         self, first: FirstLatents, clean: JointLatents, *, all_images: bool = True
@@ -250,8 +263,13 @@ class JointWorldModel(nn.Module):
         return Prediction(images, self.tokenizer.decode(tactile))
 
 
+def _keeps_precision(name: str) -> bool:
+    """Whether a tensor keeps its precision when the experts are converted."""
+    return name.startswith(_EXACT_PARTS) or any(part in name for part in FLOAT32_PARTS)
+
+
 @contextmanager
-def _products_in(precision: Precision, device_type: str) -> Iterator[None]:
+def products_in(precision: Precision, device_type: str) -> Iterator[None]:
     """Autocast matrix products; silences torch's warning about norm weights kept in float32."""
     if precision == "float32":
         yield

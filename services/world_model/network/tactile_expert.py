@@ -1,7 +1,7 @@
 """Tactile expert: embeds tactile latents for the joint layers and predicts clean ones."""
 
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
 from services.world_model.network.axes import split_axis
@@ -59,11 +59,12 @@ class TactileExpert(nn.Module):
 
         `noisy` are residuals, the first ones zero, or plain latents, the first ones clean.
         """
-        steps = self.steps[: noisy.shape[1]]
+        steps, dtype = self.steps[: noisy.shape[1]], self.steps.dtype
+        condition = condition.to(dtype)
         if self._is_anchored:
             noisy = torch.cat([noisy, first[:, None].expand_as(noisy)], dim=-1)
         # In this order, so that sums with one token per hand are those of older releases.
-        tokens = self.embed(noisy) + self.hands[:, None] + steps[:, None]
+        tokens = self.embed(noisy.to(dtype)) + self.hands[:, None] + steps[:, None]
         if self._add_condition:
             tokens = tokens + condition.vector[..., None, :]
         if self.pads is not None:
@@ -82,12 +83,13 @@ class TactileExpert(nn.Module):
         self, stream: Stream, condition: Condition
     ) -> Float32[Tensor, "batch time 2 tokens channels"]:
         """Predict the clean latents, or the velocity, as the configuration says."""
+        condition = condition.to(self.steps.dtype)
         tokens = split_axis(stream.tokens, 1, (condition.vector.shape[1], 2, self._num_tokens))
         shift, scale = self._for_each_token(self.modulate_out(condition.vector)).chunk(2, dim=-1)
-        return self.predict(modulated_norm(tokens, shift, scale))
+        return self.predict(modulated_norm(tokens, shift, scale)).float()
 
     def _for_each_token(
-        self, of_hand: Float32[Tensor, "batch time 2 width"]
-    ) -> Float32[Tensor, "batch time 2 tokens width"]:
+        self, of_hand: Float[Tensor, "batch time 2 width"]
+    ) -> Float[Tensor, "batch time 2 tokens width"]:
         """Repeat what all tokens of a hand share."""
         return of_hand[..., None, :].expand(-1, -1, -1, self._num_tokens, -1)

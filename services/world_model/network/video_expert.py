@@ -62,14 +62,15 @@ class VideoExpert(nn.Module):
 
         `noisy` are residuals, the first one zero, or plain latents, the first one clean.
         """
-        num_latents = noisy.shape[1]
+        num_latents, dtype = noisy.shape[1], self.places.dtype
+        condition = condition.to(dtype)
         if self.is_anchored:
             noisy = torch.cat([noisy, first[:, None].expand_as(noisy)], dim=-1)
-        tokens = self.embed(noisy) + self.places + self.frames[:num_latents]
+        tokens = self.embed(noisy.to(dtype)) + self.places + self.frames[:num_latents]
         if self.add_condition:
             tokens = tokens + condition.vector[:, :, None]
         if self.use_pose_raster:
-            tokens = tokens + self.embed_raster(self.raster_tokens(raster))
+            tokens = tokens + self.embed_raster(self.raster_tokens(raster).to(dtype))
         modulation = split_axis(self.modulate(condition.vector), -1, (NUM_MODULATIONS, -1))
         per_token = modulation.repeat_interleave(noisy.shape[2], dim=1)
         return Stream(tokens.flatten(1, 2), per_token, actions=condition.actions)
@@ -78,13 +79,14 @@ class VideoExpert(nn.Module):
         self, stream: Stream, condition: Condition
     ) -> Float32[Tensor, "batch latents tokens channels"]:
         """Predict the clean latents, or the velocity, as the configuration says."""
+        condition = condition.to(self.places.dtype)
         tokens = split_axis(stream.tokens, 1, (condition.vector.shape[1], -1))
         shift, scale = (
             self.modulate_out(condition.vector)[:, :, None]
             .expand(-1, -1, tokens.shape[2], -1)
             .chunk(2, dim=-1)
         )
-        return self.predict(modulated_norm(tokens, shift, scale))
+        return self.predict(modulated_norm(tokens, shift, scale)).float()
 
     def raster_tokens(
         self, raster: Float32[Tensor, "batch time 2 cells cells"]

@@ -174,7 +174,7 @@ class WanVideoExpert(nn.Module):
             embedded.flatten(1, 2),
             condition.modulation,
             turn=angles(positions, self._head_width).to(noisy.device),
-            text=condition.text,
+            text=condition.text.to(weight.dtype),
         )
 
     def finish(

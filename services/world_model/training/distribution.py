@@ -50,6 +50,18 @@ class Processes:
                 "multiple; change --optimizer.batch or --nproc-per-node"
             )
 
+    def check_device(self, device: str) -> None:
+        """Refuse a device that several processes cannot share yet.
+
+        Raises:
+            InvalidInputError: several processes on another device than the processor.
+        """
+        if self.mesh is not None and device != "cpu":
+            raise InvalidInputError(
+                f"training: got {self.count} processes on {device}, expected cpu; several "
+                "processes train on processors only"
+            )
+
     def part(self, batch: Sequence[Item]) -> list[Item]:
         """This process's part of a batch."""
         return list(batch[self.rank :: self.count])

@@ -134,8 +134,8 @@ def predict_all(
             for index in range(len(part))
         ]
         future = model.predict(inputs, stack_noise(noises))
-        images.append(to_uint8(future.images).numpy())
-        touches.append(future.tactile_kpa.numpy())
+        images.append(to_uint8(future.images).cpu().numpy())
+        touches.append(future.tactile_kpa.cpu().numpy())
     return Futures(np.concatenate(images), np.concatenate(touches))
 
 
@@ -158,10 +158,11 @@ def _through_codec(model: JointWorldModel, windows: Sequence[Window]) -> Futures
     images, touches = [], []
     for begin in range(0, len(windows), BATCH):
         batch = stack_windows(windows[begin : begin + BATCH])
-        decoded: Tensor = model.codec.decode(model.codec.encode(to_unit(batch.images)))
-        images.append(to_uint8(decoded[:, 1:]).numpy())
-        touch = model.tokenizer.decode(model.tokenizer.encode(batch.tactile_kpa))
-        touches.append(touch[:, 1:].numpy())
+        shown, felt = batch.images.to(model.device), batch.tactile_kpa.to(model.device)
+        decoded: Tensor = model.codec.decode(model.codec.encode(to_unit(shown)))
+        images.append(to_uint8(decoded[:, 1:]).cpu().numpy())
+        touch = model.tokenizer.decode(model.tokenizer.encode(felt))
+        touches.append(touch[:, 1:].cpu().numpy())
     return Futures(np.concatenate(images), np.concatenate(touches))
 
 

@@ -12,7 +12,13 @@ from dextouch.tactile.layout import NUM_TIP_TAXELS
 from services.world_model.network.axes import split_axis
 from services.world_model.network.flow_matching import add_noise, training_times, velocity
 from services.world_model.network.inputs import build_inputs
-from services.world_model.network.model import FirstLatents, JointLatents, JointWorldModel
+from services.world_model.network.model import (
+    FirstLatents,
+    JointLatents,
+    JointWorldModel,
+    Precision,
+    products_in,
+)
 from services.world_model.training.dataset import WindowBatch
 from services.world_model.training.distribution import ALONE, Processes
 
@@ -29,13 +35,27 @@ class Losses:
     tactile: Float32[Tensor, ""]
 
 
+@dataclass(frozen=True)
+class LossOptions:
+    """Options of the losses.
+
+    `context_noise` is the relative deviation of noise on the first latents, which makes the model
+    robust to starting from its own output. `touch_loss` says which tactile tokens count: all of
+    them, so that the model also learns to predict the absence of contact, or only those in contact
+    or changing, as in the paper. `precision` is that of the experts' matrix products.
+    """
+
+    context_noise: float = 0.0
+    touch_loss: TouchLoss = "all"
+    precision: Precision = "float32"
+
+
 def losses(
     model: JointWorldModel,
     batch: WindowBatch,
     *,
     generator: torch.Generator,
-    context_noise: float = 0.0,
-    touch_loss: TouchLoss = "all",
+    options: LossOptions = LossOptions(),
     processes: Processes = ALONE,
 ) -> Losses:
     """Errors of the prediction at random times.
@@ -44,21 +64,20 @@ def losses(
         model: the network.
         batch: the true windows.
         generator: source of times and noise.
-        context_noise: relative deviation of noise on the first latents, which makes the model
-            robust to starting from its own output.
-        touch_loss: tactile tokens that count: all of them, so that the model also learns to predict
-            the absence of contact, or only those in contact or changing, as in the paper.
+        options: what counts, and in which precision.
         processes: processes whose batches together are the whole one; losses are this process's
             contributions to it, which have the whole one's loss as their mean.
     """
-    inputs = build_inputs(batch.requests, model.config)
-    clean = model.targets(batch.images, batch.tactile_kpa)
-    first = _with_noise(model.first_latents(inputs), context_noise, generator, processes)
+    device = model.device
+    inputs = build_inputs(batch.requests, model.config).to(device)
+    tactile_kpa = batch.tactile_kpa.to(device)
+    clean = model.targets(batch.images.to(device), tactile_kpa)
+    first = _with_noise(model.first_latents(inputs), options.context_noise, generator, processes)
     num_windows, shift = len(inputs) * processes.count, model.config.training_time_shift
-    t = processes.own(training_times(num_windows, shift=shift, generator=generator))
+    t = processes.own(training_times(num_windows, shift=shift, generator=generator)).to(device)
     noise = JointLatents(
-        processes.randn(clean.video.shape, generator),
-        processes.randn(clean.tactile.shape, generator),
+        processes.randn(clean.video.shape, generator).to(device),
+        processes.randn(clean.tactile.shape, generator).to(device),
     )
     noisy = JointLatents(
         add_noise(clean.video, noise.video, t), add_noise(clean.tactile, noise.tactile, t)
@@ -68,13 +87,15 @@ def losses(
         target = JointLatents(
             velocity(clean.video, noise.video), velocity(clean.tactile, noise.tactile)
         )
-    guess = model(inputs, first, noisy, t)
+    with products_in(options.precision, device.type):
+        guess = model(inputs, first, noisy, t)
     video = (guess.video - target.video)[:, 1:].square().mean()
     if not model.config.use_touch:
-        return Losses(video, torch.zeros(()))
-    counted = (batch.tactile_valid & batch.tactile_valid[:, :1])[:, 1:, :, None]
-    if touch_loss == "contact_or_changing":
-        tokens = contact_or_changing(batch.tactile_kpa, clean.tactile.shape[3])
+        return Losses(video, torch.zeros((), device=device))
+    valid = batch.tactile_valid.to(device)
+    counted = (valid & valid[:, :1])[:, 1:, :, None]
+    if options.touch_loss == "contact_or_changing":
+        tokens = contact_or_changing(tactile_kpa, clean.tactile.shape[3])
         counted = counted & tokens[:, 1:]
     weights = counted[..., None].float().expand(-1, -1, -1, clean.tactile.shape[3], -1)
     error = (guess.tactile - target.tactile)[:, 1:].square() * weights
@@ -108,7 +129,7 @@ def _with_noise(
     def shaken(latents: Tensor) -> Tensor:
         # A random amount for each window, from none to the full share.
         amount = processes.rand([len(latents), *[1] * (latents.ndim - 1)], generator)
-        noise = processes.randn(latents.shape, generator)
-        return latents + context_noise * amount * processes.std(latents) * noise
+        noise = processes.randn(latents.shape, generator).to(latents.device)
+        return latents + context_noise * amount.to(noise.device) * processes.std(latents) * noise
 
     return FirstLatents(shaken(first.video), shaken(first.tactile))

@@ -24,9 +24,10 @@ from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsMember, DynamicsModel
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.touch_codec import TouchCodec
+from services.world_model.recorded_commands import flags_of, last_name
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.training import RendererProgress, train_renderer
-from services.world_model.settings import StateTrainSettings, flags_of, last_name
+from services.world_model.settings import StateTrainSettings
 from services.world_model.state_checkpoints import (
     StateBounds,
     StateMetadata,

@@ -12,7 +12,8 @@ from services.world_model.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from services.world_model.settings import TrainSettings, command_line
+from services.world_model.recorded_commands import command_line
+from services.world_model.settings import TrainSettings
 from services.world_model.tokenizer_files import StoredTokenizer
 from services.world_model.training.dataset import (
     EpisodeArrays,
@@ -119,7 +120,7 @@ def train_on(
     )
     write_checkpoint(settings.output, averaged, metadata)
     # Evaluate the weights as stored, then store them again with the results.
-    stored = read_checkpoint(settings.output).model
+    stored = read_checkpoint(settings.output).model.to(settings.device)
     metrics = {
         **evaluate_prediction(
             stored, heldout, train_fingerprints=sorted(prints), stride=settings.evaluation_stride

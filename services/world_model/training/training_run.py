@@ -1,5 +1,6 @@
 """One training run of the joint model: its network, weight average, optimizer and clock."""
 
+import copy
 import json
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -25,6 +26,7 @@ from services.world_model.checkpoints import (
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.tactile_tokenizer import TactileTokenizer
+from services.world_model.pretrained_video import initial_model, share_texts
 from services.world_model.settings import TrainSettings
 from services.world_model.training.dataset import (
     Place,
@@ -38,7 +40,7 @@ from services.world_model.training.distribution import (
     load_whole,
     whole_weights,
 )
-from services.world_model.training.objective import losses
+from services.world_model.training.objective import LossOptions, losses
 from services.world_model.training.streaming import read_batches
 from services.world_model.training.training_state import (
     TrainingState,
@@ -47,6 +49,7 @@ from services.world_model.training.training_state import (
     part_of,
     restore_optimizer,
 )
+from services.world_model.wan.configuration import WanFiles
 
 LOG_EVERY_STEPS = 20
 MIN_LEARNING_RATE_SHARE = 0.01
@@ -79,6 +82,7 @@ class TrainingRun:
         processes: Processes = ALONE,
     ) -> None:
         processes.check_batch(settings.optimizer.batch)
+        processes.check_device(settings.device)
         self.settings = settings
         self.episodes = episodes
         self.processes = processes
@@ -86,8 +90,10 @@ class TrainingRun:
         self.log: list[TrainingProgress] = []
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
-            self.model = JointWorldModel(settings.network)
-        self.averaged = JointWorldModel(settings.network).eval()
+            has_weights = settings.init is not None or settings.resume
+            model = initial_model(settings.network, settings.wan, filled_later=has_weights)
+        self.model = model.to(settings.device)
+        self.averaged = copy.deepcopy(self.model).eval()
         for network in (self.model, self.averaged):
             processes.shard(network, network.layers)
         self._generator = torch.Generator().manual_seed(settings.seed + 1)
@@ -122,6 +128,8 @@ class TrainingRun:
             tokenizer: pretrained tokenizer to use instead of fitting one.
         """
         model, config = self.model, self.settings.network
+        if model.device.type != "cpu":
+            model.cpu()
         batch = self._sampler.draw(self.settings.windows.fit_windows, config.max_steps)
         model.codec.fit(batch.images)
         if tokenizer is None:
@@ -130,10 +138,15 @@ class TrainingRun:
             model.tokenizer.load_state_dict(tokenizer.state_dict())
             model.tokenizer.peak_kpa.clamp_min_(batch.tactile_kpa.max())
         model.normalizer.fit(build_inputs(batch.requests, config).hands)
-        targets = model.targets(batch.images, batch.tactile_kpa)
-        model.video_residual_std.copy_(targets.video[:, 1:].std().clamp_min(1e-3))
+        # The pretrained expert takes its latents as they are.
+        if config.wan is None:
+            videos = model.targets(batch.images, batch.tactile_kpa).video
+            model.video_residual_std.copy_(videos[:, 1:].std().clamp_min(1e-3))
         if config.use_touch:
-            model.tactile_residual_std.copy_(targets.tactile[:, 1:].std().clamp_min(1e-3))
+            touch = model.tactile_targets(batch.tactile_kpa)
+            model.tactile_residual_std.copy_(touch[:, 1:].std().clamp_min(1e-3))
+        if self.settings.device != "cpu":
+            model.to(self.settings.device)
         self.averaged.load_state_dict(model.state_dict())
 
     def start_from(self, checkpoint: Checkpoint) -> None:
@@ -156,6 +169,7 @@ class TrainingRun:
             )
         load_whole(self.model, checkpoint.model.state_dict())
         load_whole(self.averaged, checkpoint.model.state_dict())
+        share_texts(checkpoint.model, self.model)
 
     def whole_average(self) -> JointWorldModel | None:
         """The averaged network with whole weights; None in all processes but the first."""
@@ -164,8 +178,9 @@ class TrainingRun:
         weights = whole_weights(self.averaged)
         if not self.processes.is_first:
             return None
-        model = JointWorldModel(self.settings.network).eval()
+        model = initial_model(self.settings.network, WanFiles(), filled_later=True).eval()
         model.load_state_dict(weights)
+        share_texts(self.model, model)
         return model
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -233,8 +248,9 @@ class TrainingRun:
             self.model,
             batch,
             generator=self._generator,
-            context_noise=self.settings.windows.context_noise,
-            touch_loss=settings.touch_loss,
+            options=LossOptions(
+                self.settings.windows.context_noise, settings.touch_loss, settings.precision
+            ),
             processes=self.processes,
         )
         total = loss.video + settings.tactile_weight * loss.tactile

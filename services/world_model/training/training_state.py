@@ -26,6 +26,7 @@ SUFFIX: Final = ".resume"
 _FREE_SETTINGS: Final = {
     "episodes", "human", "heldout", "output", "json_path", "resume", "state_every_cpu_s", "init",
     "tokenizer", "streaming", "loader_workers", "num_threads", "disjoint_tasks", "new_tasks",
+    "device", "wan", "plan",
 }  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Shape of the Wan2.2 networks of the full-size model; the defaults are Wan2.2-TI2V-5B."""
 
+from pathlib import Path
 from typing import Final, Literal
 
 import torch
@@ -30,6 +31,27 @@ LATENT_STD: Final = (
 # Parts of the transformer that stay in float32 whatever the precision of the others.
 FLOAT32_PARTS: Final = ("time_embedder", "scale_shift_table", "norm1", "norm2", "norm3")
 _DTYPES: Final = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+
+
+class WanFiles(FrozenModel):
+    """Where the pretrained networks are; they are never downloaded."""
+
+    folder: Path | None = Field(
+        default=None, description="local folder of Wan2.2-TI2V-5B, for --network.video-expert wan"
+    )
+    text_cache: Path | None = Field(
+        default=None, description="folder in which text features of instructions are kept"
+    )
+    max_memory_gb: float | None = Field(
+        default=None,
+        gt=0,
+        description="limit of memory for the weights of one network; default: what is available",
+    )
+
+    @property
+    def max_bytes(self) -> int | None:
+        """The limit in bytes."""
+        return None if self.max_memory_gb is None else int(self.max_memory_gb * 1e9)
 
 
 class WanConfig(FrozenModel):

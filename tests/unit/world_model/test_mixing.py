@@ -13,7 +13,8 @@ from dextouch.serving import load_settings
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.command_line import run_adapt
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.settings import AdaptCommand, TrainCommand, TrainSettings, command_line
+from services.world_model.recorded_commands import command_line
+from services.world_model.settings import AdaptCommand, TrainCommand, TrainSettings
 from services.world_model.training.dataset import WindowSampler, combined_hash
 from services.world_model.training.episodes import subset_by_hash
 from services.world_model.training.splits import check_tasks, load_split

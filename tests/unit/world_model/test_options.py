@@ -15,7 +15,7 @@ from services.world_model.network.inputs import build_inputs
 from services.world_model.network.instruction import NO_WORD, hash_subwords
 from services.world_model.network.model import JointLatents, JointWorldModel, stack_noise
 from services.world_model.training.dataset import WindowSampler
-from services.world_model.training.objective import contact_or_changing, losses
+from services.world_model.training.objective import LossOptions, contact_or_changing, losses
 from services.world_model.world import open_world
 
 CROSS = {"action_conditioning": "cross_attention", "add_condition_to_tokens": False}
@@ -185,7 +185,7 @@ def test_idle_tokens_do_not_count_in_the_papers_loss(tiny_config, batch):
     model.forward = lambda *_: JointLatents(clean.video, clean.tactile + wrong)
     for touch_loss, is_zero in (("contact_or_changing", True), ("all", False)):
         generator = torch.Generator().manual_seed(0)
-        loss = losses(model, batch, generator=generator, touch_loss=touch_loss)
+        loss = losses(model, batch, generator=generator, options=LossOptions(touch_loss=touch_loss))
         assert (loss.tactile == 0) == is_zero
 
 

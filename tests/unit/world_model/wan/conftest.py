@@ -1,5 +1,7 @@
 """Tiny Wan2.2 networks with random weights: every part of the full size, small enough for tests."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from diffusers import AutoencoderKLWan, WanTransformer3DModel
@@ -49,7 +51,8 @@ def full_config(wan_config):
     return NetworkConfig(
         video_expert="wan", wan=wan_config, image_px=64, patch_px=16, codec_channels=48,
         video_width=HEADS * HEAD_WIDTH, num_heads=HEADS, head_width=HEAD_WIDTH, num_layers=LAYERS,
-        tactile_width=16, ffn_ratio=2, use_pose_raster=False,
+        tactile_width=16, ffn_ratio=2, use_pose_raster=False, add_condition_to_tokens=False,
+        prediction="velocity", video_target="plain",
     )  # fmt: skip
 
 
@@ -82,3 +85,16 @@ def save_tokenizer(folder):
     tokenizer.pre_tokenizer = Whitespace()
     tokenizer.post_processor = TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])
     PreTrainedTokenizerFast(tokenizer_object=tokenizer, **marks).save_pretrained(folder)
+
+
+def enlarged(episode):
+    """The toy episode with images of 64 pixels, the least of four tokens per latent frame."""
+    K_head = episode.K_head.copy()
+    K_head[:2] *= 2
+    images = episode.images.repeat(2, axis=1).repeat(2, axis=2)
+    return replace(episode, images=images, K_head=K_head)
+
+
+@pytest.fixture
+def large_episode(toy_episode):
+    return lambda seed: enlarged(toy_episode(seed))

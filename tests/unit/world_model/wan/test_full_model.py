@@ -132,7 +132,7 @@ def _full_size():
     config = NetworkConfig(
         video_expert="wan", wan=WanConfig(), image_px=256, patch_px=16, codec_channels=48,
         video_width=3072, num_heads=24, head_width=128, num_layers=30, tactile_width=512,
-        ffn_ratio=4, use_pose_raster=False,
+        ffn_ratio=4, use_pose_raster=False, prediction="velocity", video_target="plain",
     )  # fmt: skip
     with torch.device("meta"):
         return JointWorldModel(config)

@@ -1,0 +1,282 @@
+"""Memory and FLOPs of a joint model, computed from its configuration without any weights.
+
+The network runs on torch's meta device, which has shapes but no numbers, so that the full size can
+be planned on a laptop. FLOPs are those of matrix products, convolutions and attention (two per
+multiplication and addition); memory is the largest sum of tensors that are alive at one time.
+Attention counts its whole matrix, which fused kernels do not store; working memory of convolutions,
+which depends on the library, is not counted.
+"""
+
+import weakref
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import torch
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.flop_counter import FlopCounterMode
+
+from dextouch.tactile.layout import NUM_TAXELS
+from services.networks.memory import memory_of
+from services.world_model.network.configuration import NetworkConfig, num_latents
+from services.world_model.network.inputs import ModelInputs
+from services.world_model.network.instruction import MAX_WORDS
+from services.world_model.network.mirroring import CAMERA_DIM, HAND_DIM
+from services.world_model.network.model import FirstLatents, JointLatents, JointWorldModel
+from services.world_model.wan.configuration import WanConfig
+from services.world_model.wan.text import key_of
+
+# Text encoder of the published model, UMT5-XXL.
+_TEXT_ENCODER: Final = {
+    "vocab_size": 256384, "d_model": 4096, "d_kv": 64, "d_ff": 10240, "num_layers": 24,
+    "num_heads": 64,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of the model; `memory_bytes` of its weights."""
+
+    name: str
+    num_weights: int
+    memory_bytes: int
+
+
+@dataclass(frozen=True)
+class Work:
+    """One computation; `memory_bytes` beside the weights while it runs."""
+
+    name: str
+    times: int
+    flops: int
+    memory_bytes: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What one action chunk of one rollout needs.
+
+    `kept_bytes` are the keys and values of clean tokens and text, if they are kept over the
+    sampler's steps. `training_bytes` are weights, gradients, two moments of AdamW and the average
+    of the weights; activations come on top.
+    """
+
+    num_steps: int
+    num_video_tokens: int
+    num_tactile_tokens: int
+    parts: tuple[Part, ...]
+    work: tuple[Work, ...]
+    kept_bytes: int
+    training_bytes: int
+
+    @property
+    def weight_bytes(self) -> int:
+        """Memory of all weights."""
+        return sum(part.memory_bytes for part in self.parts)
+
+    @property
+    def peak_bytes(self) -> int:
+        """Weights with the most memory that a computation takes."""
+        return self.weight_bytes + max(work.memory_bytes for work in self.work)
+
+    @property
+    def flops(self) -> int:
+        """FLOPs of one action chunk."""
+        return sum(work.times * work.flops for work in self.work)
+
+
+class PeakMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Largest sum of the tensors made inside the context and alive at one time, in bytes."""
+
+    def __init__(self, weights: Iterable[Tensor]) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.peak_bytes = 0
+        self._now_bytes = 0
+        # Views share the storage of their tensor. Held, since storages are known by identity.
+        self._weights = [tensor.untyped_storage() for tensor in weights]
+        self._alive = weakref.WeakSet(self._weights)
+
+    def __torch_dispatch__(
+        self,
+        func: Callable[..., object],
+        types: object,
+        args: tuple[object, ...] = (),
+        kwargs: Mapping[str, object] | None = None,
+    ) -> object:
+        """Run an operation and count its new tensors."""
+        result = func(*args, **(kwargs or {}))
+        for leaf in tree_leaves(result):
+            if isinstance(leaf, Tensor):
+                self._count(leaf.untyped_storage())
+        return result
+
+    def _count(self, storage: torch.UntypedStorage) -> None:
+        if storage in self._alive:
+            return
+        size = storage.nbytes()
+        self._alive.add(storage)
+        self._now_bytes += size
+        self.peak_bytes = max(self.peak_bytes, self._now_bytes)
+        weakref.finalize(storage, self._free, size)
+
+    def _free(self, size: int) -> None:
+        self._now_bytes -= size
+
+
+def plan_table(config: NetworkConfig) -> str:
+    """Plan as a text; for the full size in both precisions."""
+    choices: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
+    plans = {"float32": plan_of(config)}
+    if config.wan is not None:
+        plans = {
+            precision: plan_of(
+                config.model_copy(
+                    update={"wan": config.wan.model_copy(update={"precision": precision})}
+                )
+            )
+            for precision in choices
+        }
+    first, *_ = plans.values()
+
+    def row(name: str, amount: str, sizes: Iterable[int]) -> str:
+        columns = "".join(f"{size / 1e9:>15.3f} GB" for size in sizes)
+        return f"{name:<38}{amount:>18}{columns}"
+
+    return "\n".join(
+        [
+            f"one action chunk of {first.num_steps} steps, {first.num_video_tokens} video and "
+            f"{first.num_tactile_tokens} tactile tokens",
+            f"{'weights':<38}{'':>18}" + "".join(f"{name:>18}" for name in plans),
+            *(
+                row(
+                    f"  {part.name}",
+                    f"{part.num_weights:,}",
+                    (plan.parts[index].memory_bytes for plan in plans.values()),
+                )
+                for index, part in enumerate(first.parts)
+            ),
+            "work, with memory beside the weights",
+            *(
+                row(
+                    f"  {work.name}",
+                    f"{work.times} x {work.flops / 1e9:,.2f} GF",
+                    (plan.work[index].memory_bytes for plan in plans.values()),
+                )
+                for index, work in enumerate(first.work)
+            ),
+            row("all", f"{first.flops / 1e9:,.2f} GF", (p.peak_bytes for p in plans.values())),
+            row("kept keys and values", "", (plan.kept_bytes for plan in plans.values())),
+            row("training, without activations", "", (p.training_bytes for p in plans.values())),
+        ]
+    )
+
+
+def plan_of(config: NetworkConfig, *, num_steps: int | None = None) -> Plan:
+    """Plan of one action chunk.
+
+    Args:
+        config: network to plan.
+        num_steps: steps of the chunk, 4k; None for the longest.
+    """
+    steps = (config.max_steps if num_steps is None else 1 + num_steps) - 1
+    with torch.device("meta"), torch.no_grad():
+        model = JointWorldModel(config).eval()
+        return Plan(
+            num_steps=steps,
+            num_video_tokens=num_latents(1 + steps) * config.tokens_per_latent,
+            num_tactile_tokens=(1 + steps) * 2 * model.tokenizer.num_tokens,
+            parts=_parts(model),
+            work=_work(model, 1 + steps),
+            kept_bytes=_kept(model),
+            training_bytes=_training(model),
+        )
+
+
+def _parts(model: JointWorldModel) -> tuple[Part, ...]:
+    video = [model.video_condition, model.video, *(layer.video for layer in model.layers)]
+    touch = [model.tactile_condition, model.tactile, *(layer.tactile for layer in model.layers)]
+    groups: dict[str, list[Any]] = {
+        "video expert": video,
+        "tactile expert": touch,
+        "visual codec": [model.codec],
+        "tactile tokenizer": [model.tokenizer],
+    }
+    parts = [_part(name, nn.ModuleList(modules)) for name, modules in groups.items()]
+    wan = model.config.wan
+    if wan is not None and wan.text_width == _TEXT_ENCODER["d_model"]:
+        parts.append(_part("text encoder (once per instruction)", _text_encoder(wan)))
+    return tuple(parts)
+
+
+def _part(name: str, module: nn.Module) -> Part:
+    # Shared weights are counted once.
+    tensors = {**dict(module.named_parameters()), **dict(module.named_buffers())}
+    return Part(name, sum(t.numel() for t in tensors.values()), memory_of(tensors))
+
+
+def _text_encoder(wan: WanConfig) -> nn.Module:
+    from transformers import UMT5Config, UMT5EncoderModel
+
+    return UMT5EncoderModel(UMT5Config(**_TEXT_ENCODER)).to(wan.dtype)
+
+
+def _work(model: JointWorldModel, num_steps: int) -> tuple[Work, ...]:
+    config = model.config
+    inputs = _inputs(config, num_steps)
+    if model.text_features is not None and config.wan is not None:
+        model.text_features.learn({key_of(""): torch.zeros(1, config.wan.text_width)})
+    first = FirstLatents(
+        torch.zeros(1, config.tokens_per_latent, config.video_channels),
+        torch.zeros(1, 2, model.tokenizer.num_tokens, model.tokenizer.channels),
+    )
+    noisy = JointLatents(
+        first.video[:, None].repeat(1, num_latents(num_steps), 1, 1),
+        first.tactile[:, None].repeat(1, num_steps, 1, 1, 1),
+    )
+    measured = {
+        "encode the first image": (1, lambda: model.first_latents(inputs)),
+        "one sampler step": (
+            config.sampling_steps,
+            lambda: model(inputs, first, noisy, torch.ones(1)),
+        ),
+        "decode all images": (1, lambda: model.decode(first, noisy)),
+    }
+    return tuple(_measured(model, name, *job) for name, job in measured.items())
+
+
+def _measured(model: nn.Module, name: str, times: int, run: Callable[[], Any]) -> Work:
+    weights = [*model.parameters(), *model.buffers()]
+    with PeakMemory(weights) as memory, FlopCounterMode(display=False) as counter:
+        run()
+    return Work(name, times, counter.get_total_flops(), memory.peak_bytes)
+
+
+def _kept(model: JointWorldModel) -> int:
+    """Keys and values of clean tokens, and of the text, in all layers."""
+    config, wan = model.config, model.config.wan
+    clean = config.tokens_per_latent + 2 * model.tokenizer.num_tokens
+    words, size = (0, 4) if wan is None else (wan.text_tokens, wan.dtype.itemsize)
+    return 2 * config.num_layers * config.num_heads * config.head_width * (clean + words) * size
+
+
+def _training(model: JointWorldModel) -> int:
+    learned = {n: p for n, p in model.named_parameters() if p.requires_grad}
+    # Gradient and two moments of each learned weight; the average copies the whole model.
+    return 2 * memory_of(model.state_dict()) + 3 * memory_of(learned)
+
+
+def _inputs(config: NetworkConfig, num_steps: int) -> ModelInputs:
+    cells = config.raster_cells
+    return ModelInputs(
+        first_image=torch.zeros(1, config.image_px, config.image_px, 3, dtype=torch.uint8),
+        first_tactile_kpa=torch.zeros(1, 2, NUM_TAXELS),
+        hands=torch.zeros(1, num_steps, 2, HAND_DIM),
+        camera=torch.zeros(1, num_steps, 2, CAMERA_DIM),
+        layout=torch.zeros(1, 2, CAMERA_DIM),
+        raster=torch.zeros(1, num_steps, 2, cells, cells),
+        commanded=torch.zeros(1),
+        words=torch.zeros(1, MAX_WORDS, dtype=torch.int64),
+        instructions=("",),
+    )
