@@ -92,6 +92,9 @@ COMMANDS = {
         "score policies in several worlds, defined in a file and resumable",
         "cli.study.command:main",
     ),
+    "reproduce": Command(
+        "reproduce the paper's tables in miniature, in the twin", "cli.reproduce.command:main"
+    ),
     "rate": Command("score rollouts by human raters, and measure their agreement"),
     "rate serve": Command(
         "serve the page on which raters mark rollouts", "evaluation.rating.app:main"

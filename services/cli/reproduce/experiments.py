@@ -1,0 +1,313 @@
+"""Experiments of the paper in miniature: the data, models and studies of each table, as steps."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from pydantic import Field
+
+from dextouch.frozen_model import FrozenModel
+from services.cli.reproduce.steps import Step
+
+Table = Literal["tokenizer", "design", "scaling", "evaluator", "generation"]
+TABLES: Final[tuple[Table, ...]] = ("tokenizer", "design", "scaling", "evaluator", "generation")
+# Columns of the design ablation, with the preset of each.
+DESIGNS: Final = {
+    "V-only": "paper-video-only",
+    "Cross-Attn": "paper-cross-attention",
+    "Robot-only": "paper",
+}
+TOKENIZERS: Final = {"Split-Hands": "split_hands", "Grid": "grid"}
+FIRST_HELDOUT_SEED: Final = 60_000
+FIRST_STUDY_SEED: Final = 70_000
+DOWNSTREAM_TASKS: Final = ("place_shoes", "place_phone", "stack_bowls", "stand_bottle")
+ADAPTED: Final = ("WM-Robot", "WM-Mix")
+GENERATED: Final = ("Real", "Half", *(f"+{world}" for world in ADAPTED))
+# Stand-ins of the paper's three policies: a cloned one, the same early in training, and a script.
+SCRIPT_POLICY: Final = "script 15 mm"
+
+
+class Sizes(FrozenModel):
+    """Amounts of data and training; the defaults take some hours on two cores.
+
+    The paper has 5 h of robot and up to 100 h of human data, that is 20 times as much.
+    """
+
+    robot_per_task: int = Field(default=12, ge=2, description="robot episodes per pretraining task")
+    multiples: tuple[int, ...] = Field(
+        default=(1, 5, 10), description="human episodes, as multiples of the robot episodes"
+    )
+    num_robot_tasks: int = Field(default=4, ge=1, description="robot pretraining tasks")
+    num_human_tasks: int = Field(default=7, ge=1, description="human pretraining tasks")
+    heldout_per_task: int = Field(default=6, ge=1, description="held-out episodes per task")
+    downstream_per_task: int = Field(default=75, ge=3, description="robot episodes per task")
+    adapt_robot: int = Field(default=200, ge=1, description="robot episodes of WM-Robot")
+    adapt_half: int = Field(default=100, ge=1, description="robot and human episodes of WM-Mix")
+    tokenizer_cpu_s: int = Field(default=60, ge=1, description="training of a tokenizer")
+    train_cpu_s: int = Field(default=300, ge=1, description="training of a world model")
+    adapt_cpu_s: int = Field(default=150, ge=1, description="adaptation of a world model")
+    policy_steps: int = Field(default=3000, ge=1, description="training steps of a cloned policy")
+    num_starts: int = Field(default=10, ge=1, description="starts per task and policy")
+    num_generated: int = Field(default=100, ge=1, description="generated demonstrations")
+
+    @property
+    def num_robot(self) -> int:
+        """Robot episodes of pretraining."""
+        return self.robot_per_task * self.num_robot_tasks
+
+    @property
+    def human_per_task(self) -> int:
+        """Human episodes per task, for the largest multiple."""
+        return -(-max(self.multiples) * self.num_robot // self.num_human_tasks)
+
+
+QUICK: Final = Sizes(
+    robot_per_task=2,
+    multiples=(1, 2),
+    heldout_per_task=1,
+    downstream_per_task=6,
+    adapt_robot=8,
+    adapt_half=4,
+    tokenizer_cpu_s=3,
+    train_cpu_s=6,
+    adapt_cpu_s=4,
+    policy_steps=20,
+    num_starts=1,
+    num_generated=4,
+)
+
+
+@dataclass(frozen=True)
+class Experiments:
+    """Steps of all tables for some sizes and training seeds."""
+
+    sizes: Sizes
+    seeds: tuple[int, ...]
+
+    def steps(self, tables: Sequence[Table]) -> list[Step]:
+        """Steps of some tables and of what they need, each once and in order."""
+        found: dict[str, Step] = {}
+        everything = {step.name: step for step in self._all()}
+
+        def add(name: str) -> None:
+            for one in everything[name].needs:
+                add(one)
+            found.setdefault(name, everything[name])
+
+        for name in everything:
+            if name.partition("/")[0] in tables:
+                add(name)
+        return [step for name, step in everything.items() if name in found]
+
+    def _all(self) -> Iterator[Step]:
+        yield from self._data()
+        yield from self._tokenizers()
+        for design, preset in DESIGNS.items():
+            for seed in self.seeds:
+                yield from self._world_model("design", design, seed, ("--preset", preset))
+        for multiple in self.sizes.multiples:
+            human = (
+                "--human",
+                "data/human/store",
+                "--human-episodes",
+                str(multiple * self.sizes.num_robot),
+            )
+            for seed in self.seeds:
+                yield from self._world_model(
+                    "scaling", f"{multiple}x", seed, ("--preset", "paper", *human), ("data/human",)
+                )
+        for seed in self.seeds:
+            yield from self._adapted(seed)
+        yield from self._policies()
+        yield self._study()
+        yield from self._generation()
+
+    def _data(self) -> Iterator[Step]:
+        sizes = self.sizes
+        robot = ("--tasks", "robot-pretraining")
+        human = ("--domains", "human", "--path", "devices")
+        yield _data_step("data/robot", sizes.robot_per_task, robot)
+        yield _data_step("data/heldout", sizes.heldout_per_task, robot, FIRST_HELDOUT_SEED)
+        yield _data_step(
+            "data/human", sizes.human_per_task, ("--tasks", "human-pretraining", *human)
+        )
+        downstream = ("--tasks", "downstream")
+        yield _data_step("data/downstream", sizes.downstream_per_task, downstream)
+        per_task = -(-sizes.adapt_half // len(DOWNSTREAM_TASKS))
+        yield _data_step("data/downstream-human", per_task, (*downstream, *human))
+        yield _data_step(
+            "data/downstream-heldout", sizes.heldout_per_task, downstream, FIRST_HELDOUT_SEED
+        )
+
+    def _tokenizers(self) -> Iterator[Step]:
+        for kind in TOKENIZERS.values():
+            for seed in self.seeds:
+                name = f"tokenizer/{kind}/seed-{seed}"
+                words = (
+                    *("train", "tokenizer", "--episodes", "data/robot/store"),
+                    *("--tokenizer", kind, "--seed", str(seed)),
+                    *("--cpu-budget-s", str(self.sizes.tokenizer_cpu_s)),
+                    *("--output", f"{name}/tokenizer.safetensors", "--json", f"{name}/result.json"),
+                )
+                made = ("tokenizer.safetensors", "result.json")
+                yield Step(name, words, made, ("data/robot",))
+
+    def _world_model(
+        self,
+        table: Table,
+        column: str,
+        seed: int,
+        options: tuple[str, ...],
+        needs: tuple[str, ...] = (),
+    ) -> Iterator[Step]:
+        name = f"{table}/{column}/seed-{seed}/model"
+        tokenizer = f"tokenizer/split_hands/seed-{seed}"
+        words = (
+            *("train", "world-model", *options, "--episodes", "data/robot/store"),
+            *("--heldout", "data/heldout/store", "--seed", str(seed)),
+            *("--tokenizer", f"{tokenizer}/tokenizer.safetensors"),
+            *("--cpu-budget-s", str(self.sizes.train_cpu_s), "--resume"),
+            *("--output", f"{name}/model.safetensors", "--json", f"{name}/result.json"),
+        )
+        needed = ("data/robot", "data/heldout", tokenizer, *needs)
+        yield Step(name, words, ("model.safetensors", "result.json"), needed)
+        yield _prediction_step(f"{table}/{column}/seed-{seed}/prediction", name, "data/heldout")
+
+    def _adapted(self, seed: int) -> Iterator[Step]:
+        """WM-Robot and WM-Mix, from the model that saw the most human data."""
+        sizes = self.sizes
+        ancestor = f"scaling/{max(sizes.multiples)}x/seed-{seed}/model"
+        amounts = {
+            "WM-Robot": ("--robot-episodes", str(sizes.adapt_robot)),
+            "WM-Mix": (
+                *("--robot-episodes", str(sizes.adapt_half)),
+                *("--human", "data/downstream-human/store"),
+                *("--human-episodes", str(sizes.adapt_half)),
+            ),
+        }
+        for world, options in amounts.items():
+            name = f"evaluator/{world}/seed-{seed}/model"
+            words = (
+                *("train", "adapt", "--init", f"{ancestor}/model.safetensors"),
+                # Scenes of split A are left for generation.
+                *("--episodes", "data/downstream/store", "--splits", "B,C", *options),
+                *("--heldout", "data/downstream-heldout/store", "--seed", str(seed)),
+                *("--cpu-budget-s", str(sizes.adapt_cpu_s)),
+                *("--output", f"{name}/model.safetensors", "--json", f"{name}/result.json"),
+            )
+            needs = ("data/downstream", "data/downstream-human", "data/downstream-heldout")
+            made = ("model.safetensors", "result.json")
+            yield Step(name, words, made, (*needs, ancestor))
+            prediction = f"evaluator/{world}/seed-{seed}/prediction"
+            yield _prediction_step(prediction, name, "data/downstream-heldout")
+
+    def _policies(self) -> Iterator[Step]:
+        """Policies to evaluate: cloned from real demonstrations, and the same early in training."""
+        yield self._policy("evaluator/policy", ("--splits", "A,B", "--early-at", "0.15"), ())
+
+    def _policy(self, name: str, options: tuple[str, ...], needs: tuple[str, ...]) -> Step:
+        words = (
+            *("train", "policy", "--episodes", "data/downstream/store", *options),
+            *("--training.num-training-steps", str(self.sizes.policy_steps)),
+            *("--output", f"{name}/policy.safetensors", "--json", f"{name}/result.json"),
+        )
+        made = ["policy.safetensors", "result.json"]
+        if "--early-at" in options:
+            made.append("policy_early.safetensors")
+        return Step(name, words, tuple(made), ("data/downstream", *needs))
+
+    def _worlds(self) -> dict[str, str]:
+        """Adapted world models by name in studies, with the step of each."""
+        return {
+            f"{world} {seed}": f"evaluator/{world}/seed-{seed}/model"
+            for world in ADAPTED
+            for seed in self.seeds
+        }
+
+    def _study(self) -> Step:
+        """Study of the policies in the twin and in all adapted world models."""
+        step = "evaluator/policy"
+        files = {"cloned": f"{step}/policy.safetensors"}
+        files["cloned early"] = f"{step}/policy_early.safetensors"
+        script = f'[policies."{SCRIPT_POLICY}"]\nscript = "{SCRIPT_POLICY}"\n'
+        needs = (step, *self._worlds().values())
+        return self._study_step("evaluator", files, self._worlds(), needs, script)
+
+    def _study_step(
+        self,
+        table: Table,
+        policies: dict[str, str],
+        worlds: dict[str, str],
+        needs: tuple[str, ...],
+        more: str = "",
+    ) -> Step:
+        name = f"{table}/study"
+        tasks = ", ".join(f'"{task}"' for task in DOWNSTREAM_TASKS)
+        lines = [
+            f'name = "{table}"',
+            f"tasks = [{tasks}]",
+            f"first_seed = {FIRST_STUDY_SEED}",
+            f"num_starts = {self.sizes.num_starts}",
+            "keep_rollouts = false",
+        ]
+        for world, step in worlds.items():
+            lines += [f'[imagined."{world}"]', f'checkpoint = "{step}/model.safetensors"']
+        for policy, path in policies.items():
+            lines += [f'[policies."{policy}"]', 'builtin = "behaviour-cloning"']
+            lines += [f'checkpoint = "{path}"']
+        words = (
+            *("study", "run", f"{name}/study.toml", "--folder", f"{name}/results"),
+            *("--json", f"{name}/result.json"),
+        )
+        inputs = (("study.toml", "\n".join([*lines, more])),)
+        return Step(name, words, ("result.json",), needs, inputs)
+
+    def _generation(self) -> Iterator[Step]:
+        """Policies from real and from generated demonstrations, and their study in the twin."""
+        policies: dict[str, str] = {}
+        for seed in self.seeds:
+            options: dict[str, tuple[str, ...]] = {
+                "Real": ("--splits", "A,B"),
+                "Half": ("--splits", "B"),
+            }
+            needs: dict[str, tuple[str, ...]] = {}
+            for world in ADAPTED:
+                demonstrations = self._demonstrations(world, seed)
+                yield demonstrations
+                store = f"{demonstrations.name}/store"
+                options[f"+{world}"] = ("--splits", "B", "--imagined", store)
+                needs[f"+{world}"] = (demonstrations.name,)
+            for column, words in options.items():
+                name = f"generation/{column}/seed-{seed}/policy"
+                seeded = (*words, "--training.seed", str(seed))
+                yield self._policy(name, seeded, needs.get(column, ()))
+                policies[f"{column} {seed}"] = name
+        files = {policy: f"{name}/policy.safetensors" for policy, name in policies.items()}
+        yield self._study_step("generation", files, {}, tuple(policies.values()))
+
+    def _demonstrations(self, world: str, seed: int) -> Step:
+        model = f"evaluator/{world}/seed-{seed}/model"
+        name = f"generation/+{world}/seed-{seed}/demonstrations"
+        words = (
+            *("generate", "--episodes", "data/downstream/store", "--split", "A"),
+            *("--checkpoint", f"{model}/model.safetensors", "--store", f"{name}/store"),
+            *("--count", str(self.sizes.num_generated), "--strips", f"{name}/strips.html"),
+            *("--json", f"{name}/result.json"),
+        )
+        return Step(name, words, ("store", "result.json"), ("data/downstream", model))
+
+
+def _data_step(name: str, count: int, options: tuple[str, ...], first: int = 0) -> Step:
+    words = (
+        *("train", "data", "--store", f"{name}/store", *options, "--first", str(first)),
+        *("--count", str(count), "--jobs", "1", "--json", f"{name}/result.json"),
+    )
+    return Step(name, words, ("store", "result.json"), exits=(0, 1))
+
+
+def _prediction_step(name: str, model: str, heldout: str) -> Step:
+    words = (
+        *("evaluate", "prediction", "--world", f"{model}/model.safetensors"),
+        *("--episodes", f"{heldout}/store", "--json", f"{name}/result.json"),
+    )
+    return Step(name, words, ("result.json",), (heldout, model))

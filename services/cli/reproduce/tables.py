@@ -1,0 +1,333 @@
+"""Tables of a reproduction, from the results of its steps, beside the numbers of the paper."""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from services.cli.reproduce.experiments import (
+    ADAPTED,
+    DESIGNS,
+    DOWNSTREAM_TASKS,
+    GENERATED,
+    TOKENIZERS,
+    Experiments,
+    Table,
+)
+from services.cli.reproduce.steps import read_json
+from services.evaluation.scores import REAL
+
+PAPER: Final = json.loads((Path(__file__).parent / "paper.json").read_text(encoding="utf-8"))
+# Rows of the prediction tables: the paper's name, ours, and whether higher is better.
+METRICS: Final = (
+    ("PSNR", "psnr", True),
+    ("SSIM", "ssim", True),
+    ("LPIPS", "lpips", False),
+    ("Aesthetic Quality", "aesthetic_quality", True),
+    ("Image Quality", "image_quality", True),
+    ("JEPA Similarity", "jepa_similarity", True),
+    ("Subject Consistency", "subject_consistency", True),
+    ("Semantic Alignment", "semantic_alignment", True),
+    ("Trajectory Accuracy", "trajectory_accuracy", True),
+    ("Geometry Error", "geometry_error", False),
+    ("PSNR_taxel", "tactile_psnr", True),
+    ("SSIM_taxel", "tactile_ssim", True),
+    ("LPIPS_heatmap", "tactile_lpips", False),
+    ("MSE", "tactile_mse", False),
+    ("MAE", "tactile_mae", False),
+    ("Contact-MAE", "contact_mae", False),
+    ("Contact-IoU", "contact_iou", True),
+    ("Contact-F1", "contact_f1", True),
+)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A figure measured once for each training seed; NaN where it is not available."""
+
+    values: tuple[float, ...]
+
+    @property
+    def mean(self) -> float:
+        """Mean over seeds."""
+        return float(np.mean(self.values))
+
+    @property
+    def half_width(self) -> float:
+        """Half of the 95 % interval of the mean over seeds (Student's t); NaN for one seed."""
+        from scipy.stats import t
+
+        num = len(self.values)
+        if num < 2:
+            return math.nan
+        spread = float(np.std(self.values, ddof=1)) / math.sqrt(num)
+        return float(t.ppf(0.975, num - 1)) * spread
+
+    def less(self, other: "Measured") -> "Measured":
+        """Differences, seed by seed."""
+        return Measured(tuple(a - b for a, b in zip(self.values, other.values, strict=True)))
+
+    def text(self, *, signed: bool = False) -> str:
+        """Mean and interval, with as many digits as the interval has meaning."""
+        if not math.isfinite(self.mean):
+            return "n/a"
+        sign = "+" if signed else ""
+        if not math.isfinite(self.half_width):
+            return f"{self.mean:{sign}.4g}"
+        digits = max(0, 1 - math.floor(math.log10(self.half_width))) if self.half_width else 4
+        return f"{self.mean:{sign}.{digits}f} ± {self.half_width:.{digits}f}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a table: a figure in every column, with the paper's number if it has one."""
+
+    name: str
+    cells: Mapping[str, Measured]
+    paper: Mapping[str, float | None]
+    higher_is_better: bool | None = None
+
+
+@dataclass(frozen=True)
+class Page:
+    """One table; differences of its columns from `base` are shown below it."""
+
+    title: str
+    rows: tuple[Row, ...]
+    base: str | None = None
+
+    def markdown(self) -> str:
+        """Markdown of the table."""
+        columns = list(self.rows[0].cells)
+        lines = [f"## {self.title}", "", *_markdown_head(["", *columns])]
+        for row in self.rows:
+            cells = [_with_paper(row.cells[one], row.paper.get(one)) for one in columns]
+            lines.append(_markdown_row([_name(row), *cells]))
+        if self.base is not None:
+            others = [one for one in columns if one != self.base]
+            lines += ["", f"Difference from {self.base}, seed by seed:", ""]
+            lines += _markdown_head(["", *others])
+            for row in self.rows:
+                base = row.cells[self.base]
+                cells = [row.cells[one].less(base).text(signed=True) for one in others]
+                lines.append(_markdown_row([_name(row), *cells]))
+        return "\n".join([*lines, ""])
+
+    def to_json(self) -> dict[str, Any]:
+        """The values of every seed, and the paper's numbers."""
+        return {
+            "title": self.title,
+            "rows": [
+                {
+                    "name": row.name,
+                    "higher_is_better": row.higher_is_better,
+                    "values": {name: _finite(cell.values) for name, cell in row.cells.items()},
+                    "paper": dict(row.paper),
+                }
+                for row in self.rows
+            ],
+        }
+
+
+def make_pages(folder: Path, experiments: Experiments, table: Table) -> list[Page]:
+    """Tables of an experiment whose steps are done.
+
+    Raises:
+        NotFoundError: the result of a step is missing.
+    """
+    makers: dict[Table, Callable[[Path, Experiments], list[Page]]] = {
+        "tokenizer": _tokenizer_pages,
+        "design": _design_pages,
+        "scaling": _scaling_pages,
+        "evaluator": _evaluator_pages,
+        "generation": _generation_pages,
+    }
+    return makers[table](folder, experiments)
+
+
+def _tokenizer_pages(folder: Path, experiments: Experiments) -> list[Page]:
+    results = {
+        column: [
+            read_json(folder / f"tokenizer/{kind}/seed-{seed}/result.json")["metrics"]
+            for seed in experiments.seeds
+        ]
+        for column, kind in TOKENIZERS.items()
+    }
+    names = list(next(iter(results.values()))[0])
+    rows = [
+        Row(
+            name,
+            {c: Measured(tuple(float(one[name]) for one in r)) for c, r in results.items()},
+            {},
+        )
+        for name in names
+    ]
+    return [Page("Tactile tokenizers (held-out touch)", tuple(rows), "Grid")]
+
+
+def _design_pages(folder: Path, experiments: Experiments) -> list[Page]:
+    columns = {name: (f"design/{name}", name) for name in DESIGNS}
+    rows = _prediction_rows(folder, experiments, columns)
+    return [Page("Model design (no human data)", rows, "Robot-only")]
+
+
+def _scaling_pages(folder: Path, experiments: Experiments) -> list[Page]:
+    paper = ("+10h Human", "+50h Human", "+100h Human")
+    multiples = experiments.sizes.multiples
+    columns = {"0": ("design/Robot-only", "Robot-only")}
+    for index, multiple in enumerate(multiples):
+        name = paper[index] if len(multiples) == len(paper) else ""
+        columns[f"{multiple}x"] = (f"scaling/{multiple}x", name)
+    rows = _prediction_rows(folder, experiments, columns)
+    return [Page("Human data at a fixed amount of robot data", rows, "0")]
+
+
+def _prediction_rows(
+    folder: Path, experiments: Experiments, columns: Mapping[str, tuple[str, str]]
+) -> tuple[Row, ...]:
+    """Rows of a prediction table; columns are (folder of the step, the paper's column)."""
+    found = {
+        column: [
+            read_json(folder / f"{step}/seed-{seed}/prediction/result.json")
+            for seed in experiments.seeds
+        ]
+        for column, (step, _) in columns.items()
+    }
+    rows = []
+    for name, key, higher in METRICS:
+        cells = {
+            column: Measured(tuple(_figure(result, key) for result in results))
+            for column, results in found.items()
+        }
+        paper = {column: PAPER["prediction"][name].get(c) for column, (_, c) in columns.items()}
+        rows.append(Row(name, cells, paper, higher))
+    return tuple(rows)
+
+
+def _figure(result: Mapping[str, Any], key: str) -> float:
+    """A metric of the windows of all tasks; NaN where it is not available."""
+    value = result["windows"]["all"]["model"].get(key)
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _evaluator_pages(folder: Path, experiments: Experiments) -> list[Page]:
+    report = read_json(folder / "evaluator/study/result.json")
+    adapted = {world: (f"evaluator/{world}", "") for world in ADAPTED}
+    prediction = _prediction_rows(folder, experiments, adapted)
+    title = "Policy evaluation"
+    return [
+        Page("Adapted world models on held-out robot episodes", prediction, ADAPTED[0]),
+        *_study_pages(report, experiments, PAPER["agreement"], title),
+        _paper_page(title, PAPER["policies"]),
+    ]
+
+
+def _generation_pages(folder: Path, experiments: Experiments) -> list[Page]:
+    report = read_json(folder / "generation/study/result.json")
+    rate = {(row["task"], row["policy"]): float(row[REAL]) for row in report["policies"]}
+    title = "Policies from generated demonstrations"
+    rows = [
+        Row(
+            task,
+            {
+                column: Measured(
+                    tuple(rate[task, f"{column} {seed}"] for seed in experiments.seeds)
+                )
+                for column in GENERATED
+            },
+            {},
+        )
+        for task in DOWNSTREAM_TASKS
+    ]
+    return [
+        Page(f"{title}: success rates in the twin", tuple(rows), "Half"),
+        _paper_page(title, PAPER["generated"]),
+    ]
+
+
+def _paper_page(title: str, table: Mapping[str, Any]) -> Page:
+    """Success rates of the paper's own policies."""
+    tasks = next(iter(next(iter(table.values())).values()))
+    rows = [
+        Row(
+            f"{task}, {policy}",
+            {world: Measured((rates[task],)) for world, rates in worlds.items()},
+            {},
+        )
+        for task in tasks
+        for policy, worlds in table.items()
+    ]
+    return Page(f"{title}: the paper's success rates", tuple(rows))
+
+
+def _study_pages(
+    report: Mapping[str, Any],
+    experiments: Experiments,
+    paper: Mapping[str, Any],
+    title: str,
+) -> list[Page]:
+    """Success of each policy by world, and agreement of the world models with the twin."""
+    policies = list(dict.fromkeys(row["policy"] for row in report["policies"]))
+    success = []
+    for task in DOWNSTREAM_TASKS:
+        for policy in policies:
+            (row,) = [r for r in report["policies"] if (r["policy"], r["task"]) == (policy, task)]
+            by_world = {report["imagined_world"]: row["imagined"]} | {
+                world: cell["success"] for world, cell in row["other_worlds"].items()
+            }
+            cells = {"twin": Measured((float(row[REAL]),))}
+            cells |= {
+                world: Measured(tuple(by_world[f"{world} {seed}"] for seed in experiments.seeds))
+                for world in ADAPTED
+            }
+            success.append(Row(f"{task}, {policy}", cells, {}))
+    agreement = {report["imagined_world"]: report["agreement"]}
+    agreement |= report["agreement_of_other_worlds"]
+    figures = []
+    for key, name, higher in (("pearson", "Pearson", True), ("mmrv", "MMRV", False)):
+        for task in DOWNSTREAM_TASKS:
+            cells = {
+                world: Measured(
+                    tuple(
+                        _number(agreement[f"{world} {seed}"][task][key])
+                        for seed in experiments.seeds
+                    )
+                )
+                for world in ADAPTED
+            }
+            label = task.replace("_", " ").title()
+            numbers = {world: paper[world][name][label] for world in ADAPTED}
+            figures.append(Row(f"{name}, {task}", cells, numbers, higher))
+    return [
+        Page(f"{title}: success rates", tuple(success)),
+        Page(f"{title}: agreement with the twin", tuple(figures), ADAPTED[0]),
+    ]
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _finite(values: Sequence[float]) -> list[float | None]:
+    return [value if math.isfinite(value) else None for value in values]
+
+
+def _name(row: Row) -> str:
+    arrow = {True: " ↑", False: " ↓", None: ""}[row.higher_is_better]
+    return f"{row.name}{arrow}"
+
+
+def _with_paper(cell: Measured, paper: float | None) -> str:
+    return cell.text() if paper is None else f"{cell.text()} (paper {paper:g})"
+
+
+def _markdown_head(cells: Sequence[str]) -> list[str]:
+    return [_markdown_row(cells), "|" + "---|" * len(cells)]
+
+
+def _markdown_row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"

@@ -1,0 +1,162 @@
+"""Reproduction: steps run once, in order and again only if changed; tables of known results."""
+
+import json
+import math
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from dextouch.errors import ConflictError
+from services.cli.main import find_command, main
+from services.cli.reproduce.experiments import QUICK, TABLES, Experiments, Sizes
+from services.cli.reproduce.steps import Runner, Step
+from services.cli.reproduce.tables import METRICS, Measured, Page, Row, make_pages
+
+# A command that appends its last word to a file and writes the result that its first word names.
+PROGRAM = (
+    sys.executable,
+    "-c",
+    "import sys, pathlib as p\n"
+    "made, word = sys.argv[1:]\n"
+    "with open('ran.txt', 'a') as f: f.write(word + ' ')\n"
+    "p.Path(made).write_text(word)\n"
+    "sys.exit({'bad': 4, 'lenient': 1}.get(word, 0))\n",
+)
+
+
+def a_step(name, word=None, needs=(), exits=(0,)):
+    words = (f"{name}/made", word or name)
+    return Step(name, words, ("made",), needs, exits=exits)
+
+
+def ran(folder: Path) -> list[str]:
+    path = folder / "ran.txt"
+    words = path.read_text().split() if path.exists() else []
+    path.unlink(missing_ok=True)
+    return words
+
+
+def run(folder, *steps, jobs=1):
+    return Runner(folder, steps, PROGRAM).run(jobs)
+
+
+def test_steps_run_once_in_the_order_of_their_needs(tmp_path):
+    steps = (a_step("a"), a_step("b/1", needs=("a",)), a_step("c", needs=("b/1",)))
+    assert run(tmp_path, *steps) == []
+    assert ran(tmp_path) == ["a", "b/1", "c"]
+    assert run(tmp_path, *steps) == []
+    assert ran(tmp_path) == []
+
+
+def test_a_changed_command_repeats_what_depends_on_it_without_the_old_results(tmp_path):
+    run(tmp_path, a_step("a"), a_step("b", needs=("a",)), a_step("c"))
+    ran(tmp_path)
+    (tmp_path / "b" / "left over").write_text("from before")
+    run(tmp_path, a_step("a", "other"), a_step("b", needs=("a",)), a_step("c"))
+    assert ran(tmp_path) == ["other", "b"]
+    assert not (tmp_path / "b" / "left over").exists()
+
+
+def test_a_step_whose_result_is_gone_is_repeated(tmp_path):
+    run(tmp_path, a_step("a"))
+    ran(tmp_path)
+    (tmp_path / "a" / "made").unlink()
+    run(tmp_path, a_step("a"))
+    assert ran(tmp_path) == ["a"]
+
+
+def test_steps_that_need_a_failed_one_do_not_run_and_others_do(tmp_path, capsys):
+    steps = (a_step("a", "bad"), a_step("b", needs=("a",)), a_step("c"))
+    assert run(tmp_path, *steps) == ["a"]
+    assert ran(tmp_path) == ["bad", "c"]
+    assert "a: FAILED; the end of" in capsys.readouterr().out
+
+
+def test_an_allowed_exit_status_counts_as_done(tmp_path):
+    assert run(tmp_path, a_step("a", "lenient", exits=(0, 1))) == []
+
+
+def test_a_need_must_come_before(tmp_path):
+    with pytest.raises(ConflictError, match="after those that it needs"):
+        Runner(tmp_path, (a_step("b", needs=("a",)), a_step("a")))
+
+
+def test_an_interrupted_run_stops_its_command_and_resumes_in_its_folder(tmp_path):
+    """The parent gets SIGINT while the command sleeps; what the command left is there again."""
+    script = textwrap.dedent(
+        """
+        import sys
+        from pathlib import Path
+        from services.cli.reproduce.steps import Runner, Step
+        slow = ("import time, pathlib as p\\n"
+                "if p.Path('a/partial').exists(): p.Path('a/made').touch()\\n"
+                "else:\\n p.Path('a/partial').touch()\\n time.sleep(600)\\n")
+        step = Step("a", ("-c", slow), ("made",))
+        Runner(Path(sys.argv[1]), (step,), (sys.executable,)).run(1)
+        """
+    )
+    arguments = [sys.executable, "-c", script, str(tmp_path)]
+    child = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline_s = time.monotonic() + 60
+    while not (tmp_path / "a" / "partial").exists() and time.monotonic() < deadline_s:
+        time.sleep(0.02)
+    child.send_signal(signal.SIGINT)
+    assert child.wait(60) != 0
+    assert subprocess.run(arguments, timeout=60, check=False, capture_output=True).returncode == 0
+    assert (tmp_path / "a" / "made").exists()
+
+
+def test_every_step_is_a_command_of_ours_with_flags_that_it_has(capsys):
+    flags: dict[str, set[str]] = {}
+    for step in Experiments(Sizes(), (0, 1)).steps(TABLES):
+        name, rest = find_command(step.words)
+        flags.setdefault(name, set()).update(word for word in rest if word.startswith("--"))
+    for name, given in flags.items():
+        with pytest.raises(SystemExit):
+            main([*name.split(), "--help"])
+        text = capsys.readouterr().out
+        assert {flag for flag in given if flag not in text} == set(), name
+
+
+def test_a_table_takes_only_the_steps_it_needs():
+    names = {step.name for step in Experiments(QUICK, (0,)).steps(["design"])}
+    assert "design/V-only/seed-0/prediction" in names
+    assert "data/robot" in names
+    assert not any(name.startswith(("scaling", "evaluator", "data/human")) for name in names)
+
+
+def test_the_interval_is_students():
+    # t of 0.975 with 2 degrees of freedom is 4.3027 (any table of Student's t).
+    measured = Measured((1.0, 2.0, 4.5))
+    mean, spread = 2.5, math.sqrt(((1.5) ** 2 + 0.5**2 + 2.0**2) / 2)
+    assert measured.mean == pytest.approx(mean)
+    assert measured.half_width == pytest.approx(4.3027 * spread / math.sqrt(3), rel=1e-4)
+    assert Measured((3.0,)).text() == "3"
+    assert Measured((math.nan, math.nan)).text() == "n/a"
+
+
+def test_differences_are_taken_seed_by_seed():
+    row = Row("PSNR", {"a": Measured((20.0, 30.0)), "b": Measured((21.0, 31.0))}, {"a": 19.5}, True)
+    text = Page("T", (row,), "a").markdown()
+    assert "(paper 19.5)" in text
+    assert "| PSNR ↑ | +1.0000 ± 0.0000 |" in text
+
+
+def test_a_prediction_table_reads_the_figures_of_its_steps(tmp_path):
+    experiments = Experiments(QUICK, (0, 1))
+    for column, base in (("V-only", 20.0), ("Cross-Attn", 21.0), ("Robot-only", 22.0)):
+        for seed in (0, 1):
+            path = tmp_path / f"design/{column}/seed-{seed}/prediction/result.json"
+            path.parent.mkdir(parents=True)
+            figures = {key: None for _, key, _ in METRICS} | {"psnr": base + seed}
+            path.write_text(json.dumps({"windows": {"all": {"model": figures}}}))
+    (page,) = make_pages(tmp_path, experiments, "design")
+    psnr = page.rows[0]
+    assert psnr.cells["Cross-Attn"].mean == pytest.approx(21.5)
+    assert psnr.paper["Robot-only"] == pytest.approx(23.473)
+    assert page.to_json()["rows"][1]["values"]["V-only"] == [None, None]
