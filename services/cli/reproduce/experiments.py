@@ -8,6 +8,7 @@ from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
 from services.cli.reproduce.steps import Step
+from services.twin.tasks.registry import DOWNSTREAM, HUMAN_PRETRAINING, ROBOT_PRETRAINING
 
 Table = Literal["tokenizer", "design", "scaling", "evaluator", "generation"]
 TABLES: Final[tuple[Table, ...]] = ("tokenizer", "design", "scaling", "evaluator", "generation")
@@ -20,7 +21,6 @@ DESIGNS: Final = {
 TOKENIZERS: Final = {"Split-Hands": "split_hands", "Grid": "grid"}
 FIRST_HELDOUT_SEED: Final = 60_000
 FIRST_STUDY_SEED: Final = 70_000
-DOWNSTREAM_TASKS: Final = ("place_shoes", "place_phone", "stack_bowls", "stand_bottle")
 ADAPTED: Final = ("WM-Robot", "WM-Mix")
 GENERATED: Final = ("Real", "Half", *(f"+{world}" for world in ADAPTED))
 # Stand-ins of the paper's three policies: a cloned one, the same early in training, and a script.
@@ -37,8 +37,6 @@ class Sizes(FrozenModel):
     multiples: tuple[int, ...] = Field(
         default=(1, 5, 10), description="human episodes, as multiples of the robot episodes"
     )
-    num_robot_tasks: int = Field(default=4, ge=1, description="robot pretraining tasks")
-    num_human_tasks: int = Field(default=7, ge=1, description="human pretraining tasks")
     heldout_per_task: int = Field(default=6, ge=1, description="held-out episodes per task")
     downstream_per_task: int = Field(default=75, ge=3, description="robot episodes per task")
     adapt_robot: int = Field(default=200, ge=1, description="robot episodes of WM-Robot")
@@ -53,17 +51,17 @@ class Sizes(FrozenModel):
     @property
     def num_robot(self) -> int:
         """Robot episodes of pretraining."""
-        return self.robot_per_task * self.num_robot_tasks
+        return self.robot_per_task * len(ROBOT_PRETRAINING)
 
     @property
     def human_per_task(self) -> int:
         """Human episodes per task, for the largest multiple."""
-        return -(-max(self.multiples) * self.num_robot // self.num_human_tasks)
+        return -(-max(self.multiples) * self.num_robot // len(HUMAN_PRETRAINING))
 
 
 QUICK: Final = Sizes(
-    robot_per_task=2,
-    multiples=(1, 2),
+    robot_per_task=8,
+    multiples=(1,),
     heldout_per_task=1,
     downstream_per_task=6,
     adapt_robot=8,
@@ -133,7 +131,7 @@ class Experiments:
         )
         downstream = ("--tasks", "downstream")
         yield _data_step("data/downstream", sizes.downstream_per_task, downstream)
-        per_task = -(-sizes.adapt_half // len(DOWNSTREAM_TASKS))
+        per_task = -(-sizes.adapt_half // len(DOWNSTREAM))
         yield _data_step("data/downstream-human", per_task, (*downstream, *human))
         yield _data_step(
             "data/downstream-heldout", sizes.heldout_per_task, downstream, FIRST_HELDOUT_SEED
@@ -161,15 +159,17 @@ class Experiments:
         needs: tuple[str, ...] = (),
     ) -> Iterator[Step]:
         name = f"{table}/{column}/seed-{seed}/model"
-        tokenizer = f"tokenizer/split_hands/seed-{seed}"
+        if column != "V-only":
+            tokenizer = f"tokenizer/split_hands/seed-{seed}"
+            options = (*options, "--tokenizer", f"{tokenizer}/tokenizer.safetensors")
+            needs = (*needs, tokenizer)
         words = (
             *("train", "world-model", *options, "--episodes", "data/robot/store"),
             *("--heldout", "data/heldout/store", "--seed", str(seed)),
-            *("--tokenizer", f"{tokenizer}/tokenizer.safetensors"),
             *("--cpu-budget-s", str(self.sizes.train_cpu_s), "--resume"),
             *("--output", f"{name}/model.safetensors", "--json", f"{name}/result.json"),
         )
-        needed = ("data/robot", "data/heldout", tokenizer, *needs)
+        needed = ("data/robot", "data/heldout", *needs)
         yield Step(name, words, ("model.safetensors", "result.json"), needed)
         yield _prediction_step(f"{table}/{column}/seed-{seed}/prediction", name, "data/heldout")
 
@@ -242,7 +242,7 @@ class Experiments:
         more: str = "",
     ) -> Step:
         name = f"{table}/study"
-        tasks = ", ".join(f'"{task}"' for task in DOWNSTREAM_TASKS)
+        tasks = ", ".join(f'"{task}"' for task in DOWNSTREAM)
         lines = [
             f'name = "{table}"',
             f"tasks = [{tasks}]",
@@ -307,7 +307,7 @@ def _data_step(name: str, count: int, options: tuple[str, ...], first: int = 0) 
 
 def _prediction_step(name: str, model: str, heldout: str) -> Step:
     words = (
-        *("evaluate", "prediction", "--world", f"{model}/model.safetensors"),
+        *("evaluate", "prediction", "--checkpoint", f"{model}/model.safetensors"),
         *("--episodes", f"{heldout}/store", "--json", f"{name}/result.json"),
     )
     return Step(name, words, ("result.json",), (heldout, model))

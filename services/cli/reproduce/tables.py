@@ -12,7 +12,6 @@ import numpy as np
 from services.cli.reproduce.experiments import (
     ADAPTED,
     DESIGNS,
-    DOWNSTREAM_TASKS,
     GENERATED,
     TOKENIZERS,
     Experiments,
@@ -20,6 +19,7 @@ from services.cli.reproduce.experiments import (
 )
 from services.cli.reproduce.steps import read_json
 from services.evaluation.scores import REAL
+from services.twin.tasks.registry import DOWNSTREAM
 
 PAPER: Final = json.loads((Path(__file__).parent / "paper.json").read_text(encoding="utf-8"))
 # Rows of the prediction tables: the paper's name, ours, and whether higher is better.
@@ -241,7 +241,7 @@ def _generation_pages(folder: Path, experiments: Experiments) -> list[Page]:
             },
             {},
         )
-        for task in DOWNSTREAM_TASKS
+        for task in DOWNSTREAM
     ]
     return [
         Page(f"{title}: success rates in the twin", tuple(rows), "Half"),
@@ -273,7 +273,7 @@ def _study_pages(
     """Success of each policy by world, and agreement of the world models with the twin."""
     policies = list(dict.fromkeys(row["policy"] for row in report["policies"]))
     success = []
-    for task in DOWNSTREAM_TASKS:
+    for task in DOWNSTREAM:
         for policy in policies:
             (row,) = [r for r in report["policies"] if (r["policy"], r["task"]) == (policy, task)]
             by_world = {report["imagined_world"]: row["imagined"]} | {
@@ -289,7 +289,7 @@ def _study_pages(
     agreement |= report["agreement_of_other_worlds"]
     figures = []
     for key, name, higher in (("pearson", "Pearson", True), ("mmrv", "MMRV", False)):
-        for task in DOWNSTREAM_TASKS:
+        for task in DOWNSTREAM:
             cells = {
                 world: Measured(
                     tuple(

@@ -15,7 +15,7 @@ from services.cli import main
 COMMANDS = """
 align report, align retarget, align run, align serve,
 checkpoint, dashboard, demo, doctor, evaluate, evaluate prediction, export, generate, import,
-rate report, rate serve, serve,
+rate report, rate serve, reproduce, serve,
 station calibrate camera, station calibrate glove, station calibrate hand-eye,
 station calibrate latency, station calibrate profile, station calibrate robot-base,
 station calibrate show, station calibrate wrist, station serve,
