@@ -26,9 +26,9 @@ again unless their commands changed.
 """
 _EPILOG = """\
 examples:
-  dextouch reproduce --list                       # the steps, and which are done
-  dextouch reproduce design scaling               # two tables, with three training seeds
-  dextouch reproduce --quick --folder runs/quick  # all tables, from very little data
+  dextouch reproduce --list
+  dextouch reproduce design scaling
+  dextouch reproduce --quick --folder runs/quick
   dextouch reproduce --sizes '{"train_cpu_s": 900}'
 """
 
