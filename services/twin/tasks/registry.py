@@ -6,6 +6,7 @@ from typing import Final
 from dextouch.errors import UnknownNameError
 from services.twin.tasks.cans import CAN_TASKS
 from services.twin.tasks.insert_peg import InsertPeg
+from services.twin.tasks.lift_box import LiftBox
 from services.twin.tasks.open_drawer import OpenDrawer
 from services.twin.tasks.place_phone import PlacePhone
 from services.twin.tasks.place_shoes import PlaceShoes
@@ -13,6 +14,7 @@ from services.twin.tasks.regrasp_can import RegraspCan
 from services.twin.tasks.stack_bowls import StackBowls
 from services.twin.tasks.stand_bottle import StandBottle
 from services.twin.tasks.task import Task
+from services.twin.tasks.turn_lever import TurnLever
 
 _TASKS: Final[dict[str, Task]] = {
     task.name: task
@@ -25,14 +27,16 @@ _TASKS: Final[dict[str, Task]] = {
         OpenDrawer(),
         *CAN_TASKS,
         RegraspCan(),
+        LiftBox(),
+        TurnLever(),
     )
 }
 TASK_NAMES: Final = tuple(_TASKS)
 # The paper's four tasks on which policies are trained and evaluated.
 DOWNSTREAM: Final = ("place_shoes", "place_phone", "stack_bowls", "stand_bottle")
 # Tasks of robot and of human episodes for pretraining: no task is in two of these three sets.
-ROBOT_PRETRAINING: Final = ("insert_peg", "open_drawer")
-HUMAN_PRETRAINING: Final = (*(task.name for task in CAN_TASKS), "regrasp_can")
+ROBOT_PRETRAINING: Final = ("insert_peg", "open_drawer", "turn_lever")
+HUMAN_PRETRAINING: Final = (*(task.name for task in CAN_TASKS), "regrasp_can", "lift_box")
 # Tasks of the package's checkpoints; commands record and evaluate these by default.
 EVALUATED: Final = (
     "stand_bottle",
