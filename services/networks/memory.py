@@ -1,11 +1,36 @@
-"""Memory that weights need, compared with what the machine has before they are read."""
+"""Memory that weights need, compared with what a machine or device has before they are placed."""
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
-from dextouch.errors import LimitExceededError
+from dextouch.errors import LimitExceededError, UnavailableError
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def on_device(network: Network, device: str) -> Network:
+    """Move a network to a device, in place.
+
+    Raises:
+        UnavailableError: torch has no such device here.
+        LimitExceededError: a CUDA device with less free memory than the weights need.
+    """
+    try:
+        place = torch.device(device)
+        torch.empty(0, device=place)
+    except (RuntimeError, AssertionError) as error:
+        raise UnavailableError(
+            f"device {device!r}: not available ({error}); use cpu, or a device that "
+            "torch.cuda.is_available() confirms"
+        ) from error
+    if place.type == "cuda":
+        free, _ = torch.cuda.mem_get_info(place)
+        check_memory(memory_of(network.state_dict()), where=f"device {device}", max_bytes=free)
+    return network.to(place)
 
 
 def memory_of(tensors: Mapping[str, Tensor]) -> int:

@@ -29,6 +29,7 @@ from dextouch.schemas import (
 )
 from dextouch.streams import pack, unpack
 from dextouch.worlds import StartedRollout, SteppedRollout
+from services.networks.memory import on_device
 from services.world_model.checkpoints import Checkpoint, default_checkpoint, read_checkpoint
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Precision, Prediction, stack_noise
@@ -105,7 +106,8 @@ class ModelWorld:
 
         Raises:
             UnknownNameError: a task or action kind that the model was not trained on.
-            InvalidInputError: missing or invalid observation, anchor or K_head.
+            InvalidInputError: missing or invalid observation, anchor or K_head; an instruction that
+                the full size neither knows nor can encode.
         """
         first = observed_start(start, tasks=self._description.tasks)
         state = ModelState(
@@ -119,6 +121,8 @@ class ModelWorld:
             step=0,
         )
         # The checks of a chunk, so that they fail here rather than at the first one.
+        if self._model.text_features is not None:
+            self._model.text_features.of(start.instruction)
         standing = np.repeat(first.reached[None], self._description.chunk_multiple, axis=0)
         build_inputs([_request(state, standing)], self._model.config)
         return StartedRollout(state, first.observation(), first.anchor, first.K_head)
@@ -308,9 +312,10 @@ def _placed(file: Path, placement: Placement) -> Checkpoint:
     """The checkpoint on its device and in its precision."""
     limit = placement.max_file_gb
     checkpoint = read_checkpoint(file, max_bytes=None if limit is None else int(limit * 1e9))
-    model = checkpoint.model.to(placement.device)
+    model = checkpoint.model
     if placement.precision == "bfloat16":
         model.to(torch.bfloat16)
+    on_device(model, placement.device)
     if model.text_features is not None:
         model.text_features.use(placement.text.folder, placement.text.text_cache)
     return checkpoint

@@ -126,8 +126,9 @@ def predict_all(
 ) -> Futures:
     """One sample per request, in batches; the noise of request i is seeded by i."""
     images, touches = [], []
-    for begin in range(0, len(requests), BATCH):
-        part = requests[begin : begin + BATCH]
+    batch = _batch_of(model)
+    for begin in range(0, len(requests), batch):
+        part = requests[begin : begin + batch]
         inputs = build_inputs(part, model.config)
         noises = [
             model.noise(inputs.num_steps, torch.Generator().manual_seed(seed + begin + index))
@@ -137,6 +138,11 @@ def predict_all(
         images.append(to_uint8(future.images).cpu().numpy())
         touches.append(future.tactile_kpa.cpu().numpy())
     return Futures(np.concatenate(images), np.concatenate(touches))
+
+
+def _batch_of(model: JointWorldModel) -> int:
+    """Windows at a time; the autoencoder of the full size takes gigabytes for each."""
+    return BATCH if model.config.wan is None else 1
 
 
 def _cut(episode: EpisodeArrays, start: int, num_steps: int, kind: ActionKind) -> Window:
@@ -156,8 +162,9 @@ def _at(futures: Futures, kept: list[int]) -> Futures:
 
 def _through_codec(model: JointWorldModel, windows: Sequence[Window]) -> Futures:
     images, touches = [], []
-    for begin in range(0, len(windows), BATCH):
-        batch = stack_windows(windows[begin : begin + BATCH])
+    size = _batch_of(model)
+    for begin in range(0, len(windows), size):
+        batch = stack_windows(windows[begin : begin + size])
         shown, felt = batch.images.to(model.device), batch.tactile_kpa.to(model.device)
         decoded: Tensor = model.codec.decode(model.codec.encode(to_unit(shown)))
         images.append(to_uint8(decoded[:, 1:]).cpu().numpy())

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from services.networks.memory import on_device
 from services.world_model.checkpoints import (
     Checkpoint,
     CheckpointMetadata,
@@ -120,7 +121,7 @@ def train_on(
     )
     write_checkpoint(settings.output, averaged, metadata)
     # Evaluate the weights as stored, then store them again with the results.
-    stored = read_checkpoint(settings.output).model.to(settings.device)
+    stored = on_device(read_checkpoint(settings.output).model, settings.device)
     metrics = {
         **evaluate_prediction(
             stored, heldout, train_fingerprints=sorted(prints), stride=settings.evaluation_stride

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dextouch.errors import ConflictError
+from services.networks.memory import on_device
 from services.networks.optimizer import (
     Budget,
     OptimizerLoop,
@@ -92,7 +93,7 @@ class TrainingRun:
             torch.manual_seed(settings.seed)
             has_weights = settings.init is not None or settings.resume
             model = initial_model(settings.network, settings.wan, filled_later=has_weights)
-        self.model = model.to(settings.device)
+        self.model = on_device(model, settings.device)
         self.averaged = copy.deepcopy(self.model).eval()
         for network in (self.model, self.averaged):
             processes.shard(network, network.layers)
@@ -146,7 +147,7 @@ class TrainingRun:
             touch = model.tactile_targets(batch.tactile_kpa)
             model.tactile_residual_std.copy_(touch[:, 1:].std().clamp_min(1e-3))
         if self.settings.device != "cpu":
-            model.to(self.settings.device)
+            on_device(model, self.settings.device)
         self.averaged.load_state_dict(model.state_dict())
 
     def start_from(self, checkpoint: Checkpoint) -> None:

@@ -15,13 +15,15 @@ from jaxtyping import Float
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dextouch.errors import CorruptDataError, NotFoundError
+from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from services.networks.weight_files import read_tensors
 from services.world_model.wan.configuration import WanConfig
 
 ENCODER_FOLDER: Final = "text_encoder"
 TOKENIZER_FOLDER: Final = "tokenizer"
 _KEY: Final = "features"
+# Texts kept in memory; the oldest makes room.
+_MAX_TEXTS: Final = 1024
 
 
 class TextEncoder:
@@ -88,7 +90,7 @@ class TextFeatures:
         """Features of several texts, padded with zeros to `text_tokens`, as Wan2.2 expects.
 
         Raises:
-            NotFoundError: an unknown text and no encoder.
+            InvalidInputError: an unknown text and no encoder.
         """
         padded = torch.zeros(
             len(texts),
@@ -105,11 +107,13 @@ class TextFeatures:
         """Features of one text.
 
         Raises:
-            NotFoundError: an unknown text and no encoder.
+            InvalidInputError: an unknown text and no encoder.
             CorruptDataError: a damaged file in the cache.
         """
         key = key_of(text)
         if key not in self._known:
+            if len(self._known) >= _MAX_TEXTS:
+                self._known.pop(next(iter(self._known)))
             self._known[key] = self._stored(key, text).to(self._config.dtype)
         return self._known[key]
 
@@ -148,9 +152,10 @@ class TextFeatures:
     def _encode(self, text: str) -> Tensor:
         if self._encoder is None:
             if self._folder is None:
-                raise NotFoundError(
-                    f"instruction {text!r}: the checkpoint has no features of it; give the folder "
-                    "of the pretrained model, which has the text encoder, with --wan.folder"
+                raise InvalidInputError(
+                    f"instruction {text!r}: the checkpoint has no text features of it; use one of "
+                    "training, or give the folder of the text encoder (--wan.folder of training, "
+                    "--placement.text.folder of serving)"
                 )
             self._encoder = TextEncoder(self._folder, self._config)
         return self._encoder.encode(cleaned(text))

@@ -1,10 +1,12 @@
 """The full architecture in miniature: trained, stored, read and served over HTTP."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from httpx import ASGITransport, AsyncClient
 
-from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.errors import InvalidInputError, UnavailableError
 from dextouch.schemas import StartRequest, decode_answer, encode_start
 from dextouch.worlds import create_world_app
 from services.world_model.checkpoints import read_checkpoint
@@ -120,7 +122,7 @@ def test_training_resumes_and_continues_from_a_checkpoint_without_the_folder(
     more = train_on(episodes[:2], episodes[2:], alone)
     features = read_checkpoint(more.checkpoint).model.text_features
     assert len(features.of(INSTRUCTION)) > 1
-    with pytest.raises(NotFoundError, match=r"--wan\.folder"):
+    with pytest.raises(InvalidInputError, match=r"--wan\.folder"):
         features.of("stand the box")
     with pytest.raises(InvalidInputError, match="no folder"):
         TrainingRun(episodes[:2], settings.model_copy(update={"wan": WanFiles()}))
@@ -145,3 +147,19 @@ def test_the_plan_of_a_checkpoint_is_printed_from_its_metadata(checkpoint, tmp_p
     assert checkpoint.digest
     assert run_show(["--checkpoint", str(tmp_path / "untrained.safetensors"), "--plan"]) == 0
     assert "one action chunk of 16 steps" in capsys.readouterr().out
+
+
+async def test_an_unknown_instruction_is_refused_when_a_rollout_starts(settings, large_episode):
+    episodes = [large_episode(seed) for seed in range(3)]
+    report = train_on(episodes[:2], episodes[2:], settings)
+    world = open_worlds(WorldModelSettings(checkpoint=report.checkpoint))["world_model"]
+    start = make_start(episodes[0])
+    world.reset(start)
+    with pytest.raises(InvalidInputError, match=r"--placement\.text\.folder"):
+        world.reset(replace(start, instruction="open the drawer"))
+
+
+def test_a_device_that_is_not_here_is_named(settings, large_episode):
+    elsewhere = settings.model_copy(update={"device": "cuda:99"})
+    with pytest.raises(UnavailableError, match="cuda:99"):
+        TrainingRun([large_episode(0)], elsewhere)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from dextouch.errors import CorruptDataError, NotFoundError
+from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from services.world_model.wan.text import TextFeatures, cleaned, key_of
 
 # "push the box </s>" by the tokenizer of the fixture.
@@ -46,7 +46,7 @@ def test_each_text_is_encoded_once(features, wan_config, pretrained_folder, tmp_
     known = TextFeatures(wan_config)
     known.learn(features.known)
     assert torch.equal(known.of("push the box"), first)
-    with pytest.raises(NotFoundError, match=r"'stand'.*--wan\.folder"):
+    with pytest.raises(InvalidInputError, match=r"'stand'.*--wan\.folder"):
         known.of("stand")
 
 
