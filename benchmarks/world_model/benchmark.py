@@ -22,11 +22,11 @@ from benchmarks.world_model.rollouts import (
 )
 from benchmarks.world_model.tables import (
     COPY_FIRST,
+    Variant,
     cost_table,
     error_table,
     panels,
     requirements,
-    variant_name,
 )
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import EVERYTHING, ReturnSelector
@@ -34,7 +34,6 @@ from dextouch.worlds import CopyFirstWorld, World
 from services.twin.tasks import TASK_NAMES
 
 if TYPE_CHECKING:
-    from services.world_model.network.model import Precision
     from services.world_model.world import ModelWorld
 
 PACKAGES: Final = ("numpy", "torch", "mujoco-core")
@@ -42,8 +41,12 @@ PACKAGES: Final = ("numpy", "torch", "mujoco-core")
 FIRST_SEED: Final = 30_000
 USUAL: Final = {"rounds": 7, "seeds": 6}
 QUICK: Final = {"rounds": 1, "seeds": 1}
-EULER_STEPS: Final = (1, 2, 4)
-PRECISIONS: "Final[tuple[Precision, ...]]" = ("float32", "bfloat16")
+VARIANTS: Final = (
+    *(Variant(steps) for steps in (1, 2, 4, 8)),
+    *(Variant(steps, recomputed=True) for steps in (2, 4, 8)),
+    *(Variant(steps, "unipc") for steps in (2, 4, 8)),
+    *(Variant(steps, precision="bfloat16") for steps in (1, 2, 4)),
+)
 SELECTORS: Final = {
     "all images": EVERYTHING,
     "the last image": ReturnSelector(steps="last"),
@@ -68,6 +71,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: no round or seed, or a model that knows none of the twin's tasks.
     """
     from services.world_model.checkpoints import paper_form_checkpoint, read_checkpoint
+    from services.world_model.network.model import Sampling
     from services.world_model.world import ModelWorld
 
     del folder
@@ -75,13 +79,14 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     checkpoint = read_checkpoint(options.checkpoint or paper_form_checkpoint())
     network = checkpoint.metadata.network
     variants = {
-        variant_name(steps, precision): ModelWorld(
-            checkpoint, sampling_steps=steps, precision=precision
+        one.name: ModelWorld(
+            checkpoint,
+            sampling=Sampling(one.steps, one.sampler, keep_context=not one.recomputed),
+            precision=one.precision,
         )
-        for precision in PRECISIONS
-        for steps in EULER_STEPS
+        for one in VARIANTS
     }
-    served = variant_name(network.sampling_steps, "float32")
+    served = Variant(network.sampling_steps, network.sampler).name
     world = variants.setdefault(served, ModelWorld(checkpoint))
     tasks = [task for task in TASK_NAMES if task in world.description.tasks]
     if not tasks:

@@ -1,6 +1,7 @@
 """Tables, charts and requirements of the world-model benchmark."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from benchmarks.chart import Panel, Point
@@ -10,14 +11,27 @@ from benchmarks.world_model.rollouts import RolloutError
 
 if TYPE_CHECKING:
     from services.world_model.network.model import Precision
+    from services.world_model.network.solvers import Sampler
 
 COPY_FIRST: Final = "copy-first"
 MAX_CHUNK_MS: Final = 50.0
 
 
-def variant_name(euler_steps: int, precision: "Precision") -> str:
-    """Name of a sampling setting in tables and charts."""
-    return f"{euler_steps} Euler step{'s' if euler_steps > 1 else ''}, {precision}"
+@dataclass(frozen=True)
+class Variant:
+    """A sampling setting; `recomputed`: nothing is shared by its steps."""
+
+    steps: int
+    sampler: "Sampler" = "euler"
+    precision: "Precision" = "float32"
+    recomputed: bool = False
+
+    @property
+    def name(self) -> str:
+        """Name in tables and charts."""
+        solver = "UniPC" if self.sampler == "unipc" else "Euler"
+        steps = f"{self.steps} {solver} step{'s' if self.steps > 1 else ''}"
+        return f"{steps}, {self.precision}{', context recomputed' * self.recomputed}"
 
 
 def error_table(

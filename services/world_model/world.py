@@ -32,7 +32,7 @@ from dextouch.worlds import StartedRollout, SteppedRollout
 from services.networks.memory import on_device
 from services.world_model.checkpoints import Checkpoint, default_checkpoint, read_checkpoint
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
-from services.world_model.network.model import Precision, Prediction, stack_noise
+from services.world_model.network.model import Precision, Prediction, Sampling, stack_noise
 from services.world_model.network.solvers import Sampler
 from services.world_model.network.visual_codec import to_uint8, to_unit
 from services.world_model.placement import Placement
@@ -63,8 +63,7 @@ class ModelWorld:
 
     Args:
         checkpoint: loaded, from `read_checkpoint`.
-        sampling_steps: network calls per chunk; None uses the checkpoint's.
-        sampler: solver of the flow; None uses the checkpoint's.
+        sampling: network calls, solver and so on; None uses the checkpoint's.
         precision: of the experts' matrix products; codecs are always float32.
     """
 
@@ -72,13 +71,12 @@ class ModelWorld:
         self,
         checkpoint: Checkpoint,
         *,
-        sampling_steps: int | None = None,
-        sampler: Sampler | None = None,
+        sampling: Sampling | None = None,
         precision: Precision = "float32",
     ) -> None:
         self._model = checkpoint.model
         self._digest = checkpoint.digest
-        self._sampling_steps, self._sampler = sampling_steps, sampler
+        self._sampling = sampling
         self._precision: Precision = precision
         config, metadata = checkpoint.metadata.network, checkpoint.metadata
         self._description = WorldDescription(
@@ -175,8 +173,7 @@ class ModelWorld:
         future = self._model.predict(
             inputs,
             noise,
-            sampling_steps=self._sampling_steps,
-            sampler=self._sampler,
+            sampling=self._sampling,
             all_images=wanted,
             precision=self._precision,
         )
@@ -299,7 +296,7 @@ def open_world(
                 f"world model {file.name}: got one that predicts images alone, expected touch, "
                 "too; only `dextouch evaluate prediction` accepts it"
             )
-        return ModelWorld(checkpoint, sampling_steps=sampling_steps, sampler=sampler)
+        return ModelWorld(checkpoint, sampling=Sampling(sampling_steps, sampler))
     if sampling_steps is not None or sampler is not None:
         raise InvalidInputError(
             f"state model {file.name}: got {sampling_steps} sampling steps and the sampler "

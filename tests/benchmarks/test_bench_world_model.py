@@ -40,7 +40,7 @@ def run(tmp_path_factory):
 
 def test_a_quick_run_measures_everything(run):
     folder, figures = run
-    names = {tables.variant_name(n, p) for n in benchmark.EULER_STEPS for p in benchmark.PRECISIONS}
+    names = {one.name for one in benchmark.VARIANTS}
     assert set(figures["chunk_ms"]) == set(figures["errors"]) == names | {tables.COPY_FIRST}
     assert len(figures["asked_ms"]) == len(benchmark.SELECTORS) * len(benchmark.TOGETHER)
     assert figures["options"]["served"] in names
@@ -58,11 +58,18 @@ def test_the_model_is_nearer_to_the_twin_than_standing_still(run):
 def test_half_precision_is_near_full_precision_and_not_the_same(run):
     # Shape checks know float32 only, so half precision is tried without them.
     errors = run[1]["errors"]
-    for steps in benchmark.EULER_STEPS:
-        full = errors[tables.variant_name(steps, "float32")]
-        half = errors[tables.variant_name(steps, "bfloat16")]
+    for steps in (1, 2, 4):
+        full = errors[tables.Variant(steps).name]
+        half = errors[tables.Variant(steps, precision="bfloat16").name]
         assert half != full
         assert half == pytest.approx(full, rel=0.05)
+
+
+def test_a_kept_context_does_not_change_the_errors(run):
+    errors = run[1]["errors"]
+    for steps in (2, 4, 8):
+        kept = errors[tables.Variant(steps).name]
+        assert kept == pytest.approx(errors[tables.Variant(steps, recomputed=True).name], rel=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +116,7 @@ def test_rollouts_may_show_less(episode):
 
 
 def test_verdicts():
-    served = tables.variant_name(2, "float32")
+    served = tables.Variant(2).name
     assert served == "2 Euler steps, float32"
     errors = {tables.COPY_FIRST: RolloutError(30.0, 4.0, 0.0), served: RolloutError(15.0, 5.0, 0.9)}
     found = tables.requirements({served: Figure.of([40.0])}, errors, served)

@@ -108,6 +108,18 @@ class Condition:
         return Condition(self.vector.to(dtype), actions)
 
 
+@dataclass(frozen=True)
+class Constants:
+    """What conditions consist of apart from the flow time: terms of the vector, in their order."""
+
+    terms: tuple[Float32[Tensor, "batch *groups width"], ...]
+    actions: Float32[Tensor, "batch groups keys width"] | None = None
+
+    def at(self, time: Float32[Tensor, "batch *groups width"]) -> Condition:
+        """Condition at the embedded times."""
+        return Condition(sum(self.terms, start=time), self.actions)
+
+
 class VideoCondition(nn.Module):
     """Condition of every latent frame."""
 
@@ -131,12 +143,20 @@ class VideoCondition(nn.Module):
         t: Float32[Tensor, "batch latents"],
     ) -> Condition:
         """Conditions; t is zero where the latent is clean."""
-        vector, tokens, actions = self.time(t), None, _of_latents(features)
+        return self.at(self.constants(inputs, features), t)
+
+    def constants(self, inputs: ModelInputs, features: ActionFeatures) -> Constants:
+        """What does not depend on the flow time."""
+        terms, tokens, actions = [], None, _of_latents(features)
         if self.actions is not None:
-            vector = vector + after_first(self.actions(actions.flatten(2)))
+            terms.append(after_first(self.actions(actions.flatten(2))))
         if self.action_tokens is not None:
             tokens = after_first(self.action_tokens(actions))
-        return Condition(vector + self.static(inputs)[:, None], tokens)
+        return Constants((*terms, self.static(inputs)[:, None]), tokens)
+
+    def at(self, constants: Constants, t: Float32[Tensor, "batch latents"]) -> Condition:
+        """Conditions at these times."""
+        return constants.at(self.time(t))
 
 
 class TactileCondition(nn.Module):
@@ -166,15 +186,23 @@ class TactileCondition(nn.Module):
         t: Float32[Tensor, "batch time"],
     ) -> Condition:
         """Conditions; t is zero where the step is clean."""
-        vector, tokens = self.time(t)[:, :, None].expand(-1, -1, 2, -1), None
+        return self.at(self.constants(inputs, features), t)
+
+    def constants(self, inputs: ModelInputs, features: ActionFeatures) -> Constants:
+        """What does not depend on the flow time."""
+        terms, tokens = [], None
         if self.actions is not None:
-            vector = vector + after_first(self.actions(features.per_hand[:, 1:]))
+            terms.append(after_first(self.actions(features.per_hand[:, 1:])))
         if self.action_tokens is not None:
             tokens = after_first(self.action_tokens(features.per_hand[:, 1:, :, None]))
             tokens = tokens.flatten(1, 2)
         if self.scene is not None and self.layout is not None:
-            vector = vector + (self.scene(inputs) + self.layout(features.layout))[:, None]
-        return Condition(vector + self.static(inputs)[:, None, None], tokens)
+            terms.append((self.scene(inputs) + self.layout(features.layout))[:, None])
+        return Constants((*terms, self.static(inputs)[:, None, None]), tokens)
+
+    def at(self, constants: Constants, t: Float32[Tensor, "batch time"]) -> Condition:
+        """Conditions at these times."""
+        return constants.at(self.time(t)[:, :, None].expand(-1, -1, 2, -1))
 
 
 class StaticCondition(nn.Module):

@@ -34,6 +34,32 @@ class Stream:
     text: Float[Tensor, "batch words width"] | None = None
     actions: Float[Tensor, "batch parts keys width"] | None = None
 
+    def split(self, num_tokens: int) -> tuple["Stream", "Stream"]:
+        """The first tokens and the others, each with their modulation, positions and actions."""
+        total = self.tokens.shape[1]
+
+        def cut(values: Tensor, axis: int) -> list[Tensor]:
+            first = num_tokens * values.shape[axis] // total
+            return list(torch.split(values, [first, values.shape[axis] - first], dim=axis))
+
+        parts = {
+            name: cut(values, 0 if name == "turn" else 1)
+            for name in ("tokens", "modulation", "turn", "actions")
+            if (values := getattr(self, name)) is not None
+        }
+        first, others = (
+            replace(self, **{name: both[index] for name, both in parts.items()}) for index in (0, 1)
+        )
+        return first, others
+
+
+@dataclass(frozen=True)
+class KeysValues:
+    """Keys and values of the tokens of both streams in one layer."""
+
+    keys: Float[Tensor, "batch heads tokens head_width"]
+    values: Float[Tensor, "batch heads tokens head_width"]
+
 
 def clean_mask(
     is_clean: Bool[Tensor, " tokens"],
@@ -135,12 +161,38 @@ class JointLayer(nn.Module):
         self, video: Stream, tactile: Stream | None, mask: Bool[Tensor, "tokens tokens"]
     ) -> tuple[Stream, Stream | None]:
         """Update both streams through the shared attention."""
+        query, key, value = self._queries_keys_values(video, tactile)
+        attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+        return self._finish(video, tactile, attended)
+
+    def update_after(
+        self, past: KeysValues | None, video: Stream, tactile: Stream | None
+    ) -> tuple[Stream, Stream | None, KeysValues]:
+        """Update tokens that attend to all of each other and of `past`.
+
+        Returns:
+            Both streams, and the keys and values that their tokens attended to.
+        """
+        query, key, value = self._queries_keys_values(video, tactile)
+        if past is not None:
+            key = torch.cat([past.keys, key], dim=2)
+            value = torch.cat([past.values, value], dim=2)
+        attended = functional.scaled_dot_product_attention(query, key, value)
+        return *self._finish(video, tactile, attended), KeysValues(key, value)
+
+    def _queries_keys_values(
+        self, video: Stream, tactile: Stream | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         query, key, value = self.video.queries_keys_values(video)
         if self.tactile is not None and tactile is not None:
             parts = zip((query, key, value), self.tactile.queries_keys_values(tactile), strict=True)
             # The pretrained expert may have less precise weights than the tactile one.
             query, key, value = (torch.cat([a, b.to(a.dtype)], dim=2) for a, b in parts)
-        attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+        return query, key, value
+
+    def _finish(
+        self, video: Stream, tactile: Stream | None, attended: Tensor
+    ) -> tuple[Stream, Stream | None]:
         attended = attended.transpose(1, 2).flatten(2)
         num_video = video.tokens.shape[1]
         seen = self.video.finish(video, attended[:, :num_video])

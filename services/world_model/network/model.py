@@ -3,18 +3,24 @@
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor, nn
 
 from services.world_model.network import flow_matching
-from services.world_model.network.conditioning import ActionNormalizer, TactileCondition
+from services.world_model.network.clean_tokens import CleanTokens
+from services.world_model.network.conditioning import (
+    ActionNormalizer,
+    Condition,
+    Constants,
+    TactileCondition,
+)
 from services.world_model.network.configuration import NetworkConfig, num_latents
 from services.world_model.network.inputs import ModelInputs
-from services.world_model.network.joint_attention import JointLayer, clean_mask
+from services.world_model.network.joint_attention import JointLayer, Stream, clean_mask
 from services.world_model.network.solvers import Sampler
 from services.world_model.network.tactile_expert import TactileExpert
 from services.world_model.network.tokenizer_choice import build_tokenizer
@@ -38,6 +44,10 @@ class JointLatents:
     video: Float32[Tensor, "batch latents tokens channels"]
     tactile: Float32[Tensor, "batch time 2 tactile_tokens tactile_channels"]
 
+    def to(self, device: torch.device) -> "JointLatents":
+        """Copy to a device."""
+        return JointLatents(self.video.to(device), self.tactile.to(device))
+
 
 @dataclass(frozen=True)
 class FirstLatents:
@@ -45,6 +55,43 @@ class FirstLatents:
 
     video: Float32[Tensor, "batch tokens channels"]
     tactile: Float32[Tensor, "batch 2 tactile_tokens tactile_channels"]
+
+
+@dataclass(frozen=True)
+class Context:
+    """What the predictions of a chunk at all flow times have in common.
+
+    `video` (of the type of the video side) and `tactile` are the conditions without the time. With
+    `clean`, clean tokens are not computed again for every time.
+    """
+
+    first: FirstLatents
+    raster: Float32[Tensor, "batch time 2 cells cells"]
+    video: Any
+    tactile: Constants | None
+    clean: CleanTokens | None = None
+
+
+class Begun(NamedTuple):
+    """Both streams before the first layer, with their conditions."""
+
+    video: Stream
+    tactile: Stream | None
+    of_video: Any
+    of_tactile: Condition | None
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How futures are sampled.
+
+    `num_steps` (network calls) and `sampler` are the configuration's if None. With `keep_context`,
+    calls share what does not depend on the flow time, which changes results by rounding only.
+    """
+
+    num_steps: int | None = None
+    sampler: Sampler | None = None
+    keep_context: bool = True
 
 
 @dataclass(frozen=True)
@@ -145,24 +192,55 @@ class JointWorldModel(nn.Module):
 
         Without touch the tactile latents are returned as they came.
         """
-        features, noisy = self.normalizer(inputs), self.with_clean_first(noisy, first)
-        video_condition = self.video_condition(inputs, features, _time_of_each(t, noisy.video))
-        video = self.video.start(noisy.video, first.video, video_condition, inputs.raster)
-        mask = self.attention_mask(inputs.num_steps).to(t.device)
-        if self.tactile is None or self.tactile_condition is None:
+        return self.denoise(self.context(inputs, first), noisy, t)
+
+    def context(self, inputs: ModelInputs, first: FirstLatents) -> Context:
+        """What does not depend on the flow time."""
+        features, touch = self.normalizer(inputs), self.tactile_condition
+        return Context(
+            first,
+            inputs.raster,
+            self.video_condition.constants(inputs, features),
+            None if touch is None else touch.constants(inputs, features),
+        )
+
+    def with_clean_tokens(self, context: Context, noisy: JointLatents) -> Context:
+        """The context with its clean tokens, which no value of `noisy` changes."""
+        begun = self._begin(context, noisy, torch.ones(len(noisy.video), device=noisy.video.device))
+        video, tactile = begun.video.split(self.config.tokens_per_latent)[0], begun.tactile
+        if tactile is not None:
+            tactile = tactile.split(2 * self.tokenizer.num_tokens)[0]
+        return replace(context, clean=CleanTokens.through(self._joint_layers(), video, tactile))
+
+    def denoise(
+        self, context: Context, noisy: JointLatents, t: Float32[Tensor, " batch"]
+    ) -> JointLatents:
+        """`forward` with a context, which several times may share."""
+        begun = self._begin(context, noisy, t)
+        video, tactile = begun.video, begun.tactile
+        if context.clean is None:
+            mask = self.attention_mask(context.raster.shape[1]).to(t.device)
             for layer in self.layers:
-                video, _ = layer(video, None, mask)
-            return JointLatents(self.video.finish(video, video_condition), noisy.tactile)
-        tactile_condition = self.tactile_condition(
-            inputs, features, _time_of_each(t, noisy.tactile)
-        )
-        tactile = self.tactile.start(noisy.tactile, first.tactile, tactile_condition)
-        for layer in self.layers:
-            video, tactile = layer(video, tactile, mask)
-        return JointLatents(
-            self.video.finish(video, video_condition),
-            self.tactile.finish(tactile, tactile_condition),
-        )
+                video, tactile = layer(video, tactile, mask)
+        else:
+            video, tactile = context.clean.update(self._joint_layers(), video, tactile)
+        latents = self.video.finish(video, begun.of_video)
+        if self.tactile is None or tactile is None or begun.of_tactile is None:
+            return JointLatents(latents, self.with_clean_first(noisy, context.first).tactile)
+        return JointLatents(latents, self.tactile.finish(tactile, begun.of_tactile))
+
+    def _joint_layers(self) -> list[JointLayer]:
+        return [layer for layer in self.layers if isinstance(layer, JointLayer)]
+
+    def _begin(self, context: Context, noisy: JointLatents, t: Tensor) -> Begun:
+        noisy = self.with_clean_first(noisy, context.first)
+        of_video: Any = self.video_condition.at(context.video, _time_of_each(t, noisy.video))
+        video = self.video.start(noisy.video, context.first.video, of_video, context.raster)
+        if self.tactile is None or self.tactile_condition is None or context.tactile is None:
+            return Begun(video, None, of_video, None)
+        of_tactile = self.tactile_condition.at(context.tactile, _time_of_each(t, noisy.tactile))
+        tactile = self.tactile.start(noisy.tactile, context.first.tactile, of_tactile)
+        return Begun(video, tactile, of_video, of_tactile)
 
     def with_clean_first(self, noisy: JointLatents, first: FirstLatents) -> JointLatents:
         """Latents whose first ones are clean: zero for residuals, `first` for plain ones."""
@@ -202,8 +280,7 @@ class JointWorldModel(nn.Module):
         inputs: ModelInputs,
         noise: JointLatents,
         *,
-        sampling_steps: int | None = None,
-        sampler: Sampler | None = None,
+        sampling: Sampling | None = None,
         all_images: bool = True,
         precision: Precision = "float32",
     ) -> Prediction:
@@ -212,18 +289,24 @@ class JointWorldModel(nn.Module):
         Args:
             inputs: from `build_inputs`.
             noise: one per request, from `noise`; like the inputs it may be on any device.
-            sampling_steps: network calls; None uses the configuration's.
-            sampler: solver of the flow; None uses the configuration's.
+            sampling: how; None uses the configuration's.
             all_images: decode every image, or only those of the last latent.
             precision: of the experts' matrix products (autocast); codecs always use float32.
         """
         device = self.device
         inputs = inputs.to(device)
-        first = self.first_latents(inputs)
+        first, noise = self.first_latents(inputs), noise.to(device)
+        sampling = sampling or Sampling()
+        num_steps = sampling.num_steps or self.config.sampling_steps
+        kept: Context | None = None
+        if sampling.keep_context and num_steps > 1:
+            with products_in(precision, device.type):
+                kept = self.with_clean_tokens(self.context(inputs, first), noise)
 
         def denoise(video: Tensor, tactile: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-            with products_in(precision, video.device.type):
-                guess = self(inputs, first, JointLatents(video, tactile), t)
+            with products_in(precision, device.type):
+                context = self.context(inputs, first) if kept is None else kept
+                guess = self.denoise(context, JointLatents(video, tactile), t)
             found = guess.video.float(), guess.tactile.float()
             if self.config.prediction == "clean":
                 return found
@@ -234,10 +317,10 @@ class JointWorldModel(nn.Module):
 
         video, tactile = flow_matching.sample(
             denoise,
-            (noise.video.to(device), noise.tactile.to(device)),
-            num_steps=sampling_steps or self.config.sampling_steps,
+            (noise.video, noise.tactile),
+            num_steps=num_steps,
             shift=self.config.sampling_time_shift,
-            sampler=sampler or self.config.sampler,
+            sampler=sampling.sampler or self.config.sampler,
         )
         future = self.decode(first, JointLatents(video, tactile), all_images=all_images)
         touch = self.tokenizer.bounded(future.tactile_kpa, inputs.first_tactile_kpa)

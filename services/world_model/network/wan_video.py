@@ -47,6 +47,14 @@ class WanCondition:
     text: Float[Tensor, "batch words width"]
 
 
+@dataclass(frozen=True)
+class WanConstants:
+    """What conditions consist of apart from the flow time."""
+
+    actions: Float32[Tensor, "batch latents width"]
+    text: Float[Tensor, "batch words width"]
+
+
 class WanVideoCondition(nn.Module):
     """Times, actions and instructions as the transformer of Wan2.2 takes them."""
 
@@ -66,10 +74,14 @@ class WanVideoCondition(nn.Module):
         t: Float32[Tensor, "batch latents"],
     ) -> WanCondition:
         """Conditions; t is zero where the latent is clean."""
+        return self.at(self.constants(inputs, features), t)
+
+    def constants(self, inputs: ModelInputs, features: ActionFeatures) -> WanConstants:
+        """What does not depend on the flow time."""
         groups = split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT)).flatten(2)
         actions = after_first(self.actions(groups.to(self.commanded.dtype))).float()
         kind = inputs.commanded[:, None, None] * self.commanded.float()
-        return self.of(t, actions + kind, self.text_features.stack(inputs.instructions))
+        return self._constants(actions + kind, self.text_features.stack(inputs.instructions))
 
     def of(
         self,
@@ -78,14 +90,19 @@ class WanVideoCondition(nn.Module):
         text: Float[Tensor, "batch words features"],
     ) -> WanCondition:
         """Conditions from embedded actions and text features."""
+        return self.at(self._constants(actions, text), t)
+
+    def _constants(self, actions: Tensor, text: Tensor) -> WanConstants:
+        weight = self.embedder.time_proj.weight
+        return WanConstants(actions, self.embedder.text_embedder(text.to(weight)))
+
+    def at(self, constants: WanConstants, t: Float32[Tensor, "batch latents"]) -> WanCondition:
+        """Conditions at these times."""
         waves = self.embedder.timesteps_proj(TIME_RANGE * t.flatten())
-        time = split_axis(self.embedder.time_embedder(waves), 0, tuple(t.shape)) + actions
-        project, embed_text = self.embedder.time_proj, self.embedder.text_embedder
+        time = split_axis(self.embedder.time_embedder(waves), 0, tuple(t.shape)) + constants.actions
+        project = self.embedder.time_proj
         modulation = project(functional.silu(time).to(project.weight.dtype)).float()
-        features = text.to(project.weight.device, project.weight.dtype)
-        return WanCondition(
-            time, split_axis(modulation, -1, (NUM_MODULATIONS, -1)), embed_text(features)
-        )
+        return WanCondition(time, split_axis(modulation, -1, (NUM_MODULATIONS, -1)), constants.text)
 
 
 class WanBlock(Block):

@@ -13,7 +13,7 @@ from services.world_model.checkpoints import CheckpointMetadata, write_checkpoin
 from services.world_model.network.flow_matching import sample
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.instruction import NO_WORD, hash_subwords
-from services.world_model.network.model import JointLatents, JointWorldModel, stack_noise
+from services.world_model.network.model import JointLatents, JointWorldModel, Sampling, stack_noise
 from services.world_model.training.dataset import WindowSampler
 from services.world_model.training.objective import LossOptions, contact_or_changing, losses
 from services.world_model.world import open_world
@@ -136,10 +136,10 @@ def test_a_perfect_velocity_gives_the_recorded_window(tiny_config, batch):
     inputs = build_inputs(batch.requests, model.config)
     clean = model.targets(batch.images, batch.tactile_kpa)
     noise = stack_noise([model.noise(17, torch.Generator().manual_seed(i)) for i in range(2)])
-    model.forward = lambda *_: JointLatents(
+    model.denoise = lambda *_: JointLatents(
         noise.video - clean.video, noise.tactile - clean.tactile
     )
-    future = model.predict(inputs, noise, sampling_steps=4)
+    future = model.predict(inputs, noise, sampling=Sampling(4))
     expected = model.decode(model.first_latents(inputs), clean)
     torch.testing.assert_close(future.images, expected.images, atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(future.tactile_kpa, expected.tactile_kpa, atol=1e-3, rtol=1e-3)

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 from dextouch.errors import InvalidInputError
 from services.world_model.network.flow_matching import sample
+from services.world_model.network.model import Sampling
 from services.world_model.network.solvers import SOLVERS
 from services.world_model.world import ModelWorld, open_world
 from tests.unit.world_model.test_world import make_start
@@ -104,13 +105,13 @@ def test_a_world_samples_as_it_is_asked_to(checkpoint, toy_episode, tmp_path):
         weight.add_(0.1 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(0)))
     chunk = episode.actions["commanded"][1:17]
 
-    def touch(**options):
-        world = ModelWorld(checkpoint, **options)
+    def touch(*sampling):
+        world = ModelWorld(checkpoint, sampling=Sampling(*sampling))
         state = world.reset(make_start(episode)).state
         return world.step(state, chunk, seed=0).observation.tactile_kpa
 
     stored = touch()
-    assert np.array_equal(touch(sampler="euler"), stored)
-    assert not np.array_equal(touch(sampler="unipc", sampling_steps=4), touch(sampling_steps=4))
+    assert np.array_equal(touch(None, "euler"), stored)
+    assert not np.array_equal(touch(4, "unipc"), touch(4))
     with pytest.raises(InvalidInputError, match="without sampling"):
         open_world(sampler="unipc")

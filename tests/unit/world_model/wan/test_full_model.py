@@ -1,5 +1,7 @@
 """The joint model with the pretrained video side: built, loaded, stored and read."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -7,14 +9,17 @@ from safetensors.torch import save_file
 from dextouch.errors import InvalidInputError, LimitExceededError
 from services.world_model.checkpoints import read_checkpoint, write_checkpoint
 from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
 from services.world_model.pretrained_video import load_pretrained
+from services.world_model.training.dataset import cut_window
 from services.world_model.wan.configuration import WanConfig
 from services.world_model.wan.renaming import (
     TRANSFORMER_RULES,
     autoencoder_rules,
     renamed,
 )
+from tests.unit.world_model.test_clean_tokens import assert_kept_tokens_change_nothing
 
 
 @pytest.fixture
@@ -136,3 +141,15 @@ def _full_size():
     )  # fmt: skip
     with torch.device("meta"):
         return JointWorldModel(config)
+
+
+def test_kept_clean_tokens_change_nothing(model, toy_episodes):
+    with torch.no_grad():
+        for weight in model.parameters():
+            if weight.abs().max() == 0:
+                weight.normal_(0.0, 0.1)
+    larger = [replace(e, images=e.images.repeat(2, 1).repeat(2, 2)) for e in toy_episodes[:2]]
+    requests = [cut_window(episode, 0, 17).request for episode in larger]
+    assert_kept_tokens_change_nothing(
+        model.requires_grad_(requires_grad=False), build_inputs(requests, model.config)
+    )
