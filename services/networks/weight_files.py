@@ -56,7 +56,11 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], notes: dict[str, st
     """Write tensors with texts as metadata; as `write_weights`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
+    # safetensors makes files that only their owner can read; these get the usual permissions.
+    partial.touch()
+    mode = partial.stat().st_mode
     save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, partial, notes)
+    partial.chmod(mode)
     with partial.open("rb") as file:
         os.fsync(file.fileno())
     digest = digest_of(partial)

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from dextouch.command_line import write_result
 from dextouch.serving import load_settings
 from dextouch.worlds import World, serve_worlds
+from services.networks.weight_files import digest_of
 from services.world_model.checkpoints import list_checkpoints, read_checkpoint, read_metadata
 from services.world_model.plan import plan_table
 from services.world_model.settings import (
@@ -161,9 +162,12 @@ def _history(file: Path) -> dict[str, Any]:
         state = read_state_checkpoint(file)
         history = {"form": "state model", **state.metadata.model_dump(mode="json")}
         return {"file": file.name, "digest": state.digest, **history}
-    checkpoint = read_checkpoint(file)
-    history = checkpoint.metadata.model_dump(mode="json", exclude={"train_fingerprints"})
-    return {"file": file.name, "digest": checkpoint.digest, "form": "paper's form", **history}
+    metadata = read_metadata(file)
+    # The full size may not fit into memory; the others are read to check their weights, too.
+    small = metadata.network.wan is None
+    digest = read_checkpoint(file).digest if small else digest_of(file)
+    history = metadata.model_dump(mode="json", exclude={"train_fingerprints"})
+    return {"file": file.name, "digest": digest, "form": "paper's form", **history}
 
 
 def _table(report: TrainingReport) -> str:

@@ -12,11 +12,10 @@ from typing import Any, Final
 
 import torch
 from jaxtyping import Float
-from safetensors.torch import save_file
 from torch import Tensor
 
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
-from services.networks.weight_files import read_tensors
+from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.wan.configuration import WanConfig
 
 ENCODER_FOLDER: Final = "text_encoder"
@@ -143,10 +142,7 @@ class TextFeatures:
             return self._checked(tensors.get(_KEY, torch.empty(0)), where)
         features = self._encode(text)
         if file is not None:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            partial = file.with_name(file.name + ".partial")
-            save_file({_KEY: features.contiguous()}, partial)
-            partial.replace(file)
+            write_tensors(file, {_KEY: features}, {})
         return features
 
     def _encode(self, text: str) -> Tensor:

@@ -123,6 +123,13 @@ def test_foreign_files_are_refused(path, tiny_model, metadata):
         read_checkpoint(path)
 
 
+def test_files_have_the_usual_permissions(path, tiny_model, metadata):
+    write_checkpoint(path, tiny_model, metadata)
+    plain = path.with_name("plain")
+    plain.touch()
+    assert path.stat().st_mode == plain.stat().st_mode
+
+
 def test_a_cut_off_file_is_refused(path, tiny_model, metadata):
     write_checkpoint(path, tiny_model, metadata)
     path.write_bytes(path.read_bytes()[:-100])
