@@ -9,7 +9,7 @@ which depends on the library, is not counted.
 
 import weakref
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Any, Final, Literal
 
 import torch
@@ -58,8 +58,8 @@ class Work:
 class Plan:
     """What one action chunk of one rollout needs.
 
-    `kept_bytes` are the keys and values of clean tokens and text, if they are kept over the
-    sampler's steps. `training_bytes` are weights, gradients, two moments of AdamW and the average
+    `kept_bytes` is what the sampler's steps share: keys and values of clean tokens, and conditions.
+    `training_bytes` are weights, gradients, two moments of AdamW and the average
     of the weights; activations come on top.
     """
 
@@ -78,8 +78,8 @@ class Plan:
 
     @property
     def peak_bytes(self) -> int:
-        """Weights with the most memory that a computation takes."""
-        return self.weight_bytes + max(work.memory_bytes for work in self.work)
+        """Weights, what is kept, and the most memory that a computation takes."""
+        return self.weight_bytes + self.kept_bytes + max(work.memory_bytes for work in self.work)
 
     @property
     def flops(self) -> int:
@@ -167,7 +167,7 @@ def plan_table(config: NetworkConfig) -> str:
                 for index, work in enumerate(first.work)
             ),
             row("all", f"{first.flops / 1e9:,.2f} GF", (p.peak_bytes for p in plans.values())),
-            row("kept keys and values", "", (plan.kept_bytes for plan in plans.values())),
+            row("shared by sampler steps", "", (plan.kept_bytes for plan in plans.values())),
             row("training, without activations", "", (p.training_bytes for p in plans.values())),
         ]
     )
@@ -183,13 +183,14 @@ def plan_of(config: NetworkConfig, *, num_steps: int | None = None) -> Plan:
     steps = (config.max_steps if num_steps is None else 1 + num_steps) - 1
     with torch.device("meta"), torch.no_grad():
         model = JointWorldModel(config).eval()
+        work, kept_bytes = _work(model, 1 + steps)
         return Plan(
             num_steps=steps,
             num_video_tokens=num_latents(1 + steps) * config.tokens_per_latent,
             num_tactile_tokens=(1 + steps) * 2 * model.tokenizer.num_tokens,
             parts=_parts(model),
-            work=_work(model, 1 + steps),
-            kept_bytes=_kept(model),
+            work=work,
+            kept_bytes=kept_bytes,
             training_bytes=_training(model),
         )
 
@@ -222,7 +223,8 @@ def _text_encoder(wan: WanConfig) -> nn.Module:
     return UMT5EncoderModel(UMT5Config(**_TEXT_ENCODER)).to(wan.dtype)
 
 
-def _work(model: JointWorldModel, num_steps: int) -> tuple[Work, ...]:
+def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int]:
+    """Computations of a chunk, and the memory that the sampler's steps share."""
     config = model.config
     inputs = _inputs(config, num_steps)
     if model.text_features is not None and config.wan is not None:
@@ -235,15 +237,22 @@ def _work(model: JointWorldModel, num_steps: int) -> tuple[Work, ...]:
         first.video[:, None].repeat(1, num_latents(num_steps), 1, 1),
         first.tactile[:, None].repeat(1, num_steps, 1, 1, 1),
     )
-    measured = {
+    context = model.with_clean_tokens(model.context(inputs, first), noisy)
+    jobs: dict[str, tuple[int, Callable[[], Any]]] = {
         "encode the first image": (1, lambda: model.first_latents(inputs)),
+        "what sampler steps share": (
+            1,
+            lambda: model.with_clean_tokens(model.context(inputs, first), noisy),
+        ),
         "one sampler step": (
             config.sampling_steps,
-            lambda: model(inputs, first, noisy, torch.ones(1)),
+            lambda: model.denoise(context, noisy, torch.ones(1)),
         ),
         "decode all images": (1, lambda: model.decode(first, noisy)),
     }
-    return tuple(_measured(model, name, *job) for name, job in measured.items())
+    work = tuple(_measured(model, name, *job) for name, job in jobs.items())
+    kept = {str(id(tensor)): tensor for tensor in _tensors_of(context)}
+    return work, memory_of(kept)
 
 
 def _measured(model: nn.Module, name: str, times: int, run: Callable[[], Any]) -> Work:
@@ -253,12 +262,15 @@ def _measured(model: nn.Module, name: str, times: int, run: Callable[[], Any]) -
     return Work(name, times, counter.get_total_flops(), memory.peak_bytes)
 
 
-def _kept(model: JointWorldModel) -> int:
-    """Keys and values of clean tokens, and of the text, in all layers."""
-    config, wan = model.config, model.config.wan
-    clean = config.tokens_per_latent + 2 * model.tokenizer.num_tokens
-    words, size = (0, 4) if wan is None else (wan.text_tokens, wan.dtype.itemsize)
-    return 2 * config.num_layers * config.num_heads * config.head_width * (clean + words) * size
+def _tensors_of(kept: object) -> list[Tensor]:
+    """Tensors of nested dataclasses and tuples."""
+    if isinstance(kept, Tensor):
+        return [kept]
+    if is_dataclass(kept):
+        return [tensor for part in vars(kept).values() for tensor in _tensors_of(part)]
+    if isinstance(kept, tuple):
+        return [tensor for part in kept for tensor in _tensors_of(part)]
+    return []
 
 
 def _training(model: JointWorldModel) -> int:
