@@ -4,7 +4,12 @@ from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
-from pydantic_settings import BaseSettings, CliImplicitFlag, PydanticBaseSettingsSource
+from pydantic_settings import (
+    BaseSettings,
+    CliImplicitFlag,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+)
 
 from dextouch.command_line import JSON_HELP
 from dextouch.frozen_model import FrozenModel
@@ -287,7 +292,11 @@ class TrainStateCommand(BaseSettings, StateTrainSettings):
       dextouch train state --episodes runs/episodes --output runs/state.safetensors
     """
 
-    model_config = service_config("world_model_train_state", "dextouch train state")
+    model_config = SettingsConfigDict(
+        **service_config("world_model_train_state", "dextouch train state"),
+        # One flag of `drawing` leaves its other defaults, which are not those of its class.
+        nested_model_default_partial_update=True,
+    )
 
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 

@@ -78,3 +78,8 @@ def test_the_default_preset_is_that_of_no_preset():
     assert load_settings(TrainCommand, ["--episodes", "s", "--preset", "tiny"]).network == (
         NetworkConfig()
     )
+
+
+def test_one_flag_of_a_group_leaves_the_other_defaults_of_the_command():
+    drawing = load_settings(TrainStateCommand, ["--episodes", "s", "--drawing.batch", "3"]).drawing
+    assert (drawing.batch, drawing.cpu_budget_s) == (3, 1400)
