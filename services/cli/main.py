@@ -50,6 +50,10 @@ COMMANDS = {
         "train the flow-matching world model, in the paper's form",
         "world_model.command_line:run_train",
     ),
+    "train distill": Command(
+        "train a world model in the paper's form to sample in few steps",
+        "world_model.command_line:run_distill",
+    ),
     "train adapt": Command(
         "adapt a world model in the paper's form to new tasks",
         "world_model.command_line:run_adapt",

@@ -13,6 +13,7 @@ from dextouch.serving import load_settings
 from dextouch.worlds import World, serve_worlds
 from services.networks.weight_files import digest_of
 from services.world_model.checkpoints import list_checkpoints, read_checkpoint, read_metadata
+from services.world_model.distillation_settings import DistillCommand
 from services.world_model.plan import plan_table
 from services.world_model.settings import (
     AdaptCommand,
@@ -42,6 +43,13 @@ def run_train(arguments: list[str]) -> int:
 def run_adapt(arguments: list[str]) -> int:
     """Adapt a checkpoint to new tasks; print the report and optionally write it to a file."""
     settings = load_settings(AdaptCommand, arguments)
+    network = read_checkpoint(settings.init).metadata.network
+    return _train(settings.training(network), settings.json_path)
+
+
+def run_distill(arguments: list[str]) -> int:
+    """Train a checkpoint to sample in few steps; print the report and optionally write it."""
+    settings = load_settings(DistillCommand, arguments)
     network = read_checkpoint(settings.init).metadata.network
     return _train(settings.training(network), settings.json_path)
 

@@ -171,10 +171,14 @@ class TrainSettings(RunSettings):
 
     init: Path | None = Field(
         default=None,
-        description="checkpoint to initialize from; its network settings must be equal",
+        description="checkpoint to initialize from; its network settings must be equal, except "
+        "those of sampling",
     )
     tokenizer: Path | None = Field(
         default=None, description="tactile tokenizer of `dextouch train tokenizer`, kept frozen"
+    )
+    self_forcing: CliImplicitFlag[bool] = Field(
+        default=False, description="train on own contexts and samples (see dextouch train distill)"
     )
     network: NetworkConfig = Field(default=NetworkConfig(), description="shape of the network")
 

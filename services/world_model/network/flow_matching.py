@@ -6,6 +6,7 @@ step of either solver returns the predicted x_0 exactly.
 """
 
 from collections.abc import Callable
+from itertools import islice, pairwise
 
 import torch
 from jaxtyping import Float32
@@ -41,6 +42,15 @@ def add_noise(
     return (1.0 - spread) * clean + spread * noise
 
 
+def implied_noise(
+    noisy: Float32[Tensor, "batch ..."],
+    clean: Float32[Tensor, "batch ..."],
+    t: Float32[Tensor, " batch"],
+) -> Float32[Tensor, "batch ..."]:
+    """The noise from which `noisy` is on the straight path to `clean`; t > 0."""
+    return clean + (noisy - clean) / t.view(-1, *[1] * (clean.ndim - 1))
+
+
 def velocity(
     clean: Float32[Tensor, "batch ..."], noise: Float32[Tensor, "batch ..."]
 ) -> Float32[Tensor, "batch ..."]:
@@ -57,6 +67,11 @@ def clean_from_velocity(
     return noisy - t.view(-1, *[1] * (noisy.ndim - 1)) * velocity
 
 
+def sampling_times(num_steps: int, shift: float) -> Float32[Tensor, " times"]:
+    """Times from 1 to 0 of a sampler with this many steps."""
+    return shift_time(torch.linspace(1.0, 0.0, num_steps + 1), shift)
+
+
 def sample(
     denoise: Denoiser,
     noise: tuple[Float32[Tensor, "batch ..."], Float32[Tensor, "batch ..."]],
@@ -64,6 +79,7 @@ def sample(
     num_steps: int,
     shift: float,
     sampler: Sampler = "euler",
+    stop_after: int | None = None,
 ) -> tuple[Float32[Tensor, "batch ..."], Float32[Tensor, "batch ..."]]:
     """Integrate from noise to data, for both streams at once.
 
@@ -73,13 +89,14 @@ def sample(
         num_steps: network calls, at least one; with one the sample is the first prediction.
         shift: shift of the time grid.
         sampler: solver, the same for both streams.
+        stop_after: steps to take of these, for noisy latents on the way; None for all.
     """
     if num_steps < 1:
         raise InvalidInputError(f"sampling: got {num_steps} steps, expected at least 1")
     video, tactile = noise
     of_video, of_tactile = SOLVERS[sampler](), SOLVERS[sampler]()
-    times = shift_time(torch.linspace(1.0, 0.0, num_steps + 1), shift)
-    for t, t_next in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
+    times = sampling_times(num_steps, shift).tolist()
+    for t, t_next in islice(pairwise(times), stop_after):
         guess_video, guess_tactile = denoise(
             video, tactile, torch.full((len(video),), t, device=video.device)
         )

@@ -293,10 +293,26 @@ class JointWorldModel(nn.Module):
             all_images: decode every image, or only those of the last latent.
             precision: of the experts' matrix products (autocast); codecs always use float32.
         """
+        inputs = inputs.to(self.device)
+        first, noise = self.first_latents(inputs), noise.to(self.device)
+        clean = self.sample(inputs, first, noise, sampling or Sampling(), precision=precision)
+        future = self.decode(first, clean, all_images=all_images)
+        touch = self.tokenizer.bounded(future.tactile_kpa, inputs.first_tactile_kpa)
+        return Prediction(future.images, touch)
+
+    @torch.no_grad()
+    def sample(
+        self,
+        inputs: ModelInputs,
+        first: FirstLatents,
+        noise: JointLatents,
+        sampling: Sampling,
+        *,
+        precision: Precision = "float32",
+        stop_after: int | None = None,
+    ) -> JointLatents:
+        """Sample clean latents, or noisy ones after some of the steps."""
         device = self.device
-        inputs = inputs.to(device)
-        first, noise = self.first_latents(inputs), noise.to(device)
-        sampling = sampling or Sampling()
         num_steps = sampling.num_steps or self.config.sampling_steps
         kept: Context | None = None
         if sampling.keep_context and num_steps > 1:
@@ -305,8 +321,12 @@ class JointWorldModel(nn.Module):
 
         def denoise(video: Tensor, tactile: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
             with products_in(precision, device.type):
-                context = self.context(inputs, first) if kept is None else kept
-                guess = self.denoise(context, JointLatents(video, tactile), t)
+                noisy = JointLatents(video, tactile)
+                # Weights that are sharded over processes are there in `forward` only.
+                if kept is None:
+                    guess = self(inputs, first, noisy, t)
+                else:
+                    guess = self.denoise(kept, noisy, t)
             found = guess.video.float(), guess.tactile.float()
             if self.config.prediction == "clean":
                 return found
@@ -321,10 +341,9 @@ class JointWorldModel(nn.Module):
             num_steps=num_steps,
             shift=self.config.sampling_time_shift,
             sampler=sampling.sampler or self.config.sampler,
+            stop_after=stop_after,
         )
-        future = self.decode(first, JointLatents(video, tactile), all_images=all_images)
-        touch = self.tokenizer.bounded(future.tactile_kpa, inputs.first_tactile_kpa)
-        return Prediction(future.images, touch)
+        return JointLatents(video, tactile)
 
     def decode(
         self, first: FirstLatents, clean: JointLatents, *, all_images: bool = True

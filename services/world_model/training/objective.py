@@ -10,7 +10,12 @@ from torch import Tensor
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import NUM_TIP_TAXELS
 from services.world_model.network.axes import split_axis
-from services.world_model.network.flow_matching import add_noise, training_times, velocity
+from services.world_model.network.flow_matching import (
+    add_noise,
+    implied_noise,
+    training_times,
+    velocity,
+)
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import (
     FirstLatents,
@@ -21,6 +26,7 @@ from services.world_model.network.model import (
 )
 from services.world_model.training.dataset import WindowBatch
 from services.world_model.training.distribution import ALONE, Processes
+from services.world_model.training.self_forcing import own_noisy
 
 TouchLoss = Literal["all", "contact_or_changing"]
 # A taxel that differs by this much from the step before is changing.
@@ -42,12 +48,14 @@ class LossOptions:
     `context_noise` is the relative deviation of noise on the first latents, which makes the model
     robust to starting from its own output. `touch_loss` says which tactile tokens count: all of
     them, so that the model also learns to predict the absence of contact, or only those in contact
-    or changing, as in the paper. `precision` is that of the experts' matrix products.
+    or changing, as in the paper. `precision` is that of the experts' matrix products. With
+    `own_noisy`, noisy latents are those that the model's own sampler reaches.
     """
 
     context_noise: float = 0.0
     touch_loss: TouchLoss = "all"
     precision: Precision = "float32"
+    own_noisy: bool = False
 
 
 def losses(
@@ -79,9 +87,16 @@ def losses(
         processes.randn(clean.video.shape, generator).to(device),
         processes.randn(clean.tactile.shape, generator).to(device),
     )
-    noisy = JointLatents(
-        add_noise(clean.video, noise.video, t), add_noise(clean.tactile, noise.tactile, t)
-    )
+    if options.own_noisy:
+        noisy, t = own_noisy(model, inputs, first, noise, generator)
+        noise = JointLatents(
+            implied_noise(noisy.video, clean.video, t),
+            implied_noise(noisy.tactile, clean.tactile, t),
+        )
+    else:
+        noisy = JointLatents(
+            add_noise(clean.video, noise.video, t), add_noise(clean.tactile, noise.tactile, t)
+        )
     target = clean
     if model.config.prediction == "velocity":
         target = JointLatents(

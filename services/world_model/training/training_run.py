@@ -42,6 +42,7 @@ from services.world_model.training.distribution import (
     whole_weights,
 )
 from services.world_model.training.objective import LossOptions, losses
+from services.world_model.training.self_forcing import own_context
 from services.world_model.training.streaming import read_batches
 from services.world_model.training.training_state import (
     TrainingState,
@@ -106,7 +107,7 @@ class TrainingRun:
         self._sampler = WindowSampler(
             episodes,
             self._rng,
-            max_steps=settings.network.max_steps,
+            max_steps=self._window_steps(settings.network.max_steps),
             commanded_fraction=windows.commanded_fraction,
             chained_fraction=windows.chained_fraction,
             human_share=settings.share_of_human,
@@ -156,8 +157,9 @@ class TrainingRun:
         Raises:
             ConflictError: the checkpoint has other network settings; they are named.
         """
-        requested = self.settings.network.model_dump()
-        there = checkpoint.metadata.network.model_dump()
+        sampling = {"sampling_steps", "sampler", "sampling_time_shift"}
+        requested = self.settings.network.model_dump(exclude=sampling)
+        there = checkpoint.metadata.network.model_dump(exclude=sampling)
         others = {
             name: (there[name], requested[name])
             for name in requested
@@ -245,12 +247,19 @@ class TrainingRun:
     def learn(self, batch: WindowBatch) -> tuple[float, float]:
         """One optimizer step; returns the video and tactile losses."""
         settings = self.settings.optimizer
+        if self.settings.self_forcing:
+            batch = own_context(
+                self.model, batch, generator=self._generator, processes=self.processes
+            )
         loss = losses(
             self.model,
             batch,
             generator=self._generator,
             options=LossOptions(
-                self.settings.windows.context_noise, settings.touch_loss, settings.precision
+                self.settings.windows.context_noise,
+                settings.touch_loss,
+                settings.precision,
+                own_noisy=self.settings.self_forcing,
             ),
             processes=self.processes,
         )
@@ -278,7 +287,12 @@ class TrainingRun:
     def places(self) -> Iterator[list[Place]]:
         """Endless iterator over the places of the windows of each step."""
         while True:
-            yield self._sampler.places(self.settings.optimizer.batch, self._num_steps())
+            num_steps = self._window_steps(self._num_steps())
+            yield self._sampler.places(self.settings.optimizer.batch, num_steps)
+
+    def _window_steps(self, num_steps: int) -> int:
+        """Steps of a window of one chunk, or of two for self-forcing."""
+        return 2 * num_steps - 1 if self.settings.self_forcing else num_steps
 
     def _num_steps(self) -> int:
         """Mostly the full window; sometimes 5, 9, … steps, since short chunks are served, too."""

@@ -22,8 +22,8 @@ station calibrate show, station calibrate wrist, station serve,
 store delete, store list, store migrate, store purge, store repair, store restore, store serve,
 store show, store verify,
 study report, study run,
-train adapt, train data, train direct-judge, train imagined, train policy, train probe, train state,
-train tokenizer, train world-model,
+train adapt, train data, train direct-judge, train distill, train imagined, train policy,
+train probe, train state, train tokenizer, train world-model,
 twin record, twin serve, up
 """
 NAMES = [" ".join(name.split()) for name in COMMANDS.split(",")]
