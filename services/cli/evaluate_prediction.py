@@ -15,9 +15,11 @@ from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import NotFoundError, UnknownNameError
 from services.cli.generate import refuse_trained_episodes
 from services.cli.training_data import comma_separated
+from services.cli.twin_geometry import TwinGeometry
 from services.evaluation.prediction import (
     ALL_TASKS,
     BASELINES,
+    GEOMETRY,
     METRICS,
     MODEL,
     PredictionResult,
@@ -59,6 +61,9 @@ def main(arguments: Sequence[str]) -> int:
     result["baselines"] = dict(BASELINES)
     for horizon in [options.horizon] if options.horizon else _HORIZONS:
         scenes = [scene for one in wanted for scene in _HORIZONS[horizon](store.open(one))]
+        if set(options.metrics) & set(GEOMETRY):
+            geometry = TwinGeometry()
+            scenes = [geometry.added_to(one, store.open(one.episode_id)) for one in scenes]
         found = measure_prediction(world, scenes, metrics=options.metrics)
         result[horizon] = dict(found.by_task)
         result[f"num_{horizon}"] = found.num_scenes

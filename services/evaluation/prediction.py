@@ -14,6 +14,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.worlds import World
+from services.evaluation import scene_geometry
 from services.evaluation.prediction_scenes import (
     CHUNK_STEPS,
     Future,
@@ -40,6 +41,7 @@ BASELINES: Final = {
     "other_take": "the model, given the actions of another take of the task at the same step",
     "hold": "the model, given actions in which nothing moves",
     "hands_still": "the model, given actions in which only the head moves",
+    "true_images": "the true images, measured in the same way: the error of the measurement",
 }
 
 
@@ -52,7 +54,7 @@ class Metric:
     unit: str
     better: Literal["higher", "lower"]
     about: str
-    of: Literal["images", "touch"]
+    of: Literal["images", "touch", "geometry"]
     measure: Callable[[Pairs], float]
 
 
@@ -81,6 +83,17 @@ def _of_touch(function: Callable[..., float]) -> Callable[[Pairs], float]:
     return measure
 
 
+def _of_geometry(function: Callable[..., float]) -> Callable[[Pairs], float]:
+    """Over the scenes whose true geometry is known."""
+
+    def measure(pairs: Pairs) -> float:
+        return function(
+            [(one.geometry, future.images) for one, future in pairs if one.geometry is not None]
+        )
+
+    return measure
+
+
 _PEAK = f"{tactile_metrics.PEAK_KPA:g} kPa"
 METRICS: Final = {
     metric.name: metric
@@ -102,6 +115,26 @@ METRICS: Final = {
             "structural similarity, Gaussian window of 11 px, mean over images; 1 for equal ones",
             "images",
             _of_images(image_metrics.ssim),
+        ),
+        Metric(
+            "trajectory_accuracy",
+            "Trajectory Accuracy",
+            "",
+            "higher",
+            "nDTW of the hands and objects that move by 2 px or more, found by their colours, with "
+            "a tolerance of 5 % of the image's width; 1 for equal trajectories",
+            "geometry",
+            _of_geometry(scene_geometry.trajectory_accuracy),
+        ),
+        Metric(
+            "geometry_error",
+            "Geometry Error",
+            "",
+            "lower",
+            "AbsRel of the depth of what each pixel shows, found by colour, after alignment of the "
+            "scale",
+            "geometry",
+            _of_geometry(scene_geometry.geometry_error),
         ),
         Metric(
             "tactile_psnr",
@@ -168,6 +201,7 @@ METRICS: Final = {
         ),
     )
 }
+GEOMETRY: Final = tuple(name for name, metric in METRICS.items() if metric.of == "geometry")
 Figures = dict[str, dict[str, float | None]]
 
 
@@ -242,6 +276,7 @@ def _futures(world: World[Any], scene: Scene, scenes: Sequence[Scene]) -> dict[s
         "other_take": None if other is None else imagine(world, scene, other.actions[:num_steps]),
         "hold": imagine(world, scene, standing_still(scene, head_moves=False)),
         "hands_still": imagine(world, scene, standing_still(scene, head_moves=True)),
+        "true_images": scene.truth,
     }
 
 
@@ -256,6 +291,7 @@ def _figures(
         absent = source == ("warp" if metric.of == "touch" else "zero")
         if metric.of == "touch" and source not in ("copy", "zero"):
             absent = absent or not world.description.predicts_touch
+        absent = absent or (source == "true_images" and metric.of != "geometry")
         value = float("nan") if absent or not mine else metric.measure(mine)
         figures[name] = value if np.isfinite(value) else None
     return figures

@@ -1,7 +1,7 @@
 """Recorded futures that predictions of a world are compared with, and baselines of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from dextouch.hands.actions import CAMERA_HEAD, AnchorPoses, poses_from_actions
 from dextouch.schemas import ActionKind, Observation, ReturnSelector, RolloutStart
 from dextouch.worlds import ReconstructingWorld, World
 from services.evaluation.camera_warp import warp_over_table
+from services.evaluation.scene_geometry import SceneGeometry
 
 CAMERA: Final = "camera_head"
 CHUNK_STEPS: Final = 16
@@ -35,14 +36,18 @@ class Future:
 
 @dataclass(frozen=True)
 class Scene:
-    """Start at a step of an episode, its actions from there, and the true future."""
+    """Start at a step of an episode, its actions from there, and the true future.
+
+    `geometry` is that of the true images, if it is known.
+    """
 
     episode_id: str
     start: RolloutStart
     actions: Float64[np.ndarray, "steps 67"]
     truth: Future
     model_rate_hz: float
-    first_step: int = field(default=0)
+    first_step: int = 0
+    geometry: SceneGeometry | None = None
 
     @property
     def first(self) -> Observation:

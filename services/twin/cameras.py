@@ -9,7 +9,7 @@ from typing import Final
 
 import mujoco
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64, Int64, UInt8
 
 from dextouch.geometry import pinhole_matrix, transform, transform_from_pose
 from services.twin.scene import Scene
@@ -23,7 +23,7 @@ FOVY_RAD: Final = {
 }
 _TO_LIGHT: Final = np.array([0.30, -0.40, 0.85]) / np.linalg.norm([0.30, -0.40, 0.85])
 _AMBIENT: Final = 0.35
-_BACKGROUND: Final = np.array([0.16, 0.17, 0.20])
+BACKGROUND: Final = np.array([0.16, 0.17, 0.20])
 _CHECKER_M: Final = 0.08
 _CHECKER_DEPTH: Final = 0.14
 _FAR_M: Final = 4.0
@@ -78,6 +78,10 @@ class CameraRig:
         rays = pixels @ np.linalg.inv(K).T
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
+    def rays(self, camera: str) -> Float64[np.ndarray, "rays 3"]:
+        """Unit rays of a camera's pixel centres, row by row, in its optical frame."""
+        return self._rays[camera]
+
     def pose(self, simulation: Simulation, camera: str) -> Float64[np.ndarray, "4 4"]:
         """T_world_camera (optical frame) of one camera now."""
         if camera == "camera_head":
@@ -87,6 +91,23 @@ class CameraRig:
 
     def image(self, simulation: Simulation, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         """Render one camera; derived quantities of the simulation must be current."""
+        eye_m, rays_world = self._cast(simulation, camera)
+        return self._shaded(eye_m, rays_world).reshape(*self.shape_px, 3)
+
+    def cast(
+        self, simulation: Simulation, camera: str
+    ) -> tuple[Int64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
+        """Geom that each pixel shows, -1 for none, and its depth along the optical axis (m)."""
+        self._cast(simulation, camera)
+        hit = self._geom_ids >= 0
+        depth_m = np.where(hit, self._distances * self._rays[camera][:, 2], np.inf)
+        shape = self.shape_px
+        return self._geom_ids.astype(np.int64).reshape(shape), depth_m.reshape(shape)
+
+    def _cast(
+        self, simulation: Simulation, camera: str
+    ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "rays 3"]]:
+        """Cast the rays of a camera; returns its position and the rays in the world."""
         T_world_camera = self.pose(simulation, camera)
         rays_world = np.ascontiguousarray(self._rays[camera] @ T_world_camera[:3, :3].T)
         eye_m = np.ascontiguousarray(T_world_camera[:3, 3])
@@ -104,7 +125,7 @@ class CameraRig:
             len(rays_world),
             _FAR_M,
         )
-        return self._shaded(eye_m, rays_world).reshape(*self.shape_px, 3)
+        return eye_m, rays_world
 
     def _shaded(self, eye_m: np.ndarray, rays_world: np.ndarray) -> UInt8[np.ndarray, "rays 3"]:
         hit = self._geom_ids >= 0
@@ -115,6 +136,6 @@ class CameraRig:
         cells = np.floor(points / _CHECKER_M).sum(axis=1) % 2
         brightness[on_table] *= 1 - _CHECKER_DEPTH * cells
         rgb = np.where(
-            hit[:, None], self._colours[self._geom_ids] * brightness[:, None], _BACKGROUND
+            hit[:, None], self._colours[self._geom_ids] * brightness[:, None], BACKGROUND
         )
         return (np.clip(rgb, 0.0, 1.0) * 255).round().astype(np.uint8)

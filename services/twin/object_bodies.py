@@ -133,6 +133,17 @@ class ObjectBodies:
             poses[~self.is_free, 3:] = data.xquat[fixed]
         return poses
 
+    def show(
+        self, data: mujoco.MjData, Ts_world_object: Float64[np.ndarray, "objects 4 4"]
+    ) -> None:
+        """Move the geoms of every object to its pose, for rendering; joints are not set."""
+        geoms = np.flatnonzero(np.isin(self._model.geom_bodyid, self.ids))
+        owners = self.of_body[self._model.geom_bodyid[geoms]]
+        local = np.column_stack([self._model.geom_pos[geoms], self._model.geom_quat[geoms]])
+        Ts = Ts_world_object[owners] @ transform_from_pose(local)
+        data.geom_xpos[geoms] = Ts[:, :3, 3]
+        data.geom_xmat[geoms] = Ts[:, :3, :3].reshape(-1, 9)
+
     def speeds(self, data: mujoco.MjData) -> Float64[np.ndarray, " objects"]:
         """Maximum speed component (m/s or rad/s) of a free body, or of the joints below it."""
         return np.array([np.abs(data.qvel[dofs]).max(initial=0.0) for dofs in self._speed_dofs])

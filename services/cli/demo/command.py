@@ -26,6 +26,7 @@ from services.cli.demo import recording, scoring
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan, parse
 from services.cli.servers import served
 from services.cli.study.command import refuse_trained
+from services.cli.twin_geometry import TwinGeometry
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.command_line import print_scores
@@ -116,7 +117,8 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
             taken = _take(original, folder / "spool", seed, urls, stages)
             takes[original.attributes.domain] = taken
         with stages.stage("predict", "predicting held-out scenes with the world model"):
-            scenes = [read_rollout(truths.open(episode_id)) for episode_id in demonstrations]
+            geometry, readers = TwinGeometry(), map(truths.open, demonstrations)
+            scenes = [geometry.added_to(read_rollout(reader), reader) for reader in readers]
             prediction = measure_prediction(models.world_model, scenes)
         with stages.stage("judge", "scoring policies in the twin and in the world model"):
             policies = {**scoring.ladder(plan), "behaviour cloning": models.policy}

@@ -147,7 +147,7 @@ def read_scene_episode(reader: EpisodeReader) -> SceneEpisode:
         anchor=np.stack(window.anchor.as_tuple()),
         K_head=window.K_head,
         tactile_kpa=window.tactile_kpa.astype(np.float16),
-        object_poses=_object_poses(reader, window.t_ref_ns),
+        object_poses=poses_at(reader, window.t_ref_ns),
         images=images,
         image_steps=image_steps,
         content_sha256=reader.content_sha256,
@@ -162,9 +162,7 @@ def _images(reader: EpisodeReader) -> tuple[np.ndarray, np.ndarray]:
     return reader.images(CAMERA)[images], steps
 
 
-def _object_poses(
-    reader: EpisodeReader, grid_ns: np.ndarray
-) -> Float32[np.ndarray, "steps objects 7"]:
+def poses_at(reader: EpisodeReader, grid_ns: np.ndarray) -> Float32[np.ndarray, "steps objects 7"]:
     """Poses at the grid steps, interpolated between the neighbouring samples."""
     data = reader.read("object_poses")
     if np.array_equal(data.t_ref_ns, grid_ns):
