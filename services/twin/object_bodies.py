@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert, pose_from_transform, transform_from_pose
+from dextouch.geometry.rotations import vector_from_rotation
 
 _FREE: Final = int(mujoco.mjtJoint.mjJNT_FREE)
 _SINGLE: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
@@ -40,7 +41,7 @@ class ObjectBodies:
             [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in names],
             dtype=np.int64,
         )
-        chains = [self._chain(int(body)) for body in self.ids]
+        self._chains = chains = [self._chain(int(body)) for body in self.ids]
         self.is_free: Bool[np.ndarray, " objects"] = np.array(
             [self._is_free(*pair) for pair in zip(names, chains, strict=True)], dtype=bool
         )
@@ -133,16 +134,35 @@ class ObjectBodies:
             poses[~self.is_free, 3:] = data.xquat[fixed]
         return poses
 
-    def show(
-        self, data: mujoco.MjData, Ts_world_object: Float64[np.ndarray, "objects 4 4"]
-    ) -> None:
-        """Move the geoms of every object to its pose, for rendering; joints are not set."""
-        geoms = np.flatnonzero(np.isin(self._model.geom_bodyid, self.ids))
-        owners = self.of_body[self._model.geom_bodyid[geoms]]
-        local = np.column_stack([self._model.geom_pos[geoms], self._model.geom_quat[geoms]])
-        Ts = Ts_world_object[owners] @ transform_from_pose(local)
-        data.geom_xpos[geoms] = Ts[:, :3, 3]
-        data.geom_xmat[geoms] = Ts[:, :3, :3].reshape(-1, 9)
+    def restore(self, data: mujoco.MjData, poses: Float64[np.ndarray, "objects 7"]) -> None:
+        """Set the pose of every object, with joints where they must be for it.
+
+        Raises:
+            InvalidInputError: an object on several joints, or on a body that is no object itself.
+        """
+        data.qpos[self._free_qpos] = poses[self.is_free]
+        Ts = transform_from_pose(poses)
+        roots: dict[int, np.ndarray] = {}
+        for index in np.flatnonzero(~self.is_free):
+            if len(self._chains[index]) == 1:
+                row = self._mocap_rows[index]
+                roots[row] = Ts[index]
+                data.mocap_pos[row], data.mocap_quat[row] = poses[index, :3], poses[index, 3:]
+        for index in np.flatnonzero(~self.is_free):
+            chain, row = self._chains[index], self._mocap_rows[index]
+            joints = [int(self._model.body_jntadr[b]) for b in chain if self._model.body_jntnum[b]]
+            if len(chain) == 1 or (not joints and row in roots):
+                continue
+            if len(joints) != 1 or row not in roots:
+                raise InvalidInputError(
+                    f"twin: cannot restore object {self._names[index]!r} from its pose, expected "
+                    "one joint to a body that is an object, too"
+                )
+            T_rest_now = invert(roots[row] @ self._Ts_root_object[index]) @ Ts[index]
+            moved = vector_from_rotation(T_rest_now[:3, :3])
+            if self._model.jnt_type[joints[0]] == int(mujoco.mjtJoint.mjJNT_SLIDE):
+                moved = T_rest_now[:3, 3]
+            data.qpos[self._model.jnt_qposadr[joints[0]]] = moved @ self._model.jnt_axis[joints[0]]
 
     def speeds(self, data: mujoco.MjData) -> Float64[np.ndarray, " objects"]:
         """Maximum speed component (m/s or rad/s) of a free body, or of the joints below it."""

@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from dextouch.geometry import transform_from_pose
 from dextouch.hands.actions import HandTrajectory
 from services.twin.cameras import BACKGROUND
 from services.twin.stage import Stage, command_row
@@ -63,7 +62,7 @@ class SceneViews:
             step: row of both.
         """
         simulation = self.stage.simulation
-        simulation.pose(command_row(poses, step), transform_from_pose(object_poses[step]))
+        simulation.pose(command_row(poses, step), object_poses[step])
         geoms, depth_m = self.stage.rig.cast(simulation, "camera_head")
         labels = np.where(geoms >= 0, self._labels[geoms], BACKGROUND_LABEL)
         return View(labels, depth_m)

@@ -64,15 +64,12 @@ class Simulation:
         self.step_index = 0
         self._sense()
 
-    def pose(self, command: Command, Ts_world_object: Float64[np.ndarray, "objects 4 4"]) -> None:
-        """Show hands, head camera and objects in given poses, without physics.
-
-        Only rendering may follow: velocities, joints of objects and contacts are not set.
-        """
+    def pose(self, command: Command, object_poses: Float64[np.ndarray, "objects 7"]) -> None:
+        """Set hands, head camera and objects to given poses, without physics, for rendering."""
         self._apply(pose_from_transform(command.Ts_world_x), command.joints_rad)
         self._place_hands(command)
+        self._bodies.restore(self.data, object_poses)
         mujoco.mj_kinematics(self.scene.model, self.data)
-        self._bodies.show(self.data, Ts_world_object)
 
     def _place_hands(self, command: Command) -> None:
         self.data.qpos[self.scene.wrist_qpos] = pose_from_transform(command.Ts_world_x[:2])

@@ -65,9 +65,8 @@ class MjModel:
     body_rootid: np.ndarray
     geom_bodyid: np.ndarray
     geom_dataid: np.ndarray
-    geom_pos: np.ndarray
-    geom_quat: np.ndarray
     geom_rgba: np.ndarray
+    jnt_axis: np.ndarray
     geom_size: np.ndarray
     geom_type: np.ndarray
     jnt_dofadr: np.ndarray
