@@ -90,13 +90,13 @@ class Plan:
 class PeakMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Largest sum of the tensors made inside the context and alive at one time, in bytes."""
 
-    def __init__(self, weights: Iterable[Tensor]) -> None:
+    def __init__(self, given: Iterable[Tensor]) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self.peak_bytes = 0
         self._now_bytes = 0
         # Views share the storage of their tensor. Held, since storages are known by identity.
-        self._weights = [tensor.untyped_storage() for tensor in weights]
-        self._alive = weakref.WeakSet(self._weights)
+        self._given = [tensor.untyped_storage() for tensor in given]
+        self._alive = weakref.WeakSet(self._given)
 
     def __torch_dispatch__(
         self,
@@ -250,14 +250,15 @@ def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int
         ),
         "decode all images": (1, lambda: model.decode(first, noisy)),
     }
-    work = tuple(_measured(model, name, *job) for name, job in jobs.items())
     kept = {str(id(tensor)): tensor for tensor in _tensors_of(context)}
+    given = [*model.parameters(), *model.buffers(), *kept.values()]
+    work = tuple(_measured(given, name, *job) for name, job in jobs.items())
     return work, memory_of(kept)
 
 
-def _measured(model: nn.Module, name: str, times: int, run: Callable[[], Any]) -> Work:
-    weights = [*model.parameters(), *model.buffers()]
-    with PeakMemory(weights) as memory, FlopCounterMode(display=False) as counter:
+def _measured(given: Iterable[Tensor], name: str, times: int, run: Callable[[], Any]) -> Work:
+    """FLOPs and new memory of a computation on tensors that are given."""
+    with PeakMemory(given) as memory, FlopCounterMode(display=False) as counter:
         run()
     return Work(name, times, counter.get_total_flops(), memory.peak_bytes)
 
@@ -268,6 +269,8 @@ def _tensors_of(kept: object) -> list[Tensor]:
         return [kept]
     if is_dataclass(kept):
         return [tensor for part in vars(kept).values() for tensor in _tensors_of(part)]
+    if isinstance(kept, dict):
+        kept = tuple(kept.values())
     if isinstance(kept, tuple):
         return [tensor for part in kept for tensor in _tensors_of(part)]
     return []

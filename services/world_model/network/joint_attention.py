@@ -5,7 +5,9 @@ network; only the attention is shared, over the tokens of both.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Float32
@@ -20,6 +22,32 @@ NUM_MODULATIONS = 6
 
 
 @dataclass(frozen=True)
+class KeysValues:
+    """Keys and values of tokens in one layer."""
+
+    keys: Float[Tensor, "batch heads tokens head_width"]
+    values: Float[Tensor, "batch heads tokens head_width"]
+
+
+@dataclass(frozen=True)
+class Text:
+    """Embedded words that video tokens attend to; `kept` has their keys and values by layer.
+
+    The words do not depend on the flow time, so that the steps of a sampler can share one object.
+    """
+
+    words: Float[Tensor, "batch words width"]
+    kept: dict[int, KeysValues] = field(default_factory=dict)
+
+    def keys_values(self, layer: nn.Module, compute: Callable[[Tensor], KeysValues]) -> KeysValues:
+        """Keys and values of the words in a layer, computed at most once."""
+        number = id(layer)
+        if number not in self.kept:
+            self.kept[number] = compute(self.words)
+        return self.kept[number]
+
+
+@dataclass(frozen=True)
 class Stream:
     """Tokens of one expert with their modulation: shift, scale and gate, twice.
 
@@ -31,7 +59,7 @@ class Stream:
     tokens: Float[Tensor, "batch tokens width"]
     modulation: Float[Tensor, "batch groups 6 width"]
     turn: Float32[Tensor, "tokens angles"] | None = None
-    text: Float[Tensor, "batch words width"] | None = None
+    text: Text | None = None
     actions: Float[Tensor, "batch parts keys width"] | None = None
 
     def split(self, num_tokens: int) -> tuple["Stream", "Stream"]:
@@ -42,7 +70,7 @@ class Stream:
             first = num_tokens * values.shape[axis] // total
             return list(torch.split(values, [first, values.shape[axis] - first], dim=axis))
 
-        parts = {
+        parts: dict[str, Any] = {
             name: cut(values, 0 if name == "turn" else 1)
             for name in ("tokens", "modulation", "turn", "actions")
             if (values := getattr(self, name)) is not None
@@ -51,14 +79,6 @@ class Stream:
             replace(self, **{name: both[index] for name, both in parts.items()}) for index in (0, 1)
         )
         return first, others
-
-
-@dataclass(frozen=True)
-class KeysValues:
-    """Keys and values of the tokens of both streams in one layer."""
-
-    keys: Float[Tensor, "batch heads tokens head_width"]
-    values: Float[Tensor, "batch heads tokens head_width"]
 
 
 def clean_mask(

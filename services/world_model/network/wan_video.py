@@ -27,7 +27,9 @@ from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.joint_attention import (
     NUM_MODULATIONS,
     Block,
+    KeysValues,
     Stream,
+    Text,
     zero_linear,
 )
 from services.world_model.network.rotary import angles, rotate, video_positions
@@ -44,7 +46,7 @@ class WanCondition:
 
     time: Float32[Tensor, "batch latents width"]
     modulation: Float32[Tensor, "batch latents 6 width"]
-    text: Float[Tensor, "batch words width"]
+    text: Text
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class WanConstants:
     """What conditions consist of apart from the flow time."""
 
     actions: Float32[Tensor, "batch latents width"]
-    text: Float[Tensor, "batch words width"]
+    text: Text
 
 
 class WanVideoCondition(nn.Module):
@@ -94,7 +96,7 @@ class WanVideoCondition(nn.Module):
 
     def _constants(self, actions: Tensor, text: Tensor) -> WanConstants:
         weight = self.embedder.time_proj.weight
-        return WanConstants(actions, self.embedder.text_embedder(text.to(weight)))
+        return WanConstants(actions, Text(self.embedder.text_embedder(text.to(weight))))
 
     def at(self, constants: WanConstants, t: Float32[Tensor, "batch latents"]) -> WanCondition:
         """Conditions at these times."""
@@ -141,10 +143,30 @@ class WanBlock(Block):
         _, _, gate, ffn_shift, ffn_scale, ffn_gate = self._modulation(stream)
         tokens = self._gated(stream.tokens, block.attn1.to_out[0](attended), gate)
         normed = block.norm2(tokens.float()).to(tokens.dtype)
-        tokens = tokens + block.attn2(normed, stream.text)
+        if stream.text is not None:
+            tokens = tokens + self._read(normed, stream.text)
         normed = self._modulated(block.norm3, tokens, ffn_shift, ffn_scale)
         tokens = self._gated(tokens, block.ffn(normed), ffn_gate)
         return replace(stream, tokens=tokens)
+
+    def _read(self, tokens: Tensor, text: Text) -> Tensor:
+        """What tokens take from the text by cross-attention."""
+        attention = self.block.attn2
+        heads = (attention.heads, -1)
+
+        def keys_values(words: Tensor) -> KeysValues:
+            words = words.to(tokens.dtype)
+            key, value = attention.norm_k(attention.to_k(words)), attention.to_v(words)
+            return KeysValues(
+                split_axis(key, -1, heads).transpose(1, 2),
+                split_axis(value, -1, heads).transpose(1, 2),
+            )
+
+        known = text.keys_values(self, keys_values)
+        query = split_axis(attention.norm_q(attention.to_q(tokens)), -1, heads).transpose(1, 2)
+        read = functional.scaled_dot_product_attention(query, known.keys, known.values)
+        out: Tensor = attention.to_out[0](read.transpose(1, 2).flatten(2))
+        return out
 
     def _modulation(self, stream: Stream) -> tuple[Tensor, ...]:
         """Shift, scale and gate of each latent frame, twice."""
@@ -191,7 +213,7 @@ class WanVideoExpert(nn.Module):
             embedded.flatten(1, 2),
             condition.modulation,
             turn=angles(positions, self._head_width).to(noisy.device),
-            text=condition.text.to(weight.dtype),
+            text=condition.text,
         )
 
     def finish(

@@ -1,11 +1,12 @@
 """The full-size video expert equals the transformer of diffusers, and its codec the autoencoder."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
 
-from services.world_model.network.joint_attention import JointLayer, Stream
+from services.world_model.network.joint_attention import JointLayer, Stream, Text
 from services.world_model.network.rotary import angles, rotate, tactile_positions, video_positions
 from services.world_model.network.tactile_expert import TactileExpert
 from services.world_model.network.wan_codec import WanVideoCodec
@@ -168,3 +169,17 @@ def test_a_stream_without_positions_is_not_turned(full_config, transformer, late
         block.queries_keys_values(plain), block.queries_keys_values(turned), strict=True
     ):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-6)
+
+
+def test_the_keys_of_a_text_are_computed_once_for_all_steps(transformer):
+    block = WanBlock(transformer.blocks[0])
+    tokens = torch.randn(2, 12, 24, generator=torch.Generator().manual_seed(8))
+    words = Text(torch.randn(2, 12, 24, generator=torch.Generator().manual_seed(9)))
+    stream = Stream(tokens, torch.zeros(2, 3, 6, 24), text=words)
+    with torch.no_grad():
+        first = block.finish(stream, tokens)
+        again = block.finish(stream, tokens)
+        fresh = block.finish(replace(stream, text=Text(words.words)), tokens)
+    assert len(words.kept) == 1
+    assert torch.equal(first.tokens, again.tokens)
+    assert torch.equal(first.tokens, fresh.tokens)
