@@ -38,7 +38,7 @@ class Sizes(FrozenModel):
         default=(1, 5, 10), description="human episodes, as multiples of the robot episodes"
     )
     heldout_per_task: int = Field(default=6, ge=1, description="held-out episodes per task")
-    downstream_per_task: int = Field(default=75, ge=3, description="robot episodes per task")
+    downstream_per_task: int = Field(default=84, ge=3, description="robot episodes per task")
     adapt_robot: int = Field(default=200, ge=1, description="robot episodes of WM-Robot")
     adapt_half: int = Field(default=100, ge=1, description="robot and human episodes of WM-Mix")
     tokenizer_cpu_s: int = Field(default=60, ge=1, description="training of a tokenizer")
@@ -55,15 +55,20 @@ class Sizes(FrozenModel):
 
     @property
     def human_per_task(self) -> int:
-        """Human episodes per task, for the largest multiple."""
-        return -(-max(self.multiples) * self.num_robot // len(HUMAN_PRETRAINING))
+        """Human episodes per task, for the largest multiple and some that alignment refuses."""
+        return 2 + max(self.multiples) * self.num_robot // len(HUMAN_PRETRAINING)
+
+    @property
+    def downstream_human_per_task(self) -> int:
+        """Human episodes per task of which two thirds of the scenes give `adapt_half`."""
+        return 3 + 2 * self.adapt_half // len(DOWNSTREAM)
 
 
 QUICK: Final = Sizes(
     robot_per_task=8,
     multiples=(1,),
     heldout_per_task=1,
-    downstream_per_task=6,
+    downstream_per_task=16,
     adapt_robot=8,
     adapt_half=4,
     tokenizer_cpu_s=3,
@@ -131,7 +136,7 @@ class Experiments:
         )
         downstream = ("--tasks", "downstream")
         yield _data_step("data/downstream", sizes.downstream_per_task, downstream)
-        per_task = -(-sizes.adapt_half // len(DOWNSTREAM))
+        per_task = sizes.downstream_human_per_task
         yield _data_step("data/downstream-human", per_task, (*downstream, *human))
         yield _data_step(
             "data/downstream-heldout", sizes.heldout_per_task, downstream, FIRST_HELDOUT_SEED

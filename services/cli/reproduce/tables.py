@@ -44,6 +44,13 @@ METRICS: Final = (
     ("Contact-F1", "contact_f1", True),
 )
 
+TOKENIZER_METRICS: Final = (
+    ("mse_kpa2", "MSE (kPa²)", False),
+    ("mae_kpa", "MAE (kPa)", False),
+    ("contact_iou", "Contact-IoU", True),
+    ("contact_f1", "Contact-F1", True),
+)
+
 
 @dataclass(frozen=True)
 class Measured:
@@ -152,19 +159,19 @@ def make_pages(folder: Path, experiments: Experiments, table: Table) -> list[Pag
 def _tokenizer_pages(folder: Path, experiments: Experiments) -> list[Page]:
     results = {
         column: [
-            read_json(folder / f"tokenizer/{kind}/seed-{seed}/result.json")["metrics"]
+            read_json(folder / f"tokenizer/{kind}/seed-{seed}/result.json")["curve"][-1]
             for seed in experiments.seeds
         ]
         for column, kind in TOKENIZERS.items()
     }
-    names = list(next(iter(results.values()))[0])
     rows = [
         Row(
             name,
-            {c: Measured(tuple(float(one[name]) for one in r)) for c, r in results.items()},
+            {c: Measured(tuple(float(one[key]) for one in r)) for c, r in results.items()},
             {},
+            higher,
         )
-        for name in names
+        for key, name, higher in TOKENIZER_METRICS
     ]
     return [Page("Tactile tokenizers (held-out touch)", tuple(rows), "Grid")]
 

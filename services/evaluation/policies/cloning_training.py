@@ -47,6 +47,8 @@ from services.networks.training_settings import (
 # Batch size of the held-out evaluation.
 _TESTED_AT_ONCE = 128
 MOMENTS_AN_EPISODE = 3
+# Chunks that vary less (in squared deviations of their principal axes) teach nothing.
+MIN_VARIANCE = 1e-9
 # Large weights stored as float16 to keep files below a megabyte.
 _KEPT_AS_HALF = ("codec.basis", "head.0.weight", "head.2.weight")
 
@@ -218,6 +220,11 @@ def train_cloned_policy(
 
     wanted = network.codec.encode(learned.chunks, learned.task, learned.slot)
     variance = wanted.var(0).sum()
+    if not variance > MIN_VARIANCE:
+        raise InvalidInputError(
+            f"behaviour cloning: the {len(learned.firsts)} demonstrations of {len(tasks)} tasks do "
+            "not differ, expected several of each task; record more"
+        )
 
     def loss(generator: torch.Generator) -> torch.Tensor:
         index = learned.drawn(settings.batch_size, generator)

@@ -214,3 +214,11 @@ def test_spatial_softmax_finds_the_peak():
     maps[0, 1, 4, 4] = 50.0
     places = SpatialSoftmax()(maps)
     torch.testing.assert_close(places, torch.tensor([[1.0, 0.0, -1.0, 0.0]]), atol=1e-4, rtol=0)
+
+
+def test_demonstrations_that_are_all_alike_teach_nothing():
+    one = episodes(range(1))[0]
+    alike = [toy.replace(one, seed=seed, episode_id=f"e{seed}") for seed in range(40)]
+    settings = CloningSettings(num_training_steps=2)
+    with pytest.raises(InvalidInputError, match="do not differ, expected several of each task"):
+        train_cloned_policy(alike, settings, command="")
