@@ -97,10 +97,19 @@ class Processes:
         """Keep only this process's share of every learned weight, gathered layer by layer.
 
         Frozen weights and statistics stay whole, since they are used outside of `forward`.
+
+        Raises:
+            InvalidInputError: learned weights of several precisions.
         """
         if self.mesh is None:
             return
         frozen = {weight for weight in model.parameters() if not weight.requires_grad}
+        kinds = {str(weight.dtype) for weight in model.parameters() if weight.requires_grad}
+        if len(kinds) > 1:
+            raise InvalidInputError(
+                f"training: got learned weights of {', '.join(sorted(kinds))} in {self.count} "
+                "processes, expected one precision; use --network.wan.precision float32"
+            )
         for module in (*layers, model):
             fully_shard(module, mesh=self.mesh, ignored_params=frozen)
 

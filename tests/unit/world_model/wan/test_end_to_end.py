@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from httpx import ASGITransport, AsyncClient
+from torch.distributed.device_mesh import DeviceMesh
 
 from dextouch.errors import InvalidInputError, UnavailableError
 from dextouch.schemas import StartRequest, decode_answer, encode_start
@@ -12,6 +13,7 @@ from dextouch.worlds import create_world_app
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.command_line import open_worlds, run_show, run_train
 from services.world_model.placement import Placement
+from services.world_model.pretrained_video import initial_model
 from services.world_model.settings import (
     OptimizerSettings,
     TrainCommand,
@@ -19,6 +21,7 @@ from services.world_model.settings import (
     WindowSettings,
     WorldModelSettings,
 )
+from services.world_model.training.distribution import Processes
 from services.world_model.training.trainer import TrainingRun, train_on
 from services.world_model.wan.configuration import WanFiles
 from tests.unit.world_model.test_world import make_start
@@ -163,3 +166,12 @@ def test_a_device_that_is_not_here_is_named(settings, large_episode):
     elsewhere = settings.model_copy(update={"device": "cuda:99"})
     with pytest.raises(UnavailableError, match="cuda:99"):
         TrainingRun([large_episode(0)], elsewhere)
+
+
+def test_sharded_weights_have_one_precision(full_config, pretrained_folder):
+    wan = full_config.wan.model_copy(update={"precision": "bfloat16"})
+    files = WanFiles(folder=pretrained_folder)
+    model = initial_model(full_config.model_copy(update={"wan": wan}), files)
+    mesh = DeviceMesh.__new__(DeviceMesh)
+    with pytest.raises(InvalidInputError, match=r"bfloat16, torch\.float32 in 2 processes"):
+        Processes(0, 2, mesh).shard(model, model.layers)
