@@ -19,6 +19,7 @@ from services.cli.twin_geometry import TwinGeometry
 from services.evaluation.prediction import (
     ALL_TASKS,
     BASELINES,
+    DEFAULT_BASELINES,
     GEOMETRY,
     METRICS,
     MODEL,
@@ -45,9 +46,12 @@ def main(arguments: Sequence[str]) -> int:
     from services.world_model.checkpoints import default_checkpoint
     from services.world_model.world import open_world
 
-    unknown = set(options.metrics) - set(METRICS)
-    if unknown:
-        raise UnknownNameError("metric", sorted(unknown)[0], list(METRICS))
+    for kind, names, known in (
+        ("metric", options.metrics, METRICS),
+        ("baseline", options.baselines, BASELINES),
+    ):
+        if unknown := sorted(set(names) - set(known)):
+            raise UnknownNameError(kind, unknown[0], list(known))
     store, path = EpisodeStore(options.episodes), options.checkpoint or default_checkpoint()
     world = open_world(path, sampling_steps=options.sampling_steps, needs_touch=False)
     wanted = _episodes(store, options.tasks, world.description.tasks)
@@ -58,13 +62,15 @@ def main(arguments: Sequence[str]) -> int:
         for name, one in METRICS.items()
         if name in options.metrics
     }
-    result["baselines"] = dict(BASELINES)
+    result["baselines"] = {name: BASELINES[name] for name in options.baselines}
     for horizon in [options.horizon] if options.horizon else _HORIZONS:
         scenes = [scene for one in wanted for scene in _HORIZONS[horizon](store.open(one))]
         if set(options.metrics) & set(GEOMETRY):
             geometry = TwinGeometry()
             scenes = [geometry.added_to(one, store.open(one.episode_id)) for one in scenes]
-        found = measure_prediction(world, scenes, metrics=options.metrics)
+        found = measure_prediction(
+            world, scenes, metrics=options.metrics, baselines=options.baselines
+        )
         result[horizon] = dict(found.by_task)
         result[f"num_{horizon}"] = found.num_scenes
         print(f"\n{horizon}: {found.num_scenes} from {len(wanted)} episodes\n{_table(found)}")
@@ -96,19 +102,20 @@ def _episodes(store: EpisodeStore, tasks: Sequence[str], known: Sequence[str]) -
 def _table(found: PredictionResult) -> str:
     """Figures of all tasks: a row for each metric, a column for the model and each baseline."""
     figures = found.by_task[ALL_TASKS]
-    rows = [["", MODEL, *BASELINES]]
+    sources = list(figures)
+    rows = [["", *sources]]
     for name in figures[MODEL]:
         metric = METRICS[name]
         arrow = {"higher": "↑", "lower": "↓"}[metric.better]
         unit = f" ({metric.unit})" if metric.unit else ""
-        values = [figures[source][name] for source in (MODEL, *BASELINES)]
+        values = [figures[source][name] for source in sources]
         cells = ["-" if value is None else f"{value:.3f}" for value in values]
         rows.append([f"{metric.title}{unit} {arrow}", *cells])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows
     ]
-    about = [f"{name}: {text}" for name, text in BASELINES.items()]
+    about = [f"{name}: {BASELINES[name]}" for name in sources if name != MODEL]
     return "\n".join([*lines, "", *about])
 
 
@@ -121,6 +128,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--horizon", choices=list(_HORIZONS), help="only windows or only rollouts (default: both)")
     names = f"comma-separated, of {', '.join(METRICS)} (default: all)"
     add("--metrics", type=comma_separated, default=tuple(METRICS), help=names)
+    names = f"comma-separated, of {', '.join(BASELINES)} (default: without instructions)"
+    add("--baselines", type=comma_separated, default=DEFAULT_BASELINES, help=names)
     steps = "network calls per chunk of a flow-matching model"
     add("--sampling-steps", type=int, metavar="N", help=steps)
     add_json(parser)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 import numpy as np
+from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
 from dextouch.metrics import image as image_metrics
@@ -21,10 +22,12 @@ from services.evaluation.prediction_scenes import (
     Scene,
     copied,
     imagine,
+    other_instruction,
     other_take,
     reconstructed,
     standing_still,
     warped,
+    with_instruction,
 )
 from services.evaluation.progress import Progress
 from services.evaluation.reporting import PredictionPicture
@@ -41,8 +44,14 @@ BASELINES: Final = {
     "other_take": "the model, given the actions of another take of the task at the same step",
     "hold": "the model, given actions in which nothing moves",
     "hands_still": "the model, given actions in which only the head moves",
+    "no_instruction": "the model, given no instruction",
+    "other_instruction": "the model, given the instruction of another task",
     "true_images": "the true images, measured in the same way: the error of the measurement",
 }
+
+
+# Instructions matter to worlds that read them, and cost two predictions more.
+DEFAULT_BASELINES: Final = tuple(name for name in BASELINES if "instruction" not in name)
 
 
 @dataclass(frozen=True)
@@ -228,7 +237,11 @@ class PredictionResult:
 
 
 def measure_prediction(
-    world: World[Any], scenes: Sequence[Scene], *, metrics: Sequence[str] = tuple(METRICS)
+    world: World[Any],
+    scenes: Sequence[Scene],
+    *,
+    metrics: Sequence[str] = tuple(METRICS),
+    baselines: Sequence[str] = DEFAULT_BASELINES,
 ) -> PredictionResult:
     """Errors of predicted futures of scenes that the world was not trained on.
 
@@ -236,18 +249,20 @@ def measure_prediction(
         world: to measure.
         scenes: recorded futures.
         metrics: names of `METRICS`.
+        baselines: names of `BASELINES`; others are not computed.
 
     Raises:
         InvalidInputError: no scene.
     """
     if not scenes:
         raise InvalidInputError("prediction: got no scene, expected at least one")
-    found: dict[str, list[tuple[Scene, Future]]] = {name: [] for name in (MODEL, *BASELINES)}
+    found: dict[str, list[tuple[Scene, Future]]] = {name: [] for name in (MODEL, *baselines)}
     with Progress("scenes", len(scenes)) as progress:
         for scene in scenes:
-            for source, future in _futures(world, scene, scenes).items():
+            for source, pairs in found.items():
+                future = _future(source, world, scene, scenes)
                 if future is not None:
-                    found[source].append((scene, future))
+                    pairs.append((scene, future))
             progress.advance()
     tasks = list(dict.fromkeys(scene.start.task for scene in scenes))
     return PredictionResult(
@@ -263,21 +278,38 @@ def measure_prediction(
     )
 
 
-def _futures(world: World[Any], scene: Scene, scenes: Sequence[Scene]) -> dict[str, Future | None]:
-    """Predictions of the world and of all baselines; None where a baseline does not apply."""
-    other = other_take(scene, scenes)
-    num_steps = len(scene.actions)
-    return {
-        MODEL: imagine(world, scene, scene.actions),
-        "copy": copied(scene),
-        "warp": replace(scene.truth, images=warped(scene)),
-        "zero": replace(scene.truth, tactile_kpa=np.zeros_like(scene.truth.tactile_kpa)),
-        "codec": reconstructed(world, scene),
-        "other_take": None if other is None else imagine(world, scene, other.actions[:num_steps]),
-        "hold": imagine(world, scene, standing_still(scene, head_moves=False)),
-        "hands_still": imagine(world, scene, standing_still(scene, head_moves=True)),
-        "true_images": scene.truth,
+def _future(source: str, world: World[Any], scene: Scene, scenes: Sequence[Scene]) -> Future | None:
+    """Prediction of the world or of a baseline; None where a baseline does not apply."""
+    truth = scene.truth
+    simple: dict[str, Callable[[], Future | None]] = {
+        "copy": lambda: copied(scene),
+        "warp": lambda: replace(truth, images=warped(scene)),
+        "zero": lambda: replace(truth, tactile_kpa=np.zeros_like(truth.tactile_kpa)),
+        "codec": lambda: reconstructed(world, scene),
+        "true_images": lambda: truth,
     }
+    if source in simple:
+        return simple[source]()
+    asked = _asked(source, scene, scenes)
+    return None if asked is None else imagine(world, *asked)
+
+
+def _asked(
+    source: str, scene: Scene, scenes: Sequence[Scene]
+) -> tuple[Scene, Float64[np.ndarray, "steps 67"]] | None:
+    """Scene and actions that the model is given; None if there is no other take or task."""
+    actions = scene.actions
+    if source == "other_take":
+        other = other_take(scene, scenes)
+        return None if other is None else (scene, other.actions[: len(actions)])
+    if source in ("hold", "hands_still"):
+        return scene, standing_still(scene, head_moves=source == "hands_still")
+    if source == "no_instruction":
+        return with_instruction(scene, ""), actions
+    if source == "other_instruction":
+        sentence = other_instruction(scene, scenes)
+        return None if sentence is None else (with_instruction(scene, sentence), actions)
+    return scene, actions
 
 
 def _figures(

@@ -1,7 +1,7 @@
 """Recorded futures that predictions of a world are compared with, and baselines of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -150,6 +150,20 @@ def other_take(scene: Scene, scenes: Sequence[Scene]) -> Scene | None:
         if one.start.seed != scene.start.seed and len(one.actions) >= len(scene.actions):
             return one
     return None
+
+
+def other_instruction(scene: Scene, scenes: Sequence[Scene]) -> str | None:
+    """Instruction of the task after the scene's, in alphabetical order; None if it is alone."""
+    of_task = {one.start.task: one.start.instruction for one in scenes}
+    tasks = sorted(of_task)
+    others = tasks[tasks.index(scene.start.task) + 1 :] + tasks[: tasks.index(scene.start.task)]
+    sentences = [of_task[task] for task in others if of_task[task] != scene.start.instruction]
+    return sentences[0] if sentences else None
+
+
+def with_instruction(scene: Scene, sentence: str) -> Scene:
+    """The scene, begun with another instruction."""
+    return replace(scene, start=replace(scene.start, instruction=sentence))
 
 
 def standing_still(scene: Scene, *, head_moves: bool) -> Float64[np.ndarray, "steps 67"]:

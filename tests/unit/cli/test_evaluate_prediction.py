@@ -6,7 +6,7 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from services.cli import main
-from services.evaluation.prediction import BASELINES, MODEL
+from services.evaluation.prediction import DEFAULT_BASELINES, MODEL
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
@@ -37,7 +37,7 @@ def test_windows_are_measured_by_task_beside_all_baselines(store, tmp_path, caps
     assert set(result["windows"]) == {"all", "stand_bottle"}
     assert result["windows"]["all"] == result["windows"]["stand_bottle"]
     figures = result["windows"]["all"]
-    assert set(figures) == {MODEL, *BASELINES}
+    assert set(figures) == {MODEL, *DEFAULT_BASELINES}
     assert set(figures[MODEL]) == {"psnr", "contact_f1"}
     assert figures["codec"]["psnr"] > figures["copy"]["psnr"]
     assert figures["warp"]["contact_f1"] is None

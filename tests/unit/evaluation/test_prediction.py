@@ -10,7 +10,7 @@ from dextouch.geometry import pinhole_matrix, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.schemas import EVERYTHING, Observation, RolloutStart
 from dextouch.worlds import CopyFirstWorld, SteppedRollout
-from services.evaluation.prediction import ALL_TASKS, BASELINES, MODEL, measure_prediction
+from services.evaluation.prediction import ALL_TASKS, DEFAULT_BASELINES, MODEL, measure_prediction
 from services.evaluation.prediction_scenes import Future, Scene
 
 PX, NUM_STEPS = 16, 32
@@ -91,7 +91,7 @@ def test_every_metric_stands_beside_every_baseline_that_has_it():
     )
     assert set(found.by_task) == {ALL_TASKS, "press"}
     figures = found.by_task["press"]
-    assert set(figures) == {MODEL, *BASELINES}
+    assert set(figures) == {MODEL, *DEFAULT_BASELINES}
     assert figures["warp"]["tactile_mae"] is None
     assert figures["zero"]["ssim"] is None
     assert figures["codec"] == {"ssim": None, "tactile_mae": None}
@@ -126,3 +126,37 @@ def test_a_world_without_touch_has_no_figures_of_touch():
     assert "contact_f1" not in figures
     assert figures["contact_f1_copy"] == 0.0
     assert figures["psnr"] > 0
+
+
+class ListeningWorld(PressWorld):
+    """Feels twice as much when told to press hard."""
+
+    def step(self, state, actions, *, seed, selector=EVERYTHING):
+        stepped = super().step(state, actions, seed=seed, selector=selector)
+        factor = {"press hard": 2.0, "press": 1.0, "": 0.0}[self.heard]
+        felt_kpa = factor * stepped.observation.tactile_kpa
+        seen = replace(stepped.observation, tactile_kpa=felt_kpa.astype(np.float32))
+        return SteppedRollout(stepped.state, seen)
+
+    def reset(self, start):
+        self.heard = start.instruction
+        return super().reset(start)
+
+
+def test_instructions_are_removed_and_swapped():
+    world = ListeningWorld(tasks=("press", "press_hard"), image_height_px=PX, image_width_px=PX)
+    gentle = scene(1, 0.2)
+    hard = scene(2, 0.2)
+    start = replace(hard.start, task="press_hard", instruction="press hard")
+    truth = replace(hard.truth, tactile_kpa=2 * hard.truth.tactile_kpa)
+    found = measure_prediction(
+        world,
+        [gentle, replace(hard, start=start, truth=truth)],
+        metrics=("tactile_mae",),
+        baselines=("zero", "no_instruction", "other_instruction"),
+    )
+    for task, share in (("press", 1.0), ("press_hard", 0.5)):
+        figures = {name: row["tactile_mae"] for name, row in found.by_task[task].items()}
+        assert figures["model"] == pytest.approx(0.0, abs=1e-6)
+        assert figures["no_instruction"] == pytest.approx(figures["zero"])
+        assert figures["other_instruction"] == pytest.approx(share * figures["zero"])
