@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 from pydantic import Field
 
@@ -10,14 +10,37 @@ from dextouch.frozen_model import FrozenModel
 from services.cli.reproduce.steps import Step
 from services.twin.tasks.registry import DOWNSTREAM, HUMAN_PRETRAINING, ROBOT_PRETRAINING
 
-Table = Literal["tokenizer", "design", "scaling", "evaluator", "generation"]
-TABLES: Final[tuple[Table, ...]] = ("tokenizer", "design", "scaling", "evaluator", "generation")
+Table = Literal[
+    "tokenizer", "options", "instruction", "design", "scaling", "evaluator", "generation"
+]
+TABLES: Final[tuple[Table, ...]] = get_args(Table)
 # Columns of the design ablation, with the preset of each.
 DESIGNS: Final = {
     "V-only": "paper-video-only",
     "Cross-Attn": "paper-cross-attention",
     "Robot-only": "paper",
 }
+# Single options of the joint model, each changed from the default.
+OPTIONS: Final[dict[str, tuple[str, ...]]] = {
+    "default": (),
+    "no sum with tokens": ("--no-network.add-condition-to-tokens",),
+    "cross-attention": (
+        "--network.action-conditioning",
+        "cross_attention",
+        "--no-network.add-condition-to-tokens",
+    ),
+    "no pose raster": ("--no-network.use-pose-raster",),
+    "no scene encoder": ("--no-network.use-scene-encoder",),
+    "velocity": ("--network.prediction", "velocity", "--network.sampling-steps", "8"),
+    "plain video": ("--network.video-target", "plain"),
+    "plain touch": ("--network.tactile-target", "plain"),
+    "contact or changing": ("--optimizer.touch-loss", "contact_or_changing"),
+    "no touch": ("--no-network.use-touch",),
+}
+INSTRUCTIONS: Final = {"hashed words": "hashed_words", "subwords": "subwords"}
+CANS: Final = ("lift_full_can", "lift_empty_can", "move_can_left", "move_can_right")
+PREDICTION_BASELINES: Final = "copy,warp,zero,codec,other_take,true_images"
+INSTRUCTION_BASELINES: Final = "copy,no_instruction,other_instruction"
 TOKENIZERS: Final = {"Split-Hands": "split_hands", "Grid": "grid"}
 FIRST_HELDOUT_SEED: Final = 60_000
 FIRST_STUDY_SEED: Final = 70_000
@@ -105,6 +128,12 @@ class Experiments:
     def _all(self) -> Iterator[Step]:
         yield from self._data()
         yield from self._tokenizers()
+        for option, flags in OPTIONS.items():
+            for seed in self.seeds:
+                yield from self._world_model("options", option, seed, flags)
+        for encoder, kind in INSTRUCTIONS.items():
+            for seed in self.seeds:
+                yield from self._instructed(encoder, kind, seed)
         for design, preset in DESIGNS.items():
             for seed in self.seeds:
                 yield from self._world_model("design", design, seed, ("--preset", preset))
@@ -131,6 +160,9 @@ class Experiments:
         human = ("--domains", "human", "--path", "devices")
         yield _data_step("data/robot", sizes.robot_per_task, robot)
         yield _data_step("data/heldout", sizes.heldout_per_task, robot, FIRST_HELDOUT_SEED)
+        cans = ("--tasks", ",".join(CANS), "--exact")
+        yield _data_step("data/cans", sizes.robot_per_task, cans)
+        yield _data_step("data/cans-heldout", sizes.heldout_per_task, cans, FIRST_HELDOUT_SEED)
         yield _data_step(
             "data/human", sizes.human_per_task, ("--tasks", "human-pretraining", *human)
         )
@@ -163,8 +195,9 @@ class Experiments:
         options: tuple[str, ...],
         needs: tuple[str, ...] = (),
     ) -> Iterator[Step]:
-        name = f"{table}/{column}/seed-{seed}/model"
-        if column != "V-only":
+        folder = f"{table}/{column.replace(' ', '-')}/seed-{seed}"
+        name = f"{folder}/model"
+        if table != "options" and column != "V-only":
             tokenizer = f"tokenizer/split_hands/seed-{seed}"
             options = (*options, "--tokenizer", f"{tokenizer}/tokenizer.safetensors")
             needs = (*needs, tokenizer)
@@ -176,7 +209,22 @@ class Experiments:
         )
         needed = ("data/robot", "data/heldout", *needs)
         yield Step(name, words, ("model.safetensors", "result.json"), needed)
-        yield _prediction_step(f"{table}/{column}/seed-{seed}/prediction", name, "data/heldout")
+        yield _prediction_step(f"{folder}/prediction", name, "data/heldout")
+
+    def _instructed(self, encoder: str, kind: str, seed: int) -> Iterator[Step]:
+        """A model of the can tasks, which start alike, measured with right and wrong sentences."""
+        folder = f"instruction/{encoder.replace(' ', '-')}/seed-{seed}"
+        name = f"{folder}/model"
+        words = (
+            *("train", "world-model", "--network.instruction-encoder", kind),
+            *("--episodes", "data/cans/store", "--heldout", "data/cans-heldout/store"),
+            *("--seed", str(seed), "--cpu-budget-s", str(self.sizes.train_cpu_s), "--resume"),
+            *("--output", f"{name}/model.safetensors", "--json", f"{name}/result.json"),
+        )
+        needs = ("data/cans", "data/cans-heldout")
+        yield Step(name, words, ("model.safetensors", "result.json"), needs)
+        heldout = "data/cans-heldout"
+        yield _prediction_step(f"{folder}/prediction", name, heldout, INSTRUCTION_BASELINES)
 
     def _adapted(self, seed: int) -> Iterator[Step]:
         """WM-Robot and WM-Mix, from the model that saw the most human data."""
@@ -310,9 +358,12 @@ def _data_step(name: str, count: int, options: tuple[str, ...], first: int = 0) 
     return Step(name, words, ("store", "result.json"), exits=(0, 1))
 
 
-def _prediction_step(name: str, model: str, heldout: str) -> Step:
+def _prediction_step(
+    name: str, model: str, heldout: str, baselines: str = PREDICTION_BASELINES
+) -> Step:
     words = (
         *("evaluate", "prediction", "--checkpoint", f"{model}/model.safetensors"),
-        *("--episodes", f"{heldout}/store", "--json", f"{name}/result.json"),
+        *("--episodes", f"{heldout}/store", "--baselines", baselines),
+        *("--json", f"{name}/result.json"),
     )
     return Step(name, words, ("result.json",), (heldout, model))

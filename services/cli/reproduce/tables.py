@@ -13,11 +13,14 @@ from services.cli.reproduce.experiments import (
     ADAPTED,
     DESIGNS,
     GENERATED,
+    INSTRUCTIONS,
+    OPTIONS,
     TOKENIZERS,
     Experiments,
     Table,
 )
 from services.cli.reproduce.steps import read_json
+from services.evaluation.prediction import MODEL
 from services.evaluation.scores import REAL
 from services.twin.tasks.registry import DOWNSTREAM
 
@@ -148,6 +151,8 @@ def make_pages(folder: Path, experiments: Experiments, table: Table) -> list[Pag
     """
     makers: dict[Table, Callable[[Path, Experiments], list[Page]]] = {
         "tokenizer": _tokenizer_pages,
+        "options": _options_pages,
+        "instruction": _instruction_pages,
         "design": _design_pages,
         "scaling": _scaling_pages,
         "evaluator": _evaluator_pages,
@@ -180,6 +185,38 @@ def _design_pages(folder: Path, experiments: Experiments) -> list[Page]:
     columns = {name: (f"design/{name}", name) for name in DESIGNS}
     rows = _prediction_rows(folder, experiments, columns)
     return [Page("Model design (no human data)", rows, "Robot-only")]
+
+
+def _options_pages(folder: Path, experiments: Experiments) -> list[Page]:
+    columns = {name: (f"options/{name.replace(' ', '-')}", "") for name in OPTIONS}
+    rows = _prediction_rows(folder, experiments, columns)
+    return [Page("Options of the joint model, one changed at a time", rows, "default")]
+
+
+def _instruction_pages(folder: Path, experiments: Experiments) -> list[Page]:
+    """Predictions with the right sentence, with none and with another task's."""
+    sources = {"right": MODEL, "none": "no_instruction", "another's": "other_instruction"}
+    pages = []
+    for encoder in INSTRUCTIONS:
+        step = f"instruction/{encoder.replace(' ', '-')}"
+        found = [
+            read_json(folder / f"{step}/seed-{seed}/prediction/result.json")
+            for seed in experiments.seeds
+        ]
+        rows = tuple(
+            Row(
+                name,
+                {
+                    column: Measured(tuple(_figure(one, key, source) for one in found))
+                    for column, source in sources.items()
+                },
+                {},
+                higher,
+            )
+            for name, key, higher in METRICS
+        )
+        pages.append(Page(f"Sentences of the can tasks, encoder {encoder}", rows, "right"))
+    return pages
 
 
 def _scaling_pages(folder: Path, experiments: Experiments) -> list[Page]:
@@ -215,9 +252,9 @@ def _prediction_rows(
     return tuple(rows)
 
 
-def _figure(result: Mapping[str, Any], key: str) -> float:
+def _figure(result: Mapping[str, Any], key: str, source: str = MODEL) -> float:
     """A metric of the windows of all tasks; NaN where it is not available."""
-    value = result["windows"]["all"]["model"].get(key)
+    value = result["windows"]["all"][source].get(key)
     return float(value) if isinstance(value, int | float) else math.nan
 
 
