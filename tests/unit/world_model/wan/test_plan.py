@@ -31,6 +31,7 @@ def test_peak_memory_of_a_calculation_by_hand():
     assert e.shape == (KIB,)
 
 
+@pytest.mark.slow
 def test_flops_of_one_more_layer_by_hand(full_config):
     def step(config):
         return next(work.flops for work in plan_of(config).work if work.name == "one sampler step")
@@ -99,6 +100,7 @@ def _peak_of_allocator(job):
     return peak
 
 
+@pytest.mark.slow
 def test_the_full_size_fits_one_card_in_half_precision():
     config = NetworkConfig(
         video_expert="wan", wan=WanConfig(), image_px=256, patch_px=16, codec_channels=48,
@@ -117,6 +119,7 @@ def test_the_full_size_fits_one_card_in_half_precision():
     assert plan.peak_bytes < 40e9
 
 
+@pytest.mark.slow
 def test_the_table_has_both_precisions_of_the_full_size(full_config):
     table = plan_table(full_config)
     assert "one action chunk of 16 steps, 20 video and 34 tactile tokens" in table
