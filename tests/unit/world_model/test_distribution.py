@@ -106,8 +106,9 @@ def sharded():
 
 
 @pytest.mark.filterwarnings("ignore:FSDP2-wrapped module")
+@pytest.mark.parametrize("self_forcing", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_sharded_training_is_resumed_and_equals_plain_training(
-    toy_episodes, toy_episode, settings, sharded
+    toy_episodes, toy_episode, settings, sharded, self_forcing
 ):
     class StoppedError(Exception):
         pass
@@ -115,7 +116,10 @@ def test_sharded_training_is_resumed_and_equals_plain_training(
     def stop(_):
         raise StoppedError
 
-    heldout, short = [toy_episode(10_000, 25)], settings.model_copy(update={"max_steps": 3})
+    heldout, short = (
+        [toy_episode(10_000, 25)],
+        settings.model_copy(update={"max_steps": 3, "self_forcing": self_forcing}),
+    )
     expected = train_on(toy_episodes, heldout, short)
     kept = short.model_copy(
         update={
