@@ -11,8 +11,10 @@ from services.twin.tasks.open_drawer import OpenDrawer
 from services.twin.tasks.place_phone import PlacePhone
 from services.twin.tasks.place_shoes import PlaceShoes
 from services.twin.tasks.regrasp_can import RegraspCan
+from services.twin.tasks.squeeze_ball import SqueezeBall
 from services.twin.tasks.stack_bowls import StackBowls
 from services.twin.tasks.stand_bottle import StandBottle
+from services.twin.tasks.strike_bell import StrikeBell
 from services.twin.tasks.task import Task
 from services.twin.tasks.turn_lever import TurnLever
 
@@ -29,14 +31,21 @@ _TASKS: Final[dict[str, Task]] = {
         RegraspCan(),
         LiftBox(),
         TurnLever(),
+        StrikeBell(),
+        SqueezeBall(),
     )
 }
 TASK_NAMES: Final = tuple(_TASKS)
 # The paper's four tasks on which policies are trained and evaluated.
 DOWNSTREAM: Final = ("place_shoes", "place_phone", "stack_bowls", "stand_bottle")
 # Tasks of robot and of human episodes for pretraining: no task is in two of these three sets.
-ROBOT_PRETRAINING: Final = ("insert_peg", "open_drawer", "turn_lever")
-HUMAN_PRETRAINING: Final = (*(task.name for task in CAN_TASKS), "regrasp_can", "lift_box")
+ROBOT_PRETRAINING: Final = ("insert_peg", "open_drawer", "turn_lever", "strike_bell")
+HUMAN_PRETRAINING: Final = (
+    *(task.name for task in CAN_TASKS),
+    "regrasp_can",
+    "lift_box",
+    "squeeze_ball",
+)
 # Tasks of the package's checkpoints; commands record and evaluate these by default.
 EVALUATED: Final = (
     "stand_bottle",
