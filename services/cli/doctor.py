@@ -27,6 +27,7 @@ _PACKAGES = {
     "rerun": "rerun",
     "s3": "obstore",
 }
+_NOT_IN_ALL = ("full", "rerun")
 EXTRA_OF = {package: extra for extra, names in _PACKAGES.items() for package in names.split()}
 
 
@@ -65,9 +66,12 @@ def missing_package(error: ModuleNotFoundError, otherwise: str = "") -> DexTouch
     package = (error.name or "").partition(".")[0]
     if package not in EXTRA_OF:
         return None
+    hint = install_hint(package)
+    if EXTRA_OF[package] not in _NOT_IN_ALL:
+        hint += ", or 'dextouch-wm[all]' for everything"
     return UnavailableError(
-        f"the package {package!r} is not installed; {install_hint(package)}, or "
-        f"'dextouch-wm[all]' for everything{otherwise}. `dextouch doctor` lists what is missing"
+        f"the package {package!r} is not installed; {hint}{otherwise}. "
+        "`dextouch doctor` lists what is missing"
     )
 
 

@@ -157,5 +157,14 @@ def test_extras_bring_what_is_said_of_them():
             assert wanted & brings, f"{package}: not in extra {extra!r}"
 
 
+def test_all_is_offered_for_what_it_brings():
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    everything = tomllib.loads(text)["project"]["optional-dependencies"]["all"][0]
+    brought = set(re.search(r"\[(.*)\]", everything)[1].split(","))
+    for package, extra in EXTRA_OF.items():
+        message = str(missing_package(ModuleNotFoundError("no", name=package)))
+        assert ("dextouch-wm[all]" in message) == (extra in brought), package
+
+
 def test_a_module_of_ours_that_is_missing_is_an_error_of_ours():
     assert missing_package(ModuleNotFoundError("no", name="services.nothing")) is None
