@@ -6,7 +6,7 @@ Windows of one chunk begin at true steps, as in the paper; rollouts continue fro
 """
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,10 @@ from services.evaluation.prediction import (
     BASELINES,
     DEFAULT_BASELINES,
     GEOMETRY,
-    METRICS,
     MODEL,
+    Metric,
     PredictionResult,
+    all_metrics,
     measure_prediction,
 )
 from services.evaluation.prediction_scenes import Scene, read_rollout, read_windows
@@ -46,8 +47,10 @@ def main(arguments: Sequence[str]) -> int:
     from services.world_model.checkpoints import default_checkpoint
     from services.world_model.world import open_world
 
+    metrics = all_metrics(options.weights)
+    chosen = options.metrics or tuple(metrics)
     for kind, names, known in (
-        ("metric", options.metrics, METRICS),
+        ("metric", chosen, metrics),
         ("baseline", options.baselines, BASELINES),
     ):
         if unknown := sorted(set(names) - set(known)):
@@ -59,21 +62,23 @@ def main(arguments: Sequence[str]) -> int:
     result: dict[str, Any] = {"checkpoint": path.name, "digest": world.description.digest}
     result["metrics"] = {
         name: {"title": one.title, "unit": one.unit, "better": one.better, "about": one.about}
-        for name, one in METRICS.items()
-        if name in options.metrics
+        | ({"missing": one.missing} if one.missing else {})
+        for name, one in metrics.items()
+        if name in chosen
     }
+    measured = [metrics[name] for name in chosen]
     result["baselines"] = {name: BASELINES[name] for name in options.baselines}
     for horizon in [options.horizon] if options.horizon else _HORIZONS:
         scenes = [scene for one in wanted for scene in _HORIZONS[horizon](store.open(one))]
-        if set(options.metrics) & set(GEOMETRY):
+        if set(chosen) & set(GEOMETRY):
             geometry = TwinGeometry()
             scenes = [geometry.added_to(one, store.open(one.episode_id)) for one in scenes]
-        found = measure_prediction(
-            world, scenes, metrics=options.metrics, baselines=options.baselines
-        )
+        found = measure_prediction(world, scenes, metrics=measured, baselines=options.baselines)
         result[horizon] = dict(found.by_task)
         result[f"num_{horizon}"] = found.num_scenes
-        print(f"\n{horizon}: {found.num_scenes} from {len(wanted)} episodes\n{_table(found)}")
+        print(
+            f"\n{horizon}: {found.num_scenes} from {len(wanted)} episodes\n{_table(found, metrics)}"
+        )
     write_result(options.json, result, allow_nan=False)
     return 0
 
@@ -99,13 +104,15 @@ def _episodes(store: EpisodeStore, tasks: Sequence[str], known: Sequence[str]) -
     return wanted
 
 
-def _table(found: PredictionResult) -> str:
+def _table(found: PredictionResult, metrics: Mapping[str, Metric]) -> str:
     """Figures of all tasks: a row for each metric, a column for the model and each baseline."""
     figures = found.by_task[ALL_TASKS]
     sources = list(figures)
     rows = [["", *sources]]
     for name in figures[MODEL]:
-        metric = METRICS[name]
+        metric = metrics[name]
+        if metric.missing:
+            continue
         arrow = {"higher": "↑", "lower": "↓"}[metric.better]
         unit = f" ({metric.unit})" if metric.unit else ""
         values = [figures[source][name] for source in sources]
@@ -115,7 +122,10 @@ def _table(found: PredictionResult) -> str:
     lines = [
         "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows
     ]
-    about = [f"{name}: {BASELINES[name]}" for name in sources if name != MODEL]
+    about = [
+        f"{metrics[n].title}: {metrics[n].missing}" for n in figures[MODEL] if metrics[n].missing
+    ]
+    about += [f"{name}: {BASELINES[name]}" for name in sources if name != MODEL]
     return "\n".join([*lines, "", *about])
 
 
@@ -126,8 +136,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--checkpoint", type=Path, metavar="PATH", help="world model (default: the package's)")
     add("--tasks", type=comma_separated, default=(), help="comma-separated (default: the model's)")
     add("--horizon", choices=list(_HORIZONS), help="only windows or only rollouts (default: both)")
-    names = f"comma-separated, of {', '.join(METRICS)} (default: all)"
-    add("--metrics", type=comma_separated, default=tuple(METRICS), help=names)
+    names = f"comma-separated, of {', '.join(all_metrics())} (default: all)"
+    add("--metrics", type=comma_separated, default=(), help=names)
+    weights = "folder of pretrained networks for the metrics that need them (docs/evaluation.md)"
+    add("--weights", type=Path, metavar="PATH", help=weights)
     names = f"comma-separated, of {', '.join(BASELINES)} (default: without instructions)"
     add("--baselines", type=comma_separated, default=DEFAULT_BASELINES, help=names)
     steps = "network calls per chunk of a flow-matching model"

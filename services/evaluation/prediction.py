@@ -6,6 +6,7 @@ over windows of one chunk, or over whole open-loop rollouts.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -31,8 +32,8 @@ from services.evaluation.prediction_scenes import (
 )
 from services.evaluation.progress import Progress
 from services.evaluation.reporting import PredictionPicture
+from services.evaluation.weighted_metrics import DESCRIPTIONS, Pairs, weighted_measures
 
-Pairs = Sequence[tuple[Scene, Future]]
 MODEL: Final = "model"
 ALL_TASKS: Final = "all"
 # What every figure stands beside, in the order of tables.
@@ -56,7 +57,10 @@ DEFAULT_BASELINES: Final = tuple(name for name in BASELINES if "instruction" not
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of predicted futures; `measure` gets all pairs of a task, or of all tasks."""
+    """A figure of predicted futures; `measure` gets all pairs of a task, or of all tasks.
+
+    Without it, `missing` says why the metric is not available.
+    """
 
     name: str
     title: str
@@ -64,7 +68,8 @@ class Metric:
     better: Literal["higher", "lower"]
     about: str
     of: Literal["images", "touch", "geometry"]
-    measure: Callable[[Pairs], float]
+    measure: Callable[[Pairs], float] | None
+    missing: str = ""
 
 
 def _of_images(function: Callable[..., float]) -> Callable[[Pairs], float]:
@@ -210,6 +215,21 @@ METRICS: Final = {
         ),
     )
 }
+
+
+def all_metrics(weights: Path | None = None) -> dict[str, Metric]:
+    """Every metric of the paper's table; those with networks need a folder of their weights."""
+    measures = weighted_measures(weights)
+    found = dict(METRICS)
+    for name, title, better, about, of in DESCRIPTIONS:
+        measure = measures[name]
+        if isinstance(measure, str):
+            found[name] = Metric(name, title, "", better, about, of, None, measure)
+        else:
+            found[name] = Metric(name, title, "", better, about, of, measure)
+    return found
+
+
 GEOMETRY: Final = tuple(name for name, metric in METRICS.items() if metric.of == "geometry")
 Figures = dict[str, dict[str, float | None]]
 
@@ -240,7 +260,7 @@ def measure_prediction(
     world: World[Any],
     scenes: Sequence[Scene],
     *,
-    metrics: Sequence[str] = tuple(METRICS),
+    metrics: Sequence[Metric] = tuple(METRICS.values()),
     baselines: Sequence[str] = DEFAULT_BASELINES,
 ) -> PredictionResult:
     """Errors of predicted futures of scenes that the world was not trained on.
@@ -248,7 +268,7 @@ def measure_prediction(
     Args:
         world: to measure.
         scenes: recorded futures.
-        metrics: names of `METRICS`.
+        metrics: of `METRICS` or `all_metrics`.
         baselines: names of `BASELINES`; others are not computed.
 
     Raises:
@@ -313,19 +333,20 @@ def _asked(
 
 
 def _figures(
-    world: World[Any], source: str, pairs: Pairs, metrics: Sequence[str], task: str | None
+    world: World[Any], source: str, pairs: Pairs, metrics: Sequence[Metric], task: str | None
 ) -> dict[str, float | None]:
     mine = [pair for pair in pairs if task in (None, pair[0].start.task)]
     figures: dict[str, float | None] = {}
-    for name in metrics:
-        metric = METRICS[name]
+    for metric in metrics:
         # The warp is of images, zero of touch; a world may not predict touch.
         absent = source == ("warp" if metric.of == "touch" else "zero")
         if metric.of == "touch" and source not in ("copy", "zero"):
             absent = absent or not world.description.predicts_touch
         absent = absent or (source == "true_images" and metric.of != "geometry")
-        value = float("nan") if absent or not mine else metric.measure(mine)
-        figures[name] = value if np.isfinite(value) else None
+        value = float("nan")
+        if metric.measure is not None and mine and not absent:
+            value = metric.measure(mine)
+        figures[metric.name] = value if np.isfinite(value) else None
     return figures
 
 

@@ -56,6 +56,11 @@ class Scene:
             raise InvalidInputError(f"scene {self.episode_id!r}: begins without an observation")
         return self.start.observation
 
+    @property
+    def first_image(self) -> UInt8[np.ndarray, "1 h w 3"]:
+        """The observed first image of the head camera."""
+        return self.first.images[CAMERA]
+
 
 def read_rollout(reader: EpisodeReader, *, image_every: int = CHUNK_STEPS) -> Scene:
     """A whole episode as one scene, up to its last complete chunk.

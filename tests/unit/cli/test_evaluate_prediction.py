@@ -47,7 +47,7 @@ def test_windows_are_measured_by_task_beside_all_baselines(store, tmp_path, caps
 
 def test_unknown_metrics_name_the_valid_ones(store, capsys):
     assert run(store, "--metrics", "psnr,lpisp") == 3
-    assert "unknown metric 'lpisp'; valid: contact_f1" in capsys.readouterr().err
+    assert "unknown metric 'lpisp'; valid: aesthetic_quality" in capsys.readouterr().err
 
 
 def test_a_store_without_such_episodes_says_what_it_has(store, capsys):

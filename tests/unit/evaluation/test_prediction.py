@@ -10,7 +10,13 @@ from dextouch.geometry import pinhole_matrix, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.schemas import EVERYTHING, Observation, RolloutStart
 from dextouch.worlds import CopyFirstWorld, SteppedRollout
-from services.evaluation.prediction import ALL_TASKS, DEFAULT_BASELINES, MODEL, measure_prediction
+from services.evaluation.prediction import (
+    ALL_TASKS,
+    DEFAULT_BASELINES,
+    METRICS,
+    MODEL,
+    measure_prediction,
+)
 from services.evaluation.prediction_scenes import Future, Scene
 
 PX, NUM_STEPS = 16, 32
@@ -87,7 +93,7 @@ def test_a_lone_scene_has_no_other_and_no_scene_is_refused():
 def test_every_metric_stands_beside_every_baseline_that_has_it():
     world = PressWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
     found = measure_prediction(
-        world, [scene(1, 0.2), scene(2, 0.1)], metrics=("ssim", "tactile_mae")
+        world, [scene(1, 0.2), scene(2, 0.1)], metrics=(METRICS["ssim"], METRICS["tactile_mae"])
     )
     assert set(found.by_task) == {ALL_TASKS, "press"}
     figures = found.by_task["press"]
@@ -152,7 +158,7 @@ def test_instructions_are_removed_and_swapped():
     found = measure_prediction(
         world,
         [gentle, replace(hard, start=start, truth=truth)],
-        metrics=("tactile_mae",),
+        metrics=(METRICS["tactile_mae"],),
         baselines=("zero", "no_instruction", "other_instruction"),
     )
     for task, share in (("press", 1.0), ("press_hard", 0.5)):

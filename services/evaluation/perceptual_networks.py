@@ -1,0 +1,208 @@
+"""Networks of perceptual image metrics, read from local safetensors files: LPIPS, CLIP and DINO.
+
+Nothing is ever downloaded. A folder of weights has a subfolder for each network; see
+docs/evaluation.md for their contents.
+"""
+
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dextouch.errors import InvalidInputError, NotFoundError
+from services.networks.weight_files import load_strictly, read_tensors
+
+BATCH: Final = 32
+# Mean and deviation by which LPIPS scales images in -1 … 1 (Zhang et al. 2018, reference code).
+_LPIPS_SHIFT: Final = (-0.030, -0.088, -0.188)
+_LPIPS_SCALE: Final = (0.458, 0.448, 0.450)
+_CLIP_MEAN: Final = (0.48145466, 0.4578275, 0.40821073)
+_CLIP_STD: Final = (0.26862954, 0.26130258, 0.27577711)
+_IMAGENET_MEAN: Final = (0.485, 0.456, 0.406)
+_IMAGENET_STD: Final = (0.229, 0.224, 0.225)
+_INPUT_PX: Final = 224
+# AlexNet of torchvision up to its last convolution: channels, kernel, stride, padding.
+_CONVOLUTIONS: Final = (
+    (64, 11, 4, 2),
+    (192, 5, 1, 2),
+    (384, 3, 1, 1),
+    (256, 3, 1, 1),
+    (256, 3, 1, 1),
+)
+_POOLED_AFTER: Final = (0, 1)
+MIN_LPIPS_PX: Final = 63
+
+
+class Lpips(nn.Module):
+    """Learned perceptual image patch similarity with AlexNet (Zhang et al. 2018): 0 for equals.
+
+    Args:
+        folder: with `alexnet.safetensors` (names of torchvision: features.0.weight, …) and
+            `heads.safetensors` (names of the package lpips: lin0.model.1.weight, …).
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        self._taps: list[int] = []
+        channels = 3
+        for index, (width, kernel, stride, padding) in enumerate(_CONVOLUTIONS):
+            layers += [nn.Conv2d(channels, width, kernel, stride, padding), nn.ReLU()]
+            self._taps.append(len(layers) - 1)
+            if index in _POOLED_AFTER:
+                layers.append(nn.MaxPool2d(3, 2))
+            channels = width
+        self.features = nn.Sequential(*layers)
+        self.heads = nn.ModuleList(
+            nn.Conv2d(width, 1, 1, bias=False) for width, *_ in _CONVOLUTIONS
+        )
+        backbone = _tensors(folder / "alexnet.safetensors", "features.")
+        heads = _tensors(folder / "heads.safetensors", "")
+        renamed = {name.replace("lin", "").replace(".model.1", ""): w for name, w in heads.items()}
+        load_strictly({"": self.features}, backbone, where="alexnet.safetensors")
+        load_strictly({"": self.heads}, renamed, where="heads.safetensors")
+        self.eval().requires_grad_(requires_grad=False)
+
+    def forward(
+        self, first: Float32[Tensor, "n 3 h w"], second: Float32[Tensor, "n 3 h w"]
+    ) -> Float32[Tensor, " n"]:
+        """Distances of images in 0 … 1, at least 63 px high and wide."""
+        if min(first.shape[-2:]) < MIN_LPIPS_PX:
+            raise InvalidInputError(
+                f"LPIPS: got images of {tuple(first.shape[-2:])} px, expected at least "
+                f"{MIN_LPIPS_PX}"
+            )
+        one = _scaled(2 * first - 1, _LPIPS_SHIFT, _LPIPS_SCALE)
+        two = _scaled(2 * second - 1, _LPIPS_SHIFT, _LPIPS_SCALE)
+        total = torch.zeros(len(first))
+        heads = iter(self.heads)
+        for index, layer in enumerate(self.features):
+            one, two = layer(one), layer(two)
+            if index in self._taps:
+                change = functional.normalize(one, dim=1, eps=1e-10) - functional.normalize(
+                    two, dim=1, eps=1e-10
+                )
+                total = total + next(heads)(change.square()).mean(dim=(1, 2, 3))
+        return total
+
+
+class PerceptualNetworks:
+    """Networks in a folder of weights, each read when it is first used.
+
+    Args:
+        folder: with the subfolders `lpips`, `clip`, `aesthetic` and `dino`, of which any may be
+            missing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def has(self, *names: str) -> bool:
+        """Whether these subfolders exist."""
+        return all((self._folder / name).is_dir() for name in names)
+
+    @cached_property
+    def lpips(self) -> Lpips:
+        """LPIPS with AlexNet."""
+        return Lpips(self._folder / "lpips")
+
+    @cached_property
+    def _clip(self) -> nn.Module:
+        from transformers import CLIPVisionModelWithProjection
+
+        return _pretrained(CLIPVisionModelWithProjection, self._folder / "clip")
+
+    @cached_property
+    def _dino(self) -> nn.Module:
+        from transformers import ViTModel
+
+        return _pretrained(ViTModel, self._folder / "dino")
+
+    @cached_property
+    def _aesthetic_head(self) -> dict[str, Tensor]:
+        return _tensors(self._folder / "aesthetic" / "head.safetensors", "")
+
+    @torch.no_grad()
+    def perceptual_distance(
+        self, first: UInt8[np.ndarray, "n h w 3"], second: UInt8[np.ndarray, "n h w 3"]
+    ) -> Float32[np.ndarray, " n"]:
+        """LPIPS of pairs of images."""
+        parts = zip(_batches(first), _batches(second), strict=True)
+        return torch.cat([self.lpips(one, two) for one, two in parts]).numpy()
+
+    @torch.no_grad()
+    def aesthetic_quality(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float32[np.ndarray, " n"]:
+        """Rating of LAION's linear head on normalized CLIP features, divided by ten (VBench)."""
+        head = self._aesthetic_head
+        ratings = []
+        for part in _batches(images):
+            pixels = _scaled(_resized(part), _CLIP_MEAN, _CLIP_STD)
+            features = functional.normalize(self._clip(pixel_values=pixels).image_embeds, dim=1)
+            ratings.append(functional.linear(features, head["weight"], head["bias"])[:, 0] / 10)
+        return torch.cat(ratings).numpy()
+
+    @torch.no_grad()
+    def subject_consistency(self, images: UInt8[np.ndarray, "n h w 3"]) -> float:
+        """Mean similarity of DINO features to those of the image before and the first (VBench).
+
+        For each image after the first, the mean of both cosine similarities, none below 0.
+        """
+        parts = [_scaled(_resized(p), _IMAGENET_MEAN, _IMAGENET_STD) for p in _batches(images)]
+        found = [self._dino(pixel_values=part).last_hidden_state[:, 0] for part in parts]
+        features = functional.normalize(torch.cat(found), dim=1)
+        before = (features[1:] * features[:-1]).sum(dim=1).clamp_min(0.0)
+        first = (features[1:] * features[:1]).sum(dim=1).clamp_min(0.0)
+        return float(((before + first) / 2).mean())
+
+
+def _tensors(path: Path, prefix: str) -> dict[str, Tensor]:
+    """Tensors of a file whose names begin with a prefix, without it."""
+    if not path.is_file():
+        raise NotFoundError(
+            f"weights: no file {path.name} in the folder {path.parent.name} of weights; "
+            "docs/evaluation.md says how to make it"
+        )
+    tensors, _ = read_tensors(path, path.name)
+    return {
+        name.removeprefix(prefix): tensor.float()
+        for name, tensor in tensors.items()
+        if name.startswith(prefix)
+    }
+
+
+def _pretrained(kind: type, folder: Path) -> nn.Module:
+    network: nn.Module = kind.from_pretrained(  # type: ignore[attr-defined]
+        folder, local_files_only=True, use_safetensors=True
+    )
+    return network.eval().requires_grad_(requires_grad=False)
+
+
+def _batches(images: UInt8[np.ndarray, "n h w 3"]) -> tuple[Tensor, ...]:
+    """Images in 0 … 1 as [batch, 3, h, w], a few at a time."""
+    unit = torch.from_numpy(np.ascontiguousarray(images)).permute(0, 3, 1, 2).float() / 255.0
+    return torch.split(unit, BATCH)
+
+
+def _scaled(
+    images: Float32[Tensor, "n 3 h w"],
+    mean: tuple[float, float, float],
+    deviation: tuple[float, float, float],
+) -> Float32[Tensor, "n 3 h w"]:
+    return (images - torch.tensor(mean)[:, None, None]) / torch.tensor(deviation)[:, None, None]
+
+
+def _resized(images: Float32[Tensor, "n 3 h w"]) -> Float32[Tensor, "n 3 224 224"]:
+    """Resized so that the shorter side has 224 px (bicubic), and cropped around the middle."""
+    height, width = images.shape[-2:]
+    factor = _INPUT_PX / min(height, width)
+    size = [round(height * factor), round(width * factor)]
+    large = functional.interpolate(
+        images, size=size, mode="bicubic", antialias=True, align_corners=False
+    ).clamp(0.0, 1.0)
+    top, left = (size[0] - _INPUT_PX) // 2, (size[1] - _INPUT_PX) // 2
+    return large[..., top : top + _INPUT_PX, left : left + _INPUT_PX]
