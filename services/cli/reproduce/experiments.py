@@ -66,6 +66,7 @@ class Sizes(FrozenModel):
     adapt_half: int = Field(default=100, ge=1, description="robot and human episodes of WM-Mix")
     tokenizer_cpu_s: int = Field(default=60, ge=1, description="training of a tokenizer")
     train_cpu_s: int = Field(default=300, ge=1, description="training of a world model")
+    option_cpu_s: int = Field(default=120, ge=1, description="the same, to compare options")
     adapt_cpu_s: int = Field(default=150, ge=1, description="adaptation of a world model")
     policy_steps: int = Field(default=3000, ge=1, description="training steps of a cloned policy")
     num_starts: int = Field(default=10, ge=1, description="starts per task and policy")
@@ -91,11 +92,12 @@ QUICK: Final = Sizes(
     robot_per_task=8,
     multiples=(1,),
     heldout_per_task=1,
-    downstream_per_task=16,
+    downstream_per_task=24,
     adapt_robot=8,
     adapt_half=4,
     tokenizer_cpu_s=3,
     train_cpu_s=6,
+    option_cpu_s=4,
     adapt_cpu_s=4,
     policy_steps=20,
     num_starts=1,
@@ -204,12 +206,15 @@ class Experiments:
         words = (
             *("train", "world-model", *options, "--episodes", "data/robot/store"),
             *("--heldout", "data/heldout/store", "--seed", str(seed)),
-            *("--cpu-budget-s", str(self.sizes.train_cpu_s), "--resume"),
+            *("--cpu-budget-s", str(self._cpu_s(table)), "--resume"),
             *("--output", f"{name}/model.safetensors", "--json", f"{name}/result.json"),
         )
         needed = ("data/robot", "data/heldout", *needs)
         yield Step(name, words, ("model.safetensors", "result.json"), needed)
         yield _prediction_step(f"{folder}/prediction", name, "data/heldout")
+
+    def _cpu_s(self, table: Table) -> int:
+        return self.sizes.option_cpu_s if table == "options" else self.sizes.train_cpu_s
 
     def _instructed(self, encoder: str, kind: str, seed: int) -> Iterator[Step]:
         """A model of the can tasks, which start alike, measured with right and wrong sentences."""

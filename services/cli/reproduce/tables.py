@@ -101,6 +101,11 @@ class Row:
     paper: Mapping[str, float | None]
     higher_is_better: bool | None = None
 
+    @property
+    def is_available(self) -> bool:
+        """Whether any column has a figure."""
+        return any(math.isfinite(cell.mean) for cell in self.cells.values())
+
 
 @dataclass(frozen=True)
 class Page:
@@ -111,17 +116,21 @@ class Page:
     base: str | None = None
 
     def markdown(self) -> str:
-        """Markdown of the table."""
+        """Markdown of the table; rows without any figure are named below it."""
         columns = list(self.rows[0].cells)
+        shown = [row for row in self.rows if row.is_available]
+        absent = [row.name for row in self.rows if not row.is_available]
         lines = [f"## {self.title}", "", *_markdown_head(["", *columns])]
-        for row in self.rows:
+        for row in shown:
             cells = [_with_paper(row.cells[one], row.paper.get(one)) for one in columns]
             lines.append(_markdown_row([_name(row), *cells]))
+        if absent:
+            lines += ["", f"Not available: {', '.join(absent)}."]
         if self.base is not None:
             others = [one for one in columns if one != self.base]
             lines += ["", f"Difference from {self.base}, seed by seed:", ""]
             lines += _markdown_head(["", *others])
-            for row in self.rows:
+            for row in shown:
                 base = row.cells[self.base]
                 cells = [row.cells[one].less(base).text(signed=True) for one in others]
                 lines.append(_markdown_row([_name(row), *cells]))

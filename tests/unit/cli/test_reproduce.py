@@ -168,3 +168,6 @@ def test_a_prediction_table_reads_the_figures_of_its_steps(tmp_path):
     assert psnr.cells["Cross-Attn"].mean == pytest.approx(21.5)
     assert psnr.paper["Robot-only"] == pytest.approx(23.473)
     assert page.to_json()["rows"][1]["values"]["V-only"] == [None, None]
+    text = page.markdown()
+    assert "| SSIM" not in text
+    assert "Not available: SSIM, LPIPS, Aesthetic Quality" in text
