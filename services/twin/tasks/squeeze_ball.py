@@ -15,8 +15,8 @@ from services.twin.simulation import Simulation
 from services.twin.tasks.postures import THUMB_UP, relaxed, yawed
 from services.twin.tasks.task import REST_SPEED
 
-# The stand's frame: on the table below the ball. The ball is two halves on springs along y. It is
-# turned, so that the viewer sees the hand behind the ball, and both pins.
+# The ball's frame: on the table below it. The ball is two halves on springs along y. It is turned,
+# so that the viewer sees the hand behind the ball, and both pins.
 _TURNED_RAD: Final = 0.9
 _RADIUS_M, _HALF_HEIGHT_M, _CENTRE_Z_M = 0.032, 0.042, 0.115
 _HALF_Y_M: Final = 0.014
@@ -39,20 +39,16 @@ _GRASPS: Final[dict[Domain, CylinderGrasp]] = {
 }
 _SQUEEZE_N: Final = 12.0
 _OPEN_M: Final = 0.020
-# Both halves are pressed in by this much at least; the ball is round again.
-_PRESSED_M, _SQUEEZED_M, _ROUND_M = 0.002, 0.0045, 0.001
-# Objects: the stand, the near and the far half, the near and the far pin.
-_HALVES, _PINS = (1, 2), (3, 4)
+# Both pins are pushed in by this much at least.
+_PRESSED_M, _SQUEEZED_M = 0.002, 0.0045
 _SIDES: Final = (("near", 1.0), ("far", -1.0))
 
 
-def _inwards_m(
-    simulation: Simulation, parts: tuple[int, int], rest_m: float
-) -> Float64[np.ndarray, "2"]:
-    """How far the near and the far part are inside their first positions."""
+def _inwards_m(simulation: Simulation) -> float:
+    """How far both pins at least are inside their first positions."""
     Ts = transform_from_pose(simulation.object_poses())
-    y_m = (invert(Ts[0]) @ Ts[list(parts)])[:, 1, 3]
-    return np.asarray(rest_m + y_m * [inwards for _, inwards in _SIDES])
+    y_m = (invert(Ts[0]) @ Ts[1:])[:, 1, 3]
+    return float((_PIN_Y_M + y_m * [inwards for _, inwards in _SIDES]).min())
 
 
 class SqueezeBall:
@@ -60,14 +56,14 @@ class SqueezeBall:
 
     name = "squeeze_ball"
     instruction = "Squeeze the ball from both sides until its pins have moved in, and let go."
-    object_names = ("stand", "ball_near", "ball_far", "pin_near", "pin_far")
+    object_names = ("ball", "pin_near", "pin_far")
     milestones = ("touched", "pressed", "squeezed", "released")
 
     def objects_mjcf(self) -> str:
-        """A fixed stand with the halves of the ball and their pins, that slide inwards."""
+        """A fixed stand with the halves of the ball, and their pins, that slide inwards."""
         rail_z = _CENTRE_Z_M + _PIN_Z_M - _PIN_HALF_M[2] - 0.002
         parts = [
-            '<body name="stand" mocap="true"><geom name="stand_foot" class="object" '
+            '<body name="ball" mocap="true"><geom name="stand_foot" class="object" '
             'type="cylinder" contype="0" conaffinity="1" size="0.045 0.005" pos="0 0 0.005" '
             f'rgba="{_COLOURS["stand"]}"/><geom name="stand_column" {_SEEN} type="cylinder" '
             f'size="0.007 {0.5 * rail_z!r}" pos="0 0 {0.5 * rail_z!r}" '
@@ -97,7 +93,7 @@ class SqueezeBall:
             ]
         return "".join(parts) + "</body>"
 
-    def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "5 7"]:
+    def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "3 7"]:
         """Behind the centre, ±3 cm and ±0.2 rad, the ball round, the pins apart."""
         x, y = generator.uniform(-0.03, 0.03, size=2)
         R = yawed(_TURNED_RAD + float(generator.uniform(-0.2, 0.2)))
@@ -105,16 +101,15 @@ class SqueezeBall:
         offsets = np.array(
             [
                 [0.0, 0.0, 0.0],
-                *([0.0, -inwards * _HALF_Y_M, _CENTRE_Z_M] for _, inwards in _SIDES),
                 *([0.0, -inwards * _PIN_Y_M, pin_z] for _, inwards in _SIDES),
             ]
         )
         places = np.array([0.01 + x, 0.03 + y, 0.0]) + offsets @ R.T
-        return np.concatenate([places, np.tile(quaternion_from_rotation(R), (5, 1))], axis=1)
+        return np.concatenate([places, np.tile(quaternion_from_rotation(R), (3, 1))], axis=1)
 
     def script(
         self,
-        object_poses: Float64[np.ndarray, "5 7"],
+        object_poses: Float64[np.ndarray, "3 7"],
         *,
         domain: Domain,
         generator: np.random.Generator,
@@ -152,19 +147,19 @@ class SqueezeBall:
         return [Waypoint(time_s, rest, pose) for time_s, pose in path]
 
     def succeeded(self, simulation: Simulation) -> bool:
-        """Both pins moved by 4.5 mm, the ball round again, all at rest and untouched."""
+        """Both pins pushed in by 4.5 mm, at rest, and neither they nor the ball touched."""
         return bool(
-            _inwards_m(simulation, _PINS, _PIN_Y_M).min() > _SQUEEZED_M
-            and _inwards_m(simulation, _HALVES, _HALF_Y_M).max() < _ROUND_M
+            _inwards_m(simulation) > _SQUEEZED_M
             and simulation.object_speeds().max() < REST_SPEED
             and not simulation.hand_touches_object()
         )
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """Touched by a hand; both halves in by 2 mm; both pins in by 4.5 mm; released."""
+        """Touched by a hand; both pins pushed in by 2 mm; by 4.5 mm; released."""
+        inwards_m = _inwards_m(simulation)
         return (
-            bool(simulation.hand_contacts()[:, list(_HALVES)].any()),
-            bool(_inwards_m(simulation, _HALVES, _HALF_Y_M).min() > _PRESSED_M),
-            bool(_inwards_m(simulation, _PINS, _PIN_Y_M).min() > _SQUEEZED_M),
+            simulation.hand_touches(0),
+            inwards_m > _PRESSED_M,
+            inwards_m > _SQUEEZED_M,
             self.succeeded(simulation),
         )
