@@ -4,15 +4,17 @@ import hashlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 from dextouch.errors import ConflictError, NotFoundError
 from dextouch.frozen_model import FrozenModel
@@ -74,6 +76,9 @@ class Runner:
     ) -> None:
         self.folder = folder
         self._program = tuple(program)
+        # Commands that run; None once they are stopped, so that none begins after that.
+        self._children: dict[str, subprocess.Popen[bytes]] | None = {}
+        self._lock = threading.Lock()
         self._steps: dict[str, Step] = {}
         for step in steps:
             if step.name in self._steps or not set(step.needs) <= set(self._steps):
@@ -107,7 +112,6 @@ class Runner:
         waiting = {step.name: step for step in self.missing()}
         total, failed = len(waiting), list[str]()
         running: dict[Future[float | None], str] = {}
-        children: dict[str, subprocess.Popen[bytes]] = {}
         with ThreadPoolExecutor(num_jobs) as pool:
             try:
                 while True:
@@ -115,7 +119,7 @@ class Runner:
                         if len(running) < num_jobs:
                             del waiting[step.name]
                             print(f"{step.name}: {step.command}", flush=True)
-                            running[pool.submit(self._do, step, children)] = step.name
+                            running[pool.submit(self._do, step)] = step.name
                     if not running:
                         return failed
                     for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -127,15 +131,31 @@ class Runner:
                         left = len(waiting) + len(running)
                         print(f"{name}: {wall_s:.0f} s; {left} of {total} steps left", flush=True)
             except BaseException:
-                _stop(list(children.values()))
+                self._stop()
                 raise
 
-    def _do(self, step: Step, children: dict[str, subprocess.Popen[bytes]]) -> float | None:
-        """Run one step; returns its wall time, or None if it failed."""
+    def _do(self, step: Step) -> float | None:
+        """Run one step; returns its wall time, or None if it failed or was not begun."""
         self._prepare(step)
-        python_path = os.pathsep.join(str(Path(path).resolve()) for path in sys.path if path)
         started_s = time.monotonic()
         with (self.folder / step.name / LOG).open("ab") as log:
+            child = self._begin(step, log)
+            if child is None:
+                return None
+            _, status, usage = os.wait4(child.pid, 0)
+            child.returncode = os.waitstatus_to_exitcode(status)
+        made = all((self.folder / step.name / one).exists() for one in step.makes)
+        if child.returncode not in step.exits or not made:
+            return None
+        wall_s = time.monotonic() - started_s
+        self._write_receipt(step, done=True, wall_s=wall_s, cpu_s=usage.ru_utime + usage.ru_stime)
+        return wall_s
+
+    def _begin(self, step: Step, log: IO[bytes]) -> subprocess.Popen[bytes] | None:
+        python_path = os.pathsep.join(str(Path(path).resolve()) for path in sys.path if path)
+        with self._lock:
+            if self._children is None:
+                return None
             child = subprocess.Popen(  # noqa: S603 - our own commands
                 [*self._program, *step.words],
                 cwd=self.folder,
@@ -144,16 +164,21 @@ class Runner:
                 stderr=subprocess.STDOUT,
                 env=os.environ | {"PYTHONPATH": python_path, "OMP_NUM_THREADS": "1"},
             )
-            children[step.name] = child
-            _, status, usage = os.wait4(child.pid, 0)
-            child.returncode = os.waitstatus_to_exitcode(status)
-            del children[step.name]
-        made = all((self.folder / step.name / one).exists() for one in step.makes)
-        if child.returncode not in step.exits or not made:
-            return None
-        wall_s = time.monotonic() - started_s
-        self._write_receipt(step, done=True, wall_s=wall_s, cpu_s=usage.ru_utime + usage.ru_stime)
-        return wall_s
+            self._children[step.name] = child
+            return child
+
+    def _stop(self) -> None:
+        """Ask commands to end, and kill those that do not; none begins from now on."""
+        with self._lock:
+            children = list((self._children or {}).values())
+            self._children = None
+        for child in children:
+            _signal(child, signal.SIGTERM)
+        deadline_s = time.monotonic() + STOP_TIMEOUT_S
+        while time.monotonic() < deadline_s and any(child.returncode is None for child in children):
+            time.sleep(0.1)
+        for child in children:
+            _signal(child, signal.SIGKILL)
 
     def _prepare(self, step: Step) -> None:
         """Create the step's folder, without the results of another command."""
@@ -208,15 +233,8 @@ def _ready(
             yield step
 
 
-def _stop(children: Sequence[subprocess.Popen[bytes]]) -> None:
-    """Ask commands to end, and kill those that do not."""
-    for child in children:
+def _signal(child: subprocess.Popen[bytes], number: signal.Signals) -> None:
+    """Send a signal to a command that has not ended."""
+    if child.returncode is None:
         with suppress(ProcessLookupError):
-            child.terminate()
-    deadline_s = time.monotonic() + STOP_TIMEOUT_S
-    while time.monotonic() < deadline_s and any(child.returncode is None for child in children):
-        time.sleep(0.1)
-    for child in children:
-        if child.returncode is None:
-            with suppress(ProcessLookupError):
-                child.kill()
+            os.kill(child.pid, number)

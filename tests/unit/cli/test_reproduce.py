@@ -102,12 +102,15 @@ def test_an_interrupted_run_stops_its_command_and_resumes_in_its_folder(tmp_path
         """
     )
     arguments = [sys.executable, "-c", script, str(tmp_path)]
-    child = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline_s = time.monotonic() + 60
-    while not (tmp_path / "a" / "partial").exists() and time.monotonic() < deadline_s:
-        time.sleep(0.02)
-    child.send_signal(signal.SIGINT)
-    assert child.wait(60) != 0
+    with subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as child:
+        deadline_s = time.monotonic() + 60
+        while not (tmp_path / "a" / "partial").exists() and time.monotonic() < deadline_s:
+            time.sleep(0.02)
+        child.send_signal(signal.SIGINT)
+        try:
+            assert child.wait(60) != 0
+        finally:
+            child.kill()
     assert subprocess.run(arguments, timeout=60, check=False, capture_output=True).returncode == 0
     assert (tmp_path / "a" / "made").exists()
 
