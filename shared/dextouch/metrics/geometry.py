@@ -6,7 +6,7 @@ from dextouch.errors import InvalidInputError, ShapeError
 
 
 def depth_error(*, predicted_m: np.ndarray, true_m: np.ndarray) -> float:
-    """AbsRel after alignment of the scale: mean of |s p - t| / t, with s = median t / median p.
+    """AbsRel after alignment of the scale: mean of abs(s p - t) / t, s = median(t) / median(p).
 
     One scale for all images together. Pixels without depth on either side (infinite) do not count.
 
