@@ -158,7 +158,10 @@ class Experiments:
 
     def _data(self) -> Iterator[Step]:
         sizes = self.sizes
-        robot = ("--tasks", "robot-pretraining")
+        # Demonstrations move all the time; the default mix has takes in which nothing does, whose
+        # images any prediction gets right.
+        moving = ("--mix", "demonstrations")
+        robot = ("--tasks", "robot-pretraining", *moving)
         human = ("--domains", "human", "--path", "devices")
         yield _data_step("data/robot", sizes.robot_per_task, robot)
         yield _data_step("data/heldout", sizes.heldout_per_task, robot, FIRST_HELDOUT_SEED)
@@ -166,7 +169,7 @@ class Experiments:
         yield _data_step("data/cans", sizes.robot_per_task, cans)
         yield _data_step("data/cans-heldout", sizes.heldout_per_task, cans, FIRST_HELDOUT_SEED)
         yield _data_step(
-            "data/human", sizes.human_per_task, ("--tasks", "human-pretraining", *human)
+            "data/human", sizes.human_per_task, ("--tasks", "human-pretraining", *human, *moving)
         )
         downstream = ("--tasks", "downstream")
         yield _data_step("data/downstream", sizes.downstream_per_task, downstream)
