@@ -25,6 +25,7 @@ from services.evaluation.prediction import (
     Metric,
     PredictionResult,
     all_metrics,
+    described,
     measure_prediction,
 )
 from services.evaluation.prediction_scenes import Scene, read_rollout, read_windows
@@ -60,13 +61,8 @@ def main(arguments: Sequence[str]) -> int:
     wanted = _episodes(store, options.tasks, world.description.tasks)
     refuse_trained_episodes(store, wanted, path, command="evaluate prediction")
     result: dict[str, Any] = {"checkpoint": path.name, "digest": world.description.digest}
-    result["metrics"] = {
-        name: {"title": one.title, "unit": one.unit, "better": one.better, "about": one.about}
-        | ({"missing": one.missing} if one.missing else {})
-        for name, one in metrics.items()
-        if name in chosen
-    }
     measured = [metrics[name] for name in chosen]
+    result["metrics"] = described(measured)
     result["baselines"] = {name: BASELINES[name] for name in options.baselines}
     for horizon in [options.horizon] if options.horizon else _HORIZONS:
         scenes = [scene for one in wanted for scene in _HORIZONS[horizon](store.open(one))]

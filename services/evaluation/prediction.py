@@ -4,7 +4,7 @@ Only the `World` interface is used, so that all kinds of world models are measur
 over windows of one chunk, or over whole open-loop rollouts.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -254,6 +254,15 @@ class PredictionResult:
             if value is not None
         }
         return {**found, "num_rollouts": float(self.num_scenes)}
+
+
+def described(metrics: Iterable[Metric]) -> dict[str, dict[str, str]]:
+    """Titles, units, directions and definitions of metrics, and why some have no figure."""
+    return {
+        one.name: {"title": one.title, "unit": one.unit, "better": one.better, "about": one.about}
+        | ({"missing": one.missing} if one.missing else {})
+        for one in metrics
+    }
 
 
 def measure_prediction(

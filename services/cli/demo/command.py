@@ -30,7 +30,12 @@ from services.cli.twin_geometry import TwinGeometry
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.command_line import print_scores
-from services.evaluation.prediction import measure_prediction
+from services.evaluation.prediction import (
+    ALL_TASKS,
+    all_metrics,
+    described,
+    measure_prediction,
+)
 from services.evaluation.prediction_scenes import read_rollout
 from services.evaluation.reporting import (
     ActionPicture,
@@ -119,7 +124,8 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
         with stages.stage("predict", "predicting held-out scenes with the world model"):
             geometry, readers = TwinGeometry(), map(truths.open, demonstrations)
             scenes = [geometry.added_to(read_rollout(reader), reader) for reader in readers]
-            prediction = measure_prediction(models.world_model, scenes)
+            metrics = tuple(all_metrics().values())
+            prediction = measure_prediction(models.world_model, scenes, metrics=metrics)
         with stages.stage("judge", "scoring policies in the twin and in the world model"):
             policies = {**scoring.ladder(plan), "behaviour cloning": models.policy}
             scores = scoring.judge(urls, policies, models, plan)
@@ -143,6 +149,10 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
             for name, take in takes.items()
         },
         "world_model": prediction.flat(),
+        "prediction": {
+            "figures": prediction.by_task[ALL_TASKS],
+            "metrics": described(metrics),
+        },
         **scores,
     }
     with stages.stage("report", "drawing the report"):

@@ -1,8 +1,8 @@
 """HTML page of a report (the content of report.json) and its pictures, in one file.
 
 Every section is optional and omitted without data. The report may hold `title`, `about`, `stages`,
-`errors`, `world_model`, `policies`, `agreement` and `failures`; unknown keys only appear in the raw
-figures at the end.
+`errors`, `world_model`, `prediction`, `policies`, `agreement` and `failures`; unknown keys only
+appear in the raw figures at the end.
 """
 
 import json
@@ -62,6 +62,7 @@ def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
         clock_chart=clock_chart(pictures),
         action_charts=action_charts(pictures.actions),
         comparisons=comparison_bars(report.get("world_model", {})),
+        prediction=report.get("prediction"),
         policies=policy_panels(report),
         agreement=report.get("agreement", {}),
         failures=failure_rows(report),

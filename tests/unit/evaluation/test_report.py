@@ -145,6 +145,27 @@ def test_failed_rollouts_are_counted_by_kind(tmp_path):
     assert shown.count("<td>mine</td>") == 1
 
 
+def test_all_figures_of_prediction_stand_beside_their_baselines(tmp_path):
+    metrics = {
+        "psnr": {"title": "PSNR", "unit": "dB", "better": "higher", "about": ""},
+        "lpips": {
+            "title": "LPIPS",
+            "unit": "",
+            "better": "lower",
+            "about": "",
+            "missing": "not here",
+        },
+    }
+    figures = {
+        "model": {"psnr": 23.456, "lpips": None},
+        "other_take": {"psnr": None, "lpips": None},
+    }
+    path = tmp_path / "report.html"
+    write_report({"prediction": {"figures": figures, "metrics": metrics}}, ReportPictures(), path)
+    text = " ".join(re.sub("<[^>]*>", " ", path.read_text(encoding="utf-8")).split())
+    assert "model other take PSNR ↑ dB 23.5 none LPIPS ↓ not here" in text
+
+
 def test_raw_figures_come_along(tmp_path):
     report = {k: v for k, v in REPORT.items() if k in {"stages", "world_model"}}
     text, _ = page(tmp_path, report)
