@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,12 @@ def main(arguments: Sequence[str]) -> int:
     if options.list:
         _list(runner, steps)
         return 0
-    failed = runner.run(options.jobs)
+    # As Ctrl-C, so that `kill` stops the commands, too.
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        failed = runner.run(options.jobs)
+    finally:
+        signal.signal(signal.SIGTERM, before)
     pages: list[Page] = []
     for table in tables:
         try:

@@ -91,9 +91,12 @@ def test_an_interrupted_run_stops_its_command_and_resumes_in_its_folder(tmp_path
     """The parent gets SIGINT while the command sleeps; what the command left is there again."""
     script = textwrap.dedent(
         """
+        import signal
         import sys
         from pathlib import Path
         from services.cli.reproduce.steps import Runner, Step
+        # Shells let commands in the background ignore it.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         slow = ("import time, pathlib as p\\n"
                 "if p.Path('a/partial').exists(): p.Path('a/made').touch()\\n"
                 "else:\\n p.Path('a/partial').touch()\\n time.sleep(600)\\n")
