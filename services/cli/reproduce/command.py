@@ -5,6 +5,7 @@ import json
 import os
 import signal
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,12 @@ from dextouch import __version__
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.errors import NotFoundError
 from dextouch.schemas import first_problems
-from services.cli.reproduce.experiments import QUICK, TABLES, Experiments, Sizes
+from services.cli.reproduce.experiments import TABLES, Experiments, Table
+from services.cli.reproduce.pages import Page
+from services.cli.reproduce.provenance import data_markdown, data_of
+from services.cli.reproduce.sizes import QUICK, Sizes
 from services.cli.reproduce.steps import Runner, Step
-from services.cli.reproduce.tables import Page, make_pages
+from services.cli.reproduce.tables import make_pages
 
 REPORT, REPORT_JSON = "tables.md", "tables.json"
 _DESCRIPTION = """\
@@ -58,7 +62,10 @@ def main(arguments: Sequence[str]) -> int:
             print(f"{table}: no table; {error.message}")
     figures = {"version": __version__, "tables": [page.to_json() for page in pages]}
     figures["steps"] = _steps_done(runner, steps)
-    text = _head(experiments) + "\n".join(page.markdown() for page in pages)
+    data = data_of(options.folder, steps)
+    figures["data"] = [asdict(row) for row in data]
+    text = _head(tables, experiments) + "\n".join(page.markdown() for page in pages)
+    text += "\n" + data_markdown(data)
     (options.folder / REPORT).write_text(text, encoding="utf-8")
     write_result(options.folder / REPORT_JSON, figures)
     write_result(options.json, figures)
@@ -79,12 +86,14 @@ def _steps_done(runner: Runner, steps: Sequence[Step]) -> list[dict[str, Any]]:
     return [{"step": name, **one.model_dump()} for name, one in receipts.items() if one]
 
 
-def _head(experiments: Experiments) -> str:
-    seeds = ", ".join(map(str, experiments.seeds))
+def _head(tables: Sequence[Table], experiments: Experiments) -> str:
+    seeds = ",".join(map(str, experiments.seeds))
+    changed = experiments.sizes.model_dump(mode="json", exclude_defaults=True)
+    sizes = f" --sizes '{json.dumps(changed)}'" if changed else ""
     return (
-        f"# Tables\n\nDexTouch {__version__}, training seeds {seeds}. Cells are means over seeds "
-        "with 95 % intervals (Student's t); in brackets the paper's numbers, measured on other "
-        "data and in other units.\n\n"
+        f"# Tables\n\n`dextouch reproduce {' '.join(tables)} --seeds {seeds}{sizes}`, DexTouch "
+        f"{__version__}. Cells are means over training seeds with 95 % intervals (Student's t); in "
+        "brackets the paper's numbers, measured on other data and in other units.\n\n"
     )
 
 

@@ -4,31 +4,30 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
-from pydantic import Field
-
-from dextouch.frozen_model import FrozenModel
+from services.cli.reproduce.sizes import Sizes
 from services.cli.reproduce.steps import Step
-from services.twin.tasks.registry import DOWNSTREAM, HUMAN_PRETRAINING, ROBOT_PRETRAINING
+from services.twin.tasks.registry import DOWNSTREAM
 
 Table = Literal[
     "tokenizer", "options", "instruction", "design", "scaling", "evaluator", "generation"
 ]
 TABLES: Final[tuple[Table, ...]] = get_args(Table)
-# Columns of the design ablation, with the preset of each.
-DESIGNS: Final = {
-    "V-only": "paper-video-only",
-    "Cross-Attn": "paper-cross-attention",
-    "Robot-only": "paper",
+_CROSS_ATTENTION: Final = (
+    *("--network.action-conditioning", "cross_attention"),
+    "--no-network.add-condition-to-tokens",
+)
+# Columns of the design ablation: the default model, with what the paper's columns change. Models
+# as the preset `paper` has them learn nothing useful in minutes.
+DESIGNS: Final[dict[str, tuple[str, ...]]] = {
+    "V-only": (*_CROSS_ATTENTION, "--no-network.use-touch"),
+    "Cross-Attn": _CROSS_ATTENTION,
+    "Robot-only": (),
 }
 # Single options of the joint model, each changed from the default.
 OPTIONS: Final[dict[str, tuple[str, ...]]] = {
     "default": (),
     "no sum with tokens": ("--no-network.add-condition-to-tokens",),
-    "cross-attention": (
-        "--network.action-conditioning",
-        "cross_attention",
-        "--no-network.add-condition-to-tokens",
-    ),
+    "cross-attention": _CROSS_ATTENTION,
     "no pose raster": ("--no-network.use-pose-raster",),
     "no scene encoder": ("--no-network.use-scene-encoder",),
     "velocity": ("--network.prediction", "velocity", "--network.sampling-steps", "8"),
@@ -39,8 +38,19 @@ OPTIONS: Final[dict[str, tuple[str, ...]]] = {
 }
 INSTRUCTIONS: Final = {"hashed words": "hashed_words", "subwords": "subwords"}
 CANS: Final = ("lift_full_can", "lift_empty_can", "move_can_left", "move_can_right")
-PREDICTION_BASELINES: Final = "copy,warp,zero,codec,other_take,true_images"
-INSTRUCTION_BASELINES: Final = "copy,no_instruction,other_instruction"
+# Columns with which the others of their tables are compared, and steps that tables share.
+BASES: Final[dict[Table, str]] = {
+    "options": "default",
+    "design": "Robot-only",
+    "evaluator": "WM-Robot",
+}
+SHARED: Final[dict[Table, str]] = {"scaling": "design/Robot-only"}
+# Predictions that hardly depend on the model, measured beside the first seed of these columns.
+REFERENCES: Final = ("copy", "warp", "zero", "codec", "true_images")
+# Windows of held-out episodes for the short measurement at the end of a training: every n-th.
+_SHORT_EVALUATION: Final = ("--evaluation-stride", "40")
+OTHER_ACTIONS: Final = "other_take"
+INSTRUCTION_BASELINES: Final = ("copy", "no_instruction", "other_instruction")
 TOKENIZERS: Final = {"Split-Hands": "split_hands", "Grid": "grid"}
 FIRST_HELDOUT_SEED: Final = 60_000
 FIRST_STUDY_SEED: Final = 70_000
@@ -48,61 +58,9 @@ ADAPTED: Final = ("WM-Robot", "WM-Mix")
 GENERATED: Final = ("Real", "Half", *(f"+{world}" for world in ADAPTED))
 # Stand-ins of the paper's three policies: a cloned one, the same early in training, and a script.
 SCRIPT_POLICY: Final = "script 15 mm"
-
-
-class Sizes(FrozenModel):
-    """Amounts of data and training; the defaults take some hours on two cores.
-
-    The paper has 5 h of robot and up to 100 h of human data, that is 20 times as much.
-    """
-
-    robot_per_task: int = Field(default=12, ge=2, description="robot episodes per pretraining task")
-    multiples: tuple[int, ...] = Field(
-        default=(1, 5, 10), description="human episodes, as multiples of the robot episodes"
-    )
-    heldout_per_task: int = Field(default=6, ge=1, description="held-out episodes per task")
-    downstream_per_task: int = Field(default=84, ge=3, description="robot episodes per task")
-    adapt_robot: int = Field(default=200, ge=1, description="robot episodes of WM-Robot")
-    adapt_half: int = Field(default=100, ge=1, description="robot and human episodes of WM-Mix")
-    tokenizer_cpu_s: int = Field(default=60, ge=1, description="training of a tokenizer")
-    train_cpu_s: int = Field(default=300, ge=1, description="training of a world model")
-    option_cpu_s: int = Field(default=120, ge=1, description="the same, to compare options")
-    adapt_cpu_s: int = Field(default=150, ge=1, description="adaptation of a world model")
-    policy_steps: int = Field(default=3000, ge=1, description="training steps of a cloned policy")
-    num_starts: int = Field(default=10, ge=1, description="starts per task and policy")
-    num_generated: int = Field(default=100, ge=1, description="generated demonstrations")
-
-    @property
-    def num_robot(self) -> int:
-        """Robot episodes of pretraining."""
-        return self.robot_per_task * len(ROBOT_PRETRAINING)
-
-    @property
-    def human_per_task(self) -> int:
-        """Human episodes per task, for the largest multiple and some that alignment refuses."""
-        return 2 + max(self.multiples) * self.num_robot // len(HUMAN_PRETRAINING)
-
-    @property
-    def downstream_human_per_task(self) -> int:
-        """Human episodes per task of which two thirds of the scenes give `adapt_half`."""
-        return 3 + 2 * self.adapt_half // len(DOWNSTREAM)
-
-
-QUICK: Final = Sizes(
-    robot_per_task=8,
-    multiples=(1,),
-    heldout_per_task=1,
-    downstream_per_task=24,
-    adapt_robot=8,
-    adapt_half=4,
-    tokenizer_cpu_s=3,
-    train_cpu_s=6,
-    option_cpu_s=4,
-    adapt_cpu_s=4,
-    policy_steps=20,
-    num_starts=1,
-    num_generated=4,
-)
+# Half of the windows of a model with human data are the robot's: without human data, it has seen
+# as many of them after half the training.
+HALF_TRAINING: Final = "0, half as long"
 
 
 @dataclass(frozen=True)
@@ -122,8 +80,9 @@ class Experiments:
                 add(one)
             found.setdefault(name, everything[name])
 
+        wanted = (*tables, *(SHARED[table] for table in tables if table in SHARED))
         for name in everything:
-            if name.partition("/")[0] in tables:
+            if name.startswith(tuple(f"{one}/" for one in wanted)):
                 add(name)
         return [step for name, step in everything.items() if name in found]
 
@@ -136,20 +95,10 @@ class Experiments:
         for encoder, kind in INSTRUCTIONS.items():
             for seed in self.seeds:
                 yield from self._instructed(encoder, kind, seed)
-        for design, preset in DESIGNS.items():
+        for design, flags in DESIGNS.items():
             for seed in self.seeds:
-                yield from self._world_model("design", design, seed, ("--preset", preset))
-        for multiple in self.sizes.multiples:
-            human = (
-                "--human",
-                "data/human/store",
-                "--human-episodes",
-                str(multiple * self.sizes.num_robot),
-            )
-            for seed in self.seeds:
-                yield from self._world_model(
-                    "scaling", f"{multiple}x", seed, ("--preset", "paper", *human), ("data/human",)
-                )
+                yield from self._world_model("design", design, seed, flags)
+        yield from self._scaling()
         for seed in self.seeds:
             yield from self._adapted(seed)
         yield from self._policies()
@@ -192,41 +141,55 @@ class Experiments:
                 made = ("tokenizer.safetensors", "result.json")
                 yield Step(name, words, made, ("data/robot",))
 
+    def _scaling(self) -> Iterator[Step]:
+        for seed in self.seeds:
+            yield from self._world_model("scaling", HALF_TRAINING, seed)
+        for multiple in self.sizes.multiples:
+            count = str(multiple * self.sizes.num_robot)
+            human = ("--human", "data/human/store", "--human-episodes", count)
+            for seed in self.seeds:
+                column = f"{multiple}x"
+                yield from self._world_model("scaling", column, seed, human, ("data/human",))
+
     def _world_model(
         self,
         table: Table,
         column: str,
         seed: int,
-        options: tuple[str, ...],
+        options: tuple[str, ...] = (),
         needs: tuple[str, ...] = (),
     ) -> Iterator[Step]:
-        folder = f"{table}/{column.replace(' ', '-')}/seed-{seed}"
+        folder = f"{table}/{folder_of(column)}/seed-{seed}"
         name = f"{folder}/model"
-        if table != "options" and column != "V-only":
-            tokenizer = f"tokenizer/split_hands/seed-{seed}"
-            options = (*options, "--tokenizer", f"{tokenizer}/tokenizer.safetensors")
-            needs = (*needs, tokenizer)
+        cpu_s = self.sizes.option_cpu_s if table == "options" else self.sizes.train_cpu_s
+        if column == HALF_TRAINING:
+            cpu_s = cpu_s // 2
         words = (
             *("train", "world-model", *options, "--episodes", "data/robot/store"),
             *("--heldout", "data/heldout/store", "--seed", str(seed)),
-            *("--cpu-budget-s", str(self._cpu_s(table)), "--resume"),
+            *("--cpu-budget-s", str(cpu_s), "--resume", *_SHORT_EVALUATION),
             *("--output", f"{name}/model.safetensors", "--json", f"{name}/result.json"),
         )
         needed = ("data/robot", "data/heldout", *needs)
         yield Step(name, words, ("model.safetensors", "result.json"), needed)
-        yield _prediction_step(f"{folder}/prediction", name, "data/heldout")
+        prediction = f"{folder}/prediction"
+        yield _prediction_step(
+            prediction, name, "data/heldout", self._references(table, column, seed)
+        )
 
-    def _cpu_s(self, table: Table) -> int:
-        return self.sizes.option_cpu_s if table == "options" else self.sizes.train_cpu_s
+    def _references(self, table: Table, column: str, seed: int) -> Sequence[str]:
+        is_base = column == BASES.get(table) and seed == self.seeds[0]
+        return (*REFERENCES, OTHER_ACTIONS) if is_base else (OTHER_ACTIONS,)
 
     def _instructed(self, encoder: str, kind: str, seed: int) -> Iterator[Step]:
         """A model of the can tasks, which start alike, measured with right and wrong sentences."""
-        folder = f"instruction/{encoder.replace(' ', '-')}/seed-{seed}"
+        folder = f"instruction/{folder_of(encoder)}/seed-{seed}"
         name = f"{folder}/model"
         words = (
             *("train", "world-model", "--network.instruction-encoder", kind),
             *("--episodes", "data/cans/store", "--heldout", "data/cans-heldout/store"),
             *("--seed", str(seed), "--cpu-budget-s", str(self.sizes.train_cpu_s), "--resume"),
+            *_SHORT_EVALUATION,
             *("--output", f"{name}/model.safetensors", "--json", f"{name}/result.json"),
         )
         needs = ("data/cans", "data/cans-heldout")
@@ -253,14 +216,15 @@ class Experiments:
                 # Scenes of split A are left for generation.
                 *("--episodes", "data/downstream/store", "--splits", "B,C", *options),
                 *("--heldout", "data/downstream-heldout/store", "--seed", str(seed)),
-                *("--cpu-budget-s", str(sizes.adapt_cpu_s)),
+                *("--cpu-budget-s", str(sizes.adapt_cpu_s), *_SHORT_EVALUATION),
                 *("--output", f"{name}/model.safetensors", "--json", f"{name}/result.json"),
             )
             needs = ("data/downstream", "data/downstream-human", "data/downstream-heldout")
             made = ("model.safetensors", "result.json")
             yield Step(name, words, made, (*needs, ancestor))
             prediction = f"evaluator/{world}/seed-{seed}/prediction"
-            yield _prediction_step(prediction, name, "data/downstream-heldout")
+            references = self._references("evaluator", world, seed)
+            yield _prediction_step(prediction, name, "data/downstream-heldout", references)
 
     def _policies(self) -> Iterator[Step]:
         """Policies to evaluate: cloned from real demonstrations, and the same early in training."""
@@ -358,6 +322,11 @@ class Experiments:
         return Step(name, words, ("store", "result.json"), ("data/downstream", model))
 
 
+def folder_of(column: str) -> str:
+    """Name of the folder of a table's column."""
+    return column.replace(",", "").replace(" ", "-")
+
+
 def _data_step(name: str, count: int, options: tuple[str, ...], first: int = 0) -> Step:
     words = (
         *("train", "data", "--store", f"{name}/store", *options, "--first", str(first)),
@@ -366,12 +335,11 @@ def _data_step(name: str, count: int, options: tuple[str, ...], first: int = 0) 
     return Step(name, words, ("store", "result.json"), exits=(0, 1))
 
 
-def _prediction_step(
-    name: str, model: str, heldout: str, baselines: str = PREDICTION_BASELINES
-) -> Step:
+def _prediction_step(name: str, model: str, heldout: str, baselines: Sequence[str]) -> Step:
     words = (
         *("evaluate", "prediction", "--checkpoint", f"{model}/model.safetensors"),
-        *("--episodes", f"{heldout}/store", "--baselines", baselines),
+        *("--episodes", f"{heldout}/store", "--horizon", "windows"),
+        *("--baselines", ",".join(baselines)),
         *("--json", f"{name}/result.json"),
     )
     return Step(name, words, ("result.json",), (heldout, model))

@@ -2,23 +2,25 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
-
-import numpy as np
 
 from services.cli.reproduce.experiments import (
     ADAPTED,
     DESIGNS,
     GENERATED,
+    HALF_TRAINING,
     INSTRUCTIONS,
     OPTIONS,
+    OTHER_ACTIONS,
+    REFERENCES,
     TOKENIZERS,
     Experiments,
     Table,
+    folder_of,
 )
+from services.cli.reproduce.pages import Measured, Page, Row
 from services.cli.reproduce.steps import read_json
 from services.evaluation.prediction import MODEL
 from services.evaluation.scores import REAL
@@ -47,109 +49,14 @@ METRICS: Final = (
     ("Contact-F1", "contact_f1", True),
 )
 
+# Figures of the models with the actions of another take: what the actions matter.
+OTHER_ACTIONS_ROWS: Final = (("PSNR", "psnr", True), ("Contact-F1", "contact_f1", True))
 TOKENIZER_METRICS: Final = (
     ("mse_kpa2", "MSE (kPa²)", False),
     ("mae_kpa", "MAE (kPa)", False),
     ("contact_iou", "Contact-IoU", True),
     ("contact_f1", "Contact-F1", True),
 )
-
-
-@dataclass(frozen=True)
-class Measured:
-    """A figure measured once for each training seed; NaN where it is not available."""
-
-    values: tuple[float, ...]
-
-    @property
-    def mean(self) -> float:
-        """Mean over seeds."""
-        return float(np.mean(self.values))
-
-    @property
-    def half_width(self) -> float:
-        """Half of the 95 % interval of the mean over seeds (Student's t); NaN for one seed."""
-        from scipy.stats import t
-
-        num = len(self.values)
-        if num < 2:
-            return math.nan
-        spread = float(np.std(self.values, ddof=1)) / math.sqrt(num)
-        return float(t.ppf(0.975, num - 1)) * spread
-
-    def less(self, other: "Measured") -> "Measured":
-        """Differences, seed by seed."""
-        return Measured(tuple(a - b for a, b in zip(self.values, other.values, strict=True)))
-
-    def text(self, *, signed: bool = False) -> str:
-        """Mean and interval, with as many digits as the interval has meaning."""
-        if not math.isfinite(self.mean):
-            return "n/a"
-        sign = "+" if signed else ""
-        if not math.isfinite(self.half_width):
-            return f"{self.mean:{sign}.4g}"
-        digits = max(0, 1 - math.floor(math.log10(self.half_width))) if self.half_width else 4
-        return f"{self.mean:{sign}.{digits}f} ± {self.half_width:.{digits}f}"
-
-
-@dataclass(frozen=True)
-class Row:
-    """A row of a table: a figure in every column, with the paper's number if it has one."""
-
-    name: str
-    cells: Mapping[str, Measured]
-    paper: Mapping[str, float | None]
-    higher_is_better: bool | None = None
-
-    @property
-    def is_available(self) -> bool:
-        """Whether any column has a figure."""
-        return any(math.isfinite(cell.mean) for cell in self.cells.values())
-
-
-@dataclass(frozen=True)
-class Page:
-    """One table; differences of its columns from `base` are shown below it."""
-
-    title: str
-    rows: tuple[Row, ...]
-    base: str | None = None
-
-    def markdown(self) -> str:
-        """Markdown of the table; rows without any figure are named below it."""
-        columns = list(self.rows[0].cells)
-        shown = [row for row in self.rows if row.is_available]
-        absent = [row.name for row in self.rows if not row.is_available]
-        lines = [f"## {self.title}", "", *_markdown_head(["", *columns])]
-        for row in shown:
-            cells = [_with_paper(row.cells[one], row.paper.get(one)) for one in columns]
-            lines.append(_markdown_row([_name(row), *cells]))
-        if absent:
-            lines += ["", f"Not available: {', '.join(absent)}."]
-        if self.base is not None:
-            others = [one for one in columns if one != self.base]
-            lines += ["", f"Difference from {self.base}, seed by seed:", ""]
-            lines += _markdown_head(["", *others])
-            for row in shown:
-                base = row.cells[self.base]
-                cells = [row.cells[one].less(base).text(signed=True) for one in others]
-                lines.append(_markdown_row([_name(row), *cells]))
-        return "\n".join([*lines, ""])
-
-    def to_json(self) -> dict[str, Any]:
-        """The values of every seed, and the paper's numbers."""
-        return {
-            "title": self.title,
-            "rows": [
-                {
-                    "name": row.name,
-                    "higher_is_better": row.higher_is_better,
-                    "values": {name: _finite(cell.values) for name, cell in row.cells.items()},
-                    "paper": dict(row.paper),
-                }
-                for row in self.rows
-            ],
-        }
 
 
 def make_pages(folder: Path, experiments: Experiments, table: Table) -> list[Page]:
@@ -197,7 +104,7 @@ def _design_pages(folder: Path, experiments: Experiments) -> list[Page]:
 
 
 def _options_pages(folder: Path, experiments: Experiments) -> list[Page]:
-    columns = {name: (f"options/{name.replace(' ', '-')}", "") for name in OPTIONS}
+    columns = {name: (f"options/{folder_of(name)}", "") for name in OPTIONS}
     rows = _prediction_rows(folder, experiments, columns)
     return [Page("Options of the joint model, one changed at a time", rows, "default")]
 
@@ -207,7 +114,7 @@ def _instruction_pages(folder: Path, experiments: Experiments) -> list[Page]:
     sources = {"right": MODEL, "none": "no_instruction", "another's": "other_instruction"}
     pages = []
     for encoder in INSTRUCTIONS:
-        step = f"instruction/{encoder.replace(' ', '-')}"
+        step = f"instruction/{folder_of(encoder)}"
         found = [
             read_json(folder / f"{step}/seed-{seed}/prediction/result.json")
             for seed in experiments.seeds
@@ -232,6 +139,7 @@ def _scaling_pages(folder: Path, experiments: Experiments) -> list[Page]:
     paper = ("+10h Human", "+50h Human", "+100h Human")
     multiples = experiments.sizes.multiples
     columns = {"0": ("design/Robot-only", "Robot-only")}
+    columns[HALF_TRAINING] = (f"scaling/{folder_of(HALF_TRAINING)}", "")
     for index, multiple in enumerate(multiples):
         name = paper[index] if len(multiples) == len(paper) else ""
         columns[f"{multiple}x"] = (f"scaling/{multiple}x", name)
@@ -250,20 +158,28 @@ def _prediction_rows(
         ]
         for column, (step, _) in columns.items()
     }
-    rows = []
-    for name, key, higher in METRICS:
-        cells = {
-            column: Measured(tuple(_figure(result, key) for result in results))
+
+    def cells(key: str, source: str) -> dict[str, Measured]:
+        return {
+            column: Measured(tuple(_figure(result, key, source) for result in results))
             for column, results in found.items()
         }
+
+    measured = [results[0] for results in found.values()]
+    measured = [one for one in measured if REFERENCES[0] in one["windows"]["all"]]
+    rows = []
+    for name, key, higher in METRICS:
         paper = {column: PAPER["prediction"][name].get(c) for column, (_, c) in columns.items()}
-        rows.append(Row(name, cells, paper, higher))
+        beside = {one: _figure(measured[0], key, one) for one in REFERENCES if measured}
+        rows.append(Row(name, cells(key, MODEL), paper, higher, beside))
+    for name, key, higher in OTHER_ACTIONS_ROWS:
+        rows.append(Row(f"{name}, other actions", cells(key, OTHER_ACTIONS), {}, not higher))
     return tuple(rows)
 
 
 def _figure(result: Mapping[str, Any], key: str, source: str = MODEL) -> float:
     """A metric of the windows of all tasks; NaN where it is not available."""
-    value = result["windows"]["all"][source].get(key)
+    value = result["windows"]["all"].get(source, {}).get(key)
     return float(value) if isinstance(value, int | float) else math.nan
 
 
@@ -363,24 +279,3 @@ def _study_pages(
 
 def _number(value: object) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
-
-
-def _finite(values: Sequence[float]) -> list[float | None]:
-    return [value if math.isfinite(value) else None for value in values]
-
-
-def _name(row: Row) -> str:
-    arrow = {True: " ↑", False: " ↓", None: ""}[row.higher_is_better]
-    return f"{row.name}{arrow}"
-
-
-def _with_paper(cell: Measured, paper: float | None) -> str:
-    return cell.text() if paper is None else f"{cell.text()} (paper {paper:g})"
-
-
-def _markdown_head(cells: Sequence[str]) -> list[str]:
-    return [_markdown_row(cells), "|" + "---|" * len(cells)]
-
-
-def _markdown_row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"

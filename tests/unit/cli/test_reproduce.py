@@ -10,13 +10,18 @@ import textwrap
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from dextouch.errors import ConflictError
 from services.cli.main import find_command, main
-from services.cli.reproduce.experiments import QUICK, TABLES, Experiments, Sizes
+from services.cli.reproduce.experiments import TABLES, Experiments
+from services.cli.reproduce.pages import Measured, Page, Row
+from services.cli.reproduce.provenance import data_of
+from services.cli.reproduce.sizes import QUICK, Sizes
 from services.cli.reproduce.steps import Runner, Step
-from services.cli.reproduce.tables import METRICS, Measured, Page, Row, make_pages
+from services.cli.reproduce.tables import METRICS, make_pages
 
 # A command that appends its last word to a file and writes the result that its first word names.
 PROGRAM = (
@@ -139,6 +144,20 @@ def test_a_table_takes_only_the_steps_it_needs():
     assert not any(name.startswith(("scaling", "evaluator", "data/human")) for name in names)
 
 
+def test_the_table_of_scaling_takes_the_models_without_human_data():
+    steps = {step.name: step for step in Experiments(QUICK, (0, 1)).steps(["scaling"])}
+    assert "design/Robot-only/seed-1/prediction" in steps
+    assert "design/V-only/seed-0/model" not in steps
+    assert "--cpu-budget-s 3 " in steps["scaling/0-half-as-long/seed-0/model"].command
+    assert "--cpu-budget-s 6 " in steps["scaling/1x/seed-0/model"].command
+
+
+def test_predictions_without_a_model_are_measured_once():
+    steps = {step.name: step for step in Experiments(QUICK, (0, 1)).steps(["design"])}
+    with_copy = [name for name, step in steps.items() if "copy" in step.command]
+    assert with_copy == ["design/Robot-only/seed-0/prediction"]
+
+
 def test_the_interval_is_students():
     # t of 0.975 with 2 degrees of freedom is 4.3027 (any table of Student's t).
     measured = Measured((1.0, 2.0, 4.5))
@@ -168,7 +187,10 @@ def test_a_prediction_table_reads_the_figures_of_its_steps(tmp_path):
             path = tmp_path / f"design/{column}/seed-{seed}/prediction/result.json"
             path.parent.mkdir(parents=True)
             figures = {key: None for _, key, _ in METRICS} | {"psnr": base + seed}
-            path.write_text(json.dumps({"windows": {"all": {"model": figures}}}))
+            sources = {"model": figures, "other_take": figures | {"psnr": base - 3}}
+            if column == "Robot-only" and seed == 0:
+                sources["copy"] = figures | {"psnr": 18.25}
+            path.write_text(json.dumps({"windows": {"all": sources}}))
     (page,) = make_pages(tmp_path, experiments, "design")
     psnr = page.rows[0]
     assert psnr.cells["Cross-Attn"].mean == pytest.approx(21.5)
@@ -177,3 +199,29 @@ def test_a_prediction_table_reads_the_figures_of_its_steps(tmp_path):
     text = page.markdown()
     assert "| SSIM" not in text
     assert "Not available: SSIM, LPIPS, Aesthetic Quality" in text
+    (line,) = [line for line in text.splitlines() if line.startswith("| PSNR ↑ | 20.5")]
+    assert line.endswith("| 18.25 | n/a | n/a |")
+    assert page.to_json()["rows"][0]["references"]["copy"] == pytest.approx(18.25)
+    assert "| PSNR, other actions ↓ | 17.0000 ± 0.0000 |" in text
+
+
+def test_data_are_named_once_for_all_seeds(tmp_path):
+    sets = [
+        {"domain": "robot", "tasks": {"insert_peg": 4, "turn_lever": 4}, "data_hash": "a" * 64},
+        {"domain": "human", "tasks": {"lift_box": 9}, "data_hash": "b" * 64},
+        {"domain": "robot", "tasks": {"insert_peg": 2}, "data_hash": "c" * 64, "heldout": True},
+        {"domain": "robot", "tasks": {"stir": 7}, "data_hash": "d" * 64, "checkpoint": "an older"},
+    ]
+    notes = {"data_hash": "e" * 64, "sets": [{"heldout": False} | one for one in sets]}
+    steps = [Step(f"scaling/1x/seed-{seed}/model", (), ("m.safetensors",)) for seed in (0, 1)]
+    for step in steps:
+        (tmp_path / step.name).mkdir(parents=True)
+        save_file(
+            {"weight": np.zeros(1, np.float32)},
+            tmp_path / step.name / "m.safetensors",
+            {"dextouch_world_model": json.dumps(notes)},
+        )
+    (row,) = data_of(tmp_path, steps)
+    assert row.models == "scaling/1x/model"
+    assert row.trained == (f"8 robot ({'a' * 12})", f"9 human ({'b' * 12})")
+    assert row.heldout == (f"2 robot ({'c' * 12})",)
