@@ -144,12 +144,20 @@ class PeriodicCall:
         period_ns: from the end of one call to the next.
         clock: on which the thread waits.
         name: of the thread.
+        on_wake: called before each call with the time and how late the thread woke, both in ns.
     """
 
     def __init__(
-        self, call: Callable[[], None], *, period_ns: int, clock: StationClock, name: str
+        self,
+        call: Callable[[], None],
+        *,
+        period_ns: int,
+        clock: StationClock,
+        name: str,
+        on_wake: Callable[[int, int], None] | None = None,
     ) -> None:
         self._call = call
+        self._on_wake = on_wake
         self._period_ns = period_ns
         self._clock = clock
         self._name = name
@@ -175,7 +183,10 @@ class PeriodicCall:
 
     def _run(self, waiter: Waiter) -> None:
         with closing(waiter):
-            while waiter.wait_until(self._clock.now_ns() + self._period_ns):
+            while waiter.wait_until(due_ns := self._clock.now_ns() + self._period_ns):
+                if self._on_wake is not None:
+                    now_ns = self._clock.now_ns()
+                    self._on_wake(now_ns, now_ns - due_ns)
                 self._call()
 
 

@@ -224,6 +224,7 @@ class MockStation:
             clock=clock,
             calibration={**_known_of(self.pairs, unit_seed), **(calibration or {})},
             safety=safety,
+            simulated=True,
         )
         self._players: list[tuple[threading.Thread, Waiter]] = []
         self._failures: list[str] = []

@@ -36,9 +36,10 @@ class Station:
         clock: stamps and waits.
         calibration: matrices that travel with every recording.
         safety: how often the spool reaches the disk, and how much space is kept.
+        simulated: whether the devices are mocks.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - all by name
         self,
         *,
         name: str,
@@ -47,6 +48,7 @@ class Station:
         clock: StationClock,
         calibration: Mapping[str, Matrix],
         safety: SpoolSafety | None = None,
+        simulated: bool = False,
     ) -> None:
         self.name = name
         self.clock = clock
@@ -61,6 +63,7 @@ class Station:
             calibration=calibration,
             clock=clock,
             paths=self.paths,
+            simulated=simulated,
         )
         self.recorder = Recorder(
             station=name,

@@ -12,6 +12,7 @@ from dextouch.errors import DeviceError
 from dextouch.streams import Sample
 from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.transports.shared_links import shared_link
 
 logger = structlog.get_logger(__name__)
 
@@ -89,6 +90,7 @@ class DeviceSupervisor:
         reconnects: how often it was lost after it was open.
         last_error: why it was lost, or could not be opened; None while it is open.
         streams: counters of each of its streams.
+        shares: what it shares with other devices, where it was opened last.
     """
 
     def __init__(self, driver: Driver, *, sink: Sink, clock: StationClock) -> None:
@@ -97,6 +99,7 @@ class DeviceSupervisor:
         self.reconnects = 0
         self.last_error: str | None = None
         self.streams = {d.name: StreamCounters() for d in driver.descriptors}
+        self.shares = shared_link(driver.info)
         self._events = dict.fromkeys(EVENTS, 0)
         self._sink = sink
         # The last message that was logged, when, and how often it came since it was new.
@@ -148,6 +151,7 @@ class DeviceSupervisor:
 
     def _read_until_lost(self) -> None:
         self.driver.open()
+        self.shares = shared_link(self.driver.info)
         self.last_error = None
         self.connected.set()
         self._release_waiter()

@@ -1,6 +1,6 @@
 """Table of all health codes: what each one means, its limits, and what an operator can do.
 
-docs/health.md holds it as `table` shows it.
+docs/health.md holds it as `table` shows it, and the root causes as `cause_table` does.
 """
 
 import math
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from dextouch.schemas import HealthLevel
+from dextouch.schemas import CauseCode, HealthLevel
 
 SEVERITY: tuple[HealthLevel, ...] = ("OK", "WARN", "ERROR", "STALE")
 NEVER = math.inf
@@ -123,10 +123,59 @@ CODES: Final[Mapping[str, Rule]] = {
         "Calibrate with `dextouch station calibrate` before recording."),
     "calibration_age": Rule(604_800.0, NEVER, "days", "now", "age of the oldest calibration",
         "Calibrate again with `dextouch station calibrate`."),
+    "overload": Rule(0.02, 0.1, "ms", "10 s", "90th percentile of how late a thread wakes",
+        "Close other programs, or set the cameras to smaller or fewer images."),
     "upload_refused": Rule(0.0, NEVER, "", "now", "takes refused by the store; they stay here",
         "Resolve the reason that the store gives, then send the take again."),
 }
 # fmt: on
+
+
+@dataclass(frozen=True)
+class CauseRule:
+    """What a root cause is.
+
+    Attributes:
+        title: what it is called.
+        meaning: when it is found.
+        advice: what to do; empty where it is that of the leading finding.
+    """
+
+    title: str
+    meaning: str
+    advice: str
+
+
+# From the widest to the narrowest; `services.acquisition.health.causes` finds them.
+# fmt: off
+CAUSES: Final[Mapping[CauseCode, CauseRule]] = {
+    "host": CauseRule("This computer",
+        "`overload`, or `latency` or `queue` of at least 3 and of half of the devices",
+        CODES["overload"].advice),
+    "hub": CauseRule("USB hub", "all devices of a USB hub (2 or more) are gone, or lose data",
+        "Check the plug and the power supply of this hub, and spread its devices over more ports."),
+    "network": CauseRule("Network",
+        "all devices of a remote host (2 or more) are gone, or lose data",
+        "Check cable, switch and power on the way to this host, and use a direct link."),
+    "bridge": CauseRule("Bridge",
+        "all devices behind a local program (2 or more) are gone, or lose data",
+        "Restart the program that brings these devices, and look into its log."),
+    "gone": CauseRule("Device gone", "a device is `unplugged`, or `silent` for 2 s or more", ""),
+    "clock": CauseRule("Clock", "`clock_step` of a device, with what follows from it", ""),
+    "device": CauseRule("Device",
+        "what else is raised of a device, led by its gravest finding", ""),
+    "station": CauseRule("Station", "findings of the station: disk, calibration, uploads", ""),
+}
+# fmt: on
+
+
+def cause_table() -> str:
+    """The causes as a table in Markdown."""
+    rows = [
+        f"| `{code}` | {rule.meaning} | {rule.advice or 'as the finding says'} |"
+        for code, rule in CAUSES.items()
+    ]
+    return "\n".join(["| cause | found when | advice |\n|---|---|---|", *rows])
 
 
 def table() -> str:

@@ -3,8 +3,6 @@
 import threading
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from dextouch.schemas import (
     DeviceHealth,
     HealthEvents,
@@ -13,10 +11,11 @@ from dextouch.schemas import (
     StationHealth,
     StreamHealth,
 )
-from dextouch.streams import Sample, StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.drivers.base import Driver
 from services.acquisition.glove_record import glove_record, is_ours
+from services.acquisition.health.causes import SIMULATED_ADVICE, find_causes
 from services.acquisition.health.cells import TaxelJudge, cell_judge
 from services.acquisition.health.clock import ClockJudge, CountingJudge
 from services.acquisition.health.codes import CODES
@@ -29,6 +28,8 @@ from services.acquisition.health.evaluation import (
     raised_finding,
     worst,
 )
+from services.acquisition.health.host import HostJudge
+from services.acquisition.health.queues import SampleQueue
 from services.acquisition.health.station import CalibrationJudge, PathJudge
 from services.acquisition.health.streams import (
     CameraJudge,
@@ -49,55 +50,6 @@ STALE_AFTER_NS = {"image": 500_000_000}
 STALE_AFTER_OTHERS_NS = 200_000_000
 LATE_PERIODS = round(CODES["late"].warn)
 STATION = "station"
-# What is kept between two evaluations, which are a second apart.
-KEPT_S = 4.0
-JUDGED_VALUES = ("tactile", "pose", "keypoints")
-
-
-class SampleQueue:
-    """A ring of one stream's newest stamps and values; any thread may add and take.
-
-    A reader appends and goes on; when nobody evaluates, the oldest samples fall out and are
-    counted in `num_dropped`. It takes its memory once, whatever waits in it.
-    """
-
-    def __init__(self, descriptor: StreamDescriptor) -> None:
-        self.num_dropped = 0
-        self._size = max(16, round(KEPT_S * descriptor.nominal_rate_hz))
-        self._keeps_values = descriptor.kind in JUDGED_VALUES
-        self._stamps = np.zeros((self._size, 4), dtype=np.int64)
-        # Made of the first sample: its device decides on their type.
-        self._values: np.ndarray | None = None
-        self._num_added = self._num_taken = 0
-        self._lock = threading.Lock()
-
-    def add(self, samples: Sequence[Sample], now_ns: int) -> None:
-        """Append a delivery (called by the reader thread, after its samples were spooled)."""
-        if self._values is None and self._keeps_values:
-            first = samples[0].values
-            self._values = np.zeros((self._size, *first.shape), dtype=first.dtype)
-        with self._lock:
-            for sample in samples:
-                place, t_host_ns = self._num_added % self._size, sample.t_host_ns
-                stamps = (t_host_ns, sample.t_device_ns, sample.sequence, now_ns - t_host_ns)
-                self._stamps[place] = stamps
-                if self._values is not None:
-                    self._values[place] = sample.values
-                self._num_added += 1
-            num_dropped = max(0, self._num_added - self._num_taken - self._size)
-            self._num_taken += num_dropped
-            self.num_dropped += num_dropped
-
-    def take(self) -> Block:
-        """Everything that waits, oldest first."""
-        with self._lock:
-            places = np.arange(self._num_taken, self._num_added) % self._size
-            stamps = np.ascontiguousarray(self._stamps[places].T)
-            values = None
-            if self._values is not None and len(places):
-                values = self._values[places]
-            self._num_taken = self._num_added
-        return Block(stamps[0], stamps[1], stamps[2], stamps[3], values)
 
 
 class _Watched:
@@ -207,6 +159,7 @@ class HealthMonitor:
         calibration: of the station.
         clock: of the station.
         paths: measured path delays, which are compared with the calibration.
+        simulated: whether the devices are mocks, of which nothing can be plugged or replaced.
 
     Attributes:
         queues: of each stream's samples, filled by the reader threads with what they have spooled.
@@ -220,8 +173,10 @@ class HealthMonitor:
         calibration: Mapping[str, Matrix],
         clock: StationClock,
         paths: PathWatch | None = None,
+        simulated: bool = False,
     ) -> None:
         self._station = station
+        self._simulated = simulated
         self._supervisors = list(supervisors)
         self._clock = clock
         self._log = EventLog()
@@ -229,8 +184,9 @@ class HealthMonitor:
         self._streams = {stream.name: stream for stream in streams}
         self.queues = {stream.name: stream.queue for stream in streams}
         descriptors = [descriptor for s in supervisors for descriptor in s.driver.descriptors]
+        host = HostJudge()
         self._itself = _Watched(
-            STATION, [CalibrationJudge(descriptors, calibration), self._judge_itself]
+            STATION, [CalibrationJudge(descriptors, calibration), host, self._judge_itself]
         )
         self._all = [*streams, self._itself]
         self._started_ns = clock.now_ns()
@@ -238,7 +194,9 @@ class HealthMonitor:
         # One evaluates at a time; the other lock guards what a report reads.
         self._evaluating = threading.Lock()
         self._lock = threading.Lock()
-        self._ticks = PeriodicCall(self.tick, period_ns=TICK_NS, clock=clock, name="health")
+        self._ticks = PeriodicCall(
+            self.tick, period_ns=TICK_NS, clock=clock, name="health", on_wake=host.note
+        )
 
     def watch(self, judge: Judge) -> None:
         """Add a check of the station itself, such as that of its disk."""
@@ -280,17 +238,27 @@ class HealthMonitor:
         """Current health of every stream and device."""
         now_ns = self._clock.now_ns()
         with self._lock:
-            streams = tuple(stream.health(now_ns) for stream in self._streams.values())
+            streams = tuple(self._health(stream, now_ns) for stream in self._streams.values())
             findings, figures = self._itself.board.active(now_ns), self._itself.latest.figures
         levels = [stream.level for stream in streams] + [finding.level for finding in findings]
+        devices = tuple(_device_health(s, simulated=self._simulated) for s in self._supervisors)
         return StationHealth(
             station=self._station,
             level=worst(levels, default="STALE"),
+            causes=find_causes(streams, devices, findings),
             findings=findings,
             figures=figures,
             streams=streams,
-            devices=tuple(_device_health(s) for s in self._supervisors),
+            devices=devices,
         )
+
+    def _health(self, stream: _WatchedStream, now_ns: int) -> StreamHealth:
+        """A stream at this moment, without advice about plugs and cables that a mock has not."""
+        health = stream.health(now_ns)
+        if not self._simulated:
+            return health
+        findings = [f.model_copy(update={"advice": SIMULATED_ADVICE}) for f in health.findings]
+        return health.model_copy(update={"findings": tuple(findings)})
 
     def events(self, since_ns: int = 0) -> HealthEvents:
         """Changes of levels from a moment on the station's clock, oldest first."""
@@ -368,8 +336,8 @@ def _value_judges(
     return [CameraJudge(driver)] if descriptor.kind == "image" else []
 
 
-def _device_health(supervisor: DeviceSupervisor) -> DeviceHealth:
-    """A device's counters."""
+def _device_health(supervisor: DeviceSupervisor, *, simulated: bool) -> DeviceHealth:
+    """A device's counters, and what it shares with others."""
     driver, events = supervisor.driver, supervisor.events()
     sides = {descriptor.side for descriptor in driver.descriptors}
     return DeviceHealth.model_validate(
@@ -377,6 +345,8 @@ def _device_health(supervisor: DeviceSupervisor) -> DeviceHealth:
             **{name: events[name] for name in DeviceHealth.model_fields if name in events},
             "device": driver.name,
             "hand": sides.pop() if len(sides) == 1 else None,
+            "simulated": simulated,
+            "shares": supervisor.shares,
             "connected": supervisor.connected.is_set(),
             "address": str(driver.info),
             "queue_dropped": events.get("queue", 0),

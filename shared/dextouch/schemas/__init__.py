@@ -72,7 +72,9 @@ if TYPE_CHECKING:
     from dextouch.schemas.rollouts import WorldList as WorldList
     from dextouch.schemas.station import CameraList as CameraList
     from dextouch.schemas.station import CameraLive as CameraLive
+    from dextouch.schemas.station import CauseCode as CauseCode
     from dextouch.schemas.station import DeviceHealth as DeviceHealth
+    from dextouch.schemas.station import HealthCause as HealthCause
     from dextouch.schemas.station import HealthEvent as HealthEvent
     from dextouch.schemas.station import HealthEvents as HealthEvents
     from dextouch.schemas.station import HealthLevel as HealthLevel
@@ -81,6 +83,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.station import RecorderState as RecorderState
     from dextouch.schemas.station import RecorderStatus as RecorderStatus
     from dextouch.schemas.station import SaveTake as SaveTake
+    from dextouch.schemas.station import SharedLink as SharedLink
     from dextouch.schemas.station import StaleCode as StaleCode
     from dextouch.schemas.station import StationHealth as StationHealth
     from dextouch.schemas.station import StreamHealth as StreamHealth

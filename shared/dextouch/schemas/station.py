@@ -11,6 +11,8 @@ RecorderState = Literal["idle", "armed", "recording", "checking", "saved", "disc
 RecorderAction = Literal["arm", "record", "stop", "save", "discard", "rerecord"]
 HealthLevel = Literal["OK", "WARN", "ERROR", "STALE"]
 StaleCode = Literal["unplugged", "silent"]
+LinkKind = Literal["hub", "network", "bridge"]
+CauseCode = Literal["host", "hub", "network", "bridge", "gone", "clock", "device", "station"]
 
 
 class TakePrompt(FrozenModel):
@@ -152,10 +154,23 @@ class StreamHealth(FrozenModel):
     clock_residual_ms: float | None = None
 
 
+class SharedLink(FrozenModel):
+    """What a device shares with others on its way: a USB hub, a remote host, a local program."""
+
+    kind: LinkKind
+    name: str
+
+
 class DeviceHealth(FrozenModel):
-    """One device and its counters since the station's start."""
+    """One device and its counters since the station's start.
+
+    `simulated` devices are mocks in the station's process. `shares` is known where the device is
+    open, or was.
+    """
 
     device: str
+    simulated: bool = False
+    shares: SharedLink | None = None
     hand: Literal["left", "right"] | None = None
     connected: bool
     address: str
@@ -174,14 +189,33 @@ class DeviceHealth(FrozenModel):
     last_error: str | None
 
 
+class HealthCause(FrozenModel):
+    """A root cause with the one advice for all that it explains.
+
+    `code` is one of the causes in docs/health.md, `subject` the hub, host, program or device, or
+    the code of the station's finding. `findings` are the codes explained, `streams` those affected.
+    """
+
+    code: CauseCode
+    subject: str
+    level: HealthLevel
+    message: str
+    advice: str
+    lasted_s: float | None
+    streams: tuple[str, ...] = ()
+    findings: tuple[str, ...] = ()
+
+
 class StationHealth(FrozenModel):
     """All streams and devices; `level` is the worst of the streams and of `findings`.
 
     `findings` and `figures` are those of the station itself: disk, calibration and uploads.
+    `causes` explain the findings of station and streams, widest and gravest first.
     """
 
     station: str
     level: HealthLevel
+    causes: tuple[HealthCause, ...] = ()
     findings: tuple[RaisedFinding, ...] = ()
     figures: dict[str, FiniteFloat] = Field(default_factory=dict)
     streams: tuple[StreamHealth, ...]

@@ -11,7 +11,7 @@ from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.image_quality import ImageQuality
 from services.acquisition.glove_record import GloveRecord
 from services.acquisition.health.cells import TaxelJudge, count_taxels, neighbour_share
-from services.acquisition.health.monitor import SampleQueue
+from services.acquisition.health.queues import SampleQueue
 from services.acquisition.health.streams import CameraJudge, FiniteJudge, PoseJudge, TrackingJudge
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.supervisor import StreamCounters
