@@ -13,9 +13,11 @@ from dextouch.serving import create_service_app, serve
 from services.episode_store.catalog import Catalog
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
+from services.episode_store.playback import playback_router
 from services.episode_store.reading import content_router
 from services.episode_store.routes import catalog_router, uploads_router
 from services.episode_store.settings import EpisodeStoreSettings
+from services.episode_store.trash import trash_router
 
 logger = structlog.get_logger(__name__)
 
@@ -48,6 +50,8 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
             uploads_router(ingest, limits, admission, metrics),
             catalog_router(catalog, max_page=settings.max_page),
             content_router(store, settings),
+            playback_router(store, settings),
+            trash_router(store, max_page=settings.max_page),
         ],
         lifespan=lifespan,
     )

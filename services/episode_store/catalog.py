@@ -1,20 +1,16 @@
 """Catalog of a store: filtered lists of episodes and recordings from cached summaries."""
 
-import math
 import os
 import re
 import threading
 import time
-from bisect import bisect_right
-from collections import defaultdict
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from bisect import bisect_left, bisect_right
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
-from operator import attrgetter
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Any, Generic
 
 import structlog
-from pydantic import AfterValidator, AwareDatetime, Field
 
 from dextouch.episodes import (
     COMMIT_FILE,
@@ -24,18 +20,30 @@ from dextouch.episodes import (
     RecordingReader,
     disk_errors,
 )
-from dextouch.errors import LimitExceededError, NotFoundError, StorageError
-from dextouch.frozen_model import FrozenModel
+from dextouch.errors import NotFoundError, StorageError
 from dextouch.schemas import (
     ID_PATTERN,
     CatalogHours,
-    Domain,
+    CatalogValues,
+    EpisodeAttributes,
     EpisodeList,
     EpisodeSummary,
     HoursRow,
-    Origin,
+    Lineage,
+    LineageNode,
+    RecordingAttributes,
     RecordingList,
     RecordingSummary,
+)
+from services.episode_store.filters import (
+    CatalogFilter,
+    Entry,
+    EpisodeFilter,
+    Page,
+    S,
+    cursor_of,
+    place_of,
+    sort_key,
 )
 
 logger = structlog.get_logger(__name__)
@@ -48,114 +56,10 @@ BUCKET_PERIOD_NS = 5_000_000_000
 # Stamp and inode of a commit record.
 Revision = tuple[int, int]
 NO_REVISION = (-1, -1)
-S = TypeVar("S", EpisodeSummary, RecordingSummary)
-_COMPARED = ("task", "operator", "station", "domain", "success", "recovered", "origin")
-
-
-@dataclass(frozen=True, slots=True)
-class Entry(Generic[S]):
-    """A row of the catalog, with further properties to filter by."""
-
-    summary: S
-    quality: Mapping[str, float]
-    created_at: datetime | None
-
-
-def quality_bound(text: str) -> tuple[str, float]:
-    """Parse `NAME:NUMBER` to a figure's name and lower bound.
-
-    Raises:
-        ValueError: anything else, and NaN.
-    """
-    name, colon, figure = text.rpartition(":")
-    try:
-        least = float(figure)
-    except ValueError:
-        least = math.nan
-    if not (name and colon) or math.isnan(least):
-        raise ValueError(f"got {text!r}, expected NAME:NUMBER such as coverage:0.95")
-    return name, least
-
-
-class CatalogFilter(FrozenModel):
-    """Filter of episodes or recordings; omitted fields match anything.
-
-    `min_quality` are bounds `NAME:NUMBER` that must all hold; an item without the figure does not
-    match. Times are created_after ≤ t < created_before; an item without a time does not match.
-    """
-
-    task: str | None = None
-    operator: str | None = None
-    station: str | None = None
-    domain: Domain | None = None
-    success: bool | None = None
-    recovered: bool | None = None
-    min_quality: tuple[
-        Annotated[str, AfterValidator(lambda text: quality_bound(text) and text)], ...
-    ] = ()
-    created_after: AwareDatetime | None = None
-    created_before: AwareDatetime | None = None
-
-    def matcher(self) -> Callable[[Entry[S]], bool]:
-        """Compile the filter to a fast predicate."""
-        fields = [name for name in _COMPARED if getattr(self, name, None) is not None]
-        get = attrgetter(*fields) if fields else None
-        expected = get(self) if get else None
-        bounds = [quality_bound(text) for text in self.min_quality]
-        after, before = self.created_after, self.created_before
-
-        def matches(entry: Entry[S]) -> bool:
-            if get is not None and get(entry.summary) != expected:
-                return False
-            if any(not entry.quality.get(name, -math.inf) >= least for name, least in bounds):
-                return False
-            if after is None and before is None:
-                return True
-            at = entry.created_at
-            return (
-                at is not None
-                and (after is None or after <= at)
-                and (before is None or at < before)
-            )
-
-        return matches
-
-
-class EpisodeFilter(CatalogFilter):
-    """Filter of episodes."""
-
-    origin: Origin | None = None
-
-
-class Page(FrozenModel):
-    """Page of a list: after an id, or from an offset."""
-
-    limit: int | None = Field(default=None, ge=1)
-    offset: int = Field(default=0, ge=0)
-    after: str | None = Field(default=None, description="only ids after this one")
-
-    def num_rows(self, max_page: int) -> int:
-        """Number of rows of the page; the maximum by default.
-
-        Raises:
-            LimitExceededError: above the maximum.
-        """
-        if self.limit is not None and self.limit > max_page:
-            raise LimitExceededError(
-                f"limit: got {self.limit}, expected at most {max_page}; "
-                "ask for the next page with after=NEXT_AFTER",
-                got=self.limit,
-                expected=max_page,
-            )
-        return self.limit or max_page
-
-
-class EpisodeQuery(EpisodeFilter, Page):
-    """Filter and page of episodes."""
-
-
-class RecordingQuery(CatalogFilter, Page):
-    """Filter and page of recordings."""
+FIRST_PAGE = Page()
+# Limits of the values of a field and of the nodes of a lineage in one response.
+MAX_VALUES = 500
+MAX_NODES = 200
 
 
 class _Shelf(Generic[S]):
@@ -264,24 +168,74 @@ class Catalog:
         self._recordings.entries()
 
     def episodes(
-        self, wanted: EpisodeFilter, *, limit: int, offset: int = 0, after: str | None = None
+        self, wanted: EpisodeFilter, *, limit: int, page: Page = FIRST_PAGE
     ) -> EpisodeList:
-        """One page of matching episodes, sorted by id, after the id `after`."""
-        page, facts = _page(self._episodes.entries(), wanted, limit, offset, after)
-        return EpisodeList.model_construct(episodes=page, **facts)
+        """One page of matching episodes in the order of the page."""
+        rows, facts = _page(self._episodes.entries(), wanted, limit, page)
+        return EpisodeList.model_construct(episodes=rows, **facts)
 
     def recordings(
-        self,
-        wanted: CatalogFilter | None = None,
-        *,
-        limit: int,
-        offset: int = 0,
-        after: str | None = None,
+        self, wanted: CatalogFilter | None = None, *, limit: int, page: Page = FIRST_PAGE
     ) -> RecordingList:
-        """One page of matching finished recordings, sorted by id, after the id `after`."""
+        """One page of matching finished recordings in the order of the page."""
         wanted = wanted or CatalogFilter()
-        page, facts = _page(self._recordings.entries(), wanted, limit, offset, after)
-        return RecordingList.model_construct(recordings=page, **facts)
+        rows, facts = _page(self._recordings.entries(), wanted, limit, page)
+        return RecordingList.model_construct(recordings=rows, **facts)
+
+    def values(self) -> CatalogValues:
+        """Tasks, operators and stations that occur, at most MAX_VALUES of each."""
+        rows: list[EpisodeSummary | RecordingSummary] = [
+            *(entry.summary for entry in self._recordings.entries().values()),
+            *(entry.summary for entry in self._episodes.entries().values()),
+        ]
+        found = {
+            name: sorted({value for row in rows if (value := getattr(row, name)) is not None})
+            for name in ("task", "operator", "station")
+        }
+        return CatalogValues(
+            tasks=tuple(found["task"][:MAX_VALUES]),
+            operators=tuple(found["operator"][:MAX_VALUES]),
+            stations=tuple(found["station"][:MAX_VALUES]),
+        )
+
+    def lineage(self, kind: Kind, item_id: str) -> Lineage:
+        """Everything that an item was made from and that was made from it, nearest first.
+
+        Raises:
+            NotFoundError: no such item.
+        """
+        entries: dict[tuple[str, str], Entry[Any]] = {
+            ("recording", name): entry for name, entry in self._recordings.entries().items()
+        }
+        entries |= {("episode", name): entry for name, entry in self._episodes.entries().items()}
+        start: tuple[str, str] = (kind, item_id)
+        if start not in entries:
+            raise NotFoundError(f"{kind} {item_id!r}: not in the catalog")
+        sources = {
+            name: tuple((one.kind, one.id) for one in entry.lineage)
+            for name, entry in entries.items()
+        }
+        products: defaultdict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)
+        for name, above in sources.items():
+            for one in above:
+                products[one].append(name)
+        nodes = {start: "self"}
+        _walk(nodes, start, lambda name: sources.get(name, ()), "source")
+        _walk(nodes, start, lambda name: products[name], "product")
+        rows = [
+            LineageNode.model_validate(
+                {
+                    "kind": name[0],
+                    "id": name[1],
+                    "relation": relation,
+                    "is_stored": name in entries,
+                    "made_from": [one for _, one in sources.get(name, ())],
+                    "summary": _brief(entries[name]) if name in entries else "",
+                }
+            )
+            for name, relation in nodes.items()
+        ]
+        return Lineage(nodes=tuple(rows))
 
     def hours(self, wanted: EpisodeFilter) -> CatalogHours:
         """Total duration of matching episodes by task, domain and origin."""
@@ -321,10 +275,11 @@ class Catalog:
             origin=attributes.origin,
             num_steps=num_steps,
             duration_s=on_grid_s or _nominal_duration_s(reader),
+            lineage=attributes.lineage,
             created_at=attributes.created_at,
             **_shared_fields(reader),
         )
-        return Entry(summary, dict(attributes.quality), attributes.created_at)
+        return _entry(summary, attributes, attributes.created_at)
 
     def _recording(self, recording_id: str) -> Entry[RecordingSummary]:
         reader = self._store.recording(recording_id)
@@ -338,7 +293,7 @@ class Catalog:
             started_at=attributes.started_at,
             **_shared_fields(reader),
         )
-        return Entry(summary, dict(attributes.quality), attributes.started_at)
+        return _entry(summary, attributes, attributes.started_at)
 
 
 def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
@@ -354,20 +309,51 @@ def _matching(entries: Mapping[str, Entry[S]], wanted: CatalogFilter) -> dict[st
 
 
 def _page(
-    entries: Mapping[str, Entry[S]],
-    wanted: CatalogFilter,
-    limit: int,
-    offset: int,
-    after: str | None,
+    entries: Mapping[str, Entry[S]], wanted: CatalogFilter, limit: int, page: Page
 ) -> tuple[tuple[S, ...], dict[str, Any]]:
-    """The summaries of a page, and the number of all that match with the id to go on after."""
+    """The summaries of a page, and the number of all that match with the cursor to go on after."""
     found = _matching(entries, wanted)
-    names = list(found)
-    first = offset + (0 if after is None else bisect_right(names, after))
-    chosen = names[first : first + limit]
-    next_after = None if first + limit >= len(names) else chosen[-1]
+    places = sorted((sort_key(row, page.sort), name) for name, row in found.items())
+    first = page.offset
+    if page.after is not None:
+        after = place_of(page.after)
+        left, right = bisect_left(places, after), bisect_right(places, after)
+        first += len(places) - left if page.descending else right
+    if page.descending:
+        places.reverse()
+    chosen = places[first : first + limit]
+    next_after = None if first + limit >= len(places) else cursor_of(chosen[-1])
     facts = {"num_matching": len(found), "next_after": next_after}
-    return tuple(found[name] for name in chosen), facts
+    return tuple(found[name] for _, name in chosen), facts
+
+
+def _walk(
+    nodes: dict[tuple[str, str], str],
+    start: tuple[str, str],
+    neighbours: Callable[[tuple[str, str]], Iterable[tuple[str, str]]],
+    relation: str,
+) -> None:
+    """Add everything that can be reached from an item, breadth first, until MAX_NODES."""
+    waiting = deque([start])
+    while waiting and len(nodes) < MAX_NODES:
+        for name in neighbours(waiting.popleft()):
+            if name not in nodes and len(nodes) < MAX_NODES:
+                nodes[name] = relation
+                waiting.append(name)
+
+
+def _brief(entry: Entry[Any]) -> str:
+    row = entry.summary
+    origin = row.origin if isinstance(row, EpisodeSummary) else "recorded"
+    return f"{row.task}, {row.domain}, {origin}, {row.duration_s:.1f} s"
+
+
+def _entry(
+    summary: S, about: EpisodeAttributes | RecordingAttributes, at: datetime | None
+) -> Entry[S]:
+    item_id = about.episode_id if isinstance(about, EpisodeAttributes) else about.recording_id
+    searched = (item_id, about.task, about.instruction, about.operator or "", about.station or "")
+    return Entry(summary, dict(about.quality), at, about.lineage, "\n".join(searched).casefold())
 
 
 def _nominal_duration_s(reader: EpisodeReader | RecordingReader) -> float:

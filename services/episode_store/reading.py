@@ -76,7 +76,7 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         """Samples of a finished recording with start_ns ≤ t_host_ns < stop_ns, as msgpack."""
         reader = store.recording(recording_id)
         read = partial(_samples, reader, stream, span, max_bytes)
-        return _response(etag_of(reader, stream, span), if_none_match, read, MSGPACK)
+        return response(etag_of(reader, stream, span), if_none_match, read, MSGPACK)
 
     @router.get("/episodes/{episode_id}", tags=["episodes"])
     def episode(episode_id: str) -> EpisodeDetail:
@@ -103,7 +103,7 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
             )
         reader = store.open(episode_id)
         read = partial(_window, reader, query, max_bytes)
-        return _response(etag_of(reader, "window", query), if_none_match, read, WINDOW_MSGPACK)
+        return response(etag_of(reader, "window", query), if_none_match, read, WINDOW_MSGPACK)
 
     @router.get("/episodes/{episode_id}/streams/{stream}", tags=["episodes"], **SAMPLES)
     def episode_samples(
@@ -115,12 +115,12 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         """Samples with start_ns ≤ t_ref_ns < stop_ns as msgpack."""
         reader = store.open(episode_id)
         read = partial(_samples, reader, stream, span, max_bytes)
-        return _response(etag_of(reader, stream, span), if_none_match, read, MSGPACK)
+        return response(etag_of(reader, stream, span), if_none_match, read, MSGPACK)
 
     return router
 
 
-def _response(etag: str, known: str | None, read: Callable[[], bytes], media_type: str) -> Response:
+def response(etag: str, known: str | None, read: Callable[[], bytes], media_type: str) -> Response:
     """Response with ETag; 304 without a body if the client has it already."""
     headers = {"etag": etag, "cache-control": CACHE_CONTROL}
     if is_known(etag, known):

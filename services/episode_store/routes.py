@@ -11,9 +11,12 @@ from fastapi import APIRouter, Depends, Path, Query, Request
 from dextouch.schemas import (
     BatchReceipt,
     CatalogHours,
+    CatalogValues,
     EpisodeList,
     ExpireUploads,
     FinishRecording,
+    ItemKind,
+    Lineage,
     RecordingAttributes,
     RecordingList,
     RecordingStatus,
@@ -21,7 +24,8 @@ from dextouch.schemas import (
 )
 from dextouch.serving import AS_SET, JSON, KIB, OCTETS, JsonBody, RequireScope, takes
 from dextouch.streams import MAX_BATCH_BYTES
-from services.episode_store.catalog import Catalog, EpisodeFilter, EpisodeQuery, RecordingQuery
+from services.episode_store.catalog import Catalog
+from services.episode_store.filters import EpisodeFilter, EpisodeQuery, RecordingQuery
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
 
@@ -126,18 +130,26 @@ def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
     @router.get("/recordings", tags=["recordings"])
     def recordings(wanted: Annotated[RecordingQuery, Query()]) -> RecordingList:
         """List finished recordings that match all filters."""
-        limit = wanted.num_rows(max_page)
-        return catalog.recordings(wanted, limit=limit, offset=wanted.offset, after=wanted.after)
+        return catalog.recordings(wanted, limit=wanted.num_rows(max_page), page=wanted)
 
     @router.get("/episodes", tags=["episodes"])
     def episodes(wanted: Annotated[EpisodeQuery, Query()]) -> EpisodeList:
         """List episodes that match all filters."""
-        limit = wanted.num_rows(max_page)
-        return catalog.episodes(wanted, limit=limit, offset=wanted.offset, after=wanted.after)
+        return catalog.episodes(wanted, limit=wanted.num_rows(max_page), page=wanted)
 
     @router.get("/catalog/hours", tags=["catalog"])
     def hours(wanted: Annotated[EpisodeFilter, Query()]) -> CatalogHours:
         """Hours and counts of the matching episodes by task, domain and origin."""
         return catalog.hours(wanted)
+
+    @router.get("/catalog/values", tags=["catalog"])
+    def values() -> CatalogValues:
+        """Tasks, operators and stations that occur in the store."""
+        return catalog.values()
+
+    @router.get("/catalog/lineage/{kind}/{item_id}", tags=["catalog"])
+    def lineage(kind: ItemKind, item_id: str) -> Lineage:
+        """What an item was made from, and what was made from it."""
+        return catalog.lineage(kind, item_id)
 
     return router

@@ -22,7 +22,7 @@ from tests.unit.worlds.fakes import SumWorld
 
 ROOT = Path(__file__).parents[2]
 KEY = "a-key-of-some-length"
-SCOPES = ("station", "store_read", "store_write", "align", "rollout", "operate")
+SCOPES = ("station", "store_read", "store_write", "store_delete", "align", "rollout", "operate")
 PATH_VALUES = {"number": "0", "chunk": "0"}
 MIB = 2**20
 FORM = "application/x-www-form-urlencoded"

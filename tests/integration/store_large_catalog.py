@@ -11,7 +11,8 @@ from pathlib import Path
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.format import decode_commit, encode_commit, group_metadata, sha256_hex
-from services.episode_store.catalog import SETTLED_NS, Catalog, EpisodeFilter
+from services.episode_store.catalog import SETTLED_NS, Catalog
+from services.episode_store.filters import EpisodeFilter
 from tests.unit.episode_store.episodes import write_episode
 
 NUM_ROUNDS = 9

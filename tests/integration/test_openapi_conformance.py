@@ -33,7 +33,16 @@ from tests.unit.worlds.fakes import SumWorld, actions
 pytestmark = pytest.mark.filterwarnings("ignore:Do not use the `random` module")
 URL = "http://localhost"
 KEY = "a-key-of-some-length"
-SCOPES = ("station", "store_read", "store_write", "align", "rollout", "rate", "operate")
+SCOPES = (
+    "station",
+    "store_read",
+    "store_write",
+    "store_delete",
+    "align",
+    "rollout",
+    "rate",
+    "operate",
+)
 OTHER_KEY = "another-key-of-length"
 KEYED = {
     "api_keys": (

@@ -40,7 +40,7 @@ from dextouch.schemas import (
     RecordingSummary,
     json_ready,
 )
-from services.episode_store.catalog import Catalog, EpisodeFilter
+from services.episode_store.catalog import Catalog
 from services.episode_store.commands.context import (
     EXIT_DAMAGED,
     Context,
@@ -48,6 +48,7 @@ from services.episode_store.commands.context import (
     readable_size,
     table,
 )
+from services.episode_store.filters import EpisodeFilter
 
 _OUTCOMES = {True: "success", False: "failure", None: "not judged"}
 

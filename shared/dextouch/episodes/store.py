@@ -179,6 +179,14 @@ class EpisodeStore:
         """Permanently delete trash older than `older_than_s` and return the deleted entries."""
         return purge_trash(self._trash_root(), older_than_s=older_than_s)
 
+    def require_trash(self) -> None:
+        """Check that deleted items can be restored.
+
+        Raises:
+            InvalidInputError: a store in a bucket, which has no trash.
+        """
+        self._trash_root()
+
     def _trash_root(self) -> Path:
         if not isinstance(self._storage, _LocalStorage):
             raise InvalidInputError(

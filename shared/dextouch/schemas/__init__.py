@@ -5,6 +5,16 @@ from typing import TYPE_CHECKING
 from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
+    from dextouch.schemas.catalog import CatalogValues as CatalogValues
+    from dextouch.schemas.catalog import ItemKind as ItemKind
+    from dextouch.schemas.catalog import Lineage as Lineage
+    from dextouch.schemas.catalog import LineageNode as LineageNode
+    from dextouch.schemas.catalog import MovedItems as MovedItems
+    from dextouch.schemas.catalog import MoveItems as MoveItems
+    from dextouch.schemas.catalog import RefusedItem as RefusedItem
+    from dextouch.schemas.catalog import StoredItem as StoredItem
+    from dextouch.schemas.catalog import TrashContents as TrashContents
+    from dextouch.schemas.catalog import TrashedItem as TrashedItem
     from dextouch.schemas.episodes import ID_PATTERN as ID_PATTERN
     from dextouch.schemas.episodes import CatalogHours as CatalogHours
     from dextouch.schemas.episodes import ClockMethod as ClockMethod
@@ -40,6 +50,8 @@ if TYPE_CHECKING:
     from dextouch.schemas.observations import encode_start as encode_start
     from dextouch.schemas.observations import start_from as start_from
     from dextouch.schemas.observations import validate_fields as validate_fields
+    from dextouch.schemas.playback import Playback as Playback
+    from dextouch.schemas.playback import PlayedStream as PlayedStream
     from dextouch.schemas.problems import CLASS_OF_STATUS as CLASS_OF_STATUS
     from dextouch.schemas.problems import MAX_NAMED as MAX_NAMED
     from dextouch.schemas.problems import PROBLEM_MEDIA_TYPE as PROBLEM_MEDIA_TYPE

@@ -159,7 +159,11 @@ def is_rollout(attributes: EpisodeAttributes) -> bool:
 
 
 class EpisodeSummary(FrozenModel):
-    """One row of the catalog; `duration_s` is that of the model grid, or of the longest stream."""
+    """One row of the catalog.
+
+    `duration_s` is that of the model grid, or of the longest stream; an empty `lineage` is not
+    written.
+    """
 
     episode_id: StoreId
     task: str
@@ -172,6 +176,7 @@ class EpisodeSummary(FrozenModel):
     num_steps: int
     duration_s: float = Field(default=0.0, ge=0)
     created_at: AwareDatetime | None = None
+    lineage: tuple[LineageEntry, ...] = Field(default=(), exclude_if=not_)
     content_sha256: str
 
 

@@ -14,7 +14,8 @@ from pydantic import ValidationError
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, LimitExceededError, StorageError
 from services.episode_store import catalog as catalog_module
-from services.episode_store.catalog import Catalog, CatalogFilter, EpisodeFilter
+from services.episode_store.catalog import Catalog
+from services.episode_store.filters import CatalogFilter, EpisodeFilter, Page
 from tests.unit.episode_store.episodes import write_episode
 
 MORNING, NOON = (datetime(2026, 5, 4, hour, tzinfo=UTC) for hour in (8, 12))
@@ -80,11 +81,11 @@ def test_pages_stand_still_while_episodes_come_and_go(store):
     assert (first.next_after, first.num_matching) == ("b", 4)
     store.delete("a")
     write_episode(store, "aa")
-    second = catalog.episodes(EpisodeFilter(), limit=2, after=first.next_after)
+    second = catalog.episodes(EpisodeFilter(), limit=2, page=Page(after=first.next_after))
     assert [episode.episode_id for episode in second.episodes] == ["c", "d"]
     assert second.next_after is None
-    assert catalog.episodes(EpisodeFilter(), limit=2, after="d").episodes == ()
-    assert catalog.episodes(EpisodeFilter(), limit=2, offset=9).next_after is None
+    assert catalog.episodes(EpisodeFilter(), limit=2, page=Page(after="d")).episodes == ()
+    assert catalog.episodes(EpisodeFilter(), limit=2, page=Page(offset=9)).next_after is None
 
 
 def test_hours(store):
