@@ -26,7 +26,7 @@ QUICK = (
     "disk full in 20 min",
 )
 # Told to whoever asks while a sample is overdue; and what needs minutes of asking the device.
-TESTED_ELSEWHERE = {"late", "latency_calibration", "upload_refused"}
+TESTED_ELSEWHERE = {"late", "latency_calibration", "overload", "upload_refused"}
 
 
 def judged(name, outcome):
