@@ -35,6 +35,7 @@ OPTIONS: Final[dict[str, tuple[str, ...]]] = {
     "plain touch": ("--network.tactile-target", "plain"),
     "contact or changing": ("--optimizer.touch-loss", "contact_or_changing"),
     "no touch": ("--no-network.use-touch",),
+    "all palm axes": ("--network.palm-channels", "240"),
 }
 INSTRUCTIONS: Final = {"hashed words": "hashed_words", "subwords": "subwords"}
 CANS: Final = ("lift_full_can", "lift_empty_can", "move_can_left", "move_can_right")
