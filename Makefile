@@ -13,7 +13,7 @@ DOCS_VENV ?= .venv-docs
 SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow kills vm fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test \
+.PHONY: demo test check slow kills vm fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -98,6 +98,9 @@ reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's st
 fix: $(VENV)/.dev        ## format the code and apply automatic lint fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+vendor:                  ## fetch the vendored files of the dashboard again (needs npm); git diff shows whether they changed
+	$(PYTHON) deploy/fetch_vendored.py services/dashboard/static/vendor
 
 $(LEROBOT_VENV)/.complete: $(LEROBOT)/make_venv.sh $(LEROBOT)/requirements.txt $(LEROBOT)/prepare.py
 	PYTHON=$(PYTHON) $(LEROBOT)/make_venv.sh $(LEROBOT_VENV)

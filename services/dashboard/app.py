@@ -10,6 +10,7 @@ from fastapi.staticfiles import StaticFiles
 
 from dextouch.serving import AccessControl, create_service_app, serve
 from services.dashboard.feeds import Feeds
+from services.dashboard.forwarding import forwarding_router
 from services.dashboard.pages import Sessions, page_router, refusal_page
 from services.dashboard.routes import api_router, live_router
 from services.dashboard.settings import DashboardSettings
@@ -53,6 +54,7 @@ def create_app(
         routers=[
             page_router(settings, sessions),
             api_router(settings, feeds, sessions),
+            forwarding_router(feeds, sessions),
             live_router(feeds, sessions),
         ],
         lifespan=lifespan,

@@ -1,7 +1,7 @@
 """Panels of the page: what each shows, polled from the other services for all viewers.
 
 A new panel is a topic here with the function that fetches it, a section in
-`templates/index.html`, and a function in `static/` that `static/main.js` calls with the data.
+`templates/station.html`, and a function in `static/` that `static/main.js` calls with the data.
 """
 
 import asyncio

@@ -1,10 +1,12 @@
-"""HTML pages: the station, signing in and out by a session, and refusals."""
+"""HTML pages: the screens, signing in and out by a session, and refusals."""
 
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Final
 from urllib.parse import parse_qs
 
 from fastapi import APIRouter, Request, Response
@@ -35,6 +37,22 @@ PAGE_HEADERS = {
 TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"), autoescape=True
 )
+
+
+@dataclass(frozen=True)
+class Screen:
+    """A page of the dashboard: where it is, its template, and its name in the navigation.
+
+    Screens that belong to another one, such as the player, have that one's name in `within`.
+    """
+
+    path: str
+    template: str
+    title: str
+    within: str = ""
+
+
+SCREENS: Final = (Screen("/", "station.html", "Station"),)
 
 
 class Sessions:
@@ -89,22 +107,19 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
     """Router of the HTML pages."""
     router = APIRouter(include_in_schema=False)
     page = partial(_page, settings.station)
-
-    @router.get("/")
-    async def index(request: Request) -> Response:
-        if not sessions.allows(request):
-            return page("sign_in.html", reason="")
-        return page("index.html", tasks=settings.tasks, signed_in=sessions.needs_key)
+    for screen in SCREENS:
+        router.add_api_route(screen.path, _shown(screen, settings, sessions), methods=["GET"])
 
     @router.post("/sign_in")
     @takes({FORM: 4 * KIB}, needs_key=False)
     async def sign_in(request: Request) -> Response:
         fields = parse_qs((await request.body()).decode("utf-8", "replace"))
+        wanted = _own_path(fields.get("wanted", ["/"])[0])
         try:
             token = sessions.sign_in(fields.get("key", [""])[0])
         except AccessDeniedError as error:
-            return page("sign_in.html", 401, reason=error.message)
-        answer = RedirectResponse("/", 303)
+            return page("sign_in.html", 401, reason=error.message, wanted=wanted)
+        answer = RedirectResponse(wanted, 303)
         answer.set_cookie(
             COOKIE,
             token,
@@ -124,6 +139,33 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
         return answer
 
     return router
+
+
+def _shown(
+    screen: Screen, settings: DashboardSettings, sessions: Sessions
+) -> Callable[[Request], Awaitable[Response]]:
+    """Route of a screen; browsers that are not signed in get the sign-in in its place."""
+
+    async def show(request: Request) -> Response:
+        if not sessions.allows(request):
+            wanted = _own_path(f"{request.url.path}?{request.url.query}".rstrip("?"))
+            return _page(settings.station, "sign_in.html", reason="", wanted=wanted)
+        return _page(
+            settings.station,
+            screen.template,
+            screen=screen,
+            screens=[one for one in SCREENS if not one.within],
+            tasks=settings.tasks,
+            signed_in=sessions.needs_key,
+        )
+
+    return show
+
+
+def _own_path(text: str) -> str:
+    """A path of this site to go to after signing in; "/" in place of anything else."""
+    is_own = text.startswith("/") and text.isascii() and text.isprintable()
+    return text if is_own and not text.startswith(("//", "/\\")) else "/"
 
 
 def refusal_page(station: str, _: Request, error: DexTouchError) -> Response:

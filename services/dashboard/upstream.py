@@ -1,6 +1,7 @@
 """HTTP client of another service, whose failures become UnavailableError."""
 
 from collections.abc import Mapping
+from http import HTTPStatus
 from typing import Any, TypeVar
 
 import httpx
@@ -62,15 +63,28 @@ class Upstream:
             UnavailableError: no response, or a refusal without a reason.
             DexTouchError: a refusal of the service, as its own class.
         """
+        return await self._sent(self._client.build_request(method, path, json=body))
+
+    async def forward(
+        self, method: str, path: str, headers: Mapping[str, str], content: bytes
+    ) -> httpx.Response:
+        """Response to a request of a browser, also "304 Not Modified"; otherwise as `send`."""
+        request = self._client.build_request(
+            method, path, headers=dict(headers), content=content or None
+        )
+        return await self._sent(request)
+
+    async def _sent(self, request: httpx.Request) -> httpx.Response:
+        method, path = request.method, request.url.path
         try:
-            response = await self._client.request(method, path, json=body)
+            response = await self._client.send(request)
         except httpx.HTTPError as error:
             raise UnavailableError(
                 f"{self.name}: no answer to {method} {path} ({type(error).__name__}); "
                 "is the service running?",
                 service=self.name,
             ) from error
-        if response.is_success:
+        if response.is_success or response.status_code == HTTPStatus.NOT_MODIFIED:
             return response
         try:
             problem = Problem.model_validate_json(response.content)

@@ -110,7 +110,8 @@ def test_a_button_of_a_session_that_ended_goes_to_the_sign_in(page, serve, serve
 
 def test_a_password_manager_finds_its_fields(page, address):
     page.goto(address)
-    fields = page.locator("form input").evaluate_all("inputs => inputs.map(i => i.autocomplete)")
+    inputs = page.locator("form input:not([type=hidden])")
+    fields = inputs.evaluate_all("inputs => inputs.map(i => i.autocomplete)")
     assert fields == ["username", "current-password"]
 
 

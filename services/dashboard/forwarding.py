@@ -1,0 +1,81 @@
+"""Routes of other services that the pages call, forwarded by an allow-list."""
+
+from dataclasses import dataclass
+from typing import Final, Literal
+from urllib.parse import quote
+
+from fastapi import APIRouter, Depends, Request, Response
+
+from dextouch.serving import JSON, KIB, takes
+from services.dashboard.feeds import Feeds
+from services.dashboard.pages import Sessions
+
+# Headers of a response that a browser needs to show and to cache it.
+PASSED_HEADERS: Final = ("content-type", "etag", "cache-control", "location")
+
+
+@dataclass(frozen=True)
+class Forwarded:
+    """A route of a service, `path` below its /v1, offered as /v1/SERVICE/PATH."""
+
+    service: str
+    path: str
+    method: Literal["GET", "POST", "DELETE"] = "GET"
+    max_body_bytes: int = 64 * KIB
+
+
+FORWARDED: Final = (
+    Forwarded("episode_store", "/episodes"),
+    Forwarded("episode_store", "/episodes/{item_id}"),
+    Forwarded("episode_store", "/recordings"),
+    Forwarded("episode_store", "/recordings/{item_id}/attributes"),
+    Forwarded("episode_store", "/catalog/hours"),
+    Forwarded("episode_store", "/catalog/values"),
+    Forwarded("episode_store", "/catalog/lineage/{kind}/{item_id}"),
+    Forwarded("episode_store", "/playback/{kind}/{item_id}"),
+    Forwarded("episode_store", "/playback/{kind}/{item_id}/images/{camera}"),
+    Forwarded("episode_store", "/playback/{kind}/{item_id}/signals"),
+    Forwarded("episode_store", "/episodes/{item_id}/streams/{stream}"),
+    Forwarded("episode_store", "/recordings/{item_id}/streams/{stream}"),
+    Forwarded("episode_store", "/trash"),
+    Forwarded("episode_store", "/trash", "POST"),
+    Forwarded("episode_store", "/trash/restore", "POST"),
+    Forwarded("alignment", "/alignments"),
+    Forwarded("alignment", "/alignments", "POST"),
+    Forwarded("alignment", "/alignments/{alignment_id}"),
+    Forwarded("alignment", "/alignments/{alignment_id}/cancel", "POST"),
+)
+
+
+def forwarding_router(feeds: Feeds, sessions: Sessions) -> APIRouter:
+    """Create the forwarded routes; the services' own documents describe their bodies."""
+    router = APIRouter(
+        prefix="/v1", dependencies=[Depends(sessions.guard)], include_in_schema=False
+    )
+    for route in FORWARDED:
+        router.add_api_route(
+            f"/{route.service}{route.path}",
+            _forwarder(feeds, route),
+            methods=[route.method],
+            response_class=Response,
+        )
+    return router
+
+
+def _forwarder(feeds: Feeds, route: Forwarded) -> object:
+    async def forward(request: Request) -> Response:
+        names = {name: quote(value, safe="") for name, value in request.path_params.items()}
+        path = f"/v1{route.path}".format(**names)
+        if request.url.query:
+            path += f"?{request.url.query}"
+        sent = {
+            name: request.headers[name] for name in ("if-none-match",) if name in request.headers
+        }
+        content = await request.body() if route.method == "POST" else b""
+        if content:
+            sent["content-type"] = JSON
+        answer = await feeds.upstream(route.service).forward(route.method, path, sent, content)
+        passed = {name: answer.headers[name] for name in PASSED_HEADERS if name in answer.headers}
+        return Response(answer.content, answer.status_code, headers=passed)
+
+    return takes({JSON: route.max_body_bytes})(forward) if route.method == "POST" else forward

@@ -1,0 +1,64 @@
+"""Routes of other services that browsers reach through the dashboard."""
+
+import httpx
+import pytest
+
+from services.dashboard.pages import _own_path
+
+KEY = "a-key-of-some-length"
+
+
+async def test_a_route_on_the_list_is_forwarded_with_its_query(client, services):
+    answer = await client.get("/v1/episode_store/episodes?limit=3&offset=0")
+    assert answer.status_code == 200
+    assert answer.json()["episodes"][0]["episode_id"] == "take-0001"
+    assert services.asked[-1] == "/v1/episodes"
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("POST", "/v1/episode_store/recordings"),
+        ("DELETE", "/v1/episode_store/episodes/take-0001"),
+        ("GET", "/v1/episode_store/metrics"),
+        ("GET", "/v1/episode_store/episodes/../../metrics"),
+        ("GET", "/v1/twin/worlds"),
+    ],
+)
+async def test_other_routes_are_not(client, services, method, path):
+    answer = await client.request(method, path)
+    assert answer.status_code in {404, 405}
+    assert not services.asked
+
+
+async def test_names_in_paths_stay_one_part(client, services):
+    await client.get("/v1/episode_store/episodes/a%3Fb%23c")
+    assert services.asked[-1] == "/v1/episodes/a%3Fb%23c"
+
+
+async def test_refusals_are_passed_on(client):
+    answer = await client.get("/v1/episode_store/playback/episode/take-0001")
+    assert answer.status_code == 503
+    assert "episode_store" in answer.json()["detail"]
+    missing = await client.get("/v1/alignment/alignments")
+    assert missing.status_code == 404
+    assert "DEXTOUCH_DASHBOARD_ALIGNMENT_URL" in missing.json()["detail"]
+
+
+async def test_forwarding_needs_a_session(make_app, services):
+    key = {"name": "operator", "key": KEY, "scopes": ("operate",)}
+    transport = httpx.ASGITransport(app=make_app(api_keys=(key,)))
+    async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+        assert (await client.get("/v1/episode_store/episodes")).status_code == 401
+        assert not services.asked
+        answer = await client.post("/sign_in", data={"key": KEY, "wanted": "/?at=3"})
+        assert answer.headers["location"] == "/?at=3"
+        assert (await client.get("/v1/episode_store/episodes?limit=1")).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "text", ["http://evil.example", "//evil.example", "/\\evil.example", "", "/a\r\nb: c", "/é"]
+)
+def test_sign_in_goes_to_paths_of_this_site_only(text):
+    assert _own_path(text) == "/"
+    assert _own_path("/episodes/x?at=1") == "/episodes/x?at=1"

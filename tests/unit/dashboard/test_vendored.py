@@ -1,0 +1,23 @@
+"""Vendored files of the pages are those of their packages, with their licences."""
+
+import hashlib
+import json
+from pathlib import Path
+
+from services.dashboard.app import STATIC
+
+VENDOR = STATIC / "vendor"
+
+
+def test_vendored_files_have_their_recorded_hashes():
+    packages = json.loads((VENDOR / "vendored.json").read_text())
+    recorded = {name: sha for one in packages for name, sha in one["sha256"].items()}
+    found = {
+        str(path.relative_to(VENDOR)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in VENDOR.rglob("*")
+        if path.is_file() and path.name != "vendored.json"
+    }
+    assert found == recorded
+    for one in packages:
+        licences = [name for name in one["files"] if Path(name).name == "LICENSE"]
+        assert licences, one["package"]
