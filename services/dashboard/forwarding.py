@@ -1,5 +1,6 @@
 """Routes of other services that the pages call, forwarded by an allow-list."""
 
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Final, Literal
 from urllib.parse import quote
@@ -62,7 +63,7 @@ def forwarding_router(feeds: Feeds, sessions: Sessions) -> APIRouter:
     return router
 
 
-def _forwarder(feeds: Feeds, route: Forwarded) -> object:
+def _forwarder(feeds: Feeds, route: Forwarded) -> Callable[[Request], Awaitable[Response]]:
     async def forward(request: Request) -> Response:
         names = {name: quote(value, safe="") for name, value in request.path_params.items()}
         path = f"/v1{route.path}".format(**names)
