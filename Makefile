@@ -1,5 +1,5 @@
-# Every target works on a bare machine with Python 3.11 and make.
-PYTHON ?= python3.11
+# Every target works on a bare machine with Python 3.11, 3.12 or 3.13 and make.
+PYTHON ?= $(firstword $(foreach v,3.11 3.12 3.13,$(shell command -v python$(v))) python3.11)
 VENV := .venv
 BIN := $(VENV)/bin
 LEROBOT := tests/benchmarks/lerobot

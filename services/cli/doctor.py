@@ -5,6 +5,7 @@ import importlib.util
 import os
 import platform
 import shutil
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -78,8 +79,9 @@ def missing_package(error: ModuleNotFoundError, otherwise: str = "") -> DexTouch
 def examine() -> list[Finding]:
     """Check Python, packages, disk, devices and optional programs, without changing anything."""
     version = platform.python_version()
+    is_supported = (3, 11) <= sys.version_info[:2] <= (3, 13)
     findings = [
-        Finding("Python", version, ok=version.startswith("3.11"), do="install Python 3.11"),
+        Finding("Python", version, ok=is_supported, do="install Python 3.11, 3.12 or 3.13"),
         Finding("processor cores", str(os.cpu_count())),
     ]
     for package, purpose in _PURPOSES.items():

@@ -4,6 +4,7 @@ import json
 import signal
 import time
 import zipfile
+from pathlib import Path
 
 import httpx
 import pytest
@@ -17,9 +18,9 @@ SERVICES = {"episode_store", "alignment", "acquisition", "twin", "world_model", 
 READY_LIMIT_S = 900
 IMPORT_ALL = """
 import importlib, json, pkgutil
-import dextouch, services
+import dextouch, dextouch_services
 absent = []
-for package in (dextouch, services):
+for package in (dextouch, dextouch_services):
     for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         try:
             importlib.import_module(module.name)
@@ -37,15 +38,21 @@ def installed(tmp_path_factory):
     assert environment.opened_in_the_checkout() == []
 
 
-def files_below(folder):
+def files_below(folder, installed_as):
     found = (path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder.parent)) for path in found if path.suffix != ".pyc"}
+    return {str(installed_as / path.relative_to(folder)) for path in found if path.suffix != ".pyc"}
 
 
 def test_the_wheel_holds_every_file_of_both_packages(installed):
     with zipfile.ZipFile(installed.wheel) as wheel:
         names = {name for name in wheel.namelist() if ".dist-info/" not in name}
-    assert names == files_below(ROOT / "services") | files_below(ROOT / "shared/dextouch")
+    share = next(Path(name).parts[0] for name in names if ".data/" in name) / Path("data/share")
+    assert names == (
+        files_below(ROOT / "services", Path("dextouch_services"))
+        | files_below(ROOT / "shared/dextouch", Path("dextouch"))
+        | files_below(ROOT / "deploy", share / "dextouch/deploy")
+        | {str(share / "dextouch/docker-compose.yml")}
+    )
     for path in own_packages(installed).values():
         assert path.startswith(str(installed.site_packages))
 
@@ -53,7 +60,7 @@ def test_the_wheel_holds_every_file_of_both_packages(installed):
 def test_the_extras_name_what_every_module_imports(installed):
     absent = json.loads(installed.run("python", "-c", IMPORT_ALL, limit_s=600))
     # The viewer and Ray have extras of their own, which `all` leaves out.
-    apart = [["dextouch.bridges.rerun", "rerun"], ["services.cli.ray_serve", "ray"]]
+    apart = [["dextouch.bridges.rerun", "rerun"], ["dextouch_services.cli.ray_serve", "ray"]]
     assert sorted(absent) == apart
 
 

@@ -1,4 +1,4 @@
-"""Environment outside the checkout in which only a built wheel provides `services` and `dextouch`.
+"""Environment outside the checkout in which only a built wheel provides `dextouch` and services.
 
 Its third-party packages are links to the installed ones, exactly those that the wheel's extras name
 and what these need in turn: a requirement that the wheel forgets is missing, and nothing is
@@ -136,7 +136,7 @@ def link(name: str, site_packages: Path) -> None:
 def own_packages(environment: WheelEnvironment) -> dict[str, str]:
     """Where the environment's Python finds both packages."""
     code = (
-        "import json, services, dextouch;"
+        "import json, dextouch_services as services, dextouch;"
         "print(json.dumps({'services': services.__path__[0], 'dextouch': dextouch.__file__}))"
     )
     return json.loads(environment.run("python", "-c", code))
