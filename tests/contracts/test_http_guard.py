@@ -1,28 +1,32 @@
 """What every service refuses before it acts: foreign pages, bodies of forms, keyless and long ones.
 
 The attacks are those of a page of another origin in the operator's browser (no-cors requests, DNS
-rebinding), as the Fetch standard lets it send them. A new service joins `APPS`; one that builds
-its application by itself instead of by `create_service_app` fails the first two tests.
+rebinding), as the Fetch standard lets it send them. A new service joins `APPS` of `service_apps`;
+one that builds its application by itself instead of by `create_service_app` fails the first two
+tests.
 """
 
 import ast
 from pathlib import Path
 
-import httpx
 import pytest
 
 from dextouch.serving.guard import ApiKey
-from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
-from services.acquisition.settings import AcquisitionSettings
-from services.alignment.settings import AlignmentSettings
 from services.cli.up import BUILDERS
-from services.dashboard.settings import DashboardSettings
-from services.episode_store.settings import EpisodeStoreSettings
-from tests.unit.worlds.fakes import SumWorld
+from tests.contracts.service_apps import APPS, UP, client_of, dashboard
 
 ROOT = Path(__file__).parents[2]
 KEY = "a-key-of-some-length"
-SCOPES = ("station", "store_read", "store_write", "store_delete", "align", "rollout", "operate")
+SCOPES = (
+    "station",
+    "store_read",
+    "store_write",
+    "store_delete",
+    "align",
+    "rollout",
+    "rate",
+    "operate",
+)
 PATH_VALUES = {"number": "0", "chunk": "0"}
 MIB = 2**20
 FORM = "application/x-www-form-urlencoded"
@@ -30,48 +34,8 @@ FORM = "application/x-www-form-urlencoded"
 FORMS = ("/sign_in", "/sign_out")
 
 
-def acquisition(folder, **settings):
-    from services.acquisition.app import create_app
-
-    return create_app(AcquisitionSettings(mock=True, spool=folder / "spool", **settings))
-
-
-def alignment(folder, **settings):
-    from services.alignment.app import create_app
-
-    return create_app(AlignmentSettings(store_url=str(folder), **settings))
-
-
-def dashboard(_, **settings):
-    from services.dashboard.app import create_app
-
-    return create_app(DashboardSettings(**settings), {})
-
-
-def episode_store(folder, **settings):
-    from services.episode_store.app import create_app
-
-    return create_app(EpisodeStoreSettings(store_url=str(folder), **settings))
-
-
-def worlds(_, **settings):
-    world = SumWorld()
-    served = {"sum": world, "copy-first": CopyFirstWorld.beside(world.description)}
-    return create_world_app(served, WorldServiceSettings(**settings))
-
-
-APPS = {
-    "acquisition": acquisition,
-    "alignment": alignment,
-    "dashboard": dashboard,
-    "episode_store": episode_store,
-    "twin": worlds,
-    "world_model": worlds,
-}
-
-
 def test_every_service_of_the_project_is_here():
-    assert set(APPS) == set(BUILDERS)
+    assert set(UP) == set(BUILDERS)
 
 
 def test_applications_are_built_in_one_place():
@@ -85,20 +49,15 @@ def test_applications_are_built_in_one_place():
     assert built_in == {"shared/dextouch/serving/app.py"}
 
 
-@pytest.fixture(params=sorted(set(APPS) - {"world_model"}))
+@pytest.fixture(params=APPS)
 def make_app(request, tmp_path):
-    """The factory of one service; the two that serve worlds have the same routes."""
+    """The factory of one service."""
     return lambda **settings: APPS[request.param](tmp_path, **settings)
 
 
 def keyed():
     """Settings of a service that others on the network reach."""
     return {"api_keys": (ApiKey(name="all", key=KEY, scopes=SCOPES),)}
-
-
-def client_of(app, base_url="http://127.0.0.1:8000"):
-    transport = httpx.ASGITransport(app, raise_app_exceptions=False)
-    return httpx.AsyncClient(transport=transport, base_url=base_url)
 
 
 DOCUMENTED = {}

@@ -50,7 +50,8 @@ def document_service(
     schemas.pop("HTTPValidationError", None)
     schemas.pop("ValidationError", None)
     for operation, route, method in _operations(document, routers):
-        scopes = [needed.scope for needed in _dependencies(route.dependant, RequireScope)]
+        needed = _dependencies(route.dependant, RequireScope)
+        scopes = list(dict.fromkeys(one.scope for one in needed))
         if scopes:
             document["components"].setdefault("securitySchemes", {})[KEY_SCHEME] = BEARER
             keyed = {KEY_SCHEME: scopes}

@@ -1,0 +1,344 @@
+"""Every route of every service with every kind of key, against a table written by hand.
+
+The table is the intention: it does not come from the routes' own declarations. A new route fails
+`test_every_route_has_a_scope_or_is_public` until it has a row here.
+"""
+
+import httpx
+import pytest
+
+from dextouch.serving.guard import ApiKey
+from services.cli.up import BUILDERS
+from services.dashboard.upstream import Upstream
+from tests.contracts.service_apps import APPS, all_routes, client_of
+
+SCOPES = (
+    "station",
+    "store_read",
+    "store_write",
+    "store_delete",
+    "align",
+    "rollout",
+    "rate",
+    "operate",
+)
+# Needs no key on any service: probes, and the description of the routes.
+PUBLIC = {"GET /healthz", "GET /readyz", "GET /metrics", "GET /openapi.json"}
+# Scope by route. The dashboard is not here: all its routes below /v1 need a session.
+TABLE = {
+    "acquisition": {
+        "GET /v1/recorder": "station",
+        "POST /v1/recorder/arm": "station",
+        "POST /v1/recorder/record": "station",
+        "POST /v1/recorder/stop": "station",
+        "POST /v1/recorder/save": "station",
+        "POST /v1/recorder/discard": "station",
+        "POST /v1/recorder/rerecord": "station",
+        "GET /v1/health": "station",
+        "GET /v1/health/events": "station",
+        "GET /v1/live/taxels": "station",
+        "GET /v1/live/cameras": "station",
+        "GET /v1/live/cameras/{name}": "station",
+        "GET /v1/uploads": "station",
+        "POST /v1/uploads/{recording_id}/retry": "station",
+    },
+    "alignment": {
+        "POST /v1/alignments": "align",
+        "GET /v1/alignments": "align",
+        "GET /v1/alignments/{alignment_id}": "align",
+        "POST /v1/alignments/{alignment_id}/cancel": "align",
+    },
+    "episode_store": {
+        "POST /v1/recordings": "store_write",
+        "POST /v1/recordings/{recording_id}/streams/{stream}/batches/{number}": "store_write",
+        "POST /v1/recordings/{recording_id}/finish": "store_write",
+        "POST /v1/uploads/expire": "store_write",
+        "GET /v1/recordings": "store_read",
+        "GET /v1/recordings/{recording_id}": "store_read",
+        "GET /v1/recordings/{recording_id}/attributes": "store_read",
+        "GET /v1/recordings/{recording_id}/streams/{stream}": "store_read",
+        "GET /v1/uploads": "store_read",
+        "GET /v1/episodes": "store_read",
+        "GET /v1/episodes/{episode_id}": "store_read",
+        "GET /v1/episodes/{episode_id}/windows": "store_read",
+        "GET /v1/episodes/{episode_id}/streams/{stream}": "store_read",
+        "GET /v1/catalog/hours": "store_read",
+        "GET /v1/catalog/values": "store_read",
+        "GET /v1/catalog/lineage/{kind}/{item_id}": "store_read",
+        "GET /v1/playback/{kind}/{item_id}": "store_read",
+        "GET /v1/playback/{kind}/{item_id}/images/{camera}": "store_read",
+        "GET /v1/playback/{kind}/{item_id}/signals": "store_read",
+        "GET /v1/trash": "store_read",
+        "POST /v1/trash": "store_delete",
+        "POST /v1/trash/restore": "store_delete",
+    },
+    "worlds": {
+        "GET /v1/worlds": "rollout",
+        "POST /v1/rollouts": "rollout",
+        "GET /v1/rollouts/{rollout_id}": "rollout",
+        "DELETE /v1/rollouts/{rollout_id}": "rollout",
+        "POST /v1/rollouts/{rollout_id}/chunks/{chunk}": "rollout",
+        "POST /v1/rollouts/{rollout_id}/fork": "rollout",
+        "WEBSOCKET /v1/openpi": "rollout",
+    },
+    "rating": {
+        "GET /v1/rating/next": "rate",
+        "GET /v1/rating/rollouts/{token}/steps/{step}.jpg": "rate",
+        "POST /v1/rating/marks": "rate",
+    },
+}
+# The page where raters enter their key, and its files.
+RATING_PAGE = {"GET /", "GET /rate.js", "GET /rate.css", "GET /rate.svg"}
+SIGN_IN = {"POST /sign_in", "POST /sign_out"}
+PATH_VALUES = {"number": "0", "chunk": "0", "step": "0", "token": "0" * 20}
+WRONG_KEY = "wrong-key-of-some-length"
+
+
+def key_of(scope):
+    return f"key-of-the-scope-{scope}"
+
+
+KEYS = tuple(ApiKey(name=scope, key=key_of(scope), scopes=(scope,)) for scope in SCOPES)
+# What a caller may present in place of a key, with the key that would be accepted.
+NO_KEYS = {
+    "nothing": lambda key: {},
+    "a wrong key": lambda key: {"headers": {"authorization": f"Bearer {WRONG_KEY}"}},
+    "a longer key": lambda key: {"headers": {"authorization": f"Bearer {key}x"}},
+    "a shorter key": lambda key: {"headers": {"authorization": f"Bearer {key[:-1]}"}},
+    "an empty key": lambda key: {"headers": {"authorization": "Bearer "}},
+    "basic authorization": lambda key: {"headers": {"authorization": f"Basic {key}"}},
+    "no kind": lambda key: {"headers": {"authorization": key}},
+    "another header": lambda key: {"headers": {"x-api-key": key}},
+    "a cookie": lambda key: {"headers": {"cookie": f"dextouch_session={key}; key={key}"}},
+    "the query": lambda key: {"params": {"key": key, "authorization": f"Bearer {key}"}},
+}
+
+
+def operations(app):
+    """Method and path of every route; a WebSocket has the method WEBSOCKET, a folder FOLDER."""
+    found = set()
+    for route in all_routes(app):
+        kind = type(route).__name__
+        if kind == "Mount":
+            found.add(f"FOLDER {route.path}")
+        elif "WebSocket" in kind:
+            found.add(f"WEBSOCKET {route.path}")
+        else:
+            found |= {f"{method} {route.path}" for method in route.methods - {"HEAD"}}
+    documented = {
+        f"{method.upper()} {path}"
+        for path, methods in app.openapi()["paths"].items()
+        for method in methods
+    }
+    assert documented <= found
+    return found
+
+
+def filled(path):
+    for part in path.split("/"):
+        name = part.partition("{")[2].partition("}")[0]
+        path = path.replace("{" + name + "}", PATH_VALUES.get(name, "none"))
+    return path
+
+
+async def ask(client, operation, **given):
+    """Status, and reason if refused, of a request or WebSocket."""
+    method, path = operation.split()
+    if method == "WEBSOCKET":
+        return await open_websocket(client._transport.app, path, given)
+    if path.endswith("/batches/{number}"):
+        octets = {"content-type": "application/octet-stream"}
+        given |= {"content": b"x", "headers": octets | given.get("headers", {})}
+    elif method == "POST":
+        given = {"json": {}} | given
+    answer = await client.request(method, filled(path), **given)
+    is_problem = answer.headers.get("content-type") == "application/problem+json"
+    return answer.status_code, answer.json()["details"].get("reason") if is_problem else None
+
+
+async def open_websocket(app, path, given):
+    """Like `ask`: 101 if accepted, 401 or 403 by the reason of a refusal."""
+    made = httpx.Request("GET", f"http://127.0.0.1:8000{path}", **given)
+    sent = []
+    messages = [{"type": "websocket.connect"}, {"type": "websocket.disconnect", "code": 1000}]
+
+    async def receive():
+        return messages.pop(0)
+
+    async def send(message):
+        sent.append(message)
+
+    headers = [(name.lower(), value) for name, value in made.headers.raw]
+    headers = [*headers, (b"origin", b"http://127.0.0.1:8000")]
+    scope = {"type": "websocket", "scheme": "ws", "path": path, "raw_path": path.encode()}
+    scope |= {"headers": headers, "query_string": made.url.query, "root_path": ""}
+    await app(scope | {"subprotocols": [], "state": {}, "app": app}, receive, send)
+    if sent[0]["type"] == "websocket.accept":
+        return 101, None
+    assert sent[0]["code"] == 1008
+    if "lacks the scope" in sent[0]["reason"]:
+        return 403, "missing_scope"
+    assert any(word in sent[0]["reason"] for word in ("no key", "unknown key", "not signed in"))
+    return 401, None
+
+
+@pytest.fixture(params=TABLE)
+def keyed(request, tmp_path):
+    """Name and application of a service with one key for each scope."""
+    return request.param, APPS[request.param](tmp_path, api_keys=KEYS)
+
+
+def test_every_service_has_a_table():
+    assert set(APPS) == set(TABLE) | {"dashboard"}
+    assert set(BUILDERS) - set(APPS) == {"twin", "world_model"}
+
+
+def test_every_route_has_a_scope_or_is_public(keyed):
+    """Add a row for a new route: which scope should it need?"""
+    service, app = keyed
+    pages = RATING_PAGE if service == "rating" else set()
+    assert operations(app) == set(TABLE[service]) | PUBLIC | pages
+
+
+def test_the_document_says_which_scope(keyed):
+    service, app = keyed
+    paths = app.openapi()["paths"]
+    for operation, needed in TABLE[service].items():
+        method, path = operation.split()
+        if method != "WEBSOCKET":
+            assert paths[path][method.lower()]["security"] == [{"api_key": [needed]}], operation
+
+
+async def test_only_the_key_with_the_scope_is_let_in(keyed):
+    service, app = keyed
+    async with client_of(app) as client:
+        for operation, needed in TABLE[service].items():
+            for scope in SCOPES:
+                header = {"authorization": f"Bearer {key_of(scope)}"}
+                status, reason = await ask(client, operation, headers=header)
+                if scope == needed:
+                    assert status not in {401, 403}, (operation, scope, status)
+                else:
+                    assert (status, reason) == (403, "missing_scope"), (operation, scope)
+
+
+@pytest.mark.parametrize("presented", NO_KEYS)
+async def test_without_a_key_nobody_is_let_in(keyed, presented):
+    service, app = keyed
+    async with client_of(app) as client:
+        for operation, needed in TABLE[service].items():
+            given = NO_KEYS[presented](key_of(needed))
+            status, _ = await ask(client, operation, **given)
+            assert status == 401, (operation, presented)
+
+
+async def test_probes_and_pages_say_nothing_secret(keyed):
+    service, app = keyed
+    pages = RATING_PAGE if service == "rating" else set()
+    async with client_of(app) as client:
+        for operation in PUBLIC | pages:
+            answer = await client.get(operation.split()[1])
+            assert answer.status_code in {200, 503}, operation
+            assert not any(key_of(scope) in answer.text for scope in SCOPES)
+
+
+class Upstreams:
+    """Other services behind the dashboard, which note what reaches them."""
+
+    def __init__(self):
+        self.asked = []
+
+    def answer(self, request):
+        self.asked.append((request.method, request.url.path))
+        return httpx.Response(200, json={})
+
+    def clients(self):
+        return {
+            name: Upstream(
+                name,
+                httpx.AsyncClient(
+                    transport=httpx.MockTransport(self.answer), base_url=f"http://{name}"
+                ),
+            )
+            for name in ("acquisition", "episode_store", "alignment", "twin", "world_model")
+        }
+
+
+@pytest.fixture
+def upstreams():
+    return Upstreams()
+
+
+@pytest.fixture
+def page(tmp_path, upstreams):
+    return APPS["dashboard"](tmp_path, upstreams=upstreams.clients(), api_keys=KEYS)
+
+
+def kinds_of(app):
+    """Routes of the dashboard that need a session, and its pages, which show the sign-in."""
+    found = operations(app)
+    assert SIGN_IN | PUBLIC | {"FOLDER /static"} <= found
+    left = found - SIGN_IN - PUBLIC - {"FOLDER /static"}
+    pages = {one for one in left if "/v1/" not in one}
+    assert pages
+    assert all(one.startswith("GET /") for one in pages)
+    return left - pages, pages
+
+
+async def sign_in(client, key):
+    answer = await client.post("/sign_in", data={"key": key})
+    client.cookies.clear()
+    return answer
+
+
+@pytest.mark.parametrize("scope", [*SCOPES, "none"])
+async def test_only_operators_sign_in(page, scope):
+    async with client_of(page) as client:
+        answer = await sign_in(client, WRONG_KEY if scope == "none" else key_of(scope))
+        assert answer.status_code == (303 if scope == "operate" else 401)
+        assert ("set-cookie" in answer.headers) is (scope == "operate")
+
+
+async def test_the_dashboard_and_what_it_forwards_need_a_session(page, upstreams):
+    routes, _ = kinds_of(page)
+    assert "WEBSOCKET /v1/live" in routes
+    assert "POST /v1/episode_store/trash" in routes
+    presented = [given(key_of("operate")) for given in NO_KEYS.values()]
+    presented += [{"headers": {"authorization": f"Bearer {key_of(scope)}"}} for scope in SCOPES]
+    async with client_of(page) as client:
+        for operation in routes:
+            for given in presented:
+                status, _ = await ask(client, operation, **given)
+                assert status == 401, (operation, given)
+    assert not upstreams.asked
+
+
+async def test_operators_reach_every_route_until_they_sign_out(page, upstreams):
+    routes, _ = kinds_of(page)
+    async with client_of(page) as client:
+        cookie = (await sign_in(client, key_of("operate"))).headers["set-cookie"].partition(";")[0]
+        given = {"headers": {"cookie": cookie}}
+        for operation in sorted(routes):
+            status, _ = await ask(client, operation, **given)
+            assert status not in {401, 403}, operation
+        reached = set(upstreams.asked)
+        assert (("POST", "/v1/trash")) in reached
+        signed_out = await client.post("/sign_out", **given)
+        assert signed_out.status_code == 303
+        upstreams.asked.clear()
+        for operation in routes:
+            status, _ = await ask(client, operation, **given)
+            assert status == 401, operation
+    assert not upstreams.asked
+
+
+async def test_pages_show_the_sign_in_in_their_place(page):
+    _, pages = kinds_of(page)
+    async with client_of(page) as client:
+        cookie = (await sign_in(client, key_of("operate"))).headers["set-cookie"].partition(";")[0]
+        for operation in pages:
+            path = filled(operation.split()[1])
+            asks = (await client.get(path)).text
+            assert 'action="/sign_in"' in asks, path
+            shown = (await client.get(path, headers={"cookie": cookie})).text
+            assert 'action="/sign_in"' not in shown, path
