@@ -12,7 +12,6 @@ from http import HTTPStatus
 import structlog
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
     CollectorRegistry,
@@ -33,6 +32,7 @@ from dextouch.schemas import (
 from dextouch.serving.connections import RequestMiddleware, ShortcutMiddleware
 from dextouch.serving.documentation import document_service
 from dextouch.serving.guard import AccessControl, Admits, BodyRules, GuardMiddleware, SitePolicy
+from dextouch.serving.masking import hide_secrets, masked
 from dextouch.serving.settings import ServiceSettings
 
 logger = structlog.get_logger(__name__)
@@ -69,6 +69,7 @@ def create_service_app(
         renders a refusal as an HTML page, and `app.state.shortcut` answers some requests in place
         of their route (see `Shortcut`).
     """
+    hide_secrets(settings)
     app = FastAPI(
         title=name,
         version=__version__,
@@ -206,6 +207,9 @@ def _problem_response(
         headers["retry-after"] = str(error.details["retry_after_s"])
     if problem.status == HTTPStatus.UNAUTHORIZED:
         headers["www-authenticate"] = "Bearer"
-    return JSONResponse(
-        problem.model_dump(), problem.status, headers=headers, media_type=PROBLEM_MEDIA_TYPE
+    return Response(
+        masked(problem.model_dump_json()),
+        problem.status,
+        headers=headers,
+        media_type=PROBLEM_MEDIA_TYPE,
     )

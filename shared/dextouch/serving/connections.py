@@ -26,6 +26,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
 from dextouch.schemas import PROBLEM_MEDIA_TYPE, problem_from_error
 from dextouch.serving.guard import Refuse
+from dextouch.serving.masking import masked
 
 logger = structlog.get_logger(__name__)
 
@@ -355,7 +356,8 @@ def _request_id(scope: Scope) -> str:
     for name, value in scope["headers"]:
         if name == b"x-request-id":
             given = value.decode("latin-1")
-            return given if REQUEST_ID.fullmatch(given) else secrets.token_hex(16)
+            is_usable = REQUEST_ID.fullmatch(given) and masked(given) == given
+            return given if is_usable else secrets.token_hex(16)
     return secrets.token_hex(16)
 
 

@@ -2,10 +2,15 @@
 
 import logging
 import sys
-from typing import Literal
+from typing import Final, Literal
 
 import structlog
-from structlog.typing import Processor
+from structlog.typing import EventDict, Processor, WrappedLogger
+
+from dextouch.serving.masking import masked
+
+# Libraries that log headers, in which keys are sent, or every request.
+QUIET: Final = {"httpx": "WARNING", "httpcore": "INFO", "websockets": "INFO", "uvicorn": "INFO"}
 
 
 def configure_logging(
@@ -45,12 +50,23 @@ def configure_logging(
     handler.setFormatter(
         structlog.stdlib.ProcessorFormatter(
             foreign_pre_chain=shared,
-            processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, *last],
+            processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, *last, _mask],
         )
     )
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level.upper())
-    # Request logs of HTTP clients would drown the rest.
-    logging.getLogger("httpx").setLevel(logging.WARNING)
+    for name, least in QUIET.items():
+        logging.getLogger(name).setLevel(max(level.upper(), least, key=logging.getLevelName))
+    logging.getLogger("uvicorn.error").addFilter(_is_no_websocket_url)
     structlog.contextvars.bind_contextvars(service=service)
+
+
+def _mask(_: WrappedLogger, __: str, line: EventDict | str) -> str:
+    """Last processor: hides secrets in the finished line."""
+    return masked(str(line))
+
+
+def _is_no_websocket_url(record: logging.LogRecord) -> bool:
+    """False for uvicorn's lines about WebSockets, which hold the query, and so maybe a key."""
+    return '"WebSocket %s"' not in str(record.msg)

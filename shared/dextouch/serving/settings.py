@@ -11,7 +11,13 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import FastAPI
 from pydantic import AfterValidator, Field, ValidationError, model_validator
-from pydantic_settings import BaseSettings, CliApp, CliSettingsSource, SettingsConfigDict
+from pydantic_settings import (
+    BaseSettings,
+    CliApp,
+    CliSettingsSource,
+    SettingsConfigDict,
+    SettingsError,
+)
 
 from dextouch.command_line import CommandParser
 from dextouch.errors import InvalidInputError
@@ -148,6 +154,8 @@ def load_settings(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
         return CliApp.run(cls, cli_args=arguments, cli_settings_source=source)
     except ValidationError as error:
         raise InvalidInputError(f"settings of {cls.__name__}: {first_problems(error)}") from error
+    except SettingsError as error:
+        raise InvalidInputError(f"settings of {cls.__name__}: {error}; is it JSON?") from error
 
 
 def _add_argument(

@@ -259,7 +259,9 @@ def open_state(url: str) -> StateStore:
         return MemoryState()
     if url.startswith(("redis://", "rediss://")):
         return RedisState(url)
-    raise InvalidInputError(f"state: got {url!r}, expected memory:// or redis://HOST:PORT/DB")
+    # The rest may hold a password.
+    begin = url[:8]
+    raise InvalidInputError(f"state: got {begin!r}…, expected memory:// or redis://HOST:PORT/DB")
 
 
 def _version_conflict(key: str, *, expected: int, got: int) -> ConflictError:
