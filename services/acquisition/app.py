@@ -13,6 +13,7 @@ from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.health import HealthCollector
 from services.acquisition.memory import keep_for_life
+from services.acquisition.metrics import RecorderCollector
 from services.acquisition.routes import recorder_router, station_router
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import Station
@@ -100,8 +101,12 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         # /metrics shows the station's health for as long as the application runs.
-        metrics = HealthCollector(station.health.report, station.health.raised)
-        app.state.registry.register(metrics)
+        collectors = (
+            HealthCollector(station.health.report, station.health.raised),
+            RecorderCollector(station.recorder.status, uploads.counts),
+        )
+        for collector in collectors:
+            app.state.registry.register(collector)
         await run_in_threadpool((mock or station).start)
         if mock is not None:
             mock.play_forever()
@@ -111,7 +116,8 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
         finally:
             await run_in_threadpool(uploads.stop)
             await run_in_threadpool((mock or station).stop)
-            app.state.registry.unregister(metrics)
+            for collector in collectors:
+                app.state.registry.unregister(collector)
 
     async def missing() -> Sequence[str]:
         return [s.driver.name for s in station.supervisors if not s.connected.is_set()]

@@ -94,6 +94,14 @@ class Uploader:
         reasons = {path.name: _refusal(path) for path in paths}
         return {name: reason for name, reason in reasons.items() if reason is not None}
 
+    def counts(self) -> dict[str, int]:
+        """Takes of the spool that wait, are uploaded, or were refused; a running one waits too."""
+        paths = _spools(self._spool_root)
+        uploaded = sum((path / UPLOADED_FILE).exists() for path in paths)
+        refused = sum((path / REFUSED_FILE).exists() for path in paths)
+        waiting = len(paths) - uploaded - refused
+        return {"waiting": waiting, "uploaded": uploaded, "refused": refused}
+
     def status(self, *, only_refused: bool = False) -> list[UploadStatus]:
         """Every saved take, and every damaged one; or those alone that the store refused."""
         found = []

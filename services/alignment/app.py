@@ -49,13 +49,15 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
     async def readiness() -> Sequence[str]:
         return [] if jobs.is_warm else ["solver"]
 
-    return create_service_app(
+    app = create_service_app(
         name="alignment",
         settings=settings,
         routers=[alignments_router(jobs)],
         lifespan=lifespan,
         readiness=readiness,
     )
+    app.state.registry.register(jobs.metrics)
+    return app
 
 
 def alignments_router(jobs: JobRunner) -> APIRouter:

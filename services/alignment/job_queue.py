@@ -63,7 +63,7 @@ class JobQueue:
 
     def __init__(self, *, max_open: int, max_kept: int) -> None:
         self.lock = asyncio.Lock()
-        self._max_open, self._max_kept = max_open, max_kept
+        self.max_open, self._max_kept = max_open, max_kept
         self._jobs: dict[str, AlignmentJob] = {}
         self._database: JobDatabase | None = None
 
@@ -115,6 +115,10 @@ class JobQueue:
             next_after=shown[-1].alignment_id if len(rest) > limit else None,
         )
 
+    def jobs(self) -> list[AlignmentJob]:
+        """All jobs, in the order in which they were submitted."""
+        return list(self._jobs.values())
+
     @property
     def recording_ids(self) -> set[str]:
         """Recordings that have a job."""
@@ -139,10 +143,10 @@ class JobQueue:
         states = {key: job.state for key, job in self._jobs.items()}
         new = {j.alignment_id: j for j in jobs if states.get(j.alignment_id) in again}
         num_open = sum(job.state not in ENDED for job in self._jobs.values())
-        if new and num_open + len(new) > self._max_open:
+        if new and num_open + len(new) > self.max_open:
             raise LimitExceededError(
                 f"alignments: {num_open} are running or waiting and {len(new)} more were asked "
-                f"for, expected at most {self._max_open} in all; try again later",
+                f"for, expected at most {self.max_open} in all; try again later",
                 retry_after_s=RETRY_AFTER_S,
             )
         kept = {key: job for key, job in self._jobs.items() if key not in new} | new

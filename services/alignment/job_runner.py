@@ -16,6 +16,7 @@ from dextouch.errors import (
 )
 from services.alignment.job_queue import RETRY_AFTER_S, JobQueue
 from services.alignment.jobs import AlignmentWorker, check_recordings, episode_id_of
+from services.alignment.metrics import AlignmentMetrics
 from services.alignment.schemas import ENDED, AlignmentJob, AlignmentRequest
 from services.alignment.settings import AlignmentSettings
 from services.alignment.synchronization.progress import Progress
@@ -29,13 +30,15 @@ STOP_PERIOD_S = 0.05
 class JobRunner:
     """The alignments of one store; asking again for the same one gives the same job.
 
-    Runs between `start` and `close`. All methods belong to one event loop. `queue` holds the jobs.
+    Runs between `start` and `close`. All methods belong to one event loop. `queue` holds the jobs,
+    `metrics` shows them.
     """
 
     def __init__(self, store: EpisodeStore, settings: AlignmentSettings) -> None:
         self._store, self._settings = store, settings
         max_open = settings.num_workers + settings.max_waiting
         self.queue = JobQueue(max_open=max_open, max_kept=settings.max_kept)
+        self.metrics = AlignmentMetrics(self.queue)
         self._changed = asyncio.Condition(self.queue.lock)
         self._workers = [
             AlignmentWorker(settings.store_url, settings.log_level)
@@ -113,8 +116,10 @@ class JobRunner:
         recording = await asyncio.to_thread(self._store.recording, recording_id)
         options = self._settings.options
         job = AlignmentJob.new(episode_id_of(recording, options), recording_id, options)
+        failed = job.ended("failed", error=error)
         async with self.queue.lock:
-            await self.queue.add([job.ended("failed", error=error)])
+            await self.queue.add([failed])
+        self.metrics.count(failed)
         logger.warning("alignment_failed", recording_id=recording_id, reason=error.message)
 
     async def wait(self, alignment_id: str) -> AlignmentJob:
@@ -137,7 +142,9 @@ class JobRunner:
                     f"alignment {alignment_id!r}: is {job.state}, expected one that waits or runs"
                 )
             if job.state != "cancelled":
-                await self.queue.save(job.ended("cancelled"))
+                cancelled = job.ended("cancelled")
+                await self.queue.save(cancelled)
+                self.metrics.count(cancelled)
             worker = self._at_work.get(alignment_id)
             if worker is not None:
                 # While holding the lock: otherwise the worker could have started the next job.
@@ -208,6 +215,7 @@ class JobRunner:
                 reason = ended.problem.detail
                 logger.warning("alignment_failed", recording_id=job.recording_id, reason=reason)
             await self.queue.save_if_possible(ended)
+            self.metrics.count(ended)
             self._changed.notify_all()
 
     def _stop_workers(self) -> None:

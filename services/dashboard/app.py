@@ -7,6 +7,7 @@ from pathlib import Path
 
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
+from prometheus_client import Gauge
 
 from dextouch.serving import AccessControl, create_service_app, serve
 from services.dashboard.feeds import Feeds
@@ -14,7 +15,7 @@ from services.dashboard.forwarding import forwarding_router
 from services.dashboard.pages import Sessions, page_router, refusal_page
 from services.dashboard.routes import api_router, live_router
 from services.dashboard.settings import DashboardSettings
-from services.dashboard.upstream import Upstream
+from services.dashboard.upstream import Upstream, upstream_histogram
 
 STATIC = Path(__file__).parent / "static"
 
@@ -60,6 +61,13 @@ def create_app(
         lifespan=lifespan,
         admits=sessions.allows,
     )
+    seconds = upstream_histogram()
+    for upstream in upstreams.values():
+        upstream.seconds = seconds
+    app.state.registry.register(seconds)
+    text = "Signed-in browsers."
+    num_sessions = Gauge("dextouch_dashboard_sessions", text, registry=app.state.registry)
+    num_sessions.set_function(lambda: sessions.num_open)
     app.state.sessions = sessions
     app.state.refusal_page = partial(refusal_page, settings.station)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")

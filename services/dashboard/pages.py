@@ -72,6 +72,12 @@ class Sessions:
         self._clock_s = clock_s
         self._ends_s: dict[str, float] = {}
 
+    @property
+    def num_open(self) -> int:
+        """Sessions that have not ended."""
+        now_s = self._clock_s()
+        return sum(end > now_s for end in tuple(self._ends_s.values()))
+
     def sign_in(self, key: str) -> str:
         """Open a session with a key of scope `operate` and return its token.
 

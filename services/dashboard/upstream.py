@@ -1,16 +1,30 @@
 """HTTP client of another service, whose failures become UnavailableError."""
 
+import time
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any, TypeVar
 
 import httpx
+from prometheus_client import Histogram
 from pydantic import SecretStr, TypeAdapter, ValidationError
 
 from dextouch.errors import UnavailableError
 from dextouch.schemas import Problem, error_from_problem, first_problems
 
 Form = TypeVar("Form")
+SECONDS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+
+
+def upstream_histogram() -> Histogram:
+    """A metric of requests to other services, in no registry yet."""
+    return Histogram(
+        "dextouch_upstream_request_seconds",
+        "Time of a request to another service: answered, refused or failed.",
+        ("upstream", "outcome"),
+        buckets=SECONDS,
+        registry=None,
+    )
 
 
 class Upstream:
@@ -18,6 +32,7 @@ class Upstream:
 
     def __init__(self, name: str, client: httpx.AsyncClient) -> None:
         self.name = name
+        self.seconds = upstream_histogram()
         self._client = client
 
     @staticmethod
@@ -76,14 +91,19 @@ class Upstream:
 
     async def _sent(self, request: httpx.Request) -> httpx.Response:
         method, path = request.method, request.url.path
+        began_s = time.perf_counter()
+        outcome = "failed"
         try:
             response = await self._client.send(request)
+            outcome = "refused" if response.is_error else "answered"
         except httpx.HTTPError as error:
             raise UnavailableError(
                 f"{self.name}: no answer to {method} {path} ({type(error).__name__}); "
                 "is the service running?",
                 service=self.name,
             ) from error
+        finally:
+            self.seconds.labels(self.name, outcome).observe(time.perf_counter() - began_s)
         if response.is_success or response.status_code == HTTPStatus.NOT_MODIFIED:
             return response
         try:

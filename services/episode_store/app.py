@@ -55,7 +55,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         ],
         lifespan=lifespan,
     )
-    metrics.register(app.state.registry, limits)
+    metrics.register(app.state.registry, limits, catalog.num_items())
     return app
 
 

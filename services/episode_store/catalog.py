@@ -8,6 +8,7 @@ from bisect import bisect_left, bisect_right
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
+from functools import partial
 from typing import Any, Generic
 
 import structlog
@@ -84,6 +85,10 @@ class _Shelf(Generic[S]):
         self._known: dict[str, tuple[Revision, Entry[S] | None]] = {}
         self._entries: dict[str, Entry[S]] = {}
         self._guard = threading.Lock()
+
+    def __len__(self) -> int:
+        """Entries at the last look, without another one."""
+        return len(self._entries)
 
     def entries(self) -> dict[str, Entry[S]]:
         """Current entries by id; the returned dictionary is never modified."""
@@ -166,6 +171,13 @@ class Catalog:
         """Read the summaries in advance."""
         self._episodes.entries()
         self._recordings.entries()
+
+    def num_items(self) -> dict[str, Callable[[], int]]:
+        """Functions that say how many items of a kind were there when they were last listed."""
+        return {
+            "recording": partial(len, self._recordings),
+            "episode": partial(len, self._episodes),
+        }
 
     def episodes(
         self, wanted: EpisodeFilter, *, limit: int, page: Page = FIRST_PAGE

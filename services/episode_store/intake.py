@@ -3,10 +3,11 @@
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import anyio
 import structlog
@@ -221,6 +222,9 @@ class StorageLimits:
         return found
 
 
+REFUSAL_REASONS: Final = ("busy", "disk", "quota", "other")
+
+
 class UploadMetrics:
     """Prometheus metrics of uploads."""
 
@@ -253,8 +257,24 @@ class UploadMetrics:
             registry=None,
         )
 
-    def register(self, registry: CollectorRegistry, limits: StorageLimits) -> None:
-        """Add the metrics to a registry, with what the limits measure."""
+    def register(
+        self,
+        registry: CollectorRegistry,
+        limits: StorageLimits,
+        num_items: Mapping[str, Callable[[], int]],
+    ) -> None:
+        """Add the metrics to a registry, with what the limits measure.
+
+        Args:
+            registry: of the service.
+            limits: of the store's disk.
+            num_items: how many recordings and episodes are stored, by kind.
+        """
+        # A rate needs a first value to grow from.
+        for reason in REFUSAL_REASONS:
+            self.refused.labels(reason)
+        for replayed in ("true", "false"):
+            self.batches.labels(replayed)
         counts = (self.batches, self.bytes, self.refused)
         for metric in (*counts, self.ack_seconds, self.finish_seconds):
             registry.register(metric)
@@ -263,6 +283,10 @@ class UploadMetrics:
             ("free_bytes", "Free bytes on the store's disk.", limits.free_bytes),
         ):
             Gauge(f"dextouch_store_{name}", text, registry=registry).set_function(measure)
+        text = "Recordings and episodes in the catalog, as it was last read."
+        items = Gauge("dextouch_store_items", text, ("kind",), registry=registry)
+        for kind, count in num_items.items():
+            items.labels(kind).set_function(count)
 
     @contextmanager
     def counting_refusals(self) -> Iterator[None]:

@@ -85,6 +85,26 @@ def client_of(app, base_url="http://127.0.0.1:8000"):
     return httpx.AsyncClient(transport=transport, base_url=base_url)
 
 
+async def open_websocket(app, path, **given):
+    """First message of the service to a WebSocket of its own page, which closes at once."""
+    made = httpx.Request("GET", f"http://127.0.0.1:8000{path}", **given)
+    sent = []
+    messages = [{"type": "websocket.connect"}, {"type": "websocket.disconnect", "code": 1000}]
+
+    async def receive():
+        return messages.pop(0)
+
+    async def send(message):
+        sent.append(message)
+
+    headers = [(name.lower(), value) for name, value in made.headers.raw]
+    headers = [*headers, (b"origin", b"http://127.0.0.1:8000")]
+    scope = {"type": "websocket", "scheme": "ws", "path": path, "raw_path": path.encode()}
+    scope |= {"headers": headers, "query_string": made.url.query, "root_path": ""}
+    await app(scope | {"subprotocols": [], "state": {}, "app": app}, receive, send)
+    return sent[0]
+
+
 def all_routes(app):
     """Routes of an application, also those that are not in its OpenAPI document."""
     for route in app.routes:

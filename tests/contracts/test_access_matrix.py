@@ -10,7 +10,7 @@ import pytest
 from dextouch.serving.guard import ApiKey
 from services.cli.up import BUILDERS
 from services.dashboard.upstream import Upstream
-from tests.contracts.service_apps import APPS, all_routes, client_of
+from tests.contracts.service_apps import APPS, all_routes, client_of, open_websocket
 
 SCOPES = (
     "station",
@@ -145,7 +145,7 @@ async def ask(client, operation, **given):
     """Status, and reason if refused, of a request or WebSocket."""
     method, path = operation.split()
     if method == "WEBSOCKET":
-        return await open_websocket(client._transport.app, path, given)
+        return await ask_websocket(client._transport.app, path, given)
     if path.endswith("/batches/{number}"):
         octets = {"content-type": "application/octet-stream"}
         given |= {"content": b"x", "headers": octets | given.get("headers", {})}
@@ -156,29 +156,15 @@ async def ask(client, operation, **given):
     return answer.status_code, answer.json()["details"].get("reason") if is_problem else None
 
 
-async def open_websocket(app, path, given):
+async def ask_websocket(app, path, given):
     """Like `ask`: 101 if accepted, 401 or 403 by the reason of a refusal."""
-    made = httpx.Request("GET", f"http://127.0.0.1:8000{path}", **given)
-    sent = []
-    messages = [{"type": "websocket.connect"}, {"type": "websocket.disconnect", "code": 1000}]
-
-    async def receive():
-        return messages.pop(0)
-
-    async def send(message):
-        sent.append(message)
-
-    headers = [(name.lower(), value) for name, value in made.headers.raw]
-    headers = [*headers, (b"origin", b"http://127.0.0.1:8000")]
-    scope = {"type": "websocket", "scheme": "ws", "path": path, "raw_path": path.encode()}
-    scope |= {"headers": headers, "query_string": made.url.query, "root_path": ""}
-    await app(scope | {"subprotocols": [], "state": {}, "app": app}, receive, send)
-    if sent[0]["type"] == "websocket.accept":
+    first = await open_websocket(app, path, **given)
+    if first["type"] == "websocket.accept":
         return 101, None
-    assert sent[0]["code"] == 1008
-    if "lacks the scope" in sent[0]["reason"]:
+    assert first["code"] == 1008
+    if "lacks the scope" in first["reason"]:
         return 403, "missing_scope"
-    assert any(word in sent[0]["reason"] for word in ("no key", "unknown key", "not signed in"))
+    assert any(word in first["reason"] for word in ("no key", "unknown key", "not signed in"))
     return 401, None
 
 

@@ -1,11 +1,12 @@
 """Application and routes of the rating page."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path as FilePath
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Depends, FastAPI, Path, Request, Response
 from fastapi.responses import FileResponse
+from prometheus_client import Counter, Gauge
 from pydantic import Field
 
 from dextouch.episodes import EpisodeStore
@@ -82,14 +83,23 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
         rubric_of(task, rubrics)
     store = EpisodeStore(settings.store_url)
     marks = MarkLog(settings.marks)
+    rollouts = rated_rollouts(store, tasks)
     queue = RatingQueue(
-        rated_rollouts(store, tasks),
+        rollouts,
         marks,
         raters_per_rollout=settings.raters_per_rollout,
         repeat_share=settings.repeat_share,
     )
-    routers = [page_router(), rating_router(queue, marks, rubrics, RolloutPictures(store))]
-    return create_service_app(name="rating", settings=settings, routers=routers)
+    text = "Marks given since the start, with corrections."
+    given = Counter("dextouch_rating_marks", text, registry=None)
+    pictures = RolloutPictures(store)
+    routers = [page_router(), rating_router(queue, marks, rubrics, pictures, on_mark=given.inc)]
+    app = create_service_app(name="rating", settings=settings, routers=routers)
+    app.state.registry.register(given)
+    text = "Rollouts that the service shows to raters."
+    to_rate = Gauge("dextouch_rating_rollouts", text, registry=app.state.registry)
+    to_rate.set(len(rollouts))
+    return app
 
 
 def page_router() -> APIRouter:
@@ -105,7 +115,12 @@ def page_router() -> APIRouter:
 
 
 def rating_router(
-    queue: RatingQueue, marks: MarkLog, rubrics: Mapping[str, Rubric], pictures: RolloutPictures
+    queue: RatingQueue,
+    marks: MarkLog,
+    rubrics: Mapping[str, Rubric],
+    pictures: RolloutPictures,
+    *,
+    on_mark: Callable[[], object],
 ) -> APIRouter:
     """Router of assignments, pictures and marks."""
     needs_rater = RequireScope("rate")
@@ -160,7 +175,9 @@ def rating_router(
         )
         if not mark.cannot_judge:
             rubric_of(rollout.task, rubrics).score(mark.holds)
-        return GivenNumber(number=marks.add(mark))
+        number = marks.add(mark)
+        on_mark()
+        return GivenNumber(number=number)
 
     return router
 

@@ -15,6 +15,8 @@ from fastapi.exceptions import RequestValidationError
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
     CollectorRegistry,
+    Info,
+    ProcessCollector,
     generate_latest,
 )
 from starlette.exceptions import HTTPException
@@ -82,6 +84,9 @@ def create_service_app(
     app.state.settings = settings
     app.state.access = AccessControl(settings.api_keys)
     app.state.registry = CollectorRegistry()
+    ProcessCollector(registry=app.state.registry)
+    about = Info("dextouch_build", "Name and version of the service.", registry=app.state.registry)
+    about.info({"service": name, "version": __version__})
     app.state.shortcut = None
     app.state.running = False
     # The last one added is outermost, so that refusals of the guard have request ids and are
@@ -137,8 +142,8 @@ def _health_router(name: str, readiness: ReadinessCheck | None) -> APIRouter:
         return Readiness(ready=not waiting, service=name, waiting_for=tuple(waiting))
 
     @router.get("/metrics", include_in_schema=False)
-    async def metrics(request: Request) -> Response:
-        """Metrics in Prometheus text format."""
+    def metrics(request: Request) -> Response:
+        """Metrics in Prometheus text format, made in a thread since some ask the disk."""
         text = generate_latest(request.app.state.registry)
         return Response(text, headers={"content-type": CONTENT_TYPE_LATEST})
 

@@ -16,7 +16,7 @@ from http import HTTPStatus
 from typing import Any
 
 import structlog
-from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -302,12 +302,18 @@ class RequestMiddleware:
             buckets=SECONDS,
             registry=registry,
         )
+        self._websockets = Gauge(
+            "dextouch_websockets", "Open WebSockets.", ("route",), registry=registry
+        )
         self._counter = cache(self._requests.labels)
         self._part_histogram = cache(self._parts_seconds.labels)
         self._histogram = cache(self._seconds.labels)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request; other scopes (lifespan, websocket) pass through."""
+        """Handle one request or WebSocket; other scopes (lifespan) pass through."""
+        if scope["type"] == "websocket":
+            await self._count_websocket(scope, receive, send)
+            return
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -338,6 +344,21 @@ class RequestMiddleware:
             await self._app(scope, receive, send_with_headers)
         finally:
             structlog.contextvars.reset_contextvars(**tokens)
+
+    async def _count_websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
+        opened: list[Gauge] = []
+
+        async def send_and_count(message: Message) -> None:
+            if message["type"] == "websocket.accept":
+                opened.append(self._websockets.labels(scope["route"].path))
+                opened[0].inc()
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_and_count)
+        finally:
+            for gauge in opened:
+                gauge.dec()
 
     def _count(
         self, scope: Scope, status: int, duration_s: float, timings_s: Mapping[str, float]

@@ -17,6 +17,7 @@ from dextouch.serving import (
     run_workers,
     server_options,
 )
+from dextouch.worlds.metrics import WorldMetrics
 from dextouch.worlds.openpi import openpi_router
 from dextouch.worlds.rollouts import Reopen, RolloutLimits, RolloutService
 from dextouch.worlds.routes import ChunkShortcut, rollout_router
@@ -97,7 +98,7 @@ def create_world_app(
     )
     app.state.shortcut = shortcut
     app.state.drain = service.drain
-    app.state.registry.register(service.batches)
+    app.state.registry.register(WorldMetrics(service))
     return app
 
 

@@ -69,7 +69,7 @@ class WorldWorker(Generic[State]):
     ) -> None:
         self.world = world
         self._on_batch = on_batch
-        self._max_waiting = max_waiting
+        self.max_waiting = max_waiting
         self._max_batch = max_batch if isinstance(world, BatchWorld) else 1
         self._waiting: deque[StepJob[State]] = deque()
         # Of a failed batch; they run one by one, so that only the faulty rollout fails.
@@ -79,6 +79,11 @@ class WorldWorker(Generic[State]):
         self._executor = ThreadPoolExecutor(
             max_workers=1, thread_name_prefix=f"world-{world.description.name}"
         )
+
+    @property
+    def num_waiting(self) -> int:
+        """Chunks that wait for the world."""
+        return len(self._waiting) + len(self._apart)
 
     async def call(self, function: Callable[..., ResultT], *arguments: Any) -> ResultT:  # noqa: ANN401
         """Run a function in the world's thread, or here if the world is quick."""
@@ -92,10 +97,10 @@ class WorldWorker(Generic[State]):
         if self._is_quick:
             began_s, device_s, ((stepped, snapshot),) = self._step_all([job])
             return StepOutcome(stepped, snapshot, began_s - job.since_s, device_s)
-        if len(self._waiting) >= self._max_waiting:
+        if len(self._waiting) >= self.max_waiting:
             raise LimitExceededError(
                 f"world {self.world.description.name}: {len(self._waiting)} chunks are pending, "
-                f"expected at most {self._max_waiting}; try again",
+                f"expected at most {self.max_waiting}; try again",
                 retry_after_s=1,
             )
         self._waiting.append(job)

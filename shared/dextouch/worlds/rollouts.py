@@ -125,6 +125,17 @@ class RolloutService:
             for name, worker in self._workers.items()
         ]
 
+    @property
+    def num_live(self) -> int:
+        """Rollouts whose state this process holds."""
+        return len(self._live)
+
+    def queues(self) -> dict[str, tuple[int, int]]:
+        """Chunks that wait and that may wait, by world."""
+        return {
+            name: (worker.num_waiting, worker.max_waiting) for name, worker in self._workers.items()
+        }
+
     def drain(self) -> None:
         """Refuse new rollouts from now on."""
         self.is_draining = True
