@@ -93,11 +93,17 @@ def alignments_router(jobs: JobRunner) -> APIRouter:
     @router.get("", responses={404: {}})
     async def listing(
         state: JobState | None = None,
+        recording_id: Annotated[tuple[str, ...], Query(max_length=MAX_BATCH)] = (),
         after: str | None = None,
         limit: Annotated[int, Query(ge=1, le=MAX_BATCH)] = PAGE,
     ) -> AlignmentList:
-        """Alignments, oldest first, a page at a time; `after` is the last id of the page before."""
-        return jobs.queue.page(state=state, after=after, limit=limit)
+        """Alignments, oldest first, a page at a time; `after` is the last id of the page before.
+
+        A repeated `recording_id` lists only those of these recordings.
+        """
+        return jobs.queue.page(
+            state=state, recording_ids=frozenset(recording_id), after=after, limit=limit
+        )
 
     @router.get("/{alignment_id}")
     async def one(alignment_id: str) -> AlignmentJob:

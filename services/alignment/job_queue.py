@@ -6,7 +6,7 @@ Every step of a job is committed to disk before anyone hears of it; only progres
 import asyncio
 import sqlite3
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -96,13 +96,27 @@ class JobQueue:
             )
         return self._jobs[alignment_id].with_eta()
 
-    def page(self, *, state: JobState | None, after: str | None, limit: int) -> AlignmentList:
+    def page(
+        self,
+        *,
+        state: JobState | None,
+        after: str | None,
+        limit: int,
+        recording_ids: Collection[str] = (),
+    ) -> AlignmentList:
         """Some of the jobs, or of those in one state, oldest first, from the one `after` an id on.
+
+        With `recording_ids`, only those of these recordings.
 
         Raises:
             NotFoundError: there is no job `after`.
         """
-        jobs = [job for job in self._jobs.values() if job.state == (state or job.state)]
+        jobs = [
+            job
+            for job in self._jobs.values()
+            if job.state == (state or job.state)
+            and (not recording_ids or job.recording_id in recording_ids)
+        ]
         rest = jobs
         if after is not None:
             ids = list(self._jobs)

@@ -5,8 +5,8 @@ import re
 import threading
 import time
 from bisect import bisect_left, bisect_right
-from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from functools import partial
 from typing import Any, Generic
@@ -25,31 +25,36 @@ from dextouch.errors import NotFoundError, StorageError
 from dextouch.schemas import (
     ID_PATTERN,
     CatalogHours,
+    CatalogItems,
     CatalogValues,
+    ComparedGroups,
     EpisodeAttributes,
     EpisodeList,
     EpisodeSummary,
-    HoursRow,
+    HoursByField,
     Lineage,
-    LineageNode,
-    RecordingAttributes,
     RecordingList,
     RecordingSummary,
+    Review,
+    StoredItem,
 )
 from services.episode_store.filters import (
     CatalogFilter,
     Entry,
     EpisodeFilter,
+    ItemFilter,
     Page,
     S,
     cursor_of,
     place_of,
     sort_key,
 )
+from services.episode_store.hours import HoursField, HoursFilter, hours_by, hours_of
+from services.episode_store.items import ItemLists, item_of
+from services.episode_store.lineage import lineage_of
 
 logger = structlog.get_logger(__name__)
 
-SECONDS_AN_HOUR = 3600.0
 # Stamps of a file system can be this coarse: another change may get the same stamp.
 SETTLED_NS = 2_000_000_000
 # Listing a bucket takes one request per 1000 objects.
@@ -58,9 +63,8 @@ BUCKET_PERIOD_NS = 5_000_000_000
 Revision = tuple[int, int]
 NO_REVISION = (-1, -1)
 FIRST_PAGE = Page()
-# Limits of the values of a field and of the nodes of a lineage in one response.
+# Limit of the values of a field in one response.
 MAX_VALUES = 500
-MAX_NODES = 200
 
 
 class _Shelf(Generic[S]):
@@ -99,6 +103,12 @@ class _Shelf(Generic[S]):
                 known = ((name, entry) for name, (_, entry) in self._known.items())
                 self._entries = {name: entry for name, entry in known if entry is not None}
             return self._entries
+
+    def forget(self, item_id: str) -> None:
+        """Read an item again at the next look, after a change of what is beside its content."""
+        with self._guard:
+            self._known.pop(item_id, None)
+            self._is_settled, self._listed_ns = False, None
 
     def _read(self, item_id: str, revision: Revision) -> tuple[Revision, Entry[S] | None]:
         before = self._known.get(item_id)
@@ -166,6 +176,7 @@ class Catalog:
         self._store = store
         self._episodes = _Shelf(store, "episode", self._episode)
         self._recordings = _Shelf(store, "recording", self._recording)
+        self._items = ItemLists()
 
     def warm_up(self) -> None:
         """Read the summaries in advance."""
@@ -184,7 +195,8 @@ class Catalog:
     ) -> EpisodeList:
         """One page of matching episodes in the order of the page."""
         rows, facts = _page(self._episodes.entries(), wanted, limit, page)
-        return EpisodeList.model_construct(episodes=rows, **facts)
+        summaries = tuple(row.summary for row in rows)
+        return EpisodeList.model_construct(episodes=summaries, **facts)
 
     def recordings(
         self, wanted: CatalogFilter | None = None, *, limit: int, page: Page = FIRST_PAGE
@@ -192,7 +204,8 @@ class Catalog:
         """One page of matching finished recordings in the order of the page."""
         wanted = wanted or CatalogFilter()
         rows, facts = _page(self._recordings.entries(), wanted, limit, page)
-        return RecordingList.model_construct(recordings=rows, **facts)
+        summaries = tuple(row.summary for row in rows)
+        return RecordingList.model_construct(recordings=summaries, **facts)
 
     def values(self) -> CatalogValues:
         """Tasks, operators and stations that occur, at most MAX_VALUES of each."""
@@ -211,65 +224,46 @@ class Catalog:
         )
 
     def lineage(self, kind: Kind, item_id: str) -> Lineage:
-        """Everything that an item was made from and that was made from it, nearest first.
-
-        Raises:
-            NotFoundError: no such item.
-        """
+        """Everything that an item was made from and that was made from it; as `lineage_of`."""
         entries: dict[tuple[str, str], Entry[Any]] = {
             ("recording", name): entry for name, entry in self._recordings.entries().items()
         }
         entries |= {("episode", name): entry for name, entry in self._episodes.entries().items()}
-        start: tuple[str, str] = (kind, item_id)
-        if start not in entries:
-            raise NotFoundError(f"{kind} {item_id!r}: not in the catalog")
-        sources = {
-            name: tuple((one.kind, one.id) for one in entry.lineage)
-            for name, entry in entries.items()
-        }
-        products: defaultdict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)
-        for name, above in sources.items():
-            for one in above:
-                products[one].append(name)
-        nodes = {start: "self"}
-        _walk(nodes, start, lambda name: sources.get(name, ()), "source")
-        _walk(nodes, start, lambda name: products[name], "product")
-        rows = [
-            LineageNode.model_validate(
-                {
-                    "kind": name[0],
-                    "id": name[1],
-                    "relation": relation,
-                    "is_stored": name in entries,
-                    "made_from": [one for _, one in sources.get(name, ())],
-                    "summary": _brief(entries[name]) if name in entries else "",
-                }
-            )
-            for name, relation in nodes.items()
-        ]
-        return Lineage(nodes=tuple(rows))
+        return lineage_of(entries, (kind, item_id))
+
+    def items(self, wanted: ItemFilter, *, limit: int, page: Page = FIRST_PAGE) -> CatalogItems:
+        """One page of matching recordings, episodes or takes in the order of the page."""
+        found = self._items.entries(
+            wanted.kind, self._recordings.entries(), self._episodes.entries()
+        )
+        rows, facts = _page(found, wanted, limit, page)
+        return CatalogItems.model_construct(items=tuple(row.item for row in rows), **facts)
+
+    def groups(self) -> ComparedGroups:
+        """The groups of items that are compared with each other to find outliers."""
+        groups = self._items.groups(self._recordings.entries(), self._episodes.entries())
+        return ComparedGroups(groups=groups)
+
+    def review(self, item: StoredItem, review: Review | None) -> None:
+        """Keep the review of an item; None removes it.
+
+        Raises:
+            NotFoundError: no such item.
+        """
+        self._store.set_review(item.id, review, kind=item.kind)
+        (self._episodes if item.kind == "episode" else self._recordings).forget(item.id)
 
     def hours(self, wanted: EpisodeFilter) -> CatalogHours:
         """Total duration of matching episodes by task, domain and origin."""
-        groups: defaultdict[tuple[str, str, str], list[EpisodeSummary]] = defaultdict(list)
-        for episode in _matching(self._episodes.entries(), wanted).values():
-            groups[episode.task, episode.domain, episode.origin].append(episode)
-        rows = [
-            HoursRow(
-                task=task,
-                domain=group[0].domain,
-                origin=group[0].origin,
-                num_episodes=len(group),
-                num_successes=sum(episode.success is True for episode in group),
-                hours=sum(episode.duration_s for episode in group) / SECONDS_AN_HOUR,
-            )
-            for (task, *_), group in sorted(groups.items())
-        ]
-        return CatalogHours(
-            rows=tuple(rows),
-            num_episodes=sum(row.num_episodes for row in rows),
-            hours=sum(row.hours for row in rows),
+        return hours_of(_matching(self._episodes.entries(), wanted).values())
+
+    def hours_by(self, field: HoursField, wanted: HoursFilter) -> HoursByField:
+        """Total duration of matching episodes by the values of a field, and by their reviews."""
+        entries = self._items.entries(
+            "episode", self._recordings.entries(), self._episodes.entries()
         )
+        items = [entry.item for entry in _matching(entries, wanted).values()]
+        return hours_by(field, items, utc_offset_min=wanted.utc_offset_min)
 
     def bytes_by_station(self) -> dict[str, int]:
         """Disk usage of finished recordings by station."""
@@ -291,7 +285,7 @@ class Catalog:
             created_at=attributes.created_at,
             **_shared_fields(reader),
         )
-        return _entry(summary, attributes, attributes.created_at)
+        return self._entry(reader, summary, attributes.created_at)
 
     def _recording(self, recording_id: str) -> Entry[RecordingSummary]:
         reader = self._store.recording(recording_id)
@@ -305,7 +299,17 @@ class Catalog:
             started_at=attributes.started_at,
             **_shared_fields(reader),
         )
-        return _entry(summary, attributes, attributes.started_at)
+        return self._entry(reader, summary, attributes.started_at)
+
+    def _entry(
+        self, reader: EpisodeReader | RecordingReader, summary: S, at: datetime | None
+    ) -> Entry[S]:
+        about, item_id = reader.attributes, reader.item_id
+        kind: Kind = "episode" if isinstance(about, EpisodeAttributes) else "recording"
+        item = item_of(reader, summary, self._store.review(item_id, kind=kind))
+        parts = (item_id, about.task, about.instruction, about.operator or "", about.station or "")
+        text = "\n".join(parts).casefold()
+        return Entry(summary, item, dict(about.quality), at, about.lineage, text)
 
 
 def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
@@ -315,17 +319,17 @@ def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
     return fields | {"content_sha256": reader.content_sha256}
 
 
-def _matching(entries: Mapping[str, Entry[S]], wanted: CatalogFilter) -> dict[str, S]:
+def _matching(entries: Mapping[str, Entry[S]], wanted: CatalogFilter) -> dict[str, Entry[S]]:
     matches = wanted.matcher()
-    return {name: entry.summary for name, entry in entries.items() if matches(entry)}
+    return {name: entry for name, entry in entries.items() if matches(entry)}
 
 
 def _page(
     entries: Mapping[str, Entry[S]], wanted: CatalogFilter, limit: int, page: Page
-) -> tuple[tuple[S, ...], dict[str, Any]]:
-    """The summaries of a page, and the number of all that match with the cursor to go on after."""
+) -> tuple[list[Entry[S]], dict[str, Any]]:
+    """The rows of a page, and the number of all that match with the cursor to go on after."""
     found = _matching(entries, wanted)
-    places = sorted((sort_key(row, page.sort), name) for name, row in found.items())
+    places = sorted((sort_key(row.item, page.sort), name) for name, row in found.items())
     first = page.offset
     if page.after is not None:
         after = place_of(page.after)
@@ -336,36 +340,7 @@ def _page(
     chosen = places[first : first + limit]
     next_after = None if first + limit >= len(places) else cursor_of(chosen[-1])
     facts = {"num_matching": len(found), "next_after": next_after}
-    return tuple(found[name] for _, name in chosen), facts
-
-
-def _walk(
-    nodes: dict[tuple[str, str], str],
-    start: tuple[str, str],
-    neighbours: Callable[[tuple[str, str]], Iterable[tuple[str, str]]],
-    relation: str,
-) -> None:
-    """Add everything that can be reached from an item, breadth first, until MAX_NODES."""
-    waiting = deque([start])
-    while waiting and len(nodes) < MAX_NODES:
-        for name in neighbours(waiting.popleft()):
-            if name not in nodes and len(nodes) < MAX_NODES:
-                nodes[name] = relation
-                waiting.append(name)
-
-
-def _brief(entry: Entry[Any]) -> str:
-    row = entry.summary
-    origin = row.origin if isinstance(row, EpisodeSummary) else "recorded"
-    return f"{row.task}, {row.domain}, {origin}, {row.duration_s:.1f} s"
-
-
-def _entry(
-    summary: S, about: EpisodeAttributes | RecordingAttributes, at: datetime | None
-) -> Entry[S]:
-    item_id = about.episode_id if isinstance(about, EpisodeAttributes) else about.recording_id
-    searched = (item_id, about.task, about.instruction, about.operator or "", about.station or "")
-    return Entry(summary, dict(about.quality), at, about.lineage, "\n".join(searched).casefold())
+    return [found[name] for _, name in chosen], facts
 
 
 def _nominal_duration_s(reader: EpisodeReader | RecordingReader) -> float:

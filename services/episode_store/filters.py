@@ -11,20 +11,35 @@ from pydantic import AfterValidator, AwareDatetime, Field
 
 from dextouch.errors import LimitExceededError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import Domain, EpisodeSummary, LineageEntry, Origin, RecordingSummary
+from dextouch.schemas import (
+    CatalogItem,
+    Domain,
+    EpisodeSummary,
+    LineageEntry,
+    Origin,
+    RecordingSummary,
+    Verdict,
+)
 
 S = TypeVar("S", EpisodeSummary, RecordingSummary)
 Outcome = Literal["success", "failure", "not_judged"]
-SortKey = Literal["id", "time", "duration", "task", "operator", "station"]
+SortKey = Literal["id", "time", "duration", "task", "operator", "station", "findings"]
+ItemsKind = Literal["take", "recording", "episode"]
 _COMPARED = ("task", "operator", "station", "domain", "success", "recovered", "origin")
+# Order of items by their findings, where those without a score are among the outliers.
+_WEIGHTS = {"doubtful_clock": 10.0, "recovered": 5.0, "not_judged": 1.0}
 _SUCCESS: dict[Outcome, bool | None] = {"success": True, "failure": False, "not_judged": None}
 
 
 @dataclass(frozen=True, slots=True)
 class Entry(Generic[S]):
-    """A row of the catalog, with further properties to filter by; `text` is in lower case."""
+    """A row of the catalog in both forms, with further properties to filter by.
+
+    `text` is in lower case.
+    """
 
     summary: S
+    item: CatalogItem
     quality: Mapping[str, float]
     created_at: datetime | None
     lineage: tuple[LineageEntry, ...] = ()
@@ -82,7 +97,7 @@ class CatalogFilter(FrozenModel):
         further = self._further()
 
         def matches(entry: Entry[S]) -> bool:
-            if get is not None and get(entry.summary) != expected:
+            if get is not None and get(entry.item) != expected:
                 return False
             if any(not entry.quality.get(name, -math.inf) >= least for name, least in bounds):
                 return False
@@ -96,7 +111,7 @@ class CatalogFilter(FrozenModel):
         checks: list[Callable[[Entry[S]], bool]] = []
         if self.outcome is not None:
             success = _SUCCESS[self.outcome]
-            checks.append(lambda entry: entry.summary.success is success)
+            checks.append(lambda entry: entry.item.success is success)
         if self.text:
             text = self.text.casefold()
             checks.append(lambda entry: text in entry.text)
@@ -119,10 +134,39 @@ class EpisodeFilter(CatalogFilter):
         return checks
 
 
+class ItemFilter(CatalogFilter):
+    """Filter of items; `flagged` are those with findings, `id` any of these ids."""
+
+    kind: ItemsKind = Field(
+        default="take",
+        description="recordings, episodes, or both: a recording and its episodes as one take",
+    )
+    origin: Origin | None = None
+    review: Verdict | Literal["not_reviewed"] | None = None
+    flagged: bool | None = None
+    id: tuple[str, ...] = Field(default=(), max_length=200)
+
+    def _further(self) -> list[Callable[[Entry[S]], bool]]:
+        checks: list[Callable[[Entry[S]], bool]] = super()._further()
+        if self.review is not None:
+            verdict = None if self.review == "not_reviewed" else self.review
+            checks.append(
+                lambda entry: (entry.item.review and entry.item.review.verdict) == verdict
+            )
+        if self.flagged is not None:
+            flagged = self.flagged
+            checks.append(lambda entry: bool(entry.item.findings) == flagged)
+        if self.id:
+            wanted = frozenset(self.id)
+            checks.append(lambda entry: entry.item.id in wanted)
+        return checks
+
+
 class Page(FrozenModel):
     """Page of a list in an order: after a cursor, or from an offset.
 
-    Rows of equal keys are in the order of ids; rows without a key come first.
+    Rows of equal keys are in the order of ids; rows without a key come first. `findings` sorts
+    items by how far they are from what is usual.
     """
 
     sort: SortKey = "id"
@@ -160,16 +204,23 @@ class RecordingQuery(CatalogFilter, Page):
     """Filter and page of recordings."""
 
 
-def sort_key(row: EpisodeSummary | RecordingSummary, sort: SortKey) -> str:
+class ItemQuery(ItemFilter, Page):
+    """Filter and page of items."""
+
+
+def sort_key(item: CatalogItem, sort: SortKey) -> str:
     """Text by which a row is sorted; empty for ids, which follow anyway."""
     if sort == "id":
         return ""
     if sort == "duration":
-        return f"{row.duration_s:020.6f}"
+        return f"{item.duration_s:020.6f}"
+    if sort == "findings":
+        scores = (abs(one.score or _WEIGHTS.get(one.code, 0.0)) for one in item.findings)
+        return f"{max(scores, default=0.0):020.6f}"
     if sort == "time":
-        at = row.created_at if isinstance(row, EpisodeSummary) else row.started_at
+        at = item.at
         return "" if at is None else at.astimezone(UTC).isoformat(timespec="microseconds")
-    return getattr(row, sort) or ""
+    return getattr(item, sort) or ""
 
 
 def cursor_of(place: tuple[str, str]) -> str:

@@ -11,27 +11,40 @@ from fastapi import APIRouter, Depends, Path, Query, Request
 from dextouch.schemas import (
     BatchReceipt,
     CatalogHours,
+    CatalogItems,
     CatalogValues,
+    ComparedGroups,
     EpisodeList,
     ExpireUploads,
     FinishRecording,
+    HoursByField,
     ItemKind,
     Lineage,
     RecordingAttributes,
     RecordingList,
     RecordingStatus,
+    ReviewedItems,
+    ReviewItems,
     UploadList,
 )
 from dextouch.serving import AS_SET, JSON, KIB, OCTETS, JsonBody, RequireScope, takes
 from dextouch.streams import MAX_BATCH_BYTES
 from services.episode_store.catalog import Catalog
-from services.episode_store.filters import EpisodeFilter, EpisodeQuery, RecordingQuery
+from services.episode_store.filters import (
+    EpisodeFilter,
+    EpisodeQuery,
+    ItemQuery,
+    RecordingQuery,
+)
+from services.episode_store.hours import HoursField, HoursFilter
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
+from services.episode_store.reviewing import review_items
 
 Attributes = Annotated[RecordingAttributes, Depends(JsonBody(RecordingAttributes))]
 Finish = Annotated[FinishRecording, Depends(JsonBody(FinishRecording))]
 MAY_READ = Depends(RequireScope("store_read"))
+MAY_DELETE = Depends(RequireScope("store_delete"))
 MAY_WRITE = Depends(RequireScope("store_write"))
 # Room for the calibration and descriptors of a station, or the ledger of a take.
 MAX_ATTRIBUTES_BYTES = 256 * KIB
@@ -141,6 +154,27 @@ def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
     def hours(wanted: Annotated[EpisodeFilter, Query()]) -> CatalogHours:
         """Hours and counts of the matching episodes by task, domain and origin."""
         return catalog.hours(wanted)
+
+    @router.get("/catalog/hours/{field}", tags=["catalog"])
+    def hours_by(field: HoursField, wanted: Annotated[HoursFilter, Query()]) -> HoursByField:
+        """Hours of the matching episodes by the values of one field, and by their reviews."""
+        return catalog.hours_by(field, wanted)
+
+    @router.get("/catalog/items", tags=["catalog"])
+    def items(wanted: Annotated[ItemQuery, Query()]) -> CatalogItems:
+        """List recordings and episodes in one list; both as takes by default."""
+        return catalog.items(wanted, limit=wanted.num_rows(max_page), page=wanted)
+
+    @router.get("/catalog/groups", tags=["catalog"])
+    def groups() -> ComparedGroups:
+        """Groups of items that are compared to find outliers, and whether they are large enough."""
+        return catalog.groups()
+
+    @router.post("/catalog/reviews", tags=["catalog"], dependencies=[MAY_DELETE])
+    @takes({JSON: MAX_ATTRIBUTES_BYTES})
+    def review(wanted: Annotated[ReviewItems, Depends(JsonBody(ReviewItems))]) -> ReviewedItems:
+        """Accept or reject items, or remove their reviews; rejected ones are not trained on."""
+        return review_items(catalog, wanted)
 
     @router.get("/catalog/values", tags=["catalog"])
     def values() -> CatalogValues:

@@ -23,6 +23,7 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.migration import is_current
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
+from dextouch.episodes.reviews import REVIEW_FILE
 from dextouch.episodes.staged_group import (
     STAGING,
     new_stage,
@@ -262,6 +263,14 @@ class ObjectStorage:
     def delete(self, kind: Kind, item_id: str) -> None:
         """Delete a group: its commit record first, then its other objects."""
         delete_group(self._bucket, kind, item_id)
+
+    def set_review(self, kind: Kind, item_id: str, content: bytes | None) -> None:
+        """Put the review of a group in place of an earlier one; None removes it."""
+        key = f"{group_key(kind, item_id)}/{REVIEW_FILE}"
+        if content is None:
+            self._bucket.remove([key])
+        else:
+            self._bucket.put(key, content)
 
     def migrate(self, kind: Kind, item_id: str) -> bool:
         """Refuse a group of an older version: keys cannot be replaced atomically."""

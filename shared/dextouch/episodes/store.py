@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
-from dextouch.episodes.files import disk_errors, folder_bytes, sync_folder
+from dextouch.episodes.files import disk_errors, folder_bytes, replace_file, sync_folder
 from dextouch.episodes.format import (
     ATTRIBUTES,
     COMMIT_FILE,
@@ -22,6 +22,7 @@ from dextouch.episodes.format import (
 from dextouch.episodes.group_contents import read_group, read_live
 from dextouch.episodes.migration import OldGroup, is_current
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
+from dextouch.episodes.reviews import REVIEW_FILE, read_review
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.staged_group import STAGING, new_stage, stages_of, unheld_folders
 from dextouch.episodes.staging_recovery import (
@@ -50,7 +51,7 @@ from dextouch.errors import (
     UnavailableError,
     UnknownNameError,
 )
-from dextouch.schemas import ID_PATTERN, EpisodeAttributes, RecordingAttributes
+from dextouch.schemas import ID_PATTERN, EpisodeAttributes, RecordingAttributes, Review
 
 if TYPE_CHECKING:
     from dextouch.episodes.object_storage import ObjectStorage
@@ -152,6 +153,26 @@ class EpisodeStore:
     def list(self, *, kind: Kind = "episode") -> list[str]:
         """Sorted committed ids."""
         return self._storage.list(_check_kind(kind))
+
+    def review(self, item_id: str, *, kind: Kind = "episode") -> Review | None:
+        """The review of an item; None if nobody reviewed it.
+
+        Raises:
+            NotFoundError: no such id.
+            CorruptDataError: its review cannot be read.
+        """
+        group = self._storage.group(*_check(kind, item_id))
+        return read_review(group, what=f"{kind} {item_id!r}")
+
+    def set_review(self, item_id: str, review: Review | None, *, kind: Kind = "episode") -> None:
+        """Keep the review of an item in place of an earlier one; None removes it.
+
+        Raises:
+            NotFoundError: no such id.
+        """
+        self._storage.group(*_check(kind, item_id))
+        content = None if review is None else review.model_dump_json().encode()
+        self._storage.set_review(kind, item_id, content)
 
     def delete(self, item_id: str, *, kind: Kind = "episode", for_good: bool = False) -> None:
         """Move an episode or recording to the trash, or delete it `for_good`.
@@ -323,6 +344,15 @@ class _LocalStorage:
         """Delete a group permanently; it disappears atomically and is then removed from disk."""
         remove_for_good(put_into_trash(self.root, kind, item_id))
 
+    def set_review(self, kind: Kind, item_id: str, content: bytes | None) -> None:
+        path = self._folder(kind, item_id) / REVIEW_FILE
+        with disk_errors(f"review {kind} {item_id}"):
+            if content is not None:
+                replace_file(path, content)
+            elif path.exists():
+                path.unlink()
+                sync_folder(path.parent)
+
     def migrate(self, kind: Kind, item_id: str) -> bool:
         """Replace a group of an older format version atomically; its lineage names the old one."""
         files = self.group(kind, item_id)
@@ -338,7 +368,10 @@ class _LocalStorage:
         )
         streams = ((stream.name, old.blocks(stream)) for stream in old.attributes.streams)
         write_blocks(new_stage(self.root, kind, item_id), whole, old.attributes, streams)
+        review = files.get(REVIEW_FILE)
         with disk_errors(f"migrate {item_id}"):
+            if review is not None:
+                replace_file(whole / REVIEW_FILE, review)
             files.folder.rename(before)
             whole.rename(files.folder)
             sync_folder(files.folder.parent)

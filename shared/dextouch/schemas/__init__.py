@@ -5,16 +5,27 @@ from typing import TYPE_CHECKING
 from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
+    from dextouch.schemas.catalog import CatalogItem as CatalogItem
+    from dextouch.schemas.catalog import CatalogItems as CatalogItems
     from dextouch.schemas.catalog import CatalogValues as CatalogValues
+    from dextouch.schemas.catalog import ComparedGroup as ComparedGroup
+    from dextouch.schemas.catalog import ComparedGroups as ComparedGroups
+    from dextouch.schemas.catalog import Finding as Finding
+    from dextouch.schemas.catalog import HoursByField as HoursByField
+    from dextouch.schemas.catalog import HoursOf as HoursOf
     from dextouch.schemas.catalog import ItemKind as ItemKind
     from dextouch.schemas.catalog import Lineage as Lineage
     from dextouch.schemas.catalog import LineageNode as LineageNode
     from dextouch.schemas.catalog import MovedItems as MovedItems
     from dextouch.schemas.catalog import MoveItems as MoveItems
     from dextouch.schemas.catalog import RefusedItem as RefusedItem
+    from dextouch.schemas.catalog import Review as Review
+    from dextouch.schemas.catalog import ReviewedItems as ReviewedItems
+    from dextouch.schemas.catalog import ReviewItems as ReviewItems
     from dextouch.schemas.catalog import StoredItem as StoredItem
     from dextouch.schemas.catalog import TrashContents as TrashContents
     from dextouch.schemas.catalog import TrashedItem as TrashedItem
+    from dextouch.schemas.catalog import Verdict as Verdict
     from dextouch.schemas.episodes import ID_PATTERN as ID_PATTERN
     from dextouch.schemas.episodes import CatalogHours as CatalogHours
     from dextouch.schemas.episodes import ClockMethod as ClockMethod

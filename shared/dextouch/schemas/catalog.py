@@ -1,13 +1,14 @@
-"""Schemas of the store's catalog beyond its lists: values to filter by, lineage, and the trash."""
+"""Schemas of the store's catalog: items of both kinds, lineage, the trash, reviews, hours."""
 
 from typing import Literal
 
 from pydantic import AwareDatetime, Field
 
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas.episodes import StoreId
+from dextouch.schemas.episodes import Domain, Origin, StoreId
 
 ItemKind = Literal["episode", "recording"]
+Verdict = Literal["accepted", "rejected"]
 MAX_MOVED = 500
 
 
@@ -81,3 +82,121 @@ class TrashContents(FrozenModel):
 
     items: tuple[TrashedItem, ...]
     num_items: int
+
+
+class Review(FrozenModel):
+    """Verdict of a person on an item; rejected ones are not trained on.
+
+    `reviewer` is a pseudonym.
+    """
+
+    verdict: Verdict
+    reason: str = Field(default="", max_length=500)
+    reviewer: str | None = Field(default=None, max_length=128)
+    reviewed_at: AwareDatetime
+
+
+class ReviewItems(FrozenModel):
+    """Request to review items; a `verdict` of None removes their reviews."""
+
+    items: tuple[StoredItem, ...] = Field(min_length=1, max_length=MAX_MOVED)
+    verdict: Verdict | None
+    reason: str = Field(default="", max_length=500)
+    reviewer: str | None = Field(default=None, max_length=128)
+
+
+class ReviewedItems(FrozenModel):
+    """Result of a review: every item is in one of the lists."""
+
+    reviewed: tuple[StoredItem, ...]
+    refused: tuple[RefusedItem, ...] = ()
+
+
+class Finding(FrozenModel):
+    """A reason to look at an item.
+
+    `figure`, `value`, `median` and `score` (robust z-score) belong to the code `outlier`.
+    """
+
+    code: Literal["outlier", "not_judged", "doubtful_clock", "recovered"]
+    message: str
+    figure: str | None = None
+    value: float | None = None
+    median: float | None = None
+    score: float | None = None
+
+
+class CatalogItem(FrozenModel):
+    """An episode or a recording with all that a table of both shows.
+
+    `consent` of an episode is that of its recording, None where that is not stored. `figures` are
+    figures of its quality, the same for all items. `recordings` and `episodes` are the stored
+    recordings that it was made from and the episodes that were made from it; `aligned` is the last
+    of these, in the list of takes only. `time_doubts` names streams whose times are in doubt.
+    """
+
+    kind: ItemKind
+    id: str
+    task: str
+    instruction: str
+    domain: Domain
+    origin: Origin
+    station: str | None = None
+    operator: str | None = None
+    consent: bool | None = None
+    success: bool | None = None
+    recovered: bool = False
+    duration_s: float = Field(ge=0)
+    at: AwareDatetime | None = None
+    figures: dict[str, float] = Field(default={})
+    time_doubts: tuple[str, ...] = ()
+    recordings: tuple[str, ...] = ()
+    episodes: tuple[str, ...] = ()
+    review: Review | None = None
+    findings: tuple[Finding, ...] = ()
+    aligned: "CatalogItem | None" = None
+
+
+class CatalogItems(FrozenModel):
+    """One page of items, and how many match in all; `next_after` is None on the last page."""
+
+    items: tuple[CatalogItem, ...]
+    num_matching: int
+    next_after: str | None = None
+
+
+class ComparedGroup(FrozenModel):
+    """Items that are compared with each other to find outliers.
+
+    `is_compared` is False where there are fewer than `min_items`.
+    """
+
+    kind: ItemKind
+    task: str
+    domain: Domain
+    origin: Origin
+    num_items: int
+    min_items: int
+    is_compared: bool
+
+
+class ComparedGroups(FrozenModel):
+    """All groups of items, by task, domain, origin and kind."""
+
+    groups: tuple[ComparedGroup, ...]
+
+
+class HoursOf(FrozenModel):
+    """Hours of the episodes with one value of a field, by their reviews; None without a value."""
+
+    value: str | None
+    num_episodes: int
+    accepted_h: float
+    rejected_h: float
+    not_reviewed_h: float
+
+
+class HoursByField(FrozenModel):
+    """Hours of episodes by the values of one field, in their order."""
+
+    rows: tuple[HoursOf, ...]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from dextouch.hands.actions import IDENTITY_POSE_9D, pack_action
-from dextouch.schemas import EpisodeAttributes
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 from dextouch.streams import StreamDescriptor
 
 IDENTITY_ROWS = [[float(i == j) for j in range(4)] for i in range(4)]
@@ -58,3 +58,59 @@ def write_episode(store, episode_id, *, num_steps=9, **changes):
             )
             writer.append(name, values=values, t_ref_ns=grid_ns)
     return store.open(episode_id)
+
+
+def write_recording(store, recording_id, *, num_samples=30, **changes):
+    """A recording of one tracked wrist at 30 Hz, of a human who stands a bottle, unless changed."""
+    attributes = RecordingAttributes.model_validate(
+        {
+            "recording_id": recording_id,
+            "task": "stand_bottle",
+            "instruction": "do it",
+            "domain": "human",
+            "station": "bench",
+            **changes,
+        }
+    )
+    numbers = np.arange(num_samples, dtype=np.int64)
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        writer.add_stream(
+            StreamDescriptor(
+                name="wrist_left",
+                kind="pose",
+                shape=(7,),
+                dtype="float64",
+                unit="pose_m_wxyz",
+                nominal_rate_hz=30,
+            )
+        )
+        stamps_ns = numbers * 33_333_333
+        writer.append(
+            "wrist_left",
+            values=np.ones((num_samples, 7)),
+            t_host_ns=stamps_ns,
+            t_device_ns=stamps_ns,
+            sequence=numbers,
+        )
+    return store.recording(recording_id)
+
+
+def write_take(store, recording_id, *, num_steps=9, quality=None, clocks=(), **changes):
+    """A recording and the episode that alignment would make of it, `ID-aligned`."""
+    recording = write_recording(store, recording_id, num_samples=2 * num_steps, **changes)
+    about = recording.attributes
+    source = {"kind": "recording", "id": recording_id, "sha256": recording.content_sha256}
+    return write_episode(
+        store,
+        f"{recording_id}-aligned",
+        num_steps=num_steps,
+        origin="recorded",
+        created_at=about.started_at,
+        lineage=[source],
+        quality=quality or {},
+        clocks=clocks,
+        **{
+            name: getattr(about, name)
+            for name in ("task", "instruction", "domain", "station", "operator", "success")
+        },
+    )

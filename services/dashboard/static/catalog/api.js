@@ -1,0 +1,42 @@
+// Requests to the store and to alignment through the dashboard; refusals become errors with their reason.
+
+import { ask } from "../session.js";
+
+async function read(answer) {
+  if (answer.ok) return answer.json();
+  const problem = await answer.json().catch(() => ({}));
+  throw new Error(problem.detail ?? `The dashboard answered ${answer.status}.`, { cause: answer.status });
+}
+
+export async function get(path) {
+  return read(await ask(path));
+}
+
+export async function post(path, body) {
+  const headers = { "content-type": "application/json" };
+  return read(await ask(path, { method: "POST", headers, body: JSON.stringify(body) }));
+}
+
+// Services that this dashboard was started without are not asked again.
+const absent = new Set();
+
+// Of a service that may be absent or down: `missing` in its place.
+export async function getIfServed(path, missing) {
+  const service = path.split("/")[2];
+  if (absent.has(service)) return missing;
+  try {
+    return await get(path);
+  } catch (error) {
+    if (error.cause === 404) absent.add(service);
+    if ([404, 503].includes(error.cause)) return missing;
+    throw error;
+  }
+}
+
+// The newest alignment job of each of these recordings, by recording.
+export async function newestJobs(recordings) {
+  if (!recordings.length) return new Map();
+  const query = new URLSearchParams([["limit", "1000"], ...recordings.map((id) => ["recording_id", id])]);
+  const { alignments } = await getIfServed(`/v1/alignment/alignments?${query}`, { alignments: [] });
+  return new Map(alignments.map((job) => [job.recording_id, job]));
+}

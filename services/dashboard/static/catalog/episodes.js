@@ -1,0 +1,295 @@
+// The list of recordings and episodes: filters in the address, rows that move on, deletion in two steps.
+
+import { element, setText } from "../dom.js";
+import { startTheme } from "../theme.js";
+import { get, getIfServed, newestJobs, post } from "./api.js";
+import * as cells from "./cells.js";
+import { Grid, isFree } from "./grid.js";
+import { showLineage } from "./lineage.js";
+import { FILTERS, PAGE_ROWS, isFiltered, pageWords, readQuery, storeQuery, writeQuery } from "./query.js";
+import { itemsOf, playerPath, rowsOf, stageOf, subjectOf } from "./stage.js";
+
+const REFRESH_MS = 3000;
+const CONFIRM_MS = 5000;
+const TYPING_MS = 250;
+const MAX_MOVED = 500;
+const find = (id) => document.getElementById(id);
+const form = find("filters");
+let query = readQuery(location.search);
+let rows = new Map();
+let total = 0;
+let asked = 0;
+let deletion = null;
+let lastMoved = [];
+
+function say(text, level = "OK") {
+  find("message").dataset.level = level;
+  setText(find("message"), text);
+}
+
+function plural(count, name) {
+  return `${count} ${name}${count === 1 ? "" : "s"}`;
+}
+
+// Rows
+
+function checkbox(name) {
+  return element("td", { class: "pick" }, element("input", { type: "checkbox", tabindex: -1, "aria-label": `select ${name}` }));
+}
+
+function itemRow({ item, job }) {
+  return element("tr", {}, checkbox(item.id), cells.timeCell(item), cells.taskCell(item), cells.nameCell(item, playerPath(item)),
+    cells.operatorCell(item), cells.stationCell(item), cells.outcomeCell(item), cells.lengthCell(item), cells.qualityCell(item),
+    cells.stageCell(stageOf({ item, job })));
+}
+
+function uploadRow({ id, task, station, upload }) {
+  const cell = (...children) => element("td", {}, ...children);
+  return element("tr", {}, cell(), cell("just now"), cell(element("strong", {}, task ?? "–")),
+    element("td", { class: "item_name_cell" }, element("span", { class: "clipped item_name" }, id), cells.under("recording")),
+    cell("–"), cell(station ?? "–"), cell("–"), element("td", { class: "number" }, "–"), cell("–"), cells.stageCell(stageOf({ upload })));
+}
+
+function trashRow(item) {
+  const at = item.deleted_at;
+  return element("tr", {}, checkbox(item.id), element("td", {}, cells.day(at), cells.under(cells.clock(at))),
+    element("td", { class: "item_name_cell" }, element("span", { class: "item_name" }, item.id), cells.under(item.kind)),
+    element("td", { class: "number" }, `${(item.num_bytes / 1e6).toFixed(1)} MB`));
+}
+
+// Requests
+
+async function listed() {
+  if (query.view === "trash") {
+    const trash = await get(`/v1/episode_store/trash?limit=${PAGE_ROWS * query.page}`);
+    const items = trash.items.slice(PAGE_ROWS * (query.page - 1));
+    const made = items.map((item) => ({ key: `${item.kind}/${item.id}/${item.deleted_at}`, item, build: () => trashRow(item) }));
+    return { made, total: trash.num_items };
+  }
+  const isFirstPage = query.page === 1 && query.view !== "episode" && query.sort === "time" && query.descending && !isFiltered(query);
+  const [page, uploads, pending] = await Promise.all([
+    get(`/v1/episode_store/catalog/items?${storeQuery(query)}`),
+    isFirstPage ? getIfServed("/v1/acquisition/uploads", []) : [],
+    isFirstPage ? getIfServed("/v1/episode_store/uploads", { uploads: [] }) : { uploads: [] },
+  ]);
+  const unaligned = page.items.filter((item) => item.kind === "recording" && !item.episodes.length);
+  const jobs = await newestJobs(unaligned.map((item) => item.id));
+  const found = rowsOf({ items: page.items, uploads, pending: pending.uploads, jobs, isFirstPage });
+  return { made: found.map((row) => ({ ...row, build: () => (row.item ? itemRow(row) : uploadRow(row)) })), total: page.num_matching };
+}
+
+async function refresh() {
+  const number = ++asked;
+  try {
+    const { made, total: counted } = await listed();
+    if (number !== asked) return;
+    total = counted;
+    rows = new Map(made.map((row) => [row.key, row]));
+    grid.show(made.map(({ key, build, ...state }) => ({ key, build, state: JSON.stringify([query.view, state]) })));
+    find("empty").hidden = made.length > 0;
+    const nothing = query.view === "trash" ? "The trash is empty." : "Nothing is stored yet.";
+    setText(find("empty"), isFiltered(query) && query.view !== "trash" ? "Nothing matches these filters." : nothing);
+    find("list_error").hidden = true;
+    showPager();
+  } catch (error) {
+    if (number !== asked) return;
+    find("list_error").hidden = false;
+    setText(find("list_error"), `The list is not up to date: ${error.message}`);
+  }
+}
+
+async function showChoices() {
+  const values = await get("/v1/episode_store/catalog/values").catch(() => ({ tasks: [], operators: [], stations: [] }));
+  for (const [name, found] of [["task", values.tasks], ["operator", values.operators], ["station", values.stations]]) {
+    const select = form.elements[name];
+    const chosen = query.filters[name];
+    const all = chosen && !found.includes(chosen) ? [...found, chosen] : found;
+    select.replaceChildren(element("option", { value: "" }, "all"), ...all.map((value) => element("option", { value }, value)));
+    select.value = chosen;
+  }
+}
+
+// Address and filters
+
+function go(changes, { isTyping = false } = {}) {
+  query = { ...query, page: 1, ...changes };
+  const address = `${location.pathname}${writeQuery(query)}`;
+  if (isTyping) history.replaceState(null, "", address);
+  else history.pushState(null, "", address);
+  showQuery();
+  refresh();
+}
+
+function showQuery() {
+  document.body.dataset.view = query.view;
+  for (const tab of document.querySelectorAll("[data-view-tab]")) {
+    tab.setAttribute("aria-pressed", String(tab.dataset.viewTab === query.view));
+  }
+  for (const name of FILTERS) {
+    if (document.activeElement !== form.elements[name]) form.elements[name].value = query.filters[name];
+  }
+  for (const head of document.querySelectorAll("[data-sort]")) {
+    const isSorted = query.view !== "trash" && head.dataset.sort === query.sort;
+    head.parentElement.setAttribute("aria-sort", isSorted ? (query.descending ? "descending" : "ascending") : "none");
+  }
+  find("clear").hidden = !isFiltered(query);
+}
+
+function showPager() {
+  setText(find("range"), pageWords(query.page, total));
+  find("previous").disabled = query.page === 1;
+  find("next").disabled = query.page * PAGE_ROWS >= total;
+}
+
+// Selection and what is done with it
+
+function chosen() {
+  return grid.meant().map((key) => rows.get(key)).filter((row) => row?.item);
+}
+
+function showSelection() {
+  const count = grid.selected.size;
+  setText(find("selected"), count ? `${count} selected` : "none selected: keys mean the row in focus");
+  const aligned = alignable();
+  find("align").disabled = !aligned.length;
+  setText(find("align").firstElementChild, aligned.some((row) => row.job) ? "Align again" : "Align");
+  for (const id of ["delete", "restore", "lineage"]) find(id).disabled = !chosen().length;
+  if (deletion && deletion.keys !== grid.meant().join()) endDeletion();
+}
+
+function alignable() {
+  return chosen().filter(({ item, job }) => item.kind === "recording" && !item.episodes?.length && !["waiting", "running"].includes(job?.state));
+}
+
+async function move(path, items) {
+  const refused = [];
+  const moved = [];
+  for (let first = 0; first < items.length; first += MAX_MOVED) {
+    const answer = await post(path, { items: items.slice(first, first + MAX_MOVED) });
+    moved.push(...answer.moved);
+    refused.push(...answer.refused);
+  }
+  return { moved, refused };
+}
+
+function reasons(refused) {
+  return refused.length ? ` Not moved: ${refused.slice(0, 3).map((one) => one.reason).join("; ")}${refused.length > 3 ? "; …" : ""}` : "";
+}
+
+function endDeletion() {
+  if (deletion) clearTimeout(deletion.timer);
+  deletion = null;
+  setText(find("delete").firstElementChild, "Delete");
+  find("delete").classList.remove("asked");
+}
+
+async function remove() {
+  const meant = chosen();
+  if (query.view === "trash" || !meant.length) return;
+  const items = meant.flatMap((row) => itemsOf(row, query.view));
+  if (!deletion) {
+    const kinds = ["recording", "episode"].map((kind) => [kind, items.filter((item) => item.kind === kind).length]);
+    const counted = kinds.filter(([, count]) => count).map(([kind, count]) => plural(count, kind)).join(" and ");
+    deletion = { keys: grid.meant().join(), timer: setTimeout(() => { endDeletion(); say(""); }, CONFIRM_MS) };
+    setText(find("delete").firstElementChild, "Delete now");
+    find("delete").classList.add("asked");
+    say(`Move ${counted} to the trash? Once more within five seconds, by Delete or the button.`, "WARN");
+    return;
+  }
+  endDeletion();
+  await act(async () => {
+    const { moved, refused } = await move("/v1/episode_store/trash", items);
+    lastMoved = moved;
+    grid.select([...grid.selected], false);
+    say(`${plural(moved.length, "item")} in the trash; Z brings back.${reasons(refused)}`, refused.length ? "ERROR" : "OK");
+  });
+}
+
+async function restore(items) {
+  if (!items.length) return;
+  await act(async () => {
+    const { moved, refused } = await move("/v1/episode_store/trash/restore", items);
+    lastMoved = [];
+    say(`${plural(moved.length, "item")} restored.${reasons(refused)}`, refused.length ? "ERROR" : "OK");
+  });
+}
+
+async function align() {
+  const recording_ids = alignable().map(({ item }) => item.id);
+  if (!recording_ids.length) return;
+  await act(async () => {
+    await post("/v1/alignment/alignments", { recording_ids });
+    say(`${plural(recording_ids.length, "recording")} given to alignment.`);
+  });
+}
+
+async function act(work) {
+  try {
+    await work();
+  } catch (error) {
+    say(error.message, "ERROR");
+  }
+  await refresh();
+}
+
+function open(key) {
+  const item = rows.get(key)?.item;
+  if (item && query.view !== "trash") location.assign(playerPath(item));
+}
+
+const KEYS = {
+  delete: remove,
+  r: () => query.view === "trash" && restore(chosen().map(({ item }) => ({ kind: item.kind, id: item.id }))),
+  z: () => restore(lastMoved),
+  g: align,
+  l: () => query.view !== "trash" && chosen().length && showLineage(find("lineage_dialog"), lineageSubject()),
+  escape: () => { endDeletion(); say(""); grid.select([...grid.selected], false); },
+  arrowleft: () => query.page > 1 && go({ page: query.page - 1 }),
+  arrowright: () => query.page * PAGE_ROWS < total && go({ page: query.page + 1 }),
+  "/": () => form.elements.text.focus(),
+};
+
+function lineageSubject() {
+  const row = rows.get(grid.active) ?? chosen()[0];
+  return row.item.kind === "recording" ? { kind: "recording", id: row.item.id } : subjectOf(row.item);
+}
+
+document.addEventListener("keydown", (event) => {
+  if (event.key === "Escape" && form.contains(event.target)) {
+    event.target.blur();
+    grid.focus();
+  } else if (isFree(event) && !grid.onKey(event) && !event.ctrlKey && !event.metaKey && !event.repeat) {
+    const act = KEYS[event.key.toLowerCase()];
+    if (act) {
+      event.preventDefault();
+      act();
+    }
+  }
+});
+
+const grid = new Grid(find("rows"), { onChange: () => showSelection(), onOpen: open });
+let typed = null;
+form.addEventListener("input", (event) => {
+  clearTimeout(typed);
+  const isTyping = event.target.name === "text";
+  typed = setTimeout(() => {
+    go({ filters: { ...query.filters, [event.target.name]: event.target.value } }, { isTyping });
+  }, isTyping ? TYPING_MS : 0);
+});
+form.addEventListener("submit", (event) => { event.preventDefault(); document.activeElement?.blur(); grid.focus(); });
+find("clear").addEventListener("click", () => go({ filters: Object.fromEntries(FILTERS.map((name) => [name, ""])) }));
+for (const tab of document.querySelectorAll("[data-view-tab]")) tab.addEventListener("click", () => { endDeletion(); say(""); go({ view: tab.dataset.viewTab }); });
+for (const head of document.querySelectorAll("[data-sort]")) {
+  head.addEventListener("click", () => go({ sort: head.dataset.sort, descending: head.dataset.sort === query.sort ? !query.descending : ["time", "duration", "findings"].includes(head.dataset.sort) }));
+}
+for (const [id, key] of [["previous", "arrowleft"], ["next", "arrowright"], ["delete", "delete"], ["restore", "r"], ["align", "g"], ["lineage", "l"]]) {
+  find(id).addEventListener("click", () => KEYS[key]());
+}
+find("pick_all").addEventListener("change", (event) => grid.select(grid.keys, event.target.checked));
+window.addEventListener("popstate", () => { query = readQuery(location.search); showQuery(); refresh(); });
+document.addEventListener("visibilitychange", () => { if (!document.hidden) refresh(); });
+setInterval(() => { if (!document.hidden) refresh(); }, REFRESH_MS);
+startTheme(find("theme"), () => {});
+showQuery();
+await showChoices();
+await refresh();

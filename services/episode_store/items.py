@@ -1,0 +1,186 @@
+"""Items of a store in one list: recordings, episodes, or takes, with the findings of comparisons.
+
+A take is a recording together with the episodes that were made from it, or an episode without a
+stored recording.
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Final
+
+from dextouch.episodes import EpisodeReader, RecordingReader
+from dextouch.schemas import (
+    CatalogItem,
+    ComparedGroup,
+    EpisodeAttributes,
+    EpisodeSummary,
+    Finding,
+    RecordingSummary,
+    Review,
+)
+from services.episode_store.figures import figures_of
+from services.episode_store.filters import Entry, ItemsKind
+from services.episode_store.outliers import MIN_ITEMS, find_outliers
+
+AnyEntry = Entry[Any]
+Entries = Mapping[str, AnyEntry]
+Group = tuple[str, str, str, str]
+_SHARED: Final = ("task", "instruction", "domain", "station", "operator", "success", "recovered")
+
+
+def item_of(
+    reader: EpisodeReader | RecordingReader,
+    summary: EpisodeSummary | RecordingSummary,
+    review: Review | None,
+) -> CatalogItem:
+    """The row of an item on its own."""
+    about = reader.attributes
+    fields: dict[str, Any] = {name: getattr(about, name) for name in _SHARED}
+    if isinstance(summary, EpisodeSummary):
+        fields |= {"kind": "episode", "origin": summary.origin, "at": summary.created_at}
+        num_steps = summary.num_steps
+    else:
+        fields |= {"kind": "recording", "origin": "recorded", "at": summary.started_at}
+        fields |= {"consent": summary.consent}
+        num_steps = 0
+    if isinstance(about, EpisodeAttributes):
+        fields["time_doubts"] = [one.stream for one in about.clocks if one.warnings]
+    duration_s = summary.duration_s
+    figures = figures_of(about, num_steps=num_steps, duration_s=duration_s)
+    fields |= {"id": reader.item_id, "duration_s": duration_s, "figures": figures}
+    return CatalogItem.model_validate(fields | {"review": review})
+
+
+class ItemLists:
+    """The lists of a catalog's items, made anew when its entries have changed."""
+
+    def __init__(self) -> None:
+        self._made_of: tuple[Entries, Entries] = ({}, {})
+        self._lists: dict[ItemsKind, dict[str, AnyEntry]] = {}
+        self._groups: tuple[ComparedGroup, ...] = ()
+
+    def entries(self, kind: ItemsKind, recordings: Entries, episodes: Entries) -> Entries:
+        """Entries of a list by `ID/KIND`, made from the catalog's own ones by id."""
+        self._update(recordings, episodes)
+        return self._lists[kind]
+
+    def groups(self, recordings: Entries, episodes: Entries) -> tuple[ComparedGroup, ...]:
+        """The groups of items that are compared with each other."""
+        self._update(recordings, episodes)
+        return self._groups
+
+    def _update(self, recordings: Entries, episodes: Entries) -> None:
+        known = self._made_of
+        if self._lists and known[0] is recordings and known[1] is episodes:
+            return
+        ours = dict(recordings)
+        made: defaultdict[str, list[str]] = defaultdict(list)
+        theirs = {}
+        for name, entry in episodes.items():
+            theirs[name] = linked = _linked_episode(entry, recordings, episodes)
+            for source in linked.item.recordings if linked.item.origin != "imagined" else ():
+                made[source].append(name)
+        for name, products in made.items():
+            ours[name] = _with(ours[name], episodes=tuple(products))
+        compared = [*theirs.values(), *(one for one in ours.values() if not one.item.episodes)]
+        found, self._groups = _compare(compared)
+        theirs = {name: _with(one, findings=found[name, "episode"]) for name, one in theirs.items()}
+        ours = {
+            name: _with(one, findings=found.get((name, "recording"), ()))
+            for name, one in ours.items()
+        }
+        takes = {f"{name}/recording": _take(one, theirs) for name, one in ours.items()}
+        takes |= {
+            f"{name}/episode": one
+            for name, one in theirs.items()
+            if one.item.origin == "imagined" or not one.item.recordings
+        }
+        self._lists = {
+            "recording": {f"{name}/recording": one for name, one in ours.items()},
+            "episode": {f"{name}/episode": one for name, one in theirs.items()},
+            "take": takes,
+        }
+        self._made_of = (recordings, episodes)
+
+
+def _with(entry: AnyEntry, **changes: object) -> AnyEntry:
+    return replace(entry, item=entry.item.model_copy(update=changes))
+
+
+def _linked_episode(entry: AnyEntry, recordings: Entries, episodes: Entries) -> AnyEntry:
+    """An episode with its stored recordings, their consent, and the rejection of its sources."""
+    names = [one.id for one in entry.lineage if one.kind == "recording" and one.id in recordings]
+    sources = [recordings[name].item for name in names]
+    review = entry.item.review
+    if review is None:
+        sources += [
+            episodes[one.id].item
+            for one in entry.lineage
+            if one.kind == "episode" and one.id in episodes
+        ]
+        reviews = (one.review for one in sources)
+        review = next((one for one in reviews if one and one.verdict == "rejected"), None)
+    consent = all(recordings[name].item.consent for name in names) if names else None
+    return _with(entry, recordings=tuple(names), consent=consent, review=review)
+
+
+def _take(recording: AnyEntry, episodes: Entries) -> AnyEntry:
+    """A recording as a take: with the last of its episodes, and what was found in that."""
+    item = recording.item
+    if not item.episodes:
+        return recording
+    aligned = episodes[item.episodes[-1]]
+    take = _with(
+        recording,
+        aligned=aligned.item,
+        figures=aligned.item.figures,
+        time_doubts=aligned.item.time_doubts,
+        findings=aligned.item.findings,
+        review=aligned.item.review or item.review,
+    )
+    quality = {**recording.quality, **aligned.quality}
+    return replace(take, quality=quality, text=f"{recording.text}\n{aligned.text}")
+
+
+def _compare(
+    entries: list[AnyEntry],
+) -> tuple[dict[tuple[str, str], tuple[Finding, ...]], tuple[ComparedGroup, ...]]:
+    """Findings by id and kind, and the groups that were compared; rejected items are left out."""
+    groups: defaultdict[Group, list[CatalogItem]] = defaultdict(list)
+    found: dict[tuple[str, str], tuple[Finding, ...]] = {}
+    for entry in entries:
+        item = entry.item
+        if item.review is not None and item.review.verdict == "rejected":
+            found[item.id, item.kind] = ()
+        else:
+            groups[item.task, item.domain, item.origin, item.kind].append(item)
+    rows = []
+    for (task, *_), items in sorted(groups.items()):
+        outliers = find_outliers([item.figures for item in items])
+        for item, own in zip(items, outliers, strict=True):
+            found[item.id, item.kind] = (*own, *_other_findings(item))
+        row = ComparedGroup(
+            kind=items[0].kind,
+            task=task,
+            domain=items[0].domain,
+            origin=items[0].origin,
+            num_items=len(items),
+            min_items=MIN_ITEMS,
+            is_compared=len(items) >= MIN_ITEMS,
+        )
+        rows.append(row)
+    return found, tuple(rows)
+
+
+def _other_findings(item: CatalogItem) -> list[Finding]:
+    found = []
+    if item.time_doubts:
+        text = f"times in doubt: {', '.join(item.time_doubts)}"
+        found.append(Finding(code="doubtful_clock", message=text))
+    if item.recovered:
+        text = "cut short: the program that wrote it ended before the take did"
+        found.append(Finding(code="recovered", message=text))
+    if item.success is None and item.origin == "recorded":
+        found.append(Finding(code="not_judged", message="outcome not judged"))
+    return found
