@@ -52,7 +52,12 @@ class Screen:
     within: str = ""
 
 
-SCREENS: Final = (Screen("/", "station.html", "Station"),)
+SCREENS: Final = (
+    Screen("/", "station.html", "Station"),
+    Screen("/episodes", "episodes.html", "Episodes"),
+    Screen("/review", "review.html", "Review"),
+    Screen("/hours", "hours.html", "Hours"),
+)
 
 
 class Sessions:
@@ -162,6 +167,7 @@ def _shown(
             screen=screen,
             screens=[one for one in SCREENS if not one.within],
             tasks=settings.tasks,
+            settings=settings,
             signed_in=sessions.needs_key,
         )
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 
-from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore, is_rejected
 from dextouch.errors import ConflictError, NotFoundError
 from dextouch.schemas import EpisodeAttributes
 
@@ -16,6 +16,8 @@ def robot_episodes(
 ) -> Iterator[EpisodeReader]:
     """Iterate over robot episodes, store by store in the order of their ids.
 
+    Those that were rejected in review are left out.
+
     Args:
         stores: stores to read.
         tasks: tasks to read; empty for all.
@@ -27,6 +29,7 @@ def robot_episodes(
         ConflictError: two stores hold an episode of the same id.
     """
     found: set[str] = set()
+    num_rejected = 0
     for place, store in enumerate(stores, 1):
         names = sorted(store.list(kind="episode"))
         if not names:
@@ -38,12 +41,16 @@ def robot_episodes(
                 continue
             if wanted is not None and not wanted(about):
                 continue
+            if is_rejected(store, about):
+                num_rejected += 1
+                continue
             if episode_id in found:
                 raise ConflictError(f"episode {episode_id!r}: in two stores; pass only one of them")
             found.add(episode_id)
             yield reader
     if not found:
         raise NotFoundError(
-            f"no {what} of {', '.join(tasks) or 'any task'} in the stores; "
+            f"no {what} of {', '.join(tasks) or 'any task'} in the stores"
+            f"{f' but {num_rejected} that were rejected in review' if num_rejected else ''}; "
             "record some with `dextouch train data` first"
         )

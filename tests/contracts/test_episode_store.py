@@ -3,6 +3,7 @@
 import os
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,13 @@ from dextouch.errors import (
     InvalidInputError,
     NotFoundError,
 )
-from dextouch.schemas import RecordingAttributes
+from dextouch.schemas import RecordingAttributes, Review
 from dextouch.streams import StreamDescriptor
 from tests.contracts.s3_server import CREDENTIALS, running_s3
 from tests.unit.episodes.conftest import episode_of
 
 EPISODE = "stand-bottle-0003"
+NOON = datetime(2026, 5, 4, 12, tzinfo=UTC)
 FORCE = StreamDescriptor(
     name="force", kind="scalar", shape=(2,), dtype="float32", unit="N", nominal_rate_hz=10
 )
@@ -371,3 +373,25 @@ def test_a_groups_size_is_that_of_its_files(place, made):
     assert place.again().num_bytes(EPISODE) == sum(sizes) > 0
     with pytest.raises(NotFoundError):
         place.store.num_bytes("nobody")
+
+
+def test_a_review_stays_beside_the_content(place, made):
+    made.write(place.store)
+    assert place.store.review(EPISODE) is None
+    before = place.store.open(EPISODE).content_sha256
+    for verdict in ("rejected", "accepted"):
+        review = Review(verdict=verdict, reason="slipped", reviewer="mika", reviewed_at=NOON)
+        place.store.set_review(EPISODE, review)
+        assert place.again().review(EPISODE) == review
+    assert place.store.open(EPISODE).verify().content_sha256 == before
+    place.store.set_review(EPISODE, None)
+    place.store.set_review(EPISODE, None)
+    assert place.again().review(EPISODE) is None
+    place.store.set_review(EPISODE, review)
+    place.store.delete(EPISODE, for_good=True)
+    made.write(place.store)
+    assert place.store.review(EPISODE) is None
+    with pytest.raises(NotFoundError):
+        place.store.set_review("another", review)
+    with pytest.raises(NotFoundError):
+        place.store.review("another")

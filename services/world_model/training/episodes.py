@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in
+from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, is_rejected
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ActionKind, Domain
 from services.world_model.starts import CAMERA
@@ -34,13 +34,17 @@ def load_episodes(
 def training_ids(
     store: EpisodeStore, splits: Collection[Split] = (), domain: Domain | None = None
 ) -> list[str]:
-    """Ids of the episodes of these splits and this domain (default: all), but imagined ones."""
+    """Ids of the episodes of these splits and this domain (default: all).
+
+    Imagined episodes and those that were rejected in review are left out.
+    """
     return [
         episode_id
         for episode_id in store.list()
         if (about := store.open(episode_id).attributes).origin != "imagined"
         and is_in(about, splits)
         and domain in {None, about.domain}
+        and not is_rejected(store, about)
     ]
 
 
@@ -52,8 +56,8 @@ def check_rates(rates_hz: set[float], url: str) -> None:
     """
     if not rates_hz:
         raise InvalidInputError(
-            f"episodes: the store {url} has none, or none of the domain and splits asked for; "
-            "record some first (dextouch train data)"
+            f"episodes: the store {url} has none, or none of the domain and splits asked for that "
+            "was not rejected in review; record some first (dextouch train data)"
         )
     if len(rates_hz) > 1:
         raise InvalidInputError(

@@ -1,8 +1,8 @@
 """Ground-truth episodes of a store as arrays on the model grid, with their object poses.
 
 Training data of the state model: whole episodes with the pose of every object at every step and the
-outcome. Imagined episodes, truncated episodes and those with an unknown outcome are skipped and
-counted.
+outcome. Imagined episodes, truncated ones, those with an unknown outcome and those that were
+rejected in review are skipped and counted.
 """
 
 import hashlib
@@ -14,7 +14,7 @@ import numpy as np
 import structlog
 from jaxtyping import Float16, Float32, Float64, Int64, UInt8
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in
+from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, is_rejected
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
 from dextouch.schemas import ActionKind
@@ -83,7 +83,7 @@ def load_scene_episodes(
         about = reader.attributes
         if (tasks is not None and about.task not in tasks) or not is_in(about, splits):
             continue
-        reason = _unfit(reader)
+        reason = "rejected in review" if is_rejected(store, about) else _unfit(reader)
         if reason is None:
             taken.append(read_scene_episode(reader))
         else:

@@ -174,7 +174,10 @@ def test_version_1_is_brought_over(old):
     with pytest.raises(StorageError, match="store migrate"):
         old.open("golden")
     before = (old.root / "episodes" / "golden" / "commit.json").read_bytes()
+    review = {"verdict": "rejected", "reviewed_at": "2026-05-04T12:00:00Z"}
+    (old.root / "episodes" / "golden" / "review.json").write_text(json.dumps(review))
     assert old.migrate("golden")
+    assert old.review("golden").verdict == "rejected"
     assert old.migrate("golden", kind="recording")
     check_content(old)
     (lineage,) = old.open("golden").attributes.lineage

@@ -1,6 +1,7 @@
 """Episodes of a store as arrays and pictures, and what is refused."""
 
 import json
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from dextouch.clients.policy import PolicyStart
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.schemas import Review
 from services.cli.main import run_command
 from services.evaluation.endings import read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
@@ -66,6 +68,19 @@ def test_tasks_can_be_chosen(url):
     assert {reader.attributes.task for reader in chosen} == {"reach"}
     with pytest.raises(NotFoundError, match="juggle"):
         ids(EpisodeStore(url), tasks=["juggle"])
+
+
+def test_rejected_episodes_train_no_policy(tmp_path):
+    store = EpisodeStore(tmp_path)
+    for seed in range(3):
+        write(store, toy.demonstration("reach", seed, name=f"reach-{seed}"))
+    review = Review(verdict="rejected", reviewed_at=datetime(2026, 5, 4, tzinfo=UTC))
+    store.set_review("reach-1", review)
+    assert [one.episode_id for one in read_cloning_episodes(store)] == ["reach-0", "reach-2"]
+    for name in ("reach-0", "reach-2"):
+        store.set_review(name, review)
+    with pytest.raises(NotFoundError, match="3 that were rejected in review"):
+        read_cloning_episodes(store)
 
 
 def test_stores_add_up_but_no_episode_counts_twice(url, tmp_path):

@@ -1,12 +1,14 @@
 """Scene episodes of a store are what the twin recorded; a split keeps every scene on one side."""
 
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError
+from dextouch.schemas import Review
 from services.twin.episodes import record, write_episode
 from services.twin.motions import Motion
 from services.twin.settings import TwinSettings
@@ -72,6 +74,17 @@ def test_a_store_without_true_episodes_is_refused(truths, tmp_path):
     write_episode(store, truths["imagined"])
     with pytest.raises(InvalidInputError, match=r"none to train on .*origin imagined"):
         load_scene_episodes(str(store.root))
+
+
+def test_rejected_episodes_are_not_trained_on(truths, tmp_path):
+    store = EpisodeStore(tmp_path)
+    for name in ("script", "push"):
+        write_episode(store, truths[name])
+    rejected = truths["push"].attributes.episode_id
+    review = Review(verdict="rejected", reviewed_at=datetime(2026, 5, 4, tzinfo=UTC))
+    store.set_review(rejected, review)
+    (left,) = load_scene_episodes(str(store.root))
+    assert left.episode_id == truths["script"].attributes.episode_id
 
 
 @pytest.mark.parametrize("name", ["script", "push", "human"])
