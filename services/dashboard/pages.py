@@ -1,5 +1,6 @@
 """HTML pages: the screens, signing in and out by a session, and refusals."""
 
+import json
 import secrets
 import time
 from collections.abc import Awaitable, Callable
@@ -168,6 +169,7 @@ def _shown(
             screens=[one for one in SCREENS if not one.within],
             tasks=settings.tasks,
             settings=settings,
+            goals=json.dumps(settings.goal_hours),
             signed_in=sessions.needs_key,
         )
 

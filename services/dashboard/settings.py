@@ -1,5 +1,7 @@
 """Settings of the dashboard, from flags and DEXTOUCH_DASHBOARD_… variables."""
 
+from typing import Annotated
+
 from pydantic import Field, SecretStr
 
 from dextouch.serving import ServiceSettings, service_config
@@ -45,6 +47,9 @@ class DashboardSettings(ServiceSettings):
     )
     list_period_s: float = Field(
         default=2.0, ge=0.2, le=60, description="seconds between listings of takes and episodes"
+    )
+    goal_hours: dict[str, Annotated[float, Field(gt=0)]] = Field(
+        default={}, description="hours of episodes to record, by task, as JSON"
     )
     session_hours: float = Field(
         default=12.0, gt=0, le=24 * 30, description="hours until an operator must sign in again"

@@ -8,6 +8,10 @@ export function number(value, digits = 1, unit = "") {
   return unit ? `${text} ${unit}` : text;
 }
 
+export function plural(count, name) {
+  return `${count} ${name}${count === 1 ? "" : "s"}`;
+}
+
 export function count(value) {
   return value === null || value === undefined ? MISSING : String(value);
 }

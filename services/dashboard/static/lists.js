@@ -19,7 +19,7 @@ function why(text) {
 function takeRow(take) {
   return element("tr", {},
     element("td", { class: "quiet" }, take.kind, why(take.domain)),
-    element("td", { class: "name" }, take.name, why(take.size), why(take.clocks)),
+    element("td", { class: "name" }, element("a", { href: `/episodes/${take.kind}/${encodeURIComponent(take.name)}` }, take.name), why(take.size), why(take.clocks)),
     element("td", {}, take.task),
     element("td", {}, take.operator ?? "–", why(CONSENT.get(take.consent))),
     element("td", {}, take.outcome));

@@ -1,6 +1,7 @@
 // The list of recordings and episodes: filters in the address, rows that move on, deletion in two steps.
 
 import { element, setText } from "../dom.js";
+import { plural } from "../format.js";
 import { startTheme } from "../theme.js";
 import { get, getIfServed, newestJobs, post } from "./api.js";
 import * as cells from "./cells.js";
@@ -25,10 +26,6 @@ let lastMoved = [];
 function say(text, level = "OK") {
   find("message").dataset.level = level;
   setText(find("message"), text);
-}
-
-function plural(count, name) {
-  return `${count} ${name}${count === 1 ? "" : "s"}`;
 }
 
 // Rows

@@ -3,7 +3,7 @@
 export const STEPS = ["saved", "uploaded", "aligned", "checked"];
 const VERDICTS = { accepted: { label: "Accepted", level: "OK" }, rejected: { label: "Rejected", level: "ERROR" } };
 const JOBS = {
-  waiting: (job) => ({ label: "Waiting to be aligned", level: "STALE" }),
+  waiting: () => ({ label: "Waiting to be aligned", level: "STALE" }),
   running: (job) => ({ label: `Aligning, ${Math.round(100 * job.progress)} %`, level: "STALE", share: job.progress }),
   failed: (job) => ({ label: "Alignment failed", level: "ERROR", detail: job.problem?.detail ?? "" }),
   cancelled: () => ({ label: "Alignment cancelled", level: "WARN" }),

@@ -1,0 +1,189 @@
+// The review queue: what needs a look first, accepted or rejected by keys; the store remembers it.
+
+import { element, setText } from "../dom.js";
+import { startTheme } from "../theme.js";
+import { get, getIfServed, post } from "./api.js";
+import * as cells from "./cells.js";
+import { Grid, isFree } from "./grid.js";
+import { showLineage } from "./lineage.js";
+import { failedRecordings, failureWords, fewWords, queueOf, reviewedItems } from "./queue.js";
+import { playerPath, subjectOf } from "./stage.js";
+
+const REFRESH_MS = 5000;
+const MAX_ROWS = 100;
+const MAX_ITEMS = 500;
+const find = (id) => document.getElementById(id);
+const form = find("filters");
+const dialog = find("reject_dialog");
+const reasons = dialog.querySelector("form").elements;
+let rows = new Map();
+let asked = 0;
+let last = [];
+
+function say(text, level = "OK") {
+  find("message").dataset.level = level;
+  setText(find("message"), text);
+}
+
+function row({ item, job }) {
+  const findings = item.findings.map((finding) => element("li", { "data-code": finding.code }, finding.message));
+  if (job) findings.unshift(element("li", { "data-code": "alignment_failed", title: job.problem?.detail }, failureWords(job)));
+  const pick = element("td", { class: "pick" }, element("input", { type: "checkbox", tabindex: -1, "aria-label": `select ${item.id}` }));
+  return element("tr", {}, pick, element("td", {}, element("ul", { class: "findings" }, ...findings)), cells.timeCell(item), cells.taskCell(item),
+    cells.nameCell(item, playerPath(item)), cells.operatorCell(item), cells.outcomeCell(item), cells.lengthCell(item));
+}
+
+// Requests
+
+function wanted(more) {
+  const query = new URLSearchParams({ review: "not_reviewed", ...more });
+  for (const name of ["task", "origin"]) if (form.elements[name].value) query.set(name, form.elements[name].value);
+  return query;
+}
+
+async function failed() {
+  const { alignments } = await getIfServed("/v1/alignment/alignments?state=failed&limit=1000", { alignments: [] });
+  const jobs = failedRecordings(alignments);
+  if (!jobs.size) return { jobs, items: [] };
+  const query = wanted({ kind: "recording", limit: String(MAX_ROWS) });
+  for (const id of jobs.keys()) query.append("id", id);
+  const { items } = await get(`/v1/episode_store/catalog/items?${query}`);
+  return { jobs, items };
+}
+
+async function refresh() {
+  const number = ++asked;
+  try {
+    const query = wanted({ flagged: "true", sort: "findings", descending: "true", limit: String(MAX_ROWS) });
+    const [page, unaligned, { groups }] = await Promise.all([
+      get(`/v1/episode_store/catalog/items?${query}`), failed(), get("/v1/episode_store/catalog/groups"),
+    ]);
+    if (number !== asked) return;
+    const queue = queueOf(page.items, unaligned);
+    rows = new Map(queue.map((one) => [one.key, one]));
+    grid.show(queue.map((one) => ({ key: one.key, state: JSON.stringify(one), build: () => row(one) })));
+    const more = Math.max(page.num_matching - page.items.length, 0);
+    setText(find("left"), queue.length ? `${queue.length + more} to review${more ? `, the first ${queue.length} listed` : ""}` : "");
+    find("empty").hidden = queue.length > 0;
+    setText(find("few"), fewWords(groups, { task: form.elements.task.value, origin: form.elements.origin.value }));
+    find("list_error").hidden = true;
+  } catch (error) {
+    if (number !== asked) return;
+    find("list_error").hidden = false;
+    setText(find("list_error"), `The queue is not up to date: ${error.message}`);
+  }
+}
+
+async function review(items, verdict, reason = "") {
+  const words = { accepted: "accepted", rejected: "rejected", null: "in the queue again" };
+  try {
+    const refused = [];
+    const reviewer = form.elements.reviewer.value.trim() || null;
+    for (let first = 0; first < items.length; first += MAX_ITEMS) {
+      const answer = await post("/v1/episode_store/catalog/reviews", { items: items.slice(first, first + MAX_ITEMS), verdict, reason, reviewer });
+      refused.push(...answer.refused);
+    }
+    last = verdict === null ? [] : items;
+    grid.select([...grid.selected], false);
+    const done = items.length - refused.length;
+    say(`${done} ${words[verdict]}${reason ? `: ${reason}` : ""}.${refused.length ? ` Refused: ${refused[0].reason}` : ""}`, refused.length ? "ERROR" : "OK");
+  } catch (error) {
+    say(error.message, "ERROR");
+  }
+  find("undo").disabled = !last.length;
+  await refresh();
+}
+
+// Actions
+
+function meant() {
+  return grid.meant().map((key) => rows.get(key)).filter((one) => one);
+}
+
+function meantItems() {
+  return meant().flatMap(({ item }) => reviewedItems(item));
+}
+
+function askReason() {
+  const count = meant().length;
+  if (!count) return;
+  setText(find("reject_title"), count === 1 ? `Reject ${meant()[0].item.id}` : `Reject ${count} items`);
+  dialog.returnValue = "";
+  dialog.showModal();
+  (reasons.reason.value === "" ? reasons.other : [...reasons.reason].find((one) => one.checked)).focus();
+}
+
+function showReason() {
+  const isOther = reasons.reason.value === "";
+  reasons.other.disabled = !isOther;
+  reasons.other.required = isOther;
+  if (isOther) reasons.other.focus();
+}
+
+const KEYS = {
+  a: () => meant().length && review(meantItems(), "accepted"),
+  r: askReason,
+  z: () => last.length && review(last, null),
+  l: () => meant().length && showLineage(find("lineage_dialog"), subjectOf(rows.get(grid.active)?.item ?? meant()[0].item)),
+  escape: () => { say(""); grid.select([...grid.selected], false); },
+};
+
+const grid = new Grid(find("rows"), {
+  onChange: () => {
+    setText(find("selected"), grid.selected.size ? `${grid.selected.size} selected` : "none selected: keys mean the row in focus");
+    for (const id of ["accept", "reject", "lineage"]) find(id).disabled = !grid.meant().length;
+  },
+  onOpen: (key) => location.assign(playerPath(rows.get(key).item)),
+});
+
+document.addEventListener("keydown", (event) => {
+  if (event.key === "Escape" && form.contains(event.target)) {
+    event.target.blur();
+    grid.focus();
+  } else if (isFree(event) && !grid.onKey(event) && !event.ctrlKey && !event.metaKey && !event.repeat) {
+    const act = KEYS[event.key.toLowerCase()];
+    if (act) {
+      event.preventDefault();
+      act();
+    }
+  }
+});
+dialog.addEventListener("keydown", (event) => {
+  const choice = event.target === reasons.other ? undefined : reasons.reason[Number(event.key) - 1];
+  if (!choice) return;
+  event.preventDefault();
+  choice.checked = true;
+  choice.focus();
+  showReason();
+});
+dialog.addEventListener("change", showReason);
+dialog.addEventListener("close", () => {
+  const reason = reasons.reason.value || reasons.other.value.trim();
+  if (dialog.returnValue === "reject" && reason) review(meantItems(), "rejected", reason);
+  grid.focus();
+});
+for (const [id, key] of [["accept", "a"], ["reject", "r"], ["undo", "z"], ["lineage", "l"]]) find(id).addEventListener("click", () => KEYS[key]());
+find("pick_all").addEventListener("change", (event) => grid.select(grid.keys, event.target.checked));
+
+form.addEventListener("submit", (event) => event.preventDefault());
+form.addEventListener("input", (event) => {
+  if (event.target.name === "reviewer") {
+    localStorage.setItem("reviewer", event.target.value);
+    return;
+  }
+  const { task, origin } = form.elements;
+  const query = new URLSearchParams({ ...(task.value && { task: task.value }), ...(origin.value !== "recorded" && { origin: origin.value || "any" }) });
+  history.replaceState(null, "", `${location.pathname}?${query}`.replace(/\?$/, ""));
+  refresh();
+});
+
+const given = new URLSearchParams(location.search);
+const values = await get("/v1/episode_store/catalog/values").catch(() => ({ tasks: [] }));
+form.elements.task.append(...values.tasks.map((value) => element("option", { value }, value)));
+form.elements.task.value = given.get("task") ?? "";
+form.elements.origin.value = given.get("origin") === "any" ? "" : given.get("origin") ?? "recorded";
+form.elements.reviewer.value = localStorage.getItem("reviewer") ?? "";
+document.addEventListener("visibilitychange", () => { if (!document.hidden) refresh(); });
+setInterval(() => { if (!document.hidden && !dialog.open) refresh(); }, REFRESH_MS);
+startTheme(find("theme"), () => {});
+await refresh();
