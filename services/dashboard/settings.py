@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from pydantic import Field, SecretStr
+from pydantic import Field, FiniteFloat, SecretStr
 
 from dextouch.serving import ServiceSettings, service_config
 
@@ -48,7 +48,7 @@ class DashboardSettings(ServiceSettings):
     list_period_s: float = Field(
         default=2.0, ge=0.2, le=60, description="seconds between listings of takes and episodes"
     )
-    goal_hours: dict[str, Annotated[float, Field(gt=0)]] = Field(
+    goal_hours: dict[str, Annotated[FiniteFloat, Field(gt=0)]] = Field(
         default={}, description="hours of episodes to record, by task, as JSON"
     )
     session_hours: float = Field(

@@ -43,7 +43,9 @@ def test_hours_and_goals(page, serve, tmp_path):
     expect(rows.filter(has_text=HOSTILE)).to_have_count(1)
     expect(rows.filter(has_text="stack")).to_contain_text("0 % of 2.00 h")
     assert page.locator("main img").count() == 0
-    expect(page.locator("#total")).to_have_text("0.4 min in 4 episodes, hours without rejected ones")
+    expect(page.locator("#total")).to_have_text(
+        "0.4 min in 4 episodes, hours without rejected ones"
+    )
     expect(page.locator("#operator_rows tr")).to_have_text(["mika0.1 min0.3 min0.1 min0.5 min4"])
     expect(page.locator("#station_rows tr")).to_contain_text(["not known"])
     expect(page.locator("#day_rows tr")).to_contain_text(["2026-05-04"])

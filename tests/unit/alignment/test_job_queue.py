@@ -67,6 +67,15 @@ async def test_last_state_of_a_job_is_loaded(opened):
     assert queue.get("b-episode").state == "waiting"
 
 
+async def test_jobs_of_some_recordings_are_listed(opened):
+    queue = await opened()
+    await queue.add([new_job(name) for name in "abc"])
+    page = queue.page(state=None, recording_ids=("c", "a", "x"), after=None, limit=1)
+    assert ([job.recording_id for job in page.alignments], page.num_matching) == (["a"], 2)
+    rest = queue.page(state="waiting", recording_ids=("c", "a"), after=page.next_after, limit=9)
+    assert [job.recording_id for job in rest.alignments] == ["c"]
+
+
 async def test_job_submitted_again_goes_to_the_end(opened):
     queue = await opened()
     await queue.add([new_job("a"), new_job("b")])

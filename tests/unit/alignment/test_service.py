@@ -109,6 +109,10 @@ async def test_alignment_runs_once_and_is_told(serve, store):
         assert store.list(kind="episode") == [alignment_id] == [job["report"]["episode_id"]]
         assert job["report"]["num_steps"] == store.open(alignment_id).num_steps
         assert (await client.get("/v1/alignments")).json()["num_matching"] == 1
+        of_two = await client.get("/v1/alignments?recording_id=take&recording_id=other")
+        assert of_two.json()["num_matching"] == 1
+        of_other = await client.get("/v1/alignments?recording_id=other")
+        assert of_other.json()["num_matching"] == 0
 
 
 async def test_many_recordings_are_all_taken_or_none(serve, store):

@@ -31,6 +31,32 @@ async def test_other_routes_are_not(client, services, method, path):
     assert not services.asked
 
 
+@pytest.mark.parametrize(
+    "path",
+    [
+        "episode_store/catalog/items",
+        "episode_store/catalog/groups",
+        "episode_store/catalog/hours/day",
+        "episode_store/uploads",
+        "acquisition/uploads",
+    ],
+)
+async def test_what_the_lists_read_is_forwarded(client, services, path):
+    # The fakes lack these routes: what counts is where the request goes.
+    await client.get(f"/v1/{path}?limit=1")
+    assert services.asked == [f"/v1/{path.partition('/')[2]}"]
+
+
+async def test_reviews_are_forwarded(client, services):
+    body = {"items": [{"kind": "episode", "id": "a"}], "verdict": "accepted"}
+    answer = await client.post("/v1/episode_store/catalog/reviews", json=body)
+    assert services.asked == ["/v1/catalog/reviews"]
+    assert answer.status_code == 503
+    too_large = {"items": [{"kind": "episode", "id": "a" * 300_000}]}
+    answer = await client.post("/v1/episode_store/catalog/reviews", json=too_large)
+    assert answer.status_code == 413
+
+
 async def test_names_in_paths_stay_one_part(client, services):
     await client.get("/v1/episode_store/episodes/a%3Fb%23c")
     assert services.asked[-1] == "/v1/episodes/a%3Fb%23c"

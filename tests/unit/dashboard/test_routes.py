@@ -1,26 +1,55 @@
 """Routes of the dashboard: the page, its data, its buttons, and who is refused."""
 
 import asyncio
+import html
 import json
+import re
 
 import httpx
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from dextouch.tactile import hand_canvas
+from services.dashboard.settings import DashboardSettings
 
 KEY = "a-key-of-some-length"
 
 
-async def test_page_is_safe_and_complete(client):
-    answer = await client.get("/")
+@pytest.mark.parametrize(
+    ("screen", "module"),
+    [
+        ("/", "/static/main.js"),
+        ("/episodes", "/static/catalog/episodes.js"),
+        ("/review", "/static/catalog/review.js"),
+        ("/hours", "/static/catalog/hours.js"),
+    ],
+)
+async def test_page_is_safe_and_complete(client, screen, module):
+    answer = await client.get(screen)
     assert answer.status_code == 200
     assert "default-src 'none'" in answer.headers["content-security-policy"]
     assert "<script>" not in answer.text
     assert "style=" not in answer.text
-    for path in ("/static/main.js", "/static/style.css", "/static/icon.svg"):
+    for path in (module, "/static/style.css", "/static/icon.svg"):
         assert path in answer.text
         assert (await client.get(path)).status_code == 200
+
+
+async def test_goals_cannot_become_markup(make_app):
+    goals = {'"><img src=x>': 2.5}
+    transport = httpx.ASGITransport(app=make_app(goal_hours=goals))
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
+        text = (await client.get("/hours")).text
+    assert "<img src=x>" not in text
+    (written,) = re.findall(r'data-goals="([^"]*)"', text)
+    assert json.loads(html.unescape(written)) == goals
+
+
+@pytest.mark.parametrize("goal", [0, -1, "NaN", "Infinity"])
+def test_goals_are_hours(goal):
+    with pytest.raises(ValidationError, match="goal_hours"):
+        DashboardSettings(goal_hours={"fold": goal})
 
 
 async def test_station_name_cannot_become_markup(make_app):
