@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from dextouch.episodes.image_codecs import parameter_sets as parameter_sets
     from dextouch.episodes.reader import EpisodeReader as EpisodeReader
     from dextouch.episodes.reader import RecordingReader as RecordingReader
-    from dextouch.episodes.reviews import is_rejected as is_rejected
+    from dextouch.episodes.rejection import is_rejected as is_rejected
     from dextouch.episodes.rollout_episode import write_rollout as write_rollout
     from dextouch.episodes.sources import GroupFiles as GroupFiles
     from dextouch.episodes.sources import LocalGroup as LocalGroup

@@ -4,17 +4,11 @@ A review is the file `review.json` of the item's group. It is no part of the con
 change, and it goes where the item goes: to the trash, back, and away for good.
 """
 
-from typing import TYPE_CHECKING
-
 from pydantic import ValidationError
 
-from dextouch.episodes.format import KINDS
 from dextouch.episodes.sources import GroupFiles
 from dextouch.errors import CorruptDataError
-from dextouch.schemas import EpisodeAttributes, Review
-
-if TYPE_CHECKING:
-    from dextouch.episodes.store import EpisodeStore
+from dextouch.schemas import Review
 
 REVIEW_FILE = "review.json"
 
@@ -35,21 +29,3 @@ def read_review(files: GroupFiles, *, what: str) -> Review | None:
             f"{what}: {REVIEW_FILE} is no review ({error.error_count()} fields do not fit); "
             "delete the file, then review the item again"
         ) from error
-
-
-def is_rejected(store: "EpisodeStore", about: EpisodeAttributes) -> bool:
-    """Whether an episode must not be trained on.
-
-    An episode is rejected by its own review; one without a review is rejected with a recording or
-    episode that it was made from, if that is in the same store.
-    """
-    own = store.review(about.episode_id)
-    if own is not None:
-        return own.verdict == "rejected"
-    for source in about.lineage:
-        for kind in KINDS:
-            if source.kind == kind and store.exists(source.id, kind=kind):
-                review = store.review(source.id, kind=kind)
-                if review is not None and review.verdict == "rejected":
-                    return True
-    return False
