@@ -237,11 +237,20 @@ class Recorder:
         watch = TakeWatch(self._drivers, self._clock, device_events=count, health=health)
         self.take = Take(spool, watch, clock=self._clock, safety=self._options.safety)
         self._done = set()
+        if health is not None:
+            health.history.begin_take(attributes.recording_id, watch.started_ns)
         logger.info("start_take", recording_id=attributes.recording_id)
 
     def _stop(self) -> None:
         if self.take is not None:
             self._check = self.take.end()
+            self._note_end(self.take)
+
+    def _note_end(self, take: Take) -> None:
+        """Tell the history of the station's health when the take ended."""
+        if self._options.health is not None:
+            stop_ns = take.watch.started_ns + round(take.watch.duration_s * 1e9)
+            self._options.health.history.end_take(take.spool.attributes.recording_id, stop_ns)
 
     def _save(self, how: SaveTake) -> None:
         take, check = self.take, self._check
@@ -270,6 +279,7 @@ class Recorder:
             return
         self._discarded_id = take.spool.attributes.recording_id
         take.release()
+        self._note_end(take)
         with disk_errors(f"discard take {self._discarded_id!r}"):
             shutil.rmtree(take.spool.path)
         logger.info("discard_take", recording_id=self._discarded_id)

@@ -1,13 +1,16 @@
 """HTTP routes of a station: the recorder, its health, live views and uploads."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Body, Depends, Query, Response
+from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
     CameraList,
     HealthEvents,
+    HealthHistory,
     RecorderStatus,
     SaveTake,
     StationHealth,
@@ -16,9 +19,16 @@ from dextouch.schemas import (
     TakePrompt,
     UploadStatus,
 )
-from dextouch.serving import MSGPACK, RequireScope
-from dextouch.streams import pack
-from services.acquisition.health import DiskJudge, judge_uploads
+from dextouch.serving import JSON, MSGPACK, RequireScope
+from dextouch.streams import MAX_STREAMS, pack
+from services.acquisition.health import (
+    NUM_ROWS,
+    DiskJudge,
+    history_facts,
+    json_history,
+    judge_uploads,
+    packed_history,
+)
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader
 
@@ -71,6 +81,15 @@ def recorder_router(station: Station) -> APIRouter:
     return router
 
 
+class HistoryQuery(FrozenModel):
+    """Which rows of the health's history, and in which format."""
+
+    stream: tuple[str, ...] = Field(default=(), max_length=MAX_STREAMS)
+    since_ns: int = Field(default=0, ge=0, lt=2**63)
+    limit: int = Field(default=600, ge=1, le=NUM_ROWS)
+    format: Literal["json", "msgpack"] = "json"
+
+
 def station_router(station: Station, uploader: Uploader) -> APIRouter:
     """Health, live views and uploads."""
     disk = DiskJudge(station.recorder.spool_root, station.supervisors, station.clock.now_ns())
@@ -91,6 +110,27 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
     async def events(since_ns: int = 0) -> HealthEvents:
         """When something was raised and when it ended, on the station's clock."""
         return station.health.events(since_ns)
+
+    @router.get(
+        "/health/history",
+        response_class=Response,
+        responses={200: {"model": HealthHistory, "content": {MSGPACK: {}}}},
+    )
+    async def history(query: Annotated[HistoryQuery, Query()]) -> Response:
+        """Health of the newest hour, about a row a second, and its takes.
+
+        Packed, it has the arrays `t_ns` [rows], `station` [series, rows] and `streams` [stream,
+        series, rows], float32, NaN where a value is unknown, in the order of the fields
+        `station_series`, `nominal_rate_hz` and `stream_series`.
+        """
+        health = station.health
+        rows = health.history.rows(query.stream, since_ns=query.since_ns, limit=query.limit)
+        first_ns = int(rows.t_ns[0]) if len(rows.t_ns) else query.since_ns
+        rates_hz = {name: health.nominal_rates_hz[name] for name in rows.streams}
+        facts = history_facts(station.clock.now_ns(), health.history.takes(first_ns), rates_hz)
+        if query.format == "msgpack":
+            return Response(packed_history(facts, rows), media_type=MSGPACK)
+        return Response(json_history(facts, rows), media_type=JSON)
 
     @router.get(
         "/live/taxels", response_class=Response, responses={200: {"content": {MSGPACK: {}}}}

@@ -26,7 +26,7 @@ MAX_GAP_S = {"image": 0.5}
 MAX_GAP_OTHERS_S = 0.2
 # What stands in the take's quality in a form of its own (`_rate_hz`), or counts from the
 # station's start.
-OTHER_FIGURES = {"rate_hz", "clock_resets"}
+OTHER_FIGURES = {"rate_hz", "clock_offset_seconds", "clock_resets"}
 # What the check of the take says in its own words, by the code that it has there.
 IN_THE_CHECK: dict[str, tuple[str, ...]] = {
     "silent": ("gap", "missing_stream"),
@@ -213,6 +213,7 @@ class TakeWatch:
     Attributes:
         streams: counters by name of the samples that the take keeps.
         has_ended: whether what comes is no longer of the take.
+        started_ns: when it began, on the station's clock.
     """
 
     def __init__(
@@ -232,18 +233,18 @@ class TakeWatch:
         self._count = device_events or (
             lambda: {name: driver.events() for name, driver in drivers.items()}
         )
-        self._started_ns = clock.now_ns()
+        self.started_ns = clock.now_ns()
         self._stopped_ns = 0
         self._before = self._count()
         self._facts: list[StreamFacts] = []
         self._host = HostWatch(clock)
-        self._findings = TakeFindings(health, self._started_ns)
+        self._findings = TakeFindings(health, self.started_ns)
 
     @property
     def duration_s(self) -> float:
         """Length up to now, or up to the end."""
         stop_ns = self._stopped_ns if self.has_ended else self._clock.now_ns()
-        return (stop_ns - self._started_ns) / 1e9
+        return (stop_ns - self.started_ns) / 1e9
 
     def look(self) -> None:
         """Notice what does not last; called repeatedly during the take and once after its end."""
@@ -262,7 +263,7 @@ class TakeWatch:
             # What was missing before the take and came in it is no loss of the take, nor a gain.
             events["lost"] = max(0, events["lost"])
             judged = driver.events().keys() - vars(driver.statistics).keys()
-            span_ns = (self._started_ns, self._stopped_ns)
+            span_ns = (self.started_ns, self._stopped_ns)
             self._facts += [
                 StreamFacts(d, self.streams[d.name], events, span_ns, judged)
                 for d in driver.descriptors

@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import structlog
+from jaxtyping import Float32
 from pydantic_core import to_json
 
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError, UnknownNameError
@@ -42,6 +43,10 @@ from services.dashboard.upstream import Upstream
 logger = structlog.get_logger(__name__)
 
 MAX_TAXEL_BYTES = 64 * 1024
+MAX_HISTORY_BYTES = 1024 * 1024
+# Of the small plots: two minutes, two rows a point.
+TREND_ROWS = 120
+TREND_PERIOD_S = 2.0
 NUM_TAKES = 6
 OUTCOMES = {True: "success", False: "failure", None: "not judged"}
 # Of the station's recorder, which checks their bodies.
@@ -147,6 +152,7 @@ class Feeds:
         self._clocks: dict[str, str] = {}
         topics = [
             Topic.of_json("station", settings.station_period_s, self.station),
+            Topic.of_json("trends", TREND_PERIOD_S, self._trends),
             Topic("taxels", settings.taxel_period_s, self._taxel_messages),
             Topic.of_json("cameras", settings.station_period_s, self._cameras),
             Topic.of_json("services", settings.list_period_s, self.services),
@@ -178,6 +184,21 @@ class Feeds:
         except DexTouchError as error:
             return StationView(note=error.message)
         return station_view(health, recorder)
+
+    async def _trends(self) -> dict[str, list[float | None]]:
+        """Rate of each stream in the last two minutes, as a share of the nominal one."""
+        try:
+            answer = await self.upstream("acquisition").send(
+                "GET", f"/v1/health/history?format=msgpack&limit={TREND_ROWS}"
+            )
+            fields, arrays = unpack(answer.content, max_bytes=MAX_HISTORY_BYTES)
+        except DexTouchError:
+            return {}  # reported by the station topic
+        rates_hz = arrays["streams"][:, fields["stream_series"].index("rate_hz")]
+        return {
+            name: _trend(rates_hz[index] / nominal_hz)
+            for index, (name, nominal_hz) in enumerate(fields["nominal_rate_hz"].items())
+        }
 
     async def services(self) -> list[ServiceView]:
         """Readiness of each service."""
@@ -283,6 +304,12 @@ class Feeds:
 def _labels(item: EpisodeSummary | RecordingSummary) -> dict[str, Any]:
     labels = item.model_dump(include={"task", "domain", "operator"})
     return labels | {"outcome": OUTCOMES[item.success]}
+
+
+def _trend(shares: Float32[np.ndarray, " rows"]) -> list[float | None]:
+    """The lower of every two rows, so that a short gap stays visible; the newest last."""
+    pairs = shares[len(shares) % 2 :].reshape(-1, 2).min(axis=1)
+    return [None if np.isnan(share) else round(float(share), 3) for share in pairs]
 
 
 async def _last_page(form: type[Page], store: Upstream, path: str) -> Page:

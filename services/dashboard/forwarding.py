@@ -26,6 +26,9 @@ class Forwarded:
 
 
 FORWARDED: Final = (
+    Forwarded("acquisition", "/health"),
+    Forwarded("acquisition", "/health/events"),
+    Forwarded("acquisition", "/health/history"),
     Forwarded("episode_store", "/episodes"),
     Forwarded("episode_store", "/episodes/{item_id}"),
     Forwarded("episode_store", "/recordings"),

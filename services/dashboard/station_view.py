@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
     DeviceHealth,
+    HealthCause,
     HealthLevel,
     RecorderStatus,
     StationHealth,
@@ -14,20 +15,20 @@ from dextouch.schemas import (
 
 # From harmless to grave: an ERROR of one stream outranks the silence of another.
 LEVELS: tuple[HealthLevel, ...] = ("OK", "WARN", "STALE", "ERROR")
+# What the station finds of its computer.
+HOST_FINDINGS = {"overload", "disk", "host_suspended", "wall_clock_set"}
 
 
 class StreamView(FrozenModel):
-    """One row of the device table; None where not measured.
+    """One row of the devices panel; None where not measured.
 
-    `advice` refers to the most severe problem in `message`, which has lasted for `lasted_s`.
+    `note` are the counters of its device that an operator should know of.
     """
 
     name: str
     device: str
     level: HealthLevel
-    message: str
-    advice: str
-    lasted_s: float | None
+    note: str
     rate_hz: float | None
     nominal_rate_hz: float
     dropped: int
@@ -35,6 +36,28 @@ class StreamView(FrozenModel):
     age_s: float | None
     skew_ppm: float | None
     clock_error_ms: float | None
+
+
+class CauseView(FrozenModel):
+    """A root cause with its one advice; `findings` is what follows from it, a line a stream."""
+
+    key: str
+    level: HealthLevel
+    message: str
+    advice: str
+    lasted_s: float | None
+    num_streams: int
+    findings: tuple[str, ...]
+
+
+class HostView(FrozenModel):
+    """The station's computer; None where not measured."""
+
+    level: HealthLevel = "OK"
+    cpu_percent: float | None = None
+    wake_ms: float | None = None
+    disk_free_gb: float | None = None
+    disk_left_s: float | None = None
 
 
 class RecorderView(FrozenModel):
@@ -62,6 +85,8 @@ class StationView(FrozenModel):
     summary: str = "acquisition does not respond"
     note: str
     note_level: HealthLevel = "ERROR"
+    host: HostView | None = None
+    causes: tuple[CauseView, ...] = ()
     streams: tuple[StreamView, ...] = ()
     recorder: RecorderView = RecorderView(state="unknown", level="ERROR")
 
@@ -70,16 +95,17 @@ def station_view(station: StationHealth, recorder: RecorderStatus) -> StationVie
     """The station view of an acquisition service that responds."""
     devices = {device.device: device for device in station.devices}
     streams = tuple(_stream_view(item, devices.get(item.device)) for item in station.streams)
-    found: list[HealthLevel] = [finding.level for finding in station.findings]
-    notes = [f"{finding.message} → {finding.advice}" for finding in station.findings]
-    if not streams:
-        found, notes = ["STALE", *found], ["No devices are connected.", *notes]
+    causes = tuple(_cause_view(cause, station) for cause in station.causes)
+    note = "" if streams else "No devices are connected."
+    levels = [*(stream.level for stream in streams), *(cause.level for cause in causes)]
     return StationView(
         reachable=True,
-        level=_worst([*(stream.level for stream in streams), *found]),
-        summary=_summary(streams),
-        note=" · ".join(notes),
-        note_level=_worst(found),
+        level=_worst(levels if streams else ["STALE", *levels]),
+        summary=_summary(streams, causes),
+        note=note,
+        note_level="STALE" if note else "OK",
+        host=_host_view(station),
+        causes=causes,
         streams=streams,
         recorder=recorder_view(recorder),
     )
@@ -118,8 +144,7 @@ def _worst(levels: Sequence[HealthLevel]) -> HealthLevel:
 
 
 def _stream_view(item: StreamHealth, device: DeviceHealth | None) -> StreamView:
-    words = [finding.message for finding in item.findings]
-    first = item.findings[0] if item.findings else None
+    words = []
     if device is not None:
         words += [f"{device.reconnects} reconnects"] * bool(device.reconnects)
         words += [f"{device.suspects} packets held back"] * bool(device.suspects)
@@ -130,9 +155,7 @@ def _stream_view(item: StreamHealth, device: DeviceHealth | None) -> StreamView:
         name=item.stream,
         device=item.device,
         level=item.level,
-        message=" · ".join(dict.fromkeys(words)),
-        advice=first.advice if first else "",
-        lasted_s=first.lasted_s if first else None,
+        note=" · ".join(words),
         rate_hz=item.rate_hz,
         nominal_rate_hz=item.nominal_rate_hz,
         dropped=item.lost,
@@ -143,12 +166,52 @@ def _stream_view(item: StreamHealth, device: DeviceHealth | None) -> StreamView:
     )
 
 
-def _summary(streams: Sequence[StreamView]) -> str:
-    """Number of streams at each level, and the devices with problems."""
-    parts = []
-    for level in ("ERROR", "STALE", "WARN", "OK"):
-        devices = [stream.device for stream in streams if stream.level == level]
-        names = "" if level == "OK" else f" ({', '.join(dict.fromkeys(devices))})"
-        if devices:
-            parts.append(f"{len(devices)} {level}{names}")
-    return " · ".join(parts) or "no streams"
+def _cause_view(cause: HealthCause, station: StationHealth) -> CauseView:
+    found = [
+        (stream.stream, finding.message)
+        for stream in station.streams
+        if stream.stream in cause.streams
+        for finding in stream.findings
+        if finding.code in cause.findings
+    ]
+    by_stream = {name: [text for other, text in found if other == name] for name, _ in found}
+    lines = [f"{name}: {' · '.join(texts)}" for name, texts in by_stream.items()]
+    # What the message of the cause says already needs no second line.
+    says_all = len(found) == 1 and found[0][1] in cause.message
+    return CauseView(
+        key=f"{cause.code} {cause.subject}",
+        level=cause.level,
+        message=cause.message,
+        advice=cause.advice,
+        lasted_s=cause.lasted_s,
+        num_streams=len(cause.streams),
+        findings=() if says_all else tuple(lines),
+    )
+
+
+def _host_view(station: StationHealth) -> HostView:
+    figures = station.figures
+    levels = [
+        *(cause.level for cause in station.causes if cause.code == "host"),
+        *(finding.level for finding in station.findings if finding.code in HOST_FINDINGS),
+    ]
+    cpu_ratio, wake_s = figures.get("host_cpu_ratio"), figures.get("host_wake_p90_seconds")
+    free_bytes = figures.get("disk_free_bytes")
+    return HostView(
+        level=_worst(levels),
+        cpu_percent=None if cpu_ratio is None else 100 * cpu_ratio,
+        wake_ms=None if wake_s is None else 1e3 * wake_s,
+        disk_free_gb=None if free_bytes is None else free_bytes / 1e9,
+        disk_left_s=figures.get("disk_left_seconds"),
+    )
+
+
+def _summary(streams: Sequence[StreamView], causes: Sequence[CauseView]) -> str:
+    """How many streams are well, and for how many reasons others are not."""
+    if not streams:
+        return "no streams"
+    num_ok = sum(stream.level == "OK" for stream in streams)
+    words = f"{num_ok} of {len(streams)} streams OK"
+    if not causes:
+        return words
+    return f"{'1 cause' if len(causes) == 1 else f'{len(causes)} causes'} · {words}"

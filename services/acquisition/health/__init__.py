@@ -6,12 +6,15 @@ the streams, and `HealthCollector` shows its report to Prometheus.
 
 from services.acquisition.health.cells import count_taxels
 from services.acquisition.health.codes import CODES
+from services.acquisition.health.history import NUM_ROWS
+from services.acquisition.health.history_body import history_facts, json_history, packed_history
 from services.acquisition.health.metrics import STATION_FIGURES, HealthCollector
 from services.acquisition.health.monitor import STATION, TICK_NS, HealthMonitor
 from services.acquisition.health.station import DiskJudge, judge_uploads
 
 __all__ = [
     "CODES",
+    "NUM_ROWS",
     "STATION",
     "STATION_FIGURES",
     "TICK_NS",
@@ -19,5 +22,8 @@ __all__ = [
     "HealthCollector",
     "HealthMonitor",
     "count_taxels",
+    "history_facts",
+    "json_history",
     "judge_uploads",
+    "packed_history",
 ]

@@ -24,10 +24,14 @@ HOST_CODES: Final = frozenset(
     {"late", "rate", "loss", "queue", "jitter", "latency", "gap", "clock_residual", "image_gap"}
     | {"silent"}
 )
+# Findings of the station itself that tell of its computer; a sleep explains also a late wake.
+HOST_FINDINGS: Final = ("host_suspended", "overload")
 # Delays and losses that arise after the read, in this computer alone.
 INSIDE_CODES: Final = frozenset({"latency", "queue"})
 MIN_HOST_DEVICES = 3
 HOST_SHARE = 0.5
+# A computer with a processor to spare is not why devices are late.
+BUSY_RATIO = 0.9
 # A busy computer reads nothing for a moment; a stream that is silent for longer has another cause.
 BRIEF_SILENCE_S = 2.0
 GONE_CODES: Final = frozenset({"unplugged", "silent"})
@@ -80,6 +84,7 @@ def find_causes(
     streams: Sequence[StreamHealth],
     devices: Sequence[DeviceHealth],
     findings: Sequence[RaisedFinding],
+    cpu_ratio: float = 0.0,
 ) -> tuple[HealthCause, ...]:
     """Why the station is not well, widest and gravest cause first.
 
@@ -87,34 +92,45 @@ def find_causes(
         streams: with their findings.
         devices: of the streams, with what they share.
         findings: of the station itself.
+        cpu_ratio: share of the processors' time that was used in the last 10 s.
     """
     left = _Unexplained(streams)
     known = {device.device: device for device in devices}
     causes = [
         *_shared(left, known, GONE_CODES),
         *_gone(left, known),
-        *_host(left, findings),
+        *_host(left, findings, cpu_ratio),
         *_shared(left, known, LINK_CODES),
         *_clocks(left, known),
         *_own(left, known),
-        *(_of_station(finding) for finding in findings if finding.code != "overload"),
+        *(_of_station(finding) for finding in findings if finding.code not in HOST_FINDINGS),
     ]
     return tuple(
         sorted(causes, key=lambda cause: (_ORDER.index(cause.code), -SEVERITY.index(cause.level)))
     )
 
 
-def _host(left: _Unexplained, findings: Sequence[RaisedFinding]) -> Iterator[HealthCause]:
-    """The computer itself: its threads wake late, or many devices are delayed after their read."""
-    overload = [finding for finding in findings if finding.code == "overload"]
-    heard = {stream.device for stream in left.streams if stream.stale != "unplugged"}
-    delayed = left.devices(INSIDE_CODES)
-    are_many = len(delayed) >= max(MIN_HOST_DEVICES, HOST_SHARE * len(heard))
-    if not overload and not are_many:
-        return
+def _host(
+    left: _Unexplained, findings: Sequence[RaisedFinding], cpu_ratio: float
+) -> Iterator[HealthCause]:
+    """The computer itself: it slept, its threads wake late, or it is late for most devices."""
+    own = [f for code in HOST_FINDINGS for f in findings if f.code == code]
+    if own:
+        what = "slept" if own[0].code == "host_suspended" else "is overloaded"
+        why, advice = own[0].message, own[0].advice
+    else:
+        open_streams = [s for s in left.streams if s.stale != "unplugged"]
+        enough = max(MIN_HOST_DEVICES, HOST_SHARE * len({s.device for s in open_streams}))
+        what, advice = "is overloaded", ""
+        late = {s.device for s in open_streams if any(_is_of_host(f) for f in left.of(s))}
+        if (num_delayed := len(left.devices(INSIDE_CODES))) >= enough:
+            why = f"{num_delayed} devices are delayed after the read"
+        elif cpu_ratio >= BUSY_RATIO and len(late) >= enough:
+            why = f"its processors are busy ({cpu_ratio:.0%}) and {len(late)} devices are late"
+        else:
+            return
     explained = left.take(left.streams, _is_of_host)
-    why = overload[0].message if overload else f"{len(delayed)} devices are delayed after the read"
-    yield _cause("host", "", f"This computer is overloaded: {why}", explained, overload)
+    yield _cause("host", "", f"This computer {what}: {why}", explained, own, advice=advice)
 
 
 def _is_of_host(finding: RaisedFinding) -> bool:

@@ -20,6 +20,7 @@ STEP_SHOWN_NS = 60_000_000_000
 # A step is detected in two ways; detections within this time are the same step.
 SAME_STEP_NS = 2_500_000_000
 MIN_RESIDUALS = 30
+OFFSET_SPAN_NS = 1_000_000_000
 # Before the clock has a slope of its own, two halves of so many samples give a first one.
 MIN_EARLY_SAMPLES = 40
 # Arrivals that a busy host delays tilt the line of so young a clock: parts of them must agree.
@@ -83,6 +84,10 @@ class ClockJudge:
         evaluation.figures["clock_skew_ratio"] = skew_ppm * 1e-6
         text = f"its clock is skewed by {skew_ppm:+.0f} ppm"
         evaluation.judge("clock_skew", abs(skew_ppm), text)
+        newest = self._offsets.values[self._offsets.t_ns >= evaluation.now_ns - OFFSET_SPAN_NS]
+        if len(newest):
+            # The least delayed arrival shows the offset best.
+            evaluation.figures["clock_offset_seconds"] = float(newest.min()) * 1e-9
         if len(kept_s) >= MIN_RESIDUALS:
             _judge_scatter(evaluation, kept_s, "its clock")
 

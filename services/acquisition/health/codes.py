@@ -125,6 +125,10 @@ CODES: Final[Mapping[str, Rule]] = {
         "Calibrate again with `dextouch station calibrate`."),
     "overload": Rule(0.02, 0.1, "ms", "10 s", "90th percentile of how late a thread wakes",
         "Close other programs, or set the cameras to smaller or fewer images."),
+    "host_suspended": Rule(0.0, NEVER, "", "20 s", "times that this computer slept",
+        "Turn off sleep and hibernation on this computer while the station runs."),
+    "wall_clock_set": Rule(0.0, NEVER, "", "60 s", "times that the wall clock was set by 0.1 s",
+        "Set up time synchronization (chrony); timestamps within takes are not affected."),
     "upload_refused": Rule(0.0, NEVER, "", "now", "takes refused by the store; they stay here",
         "Resolve the reason that the store gives, then send the take again."),
 }
@@ -150,7 +154,8 @@ class CauseRule:
 # fmt: off
 CAUSES: Final[Mapping[CauseCode, CauseRule]] = {
     "host": CauseRule("This computer",
-        "`overload`, or `latency` or `queue` of at least 3 and of half of the devices",
+        "`overload`, `host_suspended`, or 3 and half of the devices have `latency` or `queue`, or "
+        "are late in any way while all processors are busy",
         CODES["overload"].advice),
     "hub": CauseRule("USB hub", "all devices of a USB hub (2 or more) are gone, or lose data",
         "Check the plug and the power supply of this hub, and spread its devices over more ports."),
@@ -164,7 +169,8 @@ CAUSES: Final[Mapping[CauseCode, CauseRule]] = {
     "clock": CauseRule("Clock", "`clock_step` of a device, with what follows from it", ""),
     "device": CauseRule("Device",
         "what else is raised of a device, led by its gravest finding", ""),
-    "station": CauseRule("Station", "findings of the station: disk, calibration, uploads", ""),
+    "station": CauseRule("Station",
+        "findings of the station: disk, wall clock, calibration, uploads", ""),
 }
 # fmt: on
 

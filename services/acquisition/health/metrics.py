@@ -20,6 +20,7 @@ STREAM_FIGURES: Final = {
     "suspect_ratio": "Packets held back as suspect over 10 s.",
     "interarrival_p99_seconds": "99 % of samples come sooner than this after the one before.",
     "host_latency_p99_seconds": "99 % of samples are spooled sooner than this after the read.",
+    "clock_offset_seconds": "Time of the host minus that of the device, since its first sample.",
     "clock_skew_ratio": "How much faster the host's clock runs than the device's.",
     "clock_residual_p95_seconds": "95 % of arrivals lie closer to the fitted clock's median.",
     "clock_sigma_seconds": "Scatter of the fitted clock's offset.",
@@ -43,6 +44,9 @@ STATION_FIGURES: Final = {
     "disk_left_seconds": "How long that disk lasts at the present rate.",
     "calibration_age_seconds": "Age of the oldest calibration that says when it was made.",
     "latency_sigma_seconds": "Largest stated uncertainty of a path delay.",
+    "host_cpu_ratio": "Share of the processors' time that was used.",
+    "host_cpu_10s_ratio": "The same over 10 s.",
+    "host_wake_p90_seconds": "90 % of the wakes of a thread of the station are less late.",
     "unjudged_samples": "Samples that the health evaluation did not see.",
 }
 # The field of the device's health that each counter shows.

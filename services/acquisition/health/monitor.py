@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dextouch.schemas import (
     DeviceHealth,
     HealthEvents,
+    HealthLevel,
     Matrix,
     StaleCode,
     StationHealth,
@@ -18,7 +19,7 @@ from services.acquisition.glove_record import glove_record, is_ours
 from services.acquisition.health.causes import SIMULATED_ADVICE, find_causes
 from services.acquisition.health.cells import TaxelJudge, cell_judge
 from services.acquisition.health.clock import ClockJudge, CountingJudge
-from services.acquisition.health.codes import CODES
+from services.acquisition.health.codes import CODES, SEVERITY
 from services.acquisition.health.evaluation import (
     Block,
     Board,
@@ -28,7 +29,8 @@ from services.acquisition.health.evaluation import (
     raised_finding,
     worst,
 )
-from services.acquisition.health.host import HostJudge
+from services.acquisition.health.history import STATION_FIGURES, HealthHistory, StreamMeter
+from services.acquisition.health.host import HostClockJudge, HostJudge
 from services.acquisition.health.queues import SampleQueue
 from services.acquisition.health.station import CalibrationJudge, PathJudge
 from services.acquisition.health.streams import (
@@ -87,11 +89,16 @@ class _WatchedStream(_Watched):
         self._descriptor = descriptor
         self.counters = supervisor.streams[descriptor.name]
         self.queue = SampleQueue(descriptor)
+        self.meter = StreamMeter(
+            lambda: supervisor.driver.statistics, descriptor, self.queue.capacity
+        )
         # As the event log knows it.
         self.stale: StaleCode | None = None
 
     def take(self) -> Block:
-        return self.queue.take()
+        block = self.queue.take()
+        self.meter.add(block)
+        return block
 
     def stale_code(self, now_ns: int) -> StaleCode | None:
         """Why the stream is stale, None when it is not.
@@ -163,6 +170,8 @@ class HealthMonitor:
 
     Attributes:
         queues: of each stream's samples, filled by the reader threads with what they have spooled.
+        history: a row of each regular evaluation.
+        nominal_rates_hz: of the streams.
     """
 
     def __init__(
@@ -184,10 +193,11 @@ class HealthMonitor:
         self._streams = {stream.name: stream for stream in streams}
         self.queues = {stream.name: stream.queue for stream in streams}
         descriptors = [descriptor for s in supervisors for descriptor in s.driver.descriptors]
+        self.nominal_rates_hz = {d.name: d.nominal_rate_hz for d in descriptors}
+        self.history = HealthHistory(list(self._streams))
         host = HostJudge()
-        self._itself = _Watched(
-            STATION, [CalibrationJudge(descriptors, calibration), host, self._judge_itself]
-        )
+        itself = (CalibrationJudge(descriptors, calibration), host, HostClockJudge(clock))
+        self._itself = _Watched(STATION, [*itself, self._judge_itself])
         self._all = [*streams, self._itself]
         self._started_ns = clock.now_ns()
         self._due_ns = self._started_ns + PERIOD_NS
@@ -218,6 +228,7 @@ class HealthMonitor:
         with self._evaluating:
             for watched in self._all:
                 self._evaluate(watched, now_ns, confirming=False)
+            self._remember(now_ns)
 
     def tick(self) -> None:
         """Run what is due: silence detection, confirmations, regular evaluations."""
@@ -245,7 +256,7 @@ class HealthMonitor:
         return StationHealth(
             station=self._station,
             level=worst(levels, default="STALE"),
-            causes=find_causes(streams, devices, findings),
+            causes=find_causes(streams, devices, findings, figures.get("host_cpu_10s_ratio", 0.0)),
             findings=findings,
             figures=figures,
             streams=streams,
@@ -280,6 +291,20 @@ class HealthMonitor:
             watched.latest = evaluation
         for code, level in changes:
             self._log.add(now_ns, watched.name, code, level)
+
+    def _remember(self, now_ns: int) -> None:
+        """Add this evaluation to the history."""
+        figures = self._itself.latest.figures
+        station = {name: figures[key] for name, key in STATION_FIGURES.items() if key in figures}
+        streams: dict[str, dict[str, float]] = {}
+        levels: list[HealthLevel] = [f.level for f in self._itself.board.active(now_ns)]
+        for name, stream in self._streams.items():
+            level = stream.health(now_ns).level
+            levels.append(level)
+            figures = stream.latest.figures
+            streams[name] = stream.meter.row(now_ns, SEVERITY.index(level), figures)
+        station["level"] = float(SEVERITY.index(worst(levels)))
+        self.history.add(now_ns, station, streams)
 
     def _notice_silence(self, now_ns: int) -> None:
         for name, stream in self._streams.items():

@@ -1,49 +1,118 @@
-// Health of every stream → table rows, updated in place so that the eye keeps its line.
+// Devices panel: the computer, then one line a root cause, then one row a stream, grouped by device.
 
-import { element, levelBadge } from "./dom.js";
+import { element, levelBadge, setText } from "./dom.js";
 import { age, count, number } from "./format.js";
+import { sparkline } from "./sparkline.js";
 
-function rateCell(stream) {
-  const nominal = stream.nominal_rate_hz;
-  const children = [element("span", {}, `${number(stream.rate_hz, 1)} / ${number(nominal, 0)} Hz`)];
-  if (nominal && stream.rate_hz !== null) {
-    children.unshift(element("meter", {
-      min: 0, max: 1.1 * nominal, low: 0.9 * nominal, high: 0.98 * nominal, optimum: nominal,
-      value: Math.min(stream.rate_hz, 1.1 * nominal), "aria-hidden": "true",
-    }));
-  }
-  return element("td", {}, element("span", { class: "rate" }, ...children));
+// Further causes are folded, so that the rows stay in view.
+const UNFOLDED = 2;
+
+function duration(value_s) {
+  if (value_s === null || value_s < 120) return age(value_s);
+  return value_s < 7200 ? `${Math.round(value_s / 60)} min` : `${Math.round(value_s / 3600)} h`;
+}
+
+function hostText(host) {
+  const parts = [
+    host.cpu_percent === null ? null : `CPU ${number(host.cpu_percent, 0)} %`,
+    host.wake_ms === null ? null : `wakes ${number(host.wake_ms, host.wake_ms < 10 ? 1 : 0)} ms late`,
+    host.disk_free_gb === null ? null : `${number(host.disk_free_gb, host.disk_free_gb < 10 ? 1 : 0)} GB free`,
+    host.disk_left_s === null ? null : `${duration(host.disk_left_s)} of recording`,
+  ];
+  return parts.filter((part) => part !== null).join(" · ");
 }
 
 function drops(stream) {
-  const counted = count(stream.dropped);
-  return stream.drop_percent === null ? counted : `${counted} (${number(stream.drop_percent, 2)} %)`;
+  return stream.drop_percent === null ? count(stream.dropped) : `${number(stream.drop_percent, 2)} %`;
 }
 
-function rows(stream) {
-  const figures = element("tr", { "data-level": stream.level },
-    element("td", {}, levelBadge(stream.level)),
-    element("td", { class: "name" }, stream.name),
-    rateCell(stream),
-    element("td", { class: "number" }, drops(stream)),
-    element("td", { class: "number" }, age(stream.age_s)),
-    element("td", { class: "number clock_figure" }, number(stream.skew_ppm, 1, "ppm")),
-    element("td", { class: "number clock_figure" }, number(stream.clock_error_ms, 2, "ms")),
-  );
-  if (!stream.message && !stream.advice) return [figures];
-  const lasted = stream.lasted_s === null ? "" : ` · for ${age(stream.lasted_s)}`;
-  const trouble = element("div", { class: "trouble" },
-    stream.message ? element("span", { class: "why" }, stream.message + lasted) : null,
-    stream.advice ? element("span", { class: "to_do" }, stream.advice) : null);
-  // Below the figures, over the whole width: in the column of names it would be ten lines high.
-  return [figures, element("tr", { "data-level": stream.level, class: "more" }, element("td", { colspan: 7 }, trouble))];
-}
+export class DevicesPanel {
+  constructor(root) {
+    const find = (id) => root.querySelector(`#${id}`);
+    this.host = find("host");
+    this.note = find("devices_note");
+    this.causes = find("causes");
+    this.body = find("device_rows");
+    this.trends = {};
+    // Causes that the operator unfolded, by key; "" is the fold of further causes.
+    this.open = new Set();
+    this.streams = [];
+  }
 
-export function showDevices(body, note, station) {
-  note.hidden = station.note === "";
-  note.textContent = station.note;
-  note.dataset.level = station.note_level;
-  const clocks = station.streams.some((stream) => stream.skew_ppm !== null || stream.clock_error_ms !== null);
-  body.closest("table").classList.toggle("no_clocks", !clocks);
-  body.replaceChildren(...station.streams.flatMap(rows));
+  show(station) {
+    this.note.hidden = station.note === "";
+    this.note.dataset.level = station.note_level;
+    setText(this.note, station.note);
+    this.host.hidden = station.host === null;
+    if (station.host) this.host.replaceChildren(levelBadge(station.host.level), element("span", { class: "quiet" }, hostText(station.host)));
+    this.showCauses(station.causes);
+    this.streams = station.streams;
+    this.showRows();
+  }
+
+  showTrends(trends) {
+    this.trends = trends;
+    this.showRows();
+  }
+
+  showCauses(causes) {
+    const first = causes.slice(0, UNFOLDED + (causes.length === UNFOLDED + 1 ? 1 : 0));
+    const rest = causes.slice(first.length);
+    const nodes = first.map((cause) => this.cause(cause));
+    if (rest.length) nodes.push(this.fold("", element("summary", { class: "quiet" }, `${rest.length} more causes`), rest.map((cause) => this.cause(cause))));
+    this.causes.replaceChildren(...nodes);
+  }
+
+  cause(cause) {
+    const lasted = cause.lasted_s === null ? "" : ` · for ${duration(cause.lasted_s)}`;
+    const streams = cause.num_streams > 1 ? ` · ${cause.num_streams} streams` : "";
+    const line = [
+      levelBadge(cause.level),
+      element("span", { class: "cause_text" },
+        element("strong", {}, cause.message), element("span", { class: "quiet" }, lasted + streams),
+        cause.advice ? element("span", { class: "to_do" }, cause.advice) : null),
+    ];
+    const attributes = { class: "cause", "data-level": cause.level };
+    if (!cause.findings.length) return element("div", attributes, ...line);
+    const list = element("ul", {}, ...cause.findings.map((text) => element("li", {}, text)));
+    return this.fold(cause.key, element("summary", {}, ...line), [list], attributes);
+  }
+
+  fold(key, summary, children, attributes = {}) {
+    const details = element("details", attributes, summary, ...children);
+    details.open = this.open.has(key);
+    details.addEventListener("toggle", () => (details.open ? this.open.add(key) : this.open.delete(key)));
+    return details;
+  }
+
+  showRows() {
+    const clocks = this.streams.some((stream) => stream.skew_ppm !== null || stream.clock_error_ms !== null);
+    this.body.closest("table").classList.toggle("no_clocks", !clocks);
+    const perDevice = new Map();
+    for (const stream of this.streams) perDevice.set(stream.device, [...(perDevice.get(stream.device) ?? []), stream]);
+    this.body.replaceChildren(...[...perDevice].flatMap(([device, streams]) => this.group(device, streams)));
+  }
+
+  // A device of one stream is named beside it; one of several has a row above them.
+  group(device, streams) {
+    if (streams.length === 1) return [this.row(streams[0], device)];
+    const head = element("tr", { class: "device_head" }, element("td", { colspan: 8 }, device,
+      element("span", { class: "quiet" }, ` ${streams.length} streams`)));
+    return [head, ...streams.map((stream) => this.row(stream, ""))];
+  }
+
+  row(stream, device) {
+    const about = [device, stream.note].filter((text) => text && text !== stream.name).join(" · ");
+    return element("tr", { "data-level": stream.level },
+      element("td", {}, levelBadge(stream.level)),
+      element("td", { class: "name" }, element("span", { class: "name_text", title: about || null }, stream.name,
+        about ? element("span", { class: "quiet" }, ` ${about}`) : null)),
+      element("td", { class: "trend", "data-level": stream.level }, sparkline(this.trends[stream.name] ?? [])),
+      element("td", { class: "number rate_text" }, `${number(stream.rate_hz, 1)} / ${number(stream.nominal_rate_hz, 0)} Hz`),
+      element("td", { class: "number", title: `${stream.dropped} packets lost` }, drops(stream)),
+      element("td", { class: "number" }, age(stream.age_s)),
+      element("td", { class: "number clock_figure" }, number(stream.skew_ppm, 1, "ppm")),
+      element("td", { class: "number clock_figure" }, number(stream.clock_error_ms, 2, "ms")),
+    );
+  }
 }

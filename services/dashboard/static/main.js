@@ -1,6 +1,6 @@
 // The page: one live link feeds the panels; a panel that is out of sight is not sent.
 
-import { showDevices } from "./devices.js";
+import { DevicesPanel } from "./devices.js";
 import { setText } from "./dom.js";
 import { drawScale, HandCanvas, readTaxels } from "./hands.js";
 import { showCameras, showRefused, showServices, showTakes } from "./lists.js";
@@ -16,6 +16,7 @@ const hands = {
   right: new HandCanvas(find("hand_right"), find("hand_right_text"), "right", heatmap),
 };
 const recorder = new RecorderPanel(find("recorder"));
+const devices = new DevicesPanel(find("devices"));
 drawScale(find("scale"), heatmap);
 setText(find("scale_end"), `${heatmap.full_scale_kpa} kPa`);
 
@@ -24,12 +25,13 @@ function showStation(station) {
   overall.dataset.level = station.level;
   setText(overall, station.level);
   setText(find("summary"), station.summary);
-  showDevices(find("device_rows"), find("devices_note"), station);
+  devices.show(station);
   recorder.show(station.recorder);
 }
 
 const topics = {
   station: showStation,
+  trends: (trends) => devices.showTrends(trends),
   services: (services) => showServices(find("service_list"), services),
   takes: (takes) => {
     showTakes(find("take_rows"), takes);
@@ -49,7 +51,7 @@ const link = new LiveLink({
     setText(find("link"), connected ? "live" : "dashboard not reachable, trying again");
     if (!connected) {
       showStation({ level: "STALE", summary: "", note: "No link to the dashboard: what you see is old.", note_level: "ERROR", reachable: false,
-        streams: [], recorder: { state: "unknown", actions: [], elapsed_s: null, note: "", problems: [], level: "STALE" } });
+        host: null, causes: [], streams: [], recorder: { state: "unknown", actions: [], elapsed_s: null, note: "", problems: [], level: "STALE" } });
       Object.values(hands).forEach((hand) => hand.clear("no link"));
     }
   },
@@ -57,6 +59,7 @@ const link = new LiveLink({
 
 // Station state is wanted wherever the page is scrolled; the camera panel is hidden until one exists.
 link.show("station", true);
+link.show("trends", true);
 link.show("cameras", true);
 const observer = new IntersectionObserver((entries) => {
   for (const entry of entries) link.show(entry.target.dataset.view, entry.isIntersecting);

@@ -100,6 +100,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.station import HealthCause as HealthCause
     from dextouch.schemas.station import HealthEvent as HealthEvent
     from dextouch.schemas.station import HealthEvents as HealthEvents
+    from dextouch.schemas.station import HealthHistory as HealthHistory
     from dextouch.schemas.station import HealthLevel as HealthLevel
     from dextouch.schemas.station import RaisedFinding as RaisedFinding
     from dextouch.schemas.station import RecorderAction as RecorderAction
@@ -115,6 +116,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.station import TakeName as TakeName
     from dextouch.schemas.station import TakeProblem as TakeProblem
     from dextouch.schemas.station import TakePrompt as TakePrompt
+    from dextouch.schemas.station import TakeSpan as TakeSpan
     from dextouch.schemas.station import UploadStatus as UploadStatus
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)

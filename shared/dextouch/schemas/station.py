@@ -236,3 +236,30 @@ class HealthEvents(FrozenModel):
 
     now_ns: int
     events: tuple[HealthEvent, ...]
+
+
+class TakeSpan(FrozenModel):
+    """When a take ran, on the station's clock; `stop_ns` is None while it runs."""
+
+    recording_id: str
+    start_ns: int
+    stop_ns: int | None = None
+
+
+class HealthHistory(FrozenModel):
+    """Health of the newest hour, about a row a second; null where a value is unknown.
+
+    `station` has a list of rows for each of `station_series`, `streams` for each stream and each of
+    `stream_series`. Times are on the station's clock, which shows `now_ns` when its wall clock
+    shows `now_unix_s`.
+    """
+
+    now_ns: int
+    now_unix_s: float
+    takes: tuple[TakeSpan, ...]
+    nominal_rate_hz: dict[str, float]
+    station_series: tuple[str, ...]
+    stream_series: tuple[str, ...]
+    t_ns: tuple[int, ...] = ()
+    station: tuple[tuple[float | None, ...], ...] = ()
+    streams: dict[str, tuple[tuple[float | None, ...], ...]] = Field(default_factory=dict)

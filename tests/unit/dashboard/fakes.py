@@ -64,6 +64,8 @@ class FakeServices:
         self.app.middleware("http")(self._note)
         self.app.get("/readyz")(lambda: {"ready": True, "waiting_for": []})
         self.app.get("/v1/health")(lambda: JSONResponse(self.health))
+        self.history = pack({"stream_series": ["rate_hz"], "nominal_rate_hz": {}}, {})
+        self.app.get("/v1/health/history")(lambda: Response(self.history))
         self.app.get("/v1/recorder")(lambda: self.recorder)
         self.app.get("/v1/live/taxels")(self._taxels)
         self.app.post("/v1/recorder/{action}")(self._act)

@@ -11,6 +11,7 @@ from dashboard_fakes import PRESSURES, broken_upstream
 
 from dextouch.errors import ConflictError, NotFoundError, UnavailableError, UnknownNameError
 from dextouch.schemas.station import HealthEvents
+from dextouch.streams import pack
 from services.dashboard import app
 from services.dashboard.feeds import Feeds
 from services.dashboard.settings import DashboardSettings
@@ -24,7 +25,7 @@ def feeds(upstreams):
 
 async def test_station(feeds):
     view = await feeds.station()
-    assert (view.reachable, view.level, view.summary) == (True, "OK", "1 OK")
+    assert (view.reachable, view.level, view.summary) == (True, "OK", "1 of 1 streams OK")
     (stream,) = view.streams
     assert (stream.name, stream.dropped, stream.drop_percent) == ("tactile_left", 2, 0.2)
     assert (stream.skew_ppm, stream.clock_error_ms) == (None, None)
@@ -37,32 +38,65 @@ async def test_worst_level_leads(feeds, services):
     streams = zip(levels, devices, strict=True)
     services.health["streams"] = [services.stream | {"level": a, "device": b} for a, b in streams]
     view = await feeds.station()
-    summary = "1 STALE (glove_left) · 1 WARN (camera_head) · 1 OK"
-    assert (view.level, view.summary) == ("STALE", summary)
+    assert (view.level, view.summary) == ("STALE", "1 of 3 streams OK")
 
 
-async def test_what_ails_a_device_is_said(feeds, services):
-    silent = {"code": "silent", "level": "STALE", "message": "no sample for 2.0 s"}
-    loss = {"code": "loss", "level": "WARN", "message": "1 % lost", "advice": "Move."}
-    loss |= {"lasted_s": 1.0}
-    services.stream |= {
-        "level": "STALE",
-        "findings": [silent | {"advice": "Switch it off and on.", "lasted_s": 2.0}, loss],
-    }
-    services.device |= {"reconnects": 3, "last_error": "gone", "suspects": 4}
-    (stream,) = (await feeds.station()).streams
-    words = "no sample for 2.0 s · 1 % lost · 3 reconnects · 4 packets held back · gone"
-    assert stream.message == words
-    assert (stream.advice, stream.lasted_s) == ("Switch it off and on.", 2.0)
+def raised(code, level, message):
+    return {"code": code, "level": level, "message": message, "advice": "Move.", "lasted_s": 1.0}
 
 
-async def test_what_ails_the_station_itself_is_said(feeds, services):
-    full = {"code": "disk", "level": "ERROR", "message": "the disk is full in 4 minutes"}
-    services.health["findings"] = [full | {"advice": "Delete takes.", "lasted_s": 9.0}]
+async def test_what_follows_from_a_cause_is_folded_below_it(feeds, services):
+    findings = [raised("gap", "ERROR", "0.6 s without a sample"), raised("nan", "WARN", "2 % nan")]
+    findings.append(raised("rate", "WARN", "55 Hz, expected 60 Hz"))
+    services.health["streams"] = [
+        services.stream | {"level": "ERROR", "findings": findings},
+        services.stream | {"stream": "head", "device": "tracker", "level": "OK"},
+    ]
+    cause = {"code": "host", "subject": "", "level": "ERROR", "message": "Overloaded: 9 tasks"}
+    cause |= {"advice": "Close programs.", "lasted_s": 7.0, "streams": ["tactile_left"]}
+    services.health["causes"] = [cause | {"findings": ["gap", "rate", "overload"]}]
+    services.health["figures"] = {"host_cpu_ratio": 0.98, "disk_free_bytes": 5e9}
     view = await feeds.station()
-    assert (view.level, view.note_level) == ("ERROR", "ERROR")
-    assert view.note == "the disk is full in 4 minutes → Delete takes."
-    assert view.streams[0].level == "OK"
+    (shown,) = view.causes
+    assert (shown.level, shown.message) == ("ERROR", "Overloaded: 9 tasks")
+    assert (shown.advice, shown.lasted_s, shown.num_streams) == ("Close programs.", 7.0, 1)
+    assert shown.findings == ("tactile_left: 0.6 s without a sample · 55 Hz, expected 60 Hz",)
+    assert view.summary == "1 cause · 1 of 2 streams OK"
+    assert (view.host.level, view.host.cpu_percent, view.host.wake_ms) == ("ERROR", 98.0, None)
+    assert view.host.disk_free_gb == 5.0
+
+
+async def test_a_cause_that_says_all_has_nothing_folded(feeds, services):
+    services.stream |= {"level": "STALE", "findings": [raised("silent", "STALE", "no data")]}
+    services.device |= {"reconnects": 3, "last_error": "gone", "suspects": 4}
+    cause = {"code": "gone", "subject": "glove_left", "level": "STALE", "lasted_s": 7.0}
+    cause |= {"message": "glove_left: no data", "advice": "Look.", "streams": ["tactile_left"]}
+    services.health["causes"] = [cause | {"findings": ["silent"]}]
+    view = await feeds.station()
+    assert view.causes[0].findings == ()
+    assert view.streams[0].note == "3 reconnects · 4 packets held back · gone"
+
+
+async def test_the_stations_own_finding_is_a_cause_and_sets_the_level(feeds, services):
+    services.health["findings"] = [raised("disk", "ERROR", "the disk is full in 4 minutes")]
+    cause = {"code": "station", "subject": "disk", "level": "ERROR", "lasted_s": 7.0}
+    cause |= {"message": "the disk is full in 4 minutes", "advice": "Delete takes."}
+    services.health["causes"] = [cause]
+    view = await feeds.station()
+    assert (view.level, view.host.level, view.streams[0].level) == ("ERROR", "ERROR", "OK")
+    assert view.causes[0].num_streams == 0
+
+
+async def test_trends_are_shares_of_the_nominal_rate(feeds, services):
+    rows = np.full((2, 2, 5), np.nan, np.float32)
+    rows[0, 1] = [60, 60, 30, 60, 66]
+    rows[1, 1, 3:] = [100, 90]
+    fields = {"stream_series": ["level", "rate_hz"]}
+    fields["nominal_rate_hz"] = {"tactile_left": 60.0, "head": 100.0}
+    services.history = pack(fields, {"streams": rows})
+    (message,) = await feeds.topics["trends"].newest()
+    trends = json.loads(message)["data"]
+    assert trends == {"tactile_left": [0.5, 1.0], "head": [None, 0.9]}
 
 
 async def test_incomplete_take_is_shown(feeds, services):
