@@ -58,6 +58,7 @@ SCREENS: Final = (
     Screen("/episodes", "episodes.html", "Episodes"),
     Screen("/review", "review.html", "Review"),
     Screen("/hours", "hours.html", "Hours"),
+    Screen("/health", "health.html", "Health"),
 )
 
 
