@@ -55,10 +55,10 @@ class Screen:
 
 SCREENS: Final = (
     Screen("/", "station.html", "Station"),
+    Screen("/health", "health.html", "Health"),
     Screen("/episodes", "episodes.html", "Episodes"),
     Screen("/review", "review.html", "Review"),
     Screen("/hours", "hours.html", "Hours"),
-    Screen("/health", "health.html", "Health"),
 )
 
 
