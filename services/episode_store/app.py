@@ -15,7 +15,7 @@ from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
 from services.episode_store.playback import playback_router
 from services.episode_store.reading import content_router
-from services.episode_store.routes import catalog_router, uploads_router
+from services.episode_store.routes import catalog_router, reviews_router, uploads_router
 from services.episode_store.settings import EpisodeStoreSettings
 from services.episode_store.trash import trash_router
 
@@ -49,6 +49,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         routers=[
             uploads_router(ingest, limits, admission, metrics),
             catalog_router(catalog, max_page=settings.max_page),
+            reviews_router(catalog),
             content_router(store, settings),
             playback_router(store, settings),
             trash_router(store, max_page=settings.max_page),

@@ -170,12 +170,6 @@ def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
         """Groups of items that are compared to find outliers, and whether they are large enough."""
         return catalog.groups()
 
-    @router.post("/catalog/reviews", tags=["catalog"], dependencies=[MAY_DELETE])
-    @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def review(wanted: Annotated[ReviewItems, Depends(JsonBody(ReviewItems))]) -> ReviewedItems:
-        """Accept or reject items, or remove their reviews; rejected ones are not trained on."""
-        return review_items(catalog, wanted)
-
     @router.get("/catalog/values", tags=["catalog"])
     def values() -> CatalogValues:
         """Tasks, operators and stations that occur in the store."""
@@ -185,5 +179,18 @@ def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
     def lineage(kind: ItemKind, item_id: str) -> Lineage:
         """What an item was made from, and what was made from it."""
         return catalog.lineage(kind, item_id)
+
+    return router
+
+
+def reviews_router(catalog: Catalog) -> APIRouter:
+    """Create the route that keeps reviews."""
+    router = APIRouter(prefix="/v1", dependencies=[MAY_DELETE])
+
+    @router.post("/catalog/reviews", tags=["catalog"], dependencies=[MAY_DELETE])
+    @takes({JSON: MAX_ATTRIBUTES_BYTES})
+    def review(wanted: Annotated[ReviewItems, Depends(JsonBody(ReviewItems))]) -> ReviewedItems:
+        """Accept or reject items, or remove their reviews; rejected ones are not trained on."""
+        return review_items(catalog, wanted)
 
     return router
