@@ -26,16 +26,16 @@ DESIGNS: Final[dict[str, tuple[str, ...]]] = {
 # Single options of the joint model, each changed from the default.
 OPTIONS: Final[dict[str, tuple[str, ...]]] = {
     "default": (),
-    "no sum with tokens": ("--no-network.add-condition-to-tokens",),
-    "cross-attention": _CROSS_ATTENTION,
-    "no pose raster": ("--no-network.use-pose-raster",),
-    "no scene encoder": ("--no-network.use-scene-encoder",),
     "velocity": ("--network.prediction", "velocity", "--network.sampling-steps", "8"),
     "plain video": ("--network.video-target", "plain"),
     "plain touch": ("--network.tactile-target", "plain"),
     "contact or changing": ("--optimizer.touch-loss", "contact_or_changing"),
-    "no touch": ("--no-network.use-touch",),
+    "no pose raster": ("--no-network.use-pose-raster",),
     "all palm axes": ("--network.palm-channels", "240"),
+    "no sum with tokens": ("--no-network.add-condition-to-tokens",),
+    "cross-attention": _CROSS_ATTENTION,
+    "no scene encoder": ("--no-network.use-scene-encoder",),
+    "no touch": ("--no-network.use-touch",),
 }
 INSTRUCTIONS: Final = {"hashed words": "hashed_words", "subwords": "subwords"}
 CANS: Final = ("lift_full_can", "lift_empty_can", "move_can_left", "move_can_right")

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from services.cli.reproduce.experiments import (
     ADAPTED,
+    BASES,
     DESIGNS,
     GENERATED,
     HALF_TRAINING,
@@ -104,9 +105,24 @@ def _design_pages(folder: Path, experiments: Experiments) -> list[Page]:
 
 
 def _options_pages(folder: Path, experiments: Experiments) -> list[Page]:
+    """One table of the options that are measured; it is useful before all of them are."""
     columns = {name: (f"options/{folder_of(name)}", "") for name in OPTIONS}
+    missing = [
+        name
+        for name, (step, _) in columns.items()
+        if name != BASES["options"]
+        and not all(
+            (folder / f"{step}/seed-{seed}/prediction/result.json").is_file()
+            for seed in experiments.seeds
+        )
+    ]
+    for name in missing:
+        del columns[name]
     rows = _prediction_rows(folder, experiments, columns)
-    return [Page("Options of the joint model, one changed at a time", rows, "default")]
+    title = "Options of the joint model, one changed at a time"
+    if missing:
+        title += f" (not measured yet: {', '.join(missing)})"
+    return [Page(title, rows, BASES["options"])]
 
 
 def _instruction_pages(folder: Path, experiments: Experiments) -> list[Page]:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from dextouch.errors import ConflictError
+from dextouch.errors import ConflictError, NotFoundError
 from services.cli.main import find_command, main
 from services.cli.reproduce.experiments import TABLES, Experiments
 from services.cli.reproduce.pages import Measured, Page, Row
@@ -203,6 +203,23 @@ def test_a_prediction_table_reads_the_figures_of_its_steps(tmp_path):
     assert line.endswith("| 18.25 | n/a | n/a |")
     assert page.to_json()["rows"][0]["references"]["copy"] == pytest.approx(18.25)
     assert "| PSNR, other actions ↓ | 17.0000 ± 0.0000 |" in text
+
+
+def test_the_table_of_options_has_those_that_are_measured(tmp_path):
+    experiments = Experiments(QUICK, (0, 1))
+    figures = {key: None for _, key, _ in METRICS} | {"psnr": 20.0}
+    result = json.dumps({"windows": {"all": {"model": figures, "other_take": figures}}})
+    for column, seeds in (("plain-touch", (0, 1)), ("velocity", (0,)), ("default", (0, 1))):
+        for seed in seeds:
+            path = tmp_path / f"options/{column}/seed-{seed}/prediction/result.json"
+            path.parent.mkdir(parents=True)
+            path.write_text(result)
+    (page,) = make_pages(tmp_path, experiments, "options")
+    assert list(page.rows[0].cells) == ["default", "plain touch"]
+    assert "not measured yet: velocity, " in page.title
+    (tmp_path / "options/default/seed-1/prediction/result.json").unlink()
+    with pytest.raises(NotFoundError, match="options/default/seed-1"):
+        make_pages(tmp_path, experiments, "options")
 
 
 def test_data_are_named_once_for_all_seeds(tmp_path):
