@@ -104,7 +104,7 @@ CHAOS = {
         (
             (
                 "host",
-                "This computer is overloaded: its processors are busy (97%) and 5 devices are late",
+                "This computer is overloaded: processors 97 % busy, 5 devices late",
                 "Close other programs, or set the cameras to smaller or fewer images.",
             ),
         ),

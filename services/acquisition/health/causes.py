@@ -126,7 +126,7 @@ def _host(
         if (num_delayed := len(left.devices(INSIDE_CODES))) >= enough:
             why = f"{num_delayed} devices are delayed after the read"
         elif cpu_ratio >= BUSY_RATIO and len(late) >= enough:
-            why = f"its processors are busy ({cpu_ratio:.0%}) and {len(late)} devices are late"
+            why = f"processors {100 * cpu_ratio:.0f} % busy, {len(late)} devices late"
         else:
             return
     explained = left.take(left.streams, _is_of_host)

@@ -56,10 +56,12 @@ export class DevicesPanel {
   }
 
   showCauses(causes) {
-    const first = causes.slice(0, UNFOLDED + (causes.length === UNFOLDED + 1 ? 1 : 0));
-    const rest = causes.slice(first.length);
-    const nodes = first.map((cause) => this.cause(cause));
-    if (rest.length) nodes.push(this.fold("", element("summary", { class: "quiet" }, `${rest.length} more causes`), rest.map((cause) => this.cause(cause))));
+    const nodes = causes.slice(0, UNFOLDED).map((cause) => this.cause(cause));
+    const rest = causes.slice(UNFOLDED);
+    if (rest.length) {
+      const text = rest.length === 1 ? `1 more cause: ${rest[0].message}` : `${rest.length} more causes`;
+      nodes.push(this.fold("", element("summary", { class: "quiet" }, text), rest.map((cause) => this.cause(cause))));
+    }
     this.causes.replaceChildren(...nodes);
   }
 

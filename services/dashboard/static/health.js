@@ -39,12 +39,16 @@ const PLOTS = {
   disk: { series: [{ label: "disk free", colour: "--ok", scale: "GB", digits: 1, unit: "GB" }] },
 };
 
+function hostMarks() {
+  return { takes: marks.takes, gaps: [], events: marks.events.filter((event) => event.stream === STATION) };
+}
+
 function select(from_s, to_s) {
   go({ range_s: to_s - from_s, end_s: to_s });
 }
 
 const plots = Object.fromEntries(Object.entries(PLOTS).map(([name, about]) =>
-  [name, new LinePlot(find(`plot_${name}`), about, { marks: () => (["host", "disk"].includes(name) ? { ...marks, gaps: [] } : marks), onSelect: select })]));
+  [name, new LinePlot(find(`plot_${name}`), about, { marks: () => (["host", "disk"].includes(name) ? hostMarks() : marks), onSelect: select })]));
 const overview = new StripPlot(find("overview"), { rows: () => strips, takes: () => history.takes, onSelect: select,
   onPick: (name) => { if (name !== STATION) go({ stream: name }); } });
 

@@ -6,7 +6,9 @@ import uPlot from "./vendor/uplot/uPlot.esm.js";
 const SYNC = uPlot.sync("health");
 const LEVELS = ["--ok", "--warn", "--error", "--stale"];
 const AXIS_WIDTH = 58;
+const MAX_EVENT_LINES = 12;
 export const ROW_HEIGHT = 19;
+let selection = null;
 
 export function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -32,10 +34,16 @@ function shared(onSelect, extra = {}) {
     cursor: { sync: { key: SYNC.key, scales: ["x", null] }, drag: { x: true, y: false, setScale: false }, points: { size: 6 }, y: false },
     scales: { x: { time: true } },
     hooks: { setSelect: [(plot) => {
+      // The plots of the cursor all tell of one selection; what the first says counts.
       if (plot.select.width < 4) return;
       const [from_s, to_s] = [plot.select.left, plot.select.left + plot.select.width].map((x) => plot.posToVal(x, "x"));
       plot.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
-      onSelect(from_s, to_s);
+      if (!selection) setTimeout(() => {
+        const [start_s, stop_s] = selection;
+        selection = null;
+        onSelect(start_s, stop_s);
+      });
+      selection ??= [from_s, to_s];
     }], ...extra },
   };
 }
@@ -57,7 +65,7 @@ function paint(plot, draw) {
   ctx.restore();
 }
 
-// Takes as bands, gaps of the stream in the colour of an error, events as lines in that of their level.
+// Takes as bands, gaps of the stream in the colour of an error, events in that of their level: as lines, or as ticks where they are many.
 function paintMarks(plot, marks) {
   paint(plot, (ctx, bbox) => {
     const bands = [...marks.takes.map((take) => [take.start_s, take.stop_s, "--accent", 0.1]), ...marks.gaps.map(([a, b]) => [a, b, "--error", 0.16])];
@@ -68,15 +76,15 @@ function paintMarks(plot, marks) {
       ctx.fillStyle = colour(name);
       ctx.fillRect(found[0], bbox.top, found[1], bbox.height);
     }
+    const shown = marks.events.map((event) => [event, span(plot, event.t_s, event.t_s)]).filter(([, found]) => found);
+    const length = shown.length > MAX_EVENT_LINES ? 7 * devicePixelRatio : bbox.height;
     ctx.globalAlpha = 0.8;
-    ctx.setLineDash([2 * devicePixelRatio, 3 * devicePixelRatio]);
-    for (const event of marks.events) {
-      const found = span(plot, event.t_s, event.t_s);
-      if (!found) continue;
+    ctx.setLineDash(shown.length > MAX_EVENT_LINES ? [] : [2 * devicePixelRatio, 3 * devicePixelRatio]);
+    for (const [event, [left]] of shown) {
       ctx.strokeStyle = levelColour(event.level);
       ctx.beginPath();
-      ctx.moveTo(found[0], bbox.top);
-      ctx.lineTo(found[0], bbox.top + bbox.height);
+      ctx.moveTo(left, bbox.top);
+      ctx.lineTo(left, bbox.top + length);
       ctx.stroke();
     }
   });
@@ -98,7 +106,8 @@ export class LinePlot {
       ...base, width: this.width(), height: about.height ?? 150, legend: { live: true },
       scales: { ...base.scales, ...Object.fromEntries(scales.map((scale) => [scale, { range: (_, low, high) => this.range(low, high, scale) }])) },
       axes: [timeAxis(), ...scales.map((scale, index) => valueAxis(scale, scale, index === 0 ? 3 : 1))],
-      padding: [6, scales.length > 1 ? 0 : 10, 0, 0],
+      // All plots of a column begin and end at the same place.
+      padding: [6, scales.length > 1 ? 0 : AXIS_WIDTH, 0, 0],
       series: [{ label: "Time", value: (_, t_s) => (t_s === null ? "–" : clockTime(t_s)) }, ...lines],
     }, [[], ...lines.map(() => [])], root);
     root.plot = this.plot;
@@ -152,7 +161,7 @@ export class StripPlot {
     const base = shared(onSelect, { draw: [(plot) => this.paintStrips(plot, takes())] });
     this.plot = new uPlot({
       ...base, width: Math.max(root.clientWidth, 300), height: this.height(), legend: { show: false },
-      scales: { ...base.scales, y: { range: () => [rows().length + 1, 0] } },
+      scales: { ...base.scales, y: { dir: -1, range: () => [0, rows().length + 1] } },
       axes: [timeAxis(), { scale: "y", side: 3, size: 150, gap: 6, font: "12px system-ui", stroke: () => colour("--ink"), grid: { show: false }, ticks: { show: false },
         splits: () => ["", ...rows()].map((_, index) => index + 0.5), values: () => ["takes", ...rows().map((row) => row.name)] }],
       padding: [2, 10, 0, 0],
