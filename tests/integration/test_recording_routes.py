@@ -25,6 +25,29 @@ async def station(tmp_path, **options):
             yield client
 
 
+async def assert_history(client, recording_id, names):
+    """The history holds rows of all streams and the take, in both formats; queries are checked."""
+    path = "/v1/health/history"
+    async with asyncio.timeout(30):
+        while not (history := (await client.get(path)).json())["t_ns"]:
+            await asyncio.sleep(0.1)
+    assert set(history["streams"]) == set(history["nominal_rate_hz"]) == names
+    assert [take["recording_id"] for take in history["takes"]] == [recording_id]
+    assert history["takes"][0]["start_ns"] < history["takes"][0]["stop_ns"] <= history["now_ns"]
+    assert {len(column) for column in history["streams"]["head"]} == {len(history["t_ns"])}
+    query = {"stream": "head", "limit": 1, "format": "msgpack"}
+    fields, arrays = unpack((await client.get(path, params=query)).content, max_bytes=10_000)
+    assert fields["nominal_rate_hz"] == {"head": 100.0}
+    shape = (1, len(fields["stream_series"]), 1)
+    assert (arrays["streams"].dtype, arrays["streams"].shape) == (np.float32, shape)
+    assert arrays["t_ns"].shape == (1,)
+    assert (await client.get(path, params={"since_ns": 2**62})).json()["t_ns"] == []
+    unknown = await client.get(path, params={"stream": "nose"})
+    assert unknown.status_code == 404
+    assert "head" in unknown.json()["detail"]
+    assert (await client.get(path, params={"limit": 3601})).status_code == 422
+
+
 async def until_samples(client, count):
     async with asyncio.timeout(300):
         while True:
@@ -56,6 +79,7 @@ async def test_a_take_over_http(tmp_path):
         health = (await client.get("/v1/health")).json()
         assert {s["stream"] for s in health["streams"]} == set(spool.streams)
         assert all(d["connected"] for d in health["devices"])
+        await assert_history(client, recording_id, set(spool.streams))
         fields, arrays = unpack((await client.get("/v1/live/taxels")).content, max_bytes=10_000)
         assert fields == {}
         assert arrays["tactile_left"].shape == (320,)
