@@ -23,6 +23,7 @@ from dextouch.serving import JSON, MSGPACK, RequireScope
 from dextouch.streams import MAX_STREAMS, pack
 from services.acquisition.health import (
     NUM_ROWS,
+    PERIOD_NS,
     DiskJudge,
     history_facts,
     json_history,
@@ -117,7 +118,7 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
         responses={200: {"model": HealthHistory, "content": {MSGPACK: {}}}},
     )
     async def history(query: Annotated[HistoryQuery, Query()]) -> Response:
-        """Health of the newest hour, about a row a second, and its takes.
+        """Health of the newest hour, about a row a second, and all takes of that hour.
 
         Packed, it has the arrays `t_ns` [rows], `station` [series, rows] and `streams` [stream,
         series, rows], float32, NaN where a value is unknown, in the order of the fields
@@ -125,9 +126,10 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
         """
         health = station.health
         rows = health.history.rows(query.stream, since_ns=query.since_ns, limit=query.limit)
-        first_ns = int(rows.t_ns[0]) if len(rows.t_ns) else query.since_ns
         rates_hz = {name: health.nominal_rates_hz[name] for name in rows.streams}
-        facts = history_facts(station.clock.now_ns(), health.history.takes(first_ns), rates_hz)
+        now_ns = station.clock.now_ns()
+        takes = health.history.takes(now_ns - NUM_ROWS * PERIOD_NS)
+        facts = history_facts(now_ns, takes, rates_hz)
         if query.format == "msgpack":
             return Response(packed_history(facts, rows), media_type=MSGPACK)
         return Response(json_history(facts, rows), media_type=JSON)

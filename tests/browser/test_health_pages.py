@@ -176,6 +176,39 @@ def test_plots_show_the_script_at_its_times(open_page, scripted):
     assert seen_s == pytest.approx(STALL_S[0] + 0.25, abs=1.1)
 
 
+def strip_colour(page, row, t_s):
+    """Colour and opacity in a row of the overview at a time."""
+    return page.evaluate(
+        """([row, t_s]) => {
+            const plot = document.getElementById("overview").plot;
+            const [x, y] = [plot.valToPos(t_s, "x", true), plot.valToPos(row + 0.5, "y", true)];
+            return [...plot.ctx.getImageData(Math.round(x), Math.round(y), 1, 1).data];
+        }""",
+        [row, t_s],
+    )
+
+
+def test_takes_and_silences_are_marked_on_the_axis(open_page, scripted):
+    address, began_s = scripted
+    page = open_page(viewport={"width": 1366, "height": 900}, color_scheme="light")
+    page.goto(f"{address}/health?range=120")
+    expect(page.locator("#events tr")).not_to_have_count(0)
+    # Later answers have no new rows; what was marked stays.
+    with page.expect_response("**/health/history?*"), page.expect_response("**/health/events?*"):
+        pass
+    take = {t: strip_colour(page, 0, began_s + t) for t in (-30, 5, 20)}
+    assert take[-30][3] == 0
+    # The accent colour, of much more red than blue.
+    assert all(take[t][3] > 150 and take[t][0] - take[t][2] > 80 for t in (5, 20)), take
+    names = page.evaluate(
+        "() => [...document.getElementById('stream').options].map((o) => o.value)"
+    )
+    row = 2 + names.index("head")
+    assert strip_colour(page, row, began_s + 5) != strip_colour(page, row, began_s + 12.5)
+    other = 2 + names.index("wrist_left")
+    assert strip_colour(page, other, began_s + 5) == strip_colour(page, other, began_s + 12.5)
+
+
 def test_one_cursor_and_a_view_that_the_address_keeps(open_page, scripted):
     address, _ = scripted
     page = open_page(viewport={"width": 1366, "height": 900}, timezone_id="UTC")

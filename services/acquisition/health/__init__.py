@@ -9,12 +9,13 @@ from services.acquisition.health.codes import CODES
 from services.acquisition.health.history import NUM_ROWS
 from services.acquisition.health.history_body import history_facts, json_history, packed_history
 from services.acquisition.health.metrics import STATION_FIGURES, HealthCollector
-from services.acquisition.health.monitor import STATION, TICK_NS, HealthMonitor
+from services.acquisition.health.monitor import PERIOD_NS, STATION, TICK_NS, HealthMonitor
 from services.acquisition.health.station import DiskJudge, judge_uploads
 
 __all__ = [
     "CODES",
     "NUM_ROWS",
+    "PERIOD_NS",
     "STATION",
     "STATION_FIGURES",
     "TICK_NS",
