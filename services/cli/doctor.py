@@ -1,17 +1,19 @@
 """Command `dextouch doctor`: checks this machine, and names the extra of a missing package."""
 
 import ctypes.util
+import importlib.metadata
 import importlib.util
 import os
 import platform
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.errors import DexTouchError, UnavailableError
+from services.cli.machine import Finding, Machine
 
 # Import names; if several extras provide a package, the most relevant one has it.
 _PACKAGES = {
@@ -32,16 +34,14 @@ _NOT_IN_ALL = ("full", "rerun")
 EXTRA_OF = {package: extra for extra, names in _PACKAGES.items() for package in names.split()}
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Result of one check."""
-
-    what: str
-    found: str
-    ok: bool = True
-    do: str = ""
-
-
+# Distributions that are named otherwise than what they provide.
+_DISTRIBUTIONS = {
+    "serial": "pyserial",
+    "hid": "hidapi",
+    "usb": "pyusb",
+    "cv2": "opencv-contrib-python-headless",
+    "mujoco": "mujoco-core",
+}
 _PURPOSES = {
     "zstandard": "episodes",
     "serial": "gloves over serial",
@@ -85,9 +85,7 @@ def examine() -> list[Finding]:
         Finding("processor cores", str(os.cpu_count())),
     ]
     for package, purpose in _PURPOSES.items():
-        there = importlib.util.find_spec(package) is not None
-        hint, answer = ("", "yes") if there else (install_hint(package), "no")
-        findings.append(Finding(f"{package} ({purpose})", answer, ok=there, do=hint))
+        findings.append(_package(package, purpose))
     free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
     redis = shutil.which("redis-server") or "no: rollouts are kept in memory"
     full = "yes" if importlib.util.find_spec("diffusers") else f"no: {install_hint('diffusers')}"
@@ -98,24 +96,50 @@ def examine() -> list[Finding]:
         Finding("libusb (optional)", libusb),
         Finding("diffusers (optional, the full-size world model)", full),
     ]
-    for pattern in ("ttyACM*", "ttyUSB*", "hidraw*", "video*"):
-        found = [_with_access(path) for path in sorted(Path("/dev").glob(pattern))]
-        findings.append(Finding(f"devices {pattern}", ", ".join(found) or "none"))
-    return findings
+    return [*findings, *_outdated(), *Machine().examine()]
 
 
-def _with_access(device: Path) -> str:
-    if os.access(device, os.R_OK | os.W_OK):
-        return device.name
-    return f"{device.name} (no access: deploy/udev/60-dextouch.rules)"
+def _package(name: str, purpose: str) -> Finding:
+    """Whether a package is installed, and its version."""
+    what = f"{name} ({purpose})"
+    if importlib.util.find_spec(name) is None:
+        return Finding(what, "no", ok=False, do=install_hint(name))
+    try:
+        return Finding(what, importlib.metadata.version(_DISTRIBUTIONS.get(name, name)))
+    except importlib.metadata.PackageNotFoundError:
+        return Finding(what, "yes")
+
+
+def _outdated() -> list[Finding]:
+    """Installed packages of other versions than dextouch-wm asks for."""
+    try:
+        from packaging.requirements import Requirement
+
+        asked = importlib.metadata.requires("dextouch-wm") or []
+    except (ModuleNotFoundError, importlib.metadata.PackageNotFoundError):
+        return []
+    wrong = []
+    for requirement in map(Requirement, sorted(set(asked))):
+        # What is installed counts, whichever extra brought it.
+        try:
+            version = importlib.metadata.version(requirement.name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        if not requirement.specifier.contains(version, prereleases=True):
+            spec = f"{requirement.name}{requirement.specifier}"
+            do = f"pip install '{spec}'"
+            found = f"{version}, expected {requirement.specifier}"
+            wrong.append(Finding(requirement.name, found, ok=False, do=do, required=False))
+    return wrong
 
 
 def main(argv: Sequence[str]) -> int:
     """Print the findings; returns 1 if something required is missing."""
     parser = CommandParser(
         prog="dextouch doctor",
-        description="Check Python, packages, disk and devices of this machine, without changing "
-        "anything. Exits with status 1 if something required is missing.",
+        description="Check Python, packages, disk, devices, clock, ports, memory and GPU of this "
+        "machine, without changing anything. What is not in order is shown with the command that "
+        "puts it right. Exits with status 1 if something required is missing.",
         epilog="example:\n  dextouch doctor --json doctor.json",
     )
     add_json(parser)
@@ -123,8 +147,8 @@ def main(argv: Sequence[str]) -> int:
     findings = examine()
     width = max(len(finding.what) for finding in findings)
     for finding in findings:
-        mark = "ok     " if finding.ok else "MISSING"
+        mark = "ok     " if finding.ok else "MISSING" if finding.required else "advice "
         hint = f"  → {finding.do}" if not finding.ok and finding.do else ""
         print(f"{mark}  {finding.what:<{width}}  {finding.found}{hint}")
     write_result(arguments.json, [asdict(finding) for finding in findings])
-    return 0 if all(finding.ok for finding in findings) else 1
+    return 0 if all(finding.ok or not finding.required for finding in findings) else 1
