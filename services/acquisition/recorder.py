@@ -30,6 +30,7 @@ from services.acquisition.drivers.base import Driver
 from services.acquisition.health import HealthMonitor
 from services.acquisition.memory import give_back_free_memory
 from services.acquisition.path_latency import add_latencies
+from services.acquisition.session import SessionCount
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.take import Take, check_free_space
 from services.acquisition.take_check import DeviceEvents, TakeWatch
@@ -111,6 +112,7 @@ class Recorder:
         self._lock = threading.RLock()
         self._state: RecorderState = "idle"
         self._discarded_id: str | None = None
+        self._session = SessionCount(spool_root)
         self._arm(None)
 
     def status(self) -> RecorderStatus:
@@ -129,6 +131,7 @@ class Recorder:
                 else {},
                 problems=self._problems(),
                 check=self._check,
+                session=self._session.now,
             )
 
     def arm(self, prompt: TakePrompt) -> RecorderStatus:
@@ -175,6 +178,12 @@ class Recorder:
             if again and self._state == "armed":
                 return self.status()
             return self._act("rerecord", recording_id, self._rerecord)
+
+    def begin_session(self) -> RecorderStatus:
+        """Count saved takes from zero again; what was saved stays."""
+        with self._lock:
+            self._session.begin()
+            return self.status()
 
     def close(self) -> None:
         """Give the files back; an unsaved take stays in the spool for the next start."""
@@ -271,6 +280,8 @@ class Recorder:
         spool.close()
         self._saved_as = how.success
         logger.info("save_take", recording_id=spool.attributes.recording_id)
+        if self._prompt is not None:
+            self._session.add(self._prompt, spool.attributes.recording_id)
         give_back_free_memory()
 
     def _discard(self) -> None:

@@ -79,6 +79,11 @@ def recorder_router(station: Station) -> APIRouter:
         """Throw the take away and arm the same prompt again."""
         return await run_in_threadpool(recorder.rerecord, take.recording_id if take else None)
 
+    @router.post("/session")
+    async def session() -> RecorderStatus:
+        """Begin a session: the count of saved takes starts at zero."""
+        return await run_in_threadpool(recorder.begin_session)
+
     return router
 
 
@@ -161,6 +166,11 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
     async def uploads(refused: Annotated[bool, Query()] = False) -> list[UploadStatus]:  # noqa: FBT002 - a query's flag
         """Saved takes and whether the store has them; with `refused`, those alone it refused."""
         return await run_in_threadpool(uploader.status, only_refused=refused)
+
+    @router.get("/uploads/{recording_id}")
+    async def upload(recording_id: StoreId) -> UploadStatus:
+        """One saved take and whether the store has it."""
+        return await run_in_threadpool(uploader.status_of, recording_id)
 
     @router.post("/uploads/{recording_id}/retry")
     async def retry(recording_id: StoreId) -> UploadStatus:

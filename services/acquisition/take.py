@@ -10,7 +10,7 @@ import structlog
 from dextouch.episodes import disk_errors, is_keyframe
 from dextouch.episodes.spool import LOG_FILE, SpoolWriter
 from dextouch.errors import StorageError, StorageFullError
-from dextouch.schemas import TakeCheck
+from dextouch.schemas import TakeCause, TakeCheck
 from dextouch.streams import H264_UNIT, EncodedBatch, Sample, SampleBatch
 from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.drivers.base import Readings
@@ -112,7 +112,11 @@ class Take:
                 self.spool.flush()
             except StorageError as error:
                 self._failure = error.message
-        return self.watch.check()
+        check = self.watch.check()
+        if self._failure is None:
+            return check
+        cause = TakeCause(message=self._failure, advice="Free space on the disk of the spool.")
+        return check.model_copy(update={"cause": cause})
 
     def release(self) -> None:
         """Give threads and files back; what was spooled stays as it is."""

@@ -5,11 +5,18 @@ warnings to the check, entries to the ledger and figures to the quality.
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from dextouch.schemas import LedgerEntry, StreamTake, TakeCheck, TakeProblem
+from dextouch.schemas import (
+    HealthCause,
+    LedgerEntry,
+    StreamTake,
+    TakeCause,
+    TakeCheck,
+    TakeProblem,
+)
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_TAXELS
 from services.acquisition.clock import HostWatch, StationClock
@@ -17,6 +24,7 @@ from services.acquisition.drivers.base import Driver
 from services.acquisition.glove_record import is_ours
 from services.acquisition.health import CODES, HealthMonitor, count_taxels
 from services.acquisition.supervisor import StreamCounters
+from services.acquisition.take_cause import IN_THE_CHECK, SUSPENDED, root_cause
 
 # A take may lose more than a running station before it is not worth keeping.
 LOSS_ERROR = 0.05
@@ -27,17 +35,6 @@ MAX_GAP_OTHERS_S = 0.2
 # What stands in the take's quality in a form of its own (`_rate_hz`), or counts from the
 # station's start.
 OTHER_FIGURES = {"rate_hz", "clock_offset_seconds", "clock_resets"}
-# What the check of the take says in its own words, by the code that it has there.
-IN_THE_CHECK: dict[str, tuple[str, ...]] = {
-    "silent": ("gap", "missing_stream"),
-    "unplugged": ("gap", "missing_stream"),
-    "gap": ("gap", "missing_stream"),
-    "rate": ("rate", "missing_stream"),
-    "loss": ("loss",),
-    "taxels_dead": ("dead_taxels",),
-    "taxels_stuck": ("stuck_taxels",),
-    "taxels_saturated": ("saturated_taxels",),
-}
 DeviceEvents = Mapping[str, Mapping[str, int]]
 
 
@@ -143,11 +140,20 @@ class TakeFindings:
         self._first_ns = {key: t_host_ns for key in standing if key in self._before}
         self._counts = Counter(self._first_ns.keys())
         self._worst: dict[str, float] = {}
+        self._causes: dict[tuple[str, str], HealthCause] = {}
+        self._simulated: set[str] = set()
 
     def look(self) -> None:
-        """Update the worst value of each figure; called repeatedly during the take."""
+        """Update causes and the worst of each figure; called repeatedly during the take."""
         health = self._health  # Another thread may end the take meanwhile.
-        for stream in health.report().streams if health else ():
+        if health is None:
+            return
+        report = health.report()
+        self._causes |= {(cause.code, cause.subject): cause for cause in report.causes}
+        simulated = {device.device for device in report.devices if device.simulated}
+        for stream in report.streams:
+            if stream.device in simulated:
+                self._simulated.add(stream.stream)
             for figure, value in stream.figures.items():
                 name = f"{stream.stream}_worst_{figure}"
                 if figure not in OTHER_FIGURES and abs(value) >= abs(self._worst.get(name, 0.0)):
@@ -180,6 +186,10 @@ class TakeFindings:
     def quality(self) -> dict[str, float]:
         """The worst of each figure of health during the take, as `STREAM_worst_FIGURE`."""
         return dict(self._worst)
+
+    def cause(self, problems: Sequence[TakeProblem]) -> TakeCause | None:
+        """Root cause of the gravest problem, by the causes that health named during the take."""
+        return root_cause(problems, tuple(self._causes.values()), self._simulated)
 
     def problems(
         self, streams: Collection[str], known: Collection[TakeProblem]
@@ -288,11 +298,16 @@ class TakeWatch:
             )
             for fact in self._facts
         )
+        problems = (*own, *self._findings.problems(self.streams, own))
+        cause = self._findings.cause(problems)
+        if self._host.events["host_suspended"]:
+            cause = TakeCause(message=self.host_problems()[0], advice=SUSPENDED)
         return TakeCheck(
             complete=all(problem.level != "ERROR" for problem in own),
             duration_s=self.duration_s,
             streams=streams,
-            problems=(*own, *self._findings.problems(self.streams, own)),
+            problems=problems,
+            cause=cause,
         )
 
     def ledger(self) -> tuple[LedgerEntry, ...]:

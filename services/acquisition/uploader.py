@@ -118,6 +118,19 @@ class Uploader:
             found.append(self._status(path, damage))
         return found
 
+    def status_of(self, recording_id: str) -> UploadStatus:
+        """One saved take.
+
+        Raises:
+            NotFoundError: no such take in the spool; uploaded ones may have been removed from it.
+        """
+        path = self._spool_root / recording_id
+        if not (path / RECORDING_FILE).is_file():
+            raise NotFoundError(
+                f"take {recording_id!r}: not in the spool; see GET /v1/uploads for those that are"
+            )
+        return self._status(path, None)
+
     def retry(self, recording_id: str) -> UploadStatus:
         """Send a quarantined take again.
 

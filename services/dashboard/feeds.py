@@ -38,6 +38,7 @@ from services.dashboard.station_view import (
     recorder_view,
     station_view,
 )
+from services.dashboard.take_state import TakeStateView, last_take
 from services.dashboard.upstream import Upstream
 
 logger = structlog.get_logger(__name__)
@@ -50,7 +51,7 @@ TREND_PERIOD_S = 2.0
 NUM_TAKES = 6
 OUTCOMES = {True: "success", False: "failure", None: "not judged"}
 # Of the station's recorder, which checks their bodies.
-ACTIONS = ("arm", "record", "stop", "save", "discard", "rerecord")
+ACTIONS = ("arm", "record", "stop", "save", "discard", "rerecord", "session")
 # Of the taxel maps.
 FULL_SCALE_KPA = 40.0
 RAMP_STEPS = 128
@@ -157,6 +158,7 @@ class Feeds:
             Topic.of_json("cameras", settings.station_period_s, self._cameras),
             Topic.of_json("services", settings.list_period_s, self.services),
             Topic.of_json("takes", settings.list_period_s, self.takes),
+            Topic.of_json("last_take", settings.list_period_s, self._last_take),
         ]
         self.topics = {topic.name: topic for topic in topics}
 
@@ -213,6 +215,13 @@ class Feeds:
         """The newest recordings and episodes, and takes that the store refused."""
         stored, refused = await asyncio.gather(self._stored(), self._refused())
         return stored.model_copy(update={"refused": refused})
+
+    async def _last_take(self) -> TakeStateView | None:
+        try:
+            acquisition = self.upstream("acquisition")
+            return await last_take(acquisition, self._upstreams.get("alignment"))
+        except DexTouchError:
+            return None  # reported by the station topic
 
     async def _refused(self) -> tuple[UploadStatus, ...]:
         try:

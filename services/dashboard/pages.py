@@ -19,6 +19,7 @@ from dextouch.errors import AccessDeniedError, DexTouchError
 from dextouch.schemas import status_of
 from dextouch.serving import FORM, KIB, AccessControl, not_signed_in, takes
 from services.dashboard.settings import DashboardSettings
+from services.dashboard.tasks import TaskChoice, load_tasks
 
 COOKIE = "dextouch_session"
 SCOPE = "operate"
@@ -120,8 +121,10 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
     """Router of the HTML pages."""
     router = APIRouter(include_in_schema=False)
     page = partial(_page, settings.station)
+    tasks = load_tasks(settings.task_file)
     for screen in SCREENS:
-        router.add_api_route(screen.path, _shown(screen, settings, sessions), methods=["GET"])
+        show = _shown(screen, settings, sessions, tasks)
+        router.add_api_route(screen.path, show, methods=["GET"])
 
     @router.post("/sign_in")
     @takes({FORM: 4 * KIB}, needs_key=False)
@@ -155,7 +158,10 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
 
 
 def _shown(
-    screen: Screen, settings: DashboardSettings, sessions: Sessions
+    screen: Screen,
+    settings: DashboardSettings,
+    sessions: Sessions,
+    tasks: tuple[TaskChoice, ...],
 ) -> Callable[[Request], Awaitable[Response]]:
     """Route of a screen; browsers that are not signed in get the sign-in in its place."""
 
@@ -168,7 +174,7 @@ def _shown(
             screen.template,
             screen=screen,
             screens=[one for one in SCREENS if not one.within],
-            tasks=settings.tasks,
+            tasks=tasks,
             settings=settings,
             goals=json.dumps(settings.goal_hours),
             signed_in=sessions.needs_key,

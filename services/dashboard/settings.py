@@ -1,5 +1,6 @@
 """Settings of the dashboard, from flags and DEXTOUCH_DASHBOARD_… variables."""
 
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field, FiniteFloat, SecretStr
@@ -21,10 +22,16 @@ class DashboardSettings(ServiceSettings):
     station: str = Field(
         default="station", min_length=1, max_length=64, description="name of the station"
     )
-    tasks: tuple[str, ...] = Field(
-        default=("stand_bottle", "stack_bowls"),
-        min_length=1,
-        description="tasks that the operator may choose",
+    task_file: Path | None = Field(
+        default=None,
+        description="TOML file of the tasks that the recorder offers, see docs/dashboard.md "
+        "(default: those of the twin)",
+    )
+    takes_goal: int = Field(
+        default=0, ge=0, le=1_000_000, description="takes of a task per session; 0: no goal"
+    )
+    reset_s: float = Field(
+        default=0.0, ge=0, le=3600, description="seconds to reset the scene after a saved take"
     )
     acquisition_url: str | None = Field(
         default=None, description="URL of the station; services without a URL are not shown"

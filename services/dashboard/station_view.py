@@ -7,6 +7,7 @@ from dextouch.schemas import (
     DeviceHealth,
     HealthCause,
     HealthLevel,
+    RecorderSession,
     RecorderStatus,
     StationHealth,
     StreamHealth,
@@ -63,7 +64,8 @@ class HostView(FrozenModel):
 class RecorderView(FrozenModel):
     """State of the recorder and its available actions.
 
-    `note` summarizes the check of the take, `problems` lists its findings, worst first.
+    `cause` is the root cause of the worst problem of the ended take and `advice` what to do about
+    it; `problems` lists all findings, worst first.
     """
 
     state: str
@@ -73,8 +75,10 @@ class RecorderView(FrozenModel):
     elapsed_s: float | None = None
     level: HealthLevel = "OK"
     complete: bool = True
-    note: str = ""
+    cause: str = ""
+    advice: str = ""
     problems: tuple[str, ...] = ()
+    session: RecorderSession | None = None
 
 
 class StationView(FrozenModel):
@@ -120,11 +124,7 @@ def recorder_view(recorder: RecorderStatus) -> RecorderView:
     own = [message for message in recorder.problems if message not in checked]
     problems = tuple(dict.fromkeys([*own, *checked]))
     complete = check is None or check.complete
-    words = [recorder.recording_id] if recorder.recording_id else []
-    if check is not None:
-        words.append("complete" if complete else "incomplete")
-    if problems:
-        words.append("1 finding" if len(problems) == 1 else f"{len(problems)} findings")
+    cause = check.cause if check else None
     level: HealthLevel = "WARN" if complete else "ERROR"
     return RecorderView(
         state=recorder.state,
@@ -134,8 +134,10 @@ def recorder_view(recorder: RecorderStatus) -> RecorderView:
         elapsed_s=recorder.duration_s,
         level=level if problems else "OK",
         complete=complete,
-        note=" · ".join(words),
+        cause=cause.message if cause else next(iter(problems), ""),
+        advice=cause.advice if cause else "",
         problems=problems,
+        session=recorder.session,
     )
 
 

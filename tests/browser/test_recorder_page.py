@@ -60,8 +60,10 @@ def record(page):
 
 
 def fill(page, **fields):
-    for label, text in fields.items():
-        page.get_by_label(label.capitalize()).fill(text)
+    for name, text in fields.items():
+        if name == "instruction":
+            page.locator("#instruction_choice").select_option("")
+        page.locator(f"#{name}").fill(text)
 
 
 def test_the_outcome_is_asked_at_every_take(page, address, spool):
@@ -133,11 +135,11 @@ def test_keys_work_again_after_typing(page, address):
     expect(state(page)).to_have_text("armed")
     page.get_by_label("Domain").focus()
     page.keyboard.press("Escape")
-    page.get_by_label("Instruction").focus()
+    page.locator("#instruction").focus()
     page.keyboard.press("Enter")
     page.keyboard.press("r")
     expect(state(page)).to_have_text("recording")
-    expect(page.get_by_label("Instruction")).to_have_value("Stack the bowls")
+    expect(page.locator("#instruction")).to_have_value("Stack the bowls")
     # The question outlives the news that come five times a second.
     page.keyboard.press("d")
     expect(message(page)).to_contain_text("Discard this take?")
@@ -154,7 +156,7 @@ def test_a_page_that_is_loaded_anew_shows_what_is_armed(page, address):
     expect(state(page)).to_have_text("armed")
     page.reload()
     expect(state(page)).to_have_text("armed")
-    expect(page.get_by_label("Instruction")).to_have_value("Stack the bowls")
+    expect(page.locator("#instruction")).to_have_value("Stack the bowls")
     expect(page.get_by_label("Operator")).to_have_value("p7")
     expect(page.get_by_label("Consent given")).not_to_be_checked()
     expect(page.get_by_role("button", name="Record")).to_be_enabled()
@@ -186,6 +188,9 @@ def test_a_refused_take_is_shown_and_sent_again(page, serve, serve_station, spoo
     waiting.get_by_role("button", name="Send again").click()
     expect(waiting).to_contain_text("unknown task, said 6 times")
     assert (spool / take / "recording.json").exists()
+    last = page.locator("#last_take")
+    expect(last).to_contain_text(f"{take} · refused by the store")
+    expect(last).to_contain_text("unknown task, said 6 times")
 
 
 def test_no_store_is_said(page, address):

@@ -102,7 +102,7 @@ def test_a_button_of_a_session_that_ended_goes_to_the_sign_in(page, serve, serve
     page.goto(serve(app))
     sign_in(page, KEY)
     expect(page.locator("#recorder_state")).to_have_text("idle")
-    page.get_by_label("Instruction").fill("stand the bottle")
+    page.locator("#operator").fill("p7")
     app.state.sessions._ends_s.clear()
     page.get_by_role("button", name="Arm").click()
     expect(page.get_by_label("Key")).to_be_visible()

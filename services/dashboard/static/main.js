@@ -26,7 +26,7 @@ function showStation(station) {
   setText(overall, station.level);
   setText(find("summary"), station.summary);
   devices.show(station);
-  recorder.show(station.recorder);
+  recorder.show(station.recorder, station.level);
 }
 
 const topics = {
@@ -37,6 +37,7 @@ const topics = {
     showTakes(find("take_rows"), takes);
     showRefused(find("refused_list"), takes.refused);
   },
+  last_take: (take) => recorder.showLast(take),
   cameras: (cameras) => showCameras(find("cameras"), find("camera_row"), cameras),
   taxels_lost: (reason) => Object.values(hands).forEach((hand) => hand.clear(reason)),
 };
@@ -51,16 +52,17 @@ const link = new LiveLink({
     setText(find("link"), connected ? "live" : "dashboard not reachable, trying again");
     if (!connected) {
       showStation({ level: "STALE", summary: "", note: "No link to the dashboard: what you see is old.", note_level: "ERROR", reachable: false,
-        host: null, causes: [], streams: [], recorder: { state: "unknown", actions: [], elapsed_s: null, note: "", problems: [], level: "STALE" } });
+        host: null, causes: [], streams: [], recorder: { state: "unknown", actions: [], elapsed_s: null, problems: [], level: "STALE" } });
       Object.values(hands).forEach((hand) => hand.clear("no link"));
     }
   },
 });
 
-// Station state is wanted wherever the page is scrolled; the camera panel is hidden until one exists.
+// State of station and last take is wanted wherever the page is scrolled; the camera panel is hidden until one exists.
 link.show("station", true);
 link.show("trends", true);
 link.show("cameras", true);
+link.show("last_take", true);
 const observer = new IntersectionObserver((entries) => {
   for (const entry of entries) link.show(entry.target.dataset.view, entry.isIntersecting);
 });

@@ -104,14 +104,17 @@ if TYPE_CHECKING:
     from dextouch.schemas.station import HealthLevel as HealthLevel
     from dextouch.schemas.station import RaisedFinding as RaisedFinding
     from dextouch.schemas.station import RecorderAction as RecorderAction
+    from dextouch.schemas.station import RecorderSession as RecorderSession
     from dextouch.schemas.station import RecorderState as RecorderState
     from dextouch.schemas.station import RecorderStatus as RecorderStatus
+    from dextouch.schemas.station import SavedTakes as SavedTakes
     from dextouch.schemas.station import SaveTake as SaveTake
     from dextouch.schemas.station import SharedLink as SharedLink
     from dextouch.schemas.station import StaleCode as StaleCode
     from dextouch.schemas.station import StationHealth as StationHealth
     from dextouch.schemas.station import StreamHealth as StreamHealth
     from dextouch.schemas.station import StreamTake as StreamTake
+    from dextouch.schemas.station import TakeCause as TakeCause
     from dextouch.schemas.station import TakeCheck as TakeCheck
     from dextouch.schemas.station import TakeName as TakeName
     from dextouch.schemas.station import TakeProblem as TakeProblem

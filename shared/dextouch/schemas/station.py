@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import Field, FiniteFloat
+from pydantic import AwareDatetime, Field, FiniteFloat
 
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.episodes import Domain, StoreId
@@ -62,13 +62,40 @@ class StreamTake(FrozenModel):
     crc_errors: int
 
 
+class TakeCause(FrozenModel):
+    """Root cause of the gravest problem of a take, and what to do about it."""
+
+    message: str
+    advice: str
+
+
 class TakeCheck(FrozenModel):
-    """Whether a take is complete, found right after its end."""
+    """Whether a take is complete, found right after its end; `cause` is None without problems."""
 
     complete: bool
     duration_s: float
     streams: tuple[StreamTake, ...]
     problems: tuple[TakeProblem, ...]
+    cause: TakeCause | None = None
+
+
+class SavedTakes(FrozenModel):
+    """Number of takes of one task and operator that were saved in a session."""
+
+    task: str
+    operator: str | None = None
+    num_saved: int = Field(ge=1)
+
+
+class RecorderSession(FrozenModel):
+    """Takes saved since an operator began a session; it outlives the station's process.
+
+    `last_saved` is the id of the newest saved take, also of an earlier session.
+    """
+
+    started_at: AwareDatetime
+    saved: tuple[SavedTakes, ...] = ()
+    last_saved: str | None = None
 
 
 class RecorderStatus(FrozenModel):
@@ -82,6 +109,7 @@ class RecorderStatus(FrozenModel):
     num_samples: dict[str, int] = Field(default_factory=dict)
     problems: tuple[str, ...] = ()
     check: TakeCheck | None = None
+    session: RecorderSession | None = None
 
 
 class CameraLive(FrozenModel):

@@ -214,3 +214,34 @@ def test_an_old_take_is_free_at_once_and_waits_for_no_collector(recorder, clock)
         assert take() is None
     finally:
         gc.enable()
+
+
+def counts(recorder):
+    session = recorder.status().session
+    return {(s.task, s.operator): s.num_saved for s in session.saved}, session.last_saved
+
+
+def test_saved_takes_are_counted_and_the_count_outlives_the_process(recorder, clock, tmp_path):
+    for operator, recording_id in (("p7", "a"), ("p7", "b"), ("p8", "c")):
+        recorder.arm(PROMPT.model_copy(update={"operator": operator}))
+        for keep in (False, True):
+            recorder.record(recording_id)
+            recorder.stop()
+            if not keep:
+                recorder.rerecord()
+        recorder.save(SaveTake(recording_id=recording_id, accept_incomplete=True))
+        recorder.save(SaveTake(recording_id=recording_id, accept_incomplete=True))
+    expected = {("stand_bottle", "p7"): 2, ("stand_bottle", "p8"): 1}, "c"
+    assert counts(recorder) == expected
+    again = Recorder(station="test", spool_root=tmp_path, drivers=(), clock=clock, calibration={})
+    assert counts(again) == expected
+    again.begin_session()
+    assert counts(again) == ({}, "c")
+    again = Recorder(station="test", spool_root=tmp_path, drivers=(), clock=clock, calibration={})
+    assert counts(again) == ({}, "c")
+
+
+def test_a_damaged_count_starts_anew(recorder, clock, tmp_path):
+    (tmp_path / "session.json").write_text("{")
+    again = Recorder(station="test", spool_root=tmp_path, drivers=(), clock=clock, calibration={})
+    assert counts(again) == ({}, None)

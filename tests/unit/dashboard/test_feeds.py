@@ -110,7 +110,8 @@ async def test_incomplete_take_is_shown(feeds, services):
     }
     recorder = (await feeds.station()).recorder
     assert (recorder.complete, recorder.level, recorder.elapsed_s) == (False, "ERROR", 5.5)
-    assert recorder.note == "take-7 · incomplete · 1 finding"
+    # Without a cause from the station, its worst finding stands in.
+    assert (recorder.cause, recorder.advice) == ("head: 0.4 s gap", "")
     assert (recorder.recording_id, recorder.problems) == ("take-7", ("head: 0.4 s gap",))
 
 
@@ -124,10 +125,11 @@ async def test_the_worst_of_a_take_leads(feeds, services):
         "recording_id": "take-7",
         # The check's findings are repeated here, after what the recorder says itself.
         "problems": ["the disk is full", *levels],
-        "check": {"complete": False, "duration_s": 5.5, "streams": [], "problems": problems},
+        "check": {"complete": False, "duration_s": 5.5, "streams": [], "problems": problems}
+        | {"cause": {"message": "hub 1: nothing comes", "advice": "Plug it in again."}},
     }
     recorder = (await feeds.station()).recorder
-    assert recorder.note == "take-7 · incomplete · 4 findings"
+    assert (recorder.cause, recorder.advice) == ("hub 1: nothing comes", "Plug it in again.")
     assert recorder.problems == (
         "the disk is full",
         "head: 0.4 s gap",
@@ -233,7 +235,9 @@ async def test_refusal_keeps_its_class(feeds):
 
 
 async def test_unknown_action(feeds):
-    with pytest.raises(UnknownNameError, match="valid: arm, discard, record, rerecord, save, stop"):
+    with pytest.raises(
+        UnknownNameError, match="valid: arm, discard, record, rerecord, save, session, stop"
+    ):
         await feeds.operate("../health", {})
 
 

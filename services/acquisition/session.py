@@ -1,0 +1,64 @@
+"""Count of the takes that were saved in an operator's session, kept in the spool."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import structlog
+from pydantic import ValidationError
+
+from dextouch.episodes import disk_errors, replace_file
+from dextouch.errors import StorageError
+from dextouch.schemas import RecorderSession, SavedTakes, TakePrompt
+
+logger = structlog.get_logger(__name__)
+
+SESSION_FILE: Final = "session.json"
+
+
+class SessionCount:
+    """The present session; counts survive a restart and the deletion of uploaded takes.
+
+    A session that cannot be written is counted in memory: a take that is saved must stay saved.
+
+    Args:
+        spool_root: folder of the takes.
+    """
+
+    def __init__(self, spool_root: Path) -> None:
+        self._path = spool_root / SESSION_FILE
+        self.now = self._read() or RecorderSession(started_at=datetime.now(UTC))
+
+    def begin(self) -> None:
+        """Begin a new session, in which nothing was saved yet."""
+        last_saved = self.now.last_saved
+        self._write(RecorderSession(started_at=datetime.now(UTC), last_saved=last_saved))
+
+    def add(self, prompt: TakePrompt, recording_id: str) -> None:
+        """Count a saved take."""
+        key = (prompt.task, prompt.operator)
+        counts = {(item.task, item.operator): item.num_saved for item in self.now.saved}
+        counts[key] = counts.get(key, 0) + 1
+        saved = tuple(
+            SavedTakes(task=task, operator=operator, num_saved=count)
+            for (task, operator), count in counts.items()
+        )
+        self._write(self.now.model_copy(update={"saved": saved, "last_saved": recording_id}))
+
+    def _write(self, session: RecorderSession) -> None:
+        self.now = session
+        try:
+            with disk_errors(f"write {self._path.name}"):
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                replace_file(self._path, session.model_dump_json().encode())
+        except StorageError as error:
+            logger.warning("fail_session_count", error=error.message)
+
+    def _read(self) -> RecorderSession | None:
+        try:
+            return RecorderSession.model_validate_json(self._path.read_bytes())
+        except FileNotFoundError:
+            return None
+        except (OSError, ValidationError) as error:
+            logger.warning("fail_session_count", error=str(error))
+            return None

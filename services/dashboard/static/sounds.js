@@ -1,0 +1,59 @@
+// Sounds of the recorder, made by oscillators; off until the operator switches them on in this browser.
+
+// Frequency in Hz, start and length in s, and the form of the wave.
+const TONES = {
+  start: [[660, 0, 0.11, "sine"], [990, 0.12, 0.2, "sine"]],
+  stop: [[880, 0, 0.11, "sine"], [440, 0.12, 0.22, "sine"]],
+  saved: [[523, 0, 0.1, "sine"], [659, 0.1, 0.1, "sine"], [784, 0.2, 0.24, "sine"]],
+  problem: [[185, 0, 0.2, "square"], [185, 0.28, 0.34, "square"]],
+};
+const VOLUME = 0.25;
+const RAMP_S = 0.012;
+
+export class Sounds {
+  constructor(button) {
+    this.button = button;
+    this.isOn = localStorage.getItem("sounds") === "on";
+    this.context = null;
+    button.addEventListener("click", () => this.toggle());
+    // Browsers stay silent until the page was used once.
+    for (const kind of ["keydown", "pointerdown"]) document.addEventListener(kind, () => this.wake(), { capture: true });
+    this.show();
+  }
+
+  toggle() {
+    this.isOn = !this.isOn;
+    localStorage.setItem("sounds", this.isOn ? "on" : "off");
+    this.show();
+    this.wake();
+    this.play("saved");
+  }
+
+  show() {
+    this.button.textContent = `Sounds: ${this.isOn ? "on" : "off"}`;
+    this.button.setAttribute("aria-pressed", String(this.isOn));
+  }
+
+  wake() {
+    if (!this.isOn) return;
+    this.context ??= new AudioContext();
+    if (this.context.state === "suspended") this.context.resume();
+  }
+
+  play(name) {
+    if (!this.isOn || !this.context) return;
+    const now_s = this.context.currentTime;
+    for (const [frequency_hz, start_s, length_s, form] of TONES[name]) {
+      const oscillator = new OscillatorNode(this.context, { frequency: frequency_hz, type: form });
+      const gain = new GainNode(this.context, { gain: 0 });
+      const [begin_s, end_s] = [now_s + start_s, now_s + start_s + length_s];
+      gain.gain.setValueAtTime(0, begin_s);
+      gain.gain.linearRampToValueAtTime(VOLUME, begin_s + RAMP_S);
+      gain.gain.setValueAtTime(VOLUME, end_s - RAMP_S);
+      gain.gain.linearRampToValueAtTime(0, end_s);
+      oscillator.connect(gain).connect(this.context.destination);
+      oscillator.start(begin_s);
+      oscillator.stop(end_s);
+    }
+  }
+}

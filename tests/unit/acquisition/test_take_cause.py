@@ -1,0 +1,54 @@
+"""The root cause of an ended take: one sentence, one advice, for its gravest problem."""
+
+from dextouch.schemas import HealthCause, TakeProblem
+from services.acquisition.take_cause import root_cause
+
+HUB = HealthCause(
+    code="hub",
+    subject="1-2",
+    level="STALE",
+    message="USB hub 1-2: nothing comes from head, wrist",
+    advice="Plug the hub in again.",
+    lasted_s=2.0,
+    streams=("head", "wrist"),
+    findings=("unplugged",),
+)
+
+
+def problem(stream, code, level="ERROR"):
+    return TakeProblem(stream=stream, code=code, level=level, message=f"{stream}: {code}")
+
+
+def test_no_problem_has_no_cause():
+    assert root_cause((), (HUB,)) is None
+
+
+def test_what_health_saw_explains_the_gravest_problem():
+    problems = (problem("glove", "loss", "WARN"), problem("wrist", "gap"))
+    cause = root_cause(problems, (HUB,))
+    assert (cause.message, cause.advice) == (HUB.message, HUB.advice)
+
+
+def test_a_cause_of_something_else_explains_nothing():
+    jitter = HUB.model_copy(update={"findings": ("jitter",)})
+    elsewhere = HUB.model_copy(update={"streams": ("camera",)})
+    cause = root_cause((problem("wrist", "gap"),), (jitter, elsewhere))
+    assert cause.message == "wrist: gap"
+
+
+def test_errors_lead_and_a_missing_stream_leads_them():
+    problems = (
+        problem("camera", "image_blurred", "WARN"),
+        problem("head", "gap"),
+        problem("wrist", "missing_stream"),
+        problem("glove", "missing_stream"),
+    )
+    cause = root_cause(problems, ())
+    assert cause.message == "wrist: missing_stream (and in 1 other stream)"
+    # The advice of docs/health.md for a device from which nothing comes.
+    assert cause.advice.startswith("Power-cycle the device")
+
+
+def test_nothing_is_to_plug_on_a_simulated_device():
+    cause = root_cause((problem("head", "missing_stream"),), (), simulated={"head"})
+    assert "simulated" in cause.advice
