@@ -49,6 +49,10 @@ def _mock_station(settings: AcquisitionSettings) -> "MockStation":
 
         episode = EpisodeStore(settings.mock_store).open(settings.mock_episode_id)
         streams, known = replay_streams(episode), {**known, **replay_calibration(episode)}
+    elif settings.mock_practice:
+        from services.acquisition.mocks.practice import practice_streams
+
+        streams, known = practice_streams(settings.seed), {}
     is_disturbed = settings.mock_faults == "first_light"
     return MockStation(
         streams,

@@ -57,6 +57,11 @@ class AcquisitionSettings(ServiceSettings, SpoolSafety):
     mock_faults: Literal["none", "first_light"] = Field(
         default="none", description="first_light: losses, delays and drifts of an ordinary station"
     )
+    mock_practice: bool = Field(
+        default=False,
+        description="to practise calibration: a moving board before the mock head camera, gloves "
+        "at rest",
+    )
     mock_links: MockLinks = MockLinks()
     seed: int = Field(default=0, ge=0, description="random seed of mock devices")
     devices: tuple[ChosenDevice, ...] = Field(

@@ -21,6 +21,8 @@ from services.alignment.schemas import (
     JobState,
 )
 from services.alignment.settings import AlignmentSettings
+from services.alignment.station_calibration.routes import calibration_router
+from services.alignment.station_calibration.runs import CalibrationRuns, StationPlace
 
 SCOPE = "align"
 PAGE = 100
@@ -30,6 +32,16 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
     """Create the service, which reads recordings from a store and writes episodes to it."""
     store = EpisodeStore(settings.store_url)
     jobs = JobRunner(store, settings)
+    key = settings.station_key
+    runs = CalibrationRuns(
+        StationPlace(
+            url=settings.station_url,
+            key=None if key is None else key.get_secret_value(),
+            folder=settings.calibration_folder,
+            spool=settings.station_spool,
+            store_url=settings.store_url,
+        )
+    )
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -44,6 +56,7 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
             if watch is not None:
                 watch.cancel()
                 await asyncio.gather(watch, return_exceptions=True)
+            await asyncio.to_thread(runs.close)
             await jobs.close()
 
     async def readiness() -> Sequence[str]:
@@ -52,7 +65,7 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
     app = create_service_app(
         name="alignment",
         settings=settings,
-        routers=[alignments_router(jobs)],
+        routers=[alignments_router(jobs), calibration_router(runs)],
         lifespan=lifespan,
         readiness=readiness,
     )

@@ -3,9 +3,9 @@
 import os
 from pathlib import Path
 
-from pydantic import Field
+from pydantic import Field, SecretStr
 
-from dextouch.data_folder import default_store
+from dextouch.data_folder import data_folder, default_spool, default_store
 from dextouch.serving import ServiceSettings, service_config
 from services.alignment.options import AlignmentOptions
 
@@ -57,6 +57,20 @@ class AlignmentSettings(ServiceSettings):
         gt=0,
         le=3600,
         description="seconds between listings of the store (default: 2; 30 for a bucket)",
+    )
+
+    station_url: str | None = Field(
+        default=None, description="URL of the station whose devices are calibrated over HTTP"
+    )
+    station_key: SecretStr | None = Field(default=None, description="bearer key of the station")
+    station_spool: Path = Field(
+        default_factory=default_spool,
+        description="spool of the station; calibration takes that are not there are read from the "
+        "store",
+    )
+    calibration_folder: Path = Field(
+        default_factory=lambda: data_folder() / "calibration",
+        description="folder of the station's calibration",
     )
 
     @property

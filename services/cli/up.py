@@ -162,7 +162,7 @@ def _episode_store(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
     return create_app(EpisodeStoreSettings(store_url=settings.store_url))
 
 
-def _alignment(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
+def _alignment(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
     from services.alignment.app import create_app
     from services.alignment.settings import AlignmentSettings
 
@@ -170,6 +170,9 @@ def _alignment(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
         AlignmentSettings(
             store_url=settings.store_url,
             align_new=settings.align_new,
+            station_url=urls["acquisition"],
+            station_spool=settings.data / "spool",
+            calibration_folder=settings.data / "calibration",
             log_level=settings.log_level,
         )
     )
@@ -196,6 +199,9 @@ def _station(settings: UpSettings, **given: object) -> "AcquisitionSettings":
             "up: got --no-mock and no devices, expected them in DEXTOUCH_ACQUISITION_DEVICES "
             "(docs/stations.md)"
         )
+    calibrated = settings.data / "calibration" / "calibration.json"
+    if not station.mock and station.calibration is None and calibrated.is_file():
+        return station.model_copy(update={"calibration": calibrated})
     return station
 
 

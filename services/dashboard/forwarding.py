@@ -54,6 +54,13 @@ FORWARDED: Final = (
     Forwarded("alignment", "/alignments", "POST"),
     Forwarded("alignment", "/alignments/{alignment_id}"),
     Forwarded("alignment", "/alignments/{alignment_id}/cancel", "POST"),
+    Forwarded("alignment", "/calibration"),
+    Forwarded("alignment", "/calibration/run"),
+    Forwarded("alignment", "/calibration/run/image"),
+    Forwarded("alignment", "/calibration/runs", "POST"),
+    Forwarded("alignment", "/calibration/run/answer", "POST"),
+    Forwarded("alignment", "/calibration/run/finish", "POST"),
+    Forwarded("alignment", "/calibration/run/cancel", "POST"),
 )
 
 

@@ -60,6 +60,7 @@ SCREENS: Final = (
     Screen("/episodes", "episodes.html", "Episodes"),
     Screen("/review", "review.html", "Review"),
     Screen("/hours", "hours.html", "Hours"),
+    Screen("/calibration", "calibration.html", "Calibration"),
 )
 
 

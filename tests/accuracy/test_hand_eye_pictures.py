@@ -15,9 +15,9 @@ from services.acquisition.devices import load_calibration
 from services.alignment.calibration.hand_eye import project
 from services.alignment.calibration.intrinsics import edge_width_px
 from services.alignment.calibration.motion import move
-from services.cli.calibrate.boards import find_board, parse_board
+from services.alignment.station_calibration.boards import find_board, parse_board
+from services.alignment.station_calibration.record import write_entry
 from services.cli.calibrate.command import main
-from services.cli.calibrate.record import write_entry
 from tests.unit.cli.rendered_boards import (
     CHARUCO,
     CHARUCO_K,

@@ -8,7 +8,7 @@ from typing import Any
 
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.data_folder import default_spool
-from services.cli.calibrate.boards import BOARD_HELP
+from services.alignment.station_calibration.boards import BOARD_HELP
 
 EXIT_LEVEL = 1
 
@@ -122,18 +122,46 @@ examples:
 
 # What each command measures, its longer help, and `module:function` that runs it.
 _COMMANDS = {
-    "camera": ("photos of a board → K and distortion of a camera", _CAMERA, "camera:calibrate"),
-    "hand-eye": ("photos and poses → camera on its tracker", _HAND_EYE, "mounts:calibrate_mount"),
-    "glove": ("rest and known pressures → tare, gain, faults", _GLOVE, "glove:calibrate"),
-    "wrist": ("flat hand → wrist axes of a glove's keypoints", _WRIST, "takes:measure_wrist"),
-    "profile": ("moving hand → the person's bones and knuckles", _PROFILE, "takes:measure_person"),
+    "camera": (
+        "photos of a board → K and distortion of a camera",
+        _CAMERA,
+        "cli.calibrate.camera:calibrate",
+    ),
+    "hand-eye": (
+        "photos and poses → camera on its tracker",
+        _HAND_EYE,
+        "cli.calibrate.mounts:calibrate_mount",
+    ),
+    "glove": (
+        "rest and known pressures → tare, gain, faults",
+        _GLOVE,
+        "alignment.station_calibration.glove:calibrate",
+    ),
+    "wrist": (
+        "flat hand → wrist axes of a glove's keypoints",
+        _WRIST,
+        "cli.calibrate.takes:measure_wrist",
+    ),
+    "profile": (
+        "moving hand → the person's bones and knuckles",
+        _PROFILE,
+        "cli.calibrate.takes:measure_person",
+    ),
     "robot-base": (
         "pairs of poses → the robot's base in the world",
         _ROBOT_BASE,
-        "mounts:calibrate_base",
+        "cli.calibrate.mounts:calibrate_base",
     ),
-    "latency": ("common motion or taps → path delay", _LATENCY, "takes:measure_latency"),
-    "show": ("contents, age and accuracy of a calibration", _SHOW, "show:show"),
+    "latency": (
+        "common motion or taps → path delay",
+        _LATENCY,
+        "cli.calibrate.takes:measure_latency",
+    ),
+    "show": (
+        "contents, age and accuracy of a calibration",
+        _SHOW,
+        "cli.calibrate.show:show",
+    ),
 }
 
 
@@ -145,7 +173,7 @@ def main(argv: Sequence[str]) -> int:
     """
     options = _parser().parse_args(list(argv))
     module, _, function = _COMMANDS[options.word][2].partition(":")
-    run = getattr(importlib.import_module(f"services.cli.calibrate.{module}"), function)
+    run = getattr(importlib.import_module(f"services.{module}"), function)
     report: dict[str, object] = run(options)
     write_result(options.json, report, allow_nan=False)
     return EXIT_LEVEL if report.get("level") == "ERROR" else 0

@@ -9,19 +9,23 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import invert
 from services.alignment.calibration.hand_eye import BoardViews, solve_hand_eye, solve_robot_base
-from services.cli.calibrate.boards import (
+from services.alignment.station_calibration.boards import (
     board_pose,
     is_ambiguous,
     parse_board,
     read_photos,
     turn_coverage,
 )
-from services.cli.calibrate.camera import read_lens
-from services.cli.calibrate.pictures import turns_picture
-from services.cli.calibrate.record import poses_of_photos, read_pairs, write_picture, write_pose
+from services.alignment.station_calibration.camera_views import read_lens
+from services.alignment.station_calibration.overview import TRACKERS
+from services.alignment.station_calibration.pictures import turns_picture
+from services.alignment.station_calibration.record import (
+    poses_of_photos,
+    read_pairs,
+    write_picture,
+    write_pose,
+)
 
-# Tracker of each camera, by the stream names of recordings.
-TRACKERS = {"head": "head", "wrist_left": "left", "wrist_right": "right"}
 POSES_HELP = (
     "CSV with the columns image,x_m,y_m,z_m,qw,qx,qy,qz (T_world_tracker), or without photos "
     "JSON: [[T_world_tracker, T_camera_board], …], each 4x4"

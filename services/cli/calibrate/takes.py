@@ -26,7 +26,7 @@ from services.alignment.retargeting.wrist_frame import (
     calibration_record,
     hand_axes_check,
 )
-from services.cli.calibrate.record import (
+from services.alignment.station_calibration.record import (
     MATRICES_FILE,
     TakenStream,
     read_matrices,

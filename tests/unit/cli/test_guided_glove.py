@@ -20,7 +20,7 @@ from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.recorder import Recorder
 from services.acquisition.station import LiveView
 from services.alignment.calibration.tactile_baseline import TactileCalibration
-from services.cli.calibrate import glove, glove_takes
+from services.alignment.station_calibration import glove, glove_takes
 from services.cli.calibrate.command import main
 
 TRUTH = GloveCalibration.seeded("left", 4)
@@ -122,7 +122,7 @@ def guide(bench, tmp_path, script, monkeypatch, **changed):
     given = options(tmp_path, **changed)
     leads = glove_takes.Guide(given, bench.request, ask=ask, wait=bench.wait)
     record = glove_takes.record_takes
-    monkeypatch.setattr(glove, "record_takes", lambda o: record(o, leads))
+    monkeypatch.setattr(glove, "record_takes", lambda o, _: record(o, leads))
     return glove.calibrate(given), asked
 
 
@@ -163,7 +163,7 @@ def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsy
     gain_error = found.gain_counts_per_kpa / TRUTH.gain_counts_per_kpa[found.cells] - 1
     assert np.abs(gain_error).max() < 0.02
     # The good takes are there, the dropped one too; the kept list repeats the calibration.
-    assert len(list((tmp_path / "spool").iterdir())) == 4
+    assert len(list((tmp_path / "spool").glob("*/"))) == 4
     rows = glove_takes.read_presses(tmp_path / "to/presses_left.csv", 0.02)
     assert [round(row.pressure_kpa, 2) for row in rows] == [10.0, 30.0]
     arguments = [
@@ -194,7 +194,8 @@ def test_a_glove_that_was_touched_rests_once_more(bench, tmp_path, monkeypatch, 
     assert rest.endswith("-2")
     assert "Once more: rest take" in capsys.readouterr().out
     # What was not good was thrown away.
-    assert [take.name for take in (tmp_path / "spool").iterdir()] == [rest.rsplit("/", 1)[-1]]
+    kept = [take.name for take in (tmp_path / "spool").glob("*/")]
+    assert kept == [rest.rsplit("/", 1)[-1]]
 
 
 def test_presses_that_do_not_hold_are_not_used(bench, tmp_path, capsys):

@@ -26,7 +26,7 @@ from services.alignment.calibration.tactile_gain import (
     pad_taxels,
 )
 from services.alignment.calibration.tactile_tare import TaxelTare, measure_tare
-from services.cli.calibrate.record import read_rows, read_stream
+from services.alignment.station_calibration.record import read_rows, read_stream
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 REST_S, PRESS_S, TICK_S = 10.0, 5.0, 0.1
@@ -47,6 +47,7 @@ _PRESS = re.compile(
 )
 
 Found = TypeVar("Found")
+Say = Callable[[str], None]
 
 
 class PressRow(BaseModel):
@@ -146,6 +147,7 @@ class Guide:
         options: of the command.
         request: sends a request to the station, as `HttpLink.request`.
         ask: puts a question to the operator.
+        say: tells the operator something.
         wait: sleeps.
     """
 
@@ -155,9 +157,11 @@ class Guide:
         request: Callable[..., Reply],
         *,
         ask: Callable[[str], str] = input,
+        say: Say = print,
         wait: Callable[[float], None] = time.sleep,
     ) -> None:
         self._options, self._request, self._ask, self._wait = options, request, ask, wait
+        self.say = say
         started = f"calibration-glove-{options.side}-{datetime.now(UTC):%Y%m%d-%H%M%S}"
         self._names = (f"{started}-{number}" for number in count(1))
 
@@ -177,28 +181,30 @@ class Guide:
                     lambda take: measure_tare(read_take(take, self._options).values, side=side),
                 )
             except InvalidInputError as error:
-                print(f"Once more: {error.message}")
+                self.say(f"Once more: {error.message}")
 
     def presses(self, tare: TaxelTare) -> list[PressRow]:
         """Record presses until the operator is done."""
-        print(f"Now two to four known pressures, the highest as high as work needs: {PRESS_HELP}.")
+        self.say(
+            f"Now two to four known pressures, the highest as high as work needs: {PRESS_HELP}."
+        )
         known: list[tuple[PressRow, TaxelPress]] = []
         while words := self._answer(NEXT).strip():
             if words == "drop":
                 known = known[:-1]
-                print(f"{len(known)} presses are left")
+                self.say(f"{len(known)} presses are left")
                 continue
             try:
                 wanted = parse_press(words, self._options.pressure_sigma)
             except (InvalidInputError, UnknownNameError) as error:
-                print(error.message)
+                self.say(error.message)
                 continue
             try:
                 known.append(self._press(wanted, tare))
             except InvalidInputError as error:
-                print(f"Not used: {error.message}")
+                self.say(f"Not used: {error.message}")
                 continue
-            print(self._known_so_far(tare, [press for _, press in known]))
+            self.say(self._known_so_far(tare, [press for _, press in known]))
         return [row for row, _ in known]
 
     def _press(self, wanted: PressRow, tare: TaxelTare) -> tuple[PressRow, TaxelPress]:
@@ -312,5 +318,5 @@ def record_takes(
         path = options.to / f"presses_{options.side}.csv"
         write_presses(path, rows)
         again += f" --presses {path}"
-    print(f"The same takes again: {again} --to {options.to}")
+    guide.say(f"The same takes again: {again} --to {options.to}")
     return rest, rows

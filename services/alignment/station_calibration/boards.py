@@ -1,7 +1,7 @@
 """Calibration boards in photos: corners, poses, coverage of the views and what to capture next."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -96,12 +96,12 @@ class Photos:
             self.pattern,
         )
 
-    def tell_left_out(self) -> None:
+    def tell_left_out(self, say: Callable[[str], None] = print) -> None:
         """List the excluded photos with the reasons."""
         for name in self.without_board:
-            print(f"  no board in {name}: left out")
+            say(f"  no board in {name}: left out")
         for name in self.blurred:
-            print(
+            say(
                 f"  {name} is blurred: left out; hold camera and board still, or give it more light"
             )
 

@@ -10,7 +10,12 @@ from dextouch.tactile import hand_canvas
 from dextouch.tactile.layout import Side, select_taxels
 from services.alignment.calibration.tactile_gain import GloveCalibration, filled_gain
 from services.alignment.calibration.tactile_tare import STATES
-from services.cli.calibrate.boards import VIEWS_PER_REGION, BoardView, Coverage, TurnCoverage
+from services.alignment.station_calibration.boards import (
+    VIEWS_PER_REGION,
+    BoardView,
+    Coverage,
+    TurnCoverage,
+)
 
 INK, LINE, GOOD, BAD, FAINT = "#1e293b", "#cbd5e1", "#0f766e", "#c2410c", "#94a3b8"
 _WIDTH, _ROW, _CELL = 480.0, 18.0, 9

@@ -1,0 +1,284 @@
+"""Views of a board collected from photos or a running station, and the intrinsics they give."""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+
+from dextouch.errors import NotFoundError, StaleDataError
+from services.alignment.calibration.intrinsics import CameraCalibration, calibrate_found
+from services.alignment.station_calibration.boards import (
+    SUFFIXES,
+    BoardView,
+    Coverage,
+    Lens,
+    Photos,
+    camera_coverage,
+    decode_photo,
+    find_board,
+    parse_board,
+    photo_paths,
+    read_photos,
+    reprojection,
+)
+from services.alignment.station_calibration.pictures import coverage_picture, residual_picture
+from services.alignment.station_calibration.record import (
+    named_matrix,
+    read_matrices,
+    write_entry,
+    write_picture,
+)
+
+# OpenCV's pixel origin is the centre of the first pixel, DexTouch's its corner.
+PIXEL_SHIFT_PX = 0.5
+LIVE_PERIOD_S = 0.2
+WATCH_PERIOD_S = 1.0
+# A board that moved by more between two live images is motion-blurred (0.5 px at 6 px).
+MAX_MOTION_PX = 1.5
+# Views nearer to a kept one than this share of the image diagonal are redundant.
+MIN_NEWS = 0.04
+MAX_VIEWS = 60
+# Number of live images without a new view (4 s and more) after which a hint is printed.
+TELL_AFTER_IMAGES = 20
+
+Arrivals = Iterator[tuple[str, bytes]]
+Wait = Callable[[float], None]
+Say = Callable[[str], None]
+
+
+def calibrate_photos(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:
+    """Calibrate from the photos of a folder; coverage and advice are written in any case."""
+    paths = photo_paths(options.photos)
+    if not paths:
+        raise NotFoundError(f"{options.photos}: holds no photo; expected {', '.join(SUFFIXES)}")
+    photos = read_photos(paths, parse_board(options.board))
+    coverage, path = write_coverage(photos.views, photos.size_px, options.to, options.camera)
+    say(f"board found in {len(photos.views)} of {len(photos)} photos ({photos.pattern})")
+    photos.tell_left_out(say)
+    for words in coverage.todo:
+        say(f"next: {words}")
+    say(f"coverage: {path}")
+    report: dict[str, object] = {
+        "num_photos": len(photos),
+        "num_with_board": len(photos.views),
+        "without_board": list(photos.without_board),
+        "blurred": list(photos.blurred),
+        "board_kind": photos.pattern,
+        "views_by_region": coverage.views_by_region.tolist(),
+        "next": list(coverage.todo),
+    }
+    if options.check:
+        return report
+    result = calibrate_found(photos.corners())
+    lens = Lens(result.K, result.distortion)
+    coverage, _ = write_coverage(photos.views, photos.size_px, options.to, options.camera, lens)
+    residuals = [reprojection(view, lens) for view in photos.views]
+    picture = residual_picture(photos.views, residuals, photos.size_px)
+    write_picture(options.to, f"residuals_{options.camera}.svg", picture)
+    return report | keep_camera(result, photos, coverage, options, say=say)
+
+
+def write_coverage(
+    views: Sequence[BoardView],
+    size_px: tuple[int, int],
+    folder: Path,
+    camera: str,
+    lens: Lens | None = None,
+) -> tuple[Coverage, Path]:
+    """Coverage by these views, and the path of its picture; arguments as `camera_coverage`."""
+    coverage = camera_coverage(views, size_px, lens)
+    picture = coverage_picture(views, coverage, size_px)
+    return coverage, write_picture(folder, f"coverage_{camera}.svg", picture)
+
+
+def keep_camera(
+    result: CameraCalibration,
+    photos: Photos,
+    coverage: Coverage,
+    options: argparse.Namespace,
+    *,
+    say: Say = print,
+) -> dict[str, object]:
+    """Write the intrinsics of a camera to the calibration folder, say them and return the facts."""
+    K, sigma = result.K.copy(), result.sigma_fxfycxcy_px
+    K[:2, 2] += PIXEL_SHIFT_PX
+    fx, fy, cx, cy = (float(v) for v in K[[0, 1, 0, 1], [0, 1, 2, 2]])
+    name = f"K_{options.camera}"
+    facts: dict[str, object] = {
+        "camera": options.camera,
+        "board": asdict(parse_board(options.board)),
+        "num_views": len(result.used_images),
+        "fx_fy_cx_cy_px": [fx, fy, cx, cy],
+        "sigma_fx_fy_cx_cy_px": sigma.tolist(),
+        "distortion_k1_k2_p1_p2_k3": result.distortion.tolist(),
+        "sigma_distortion": result.sigma_distortion.tolist(),
+        "rms_px": result.rms_px,
+        "board_kind": photos.pattern,
+        "image_size_px": list(photos.size_px),
+        "views_by_region": coverage.views_by_region.tolist(),
+        "next": list(coverage.todo),
+    }
+    matrices = {
+        name: K,
+        f"{name}_sigma_px": sigma,
+        f"distortion_{options.camera}": result.distortion,
+        f"image_size_{options.camera}_px": np.array(photos.size_px, dtype=np.float64),
+    }
+    write_entry(options.to, name, matrices, facts)
+    say(
+        f"{name}: fx {fx:.2f} ± {sigma[0]:.2f}, fy {fy:.2f} ± {sigma[1]:.2f}, "
+        f"cx {cx:.2f} ± {sigma[2]:.2f}, cy {cy:.2f} ± {sigma[3]:.2f} px "
+        f"({len(result.used_images)} views, residual {result.rms_px:.3f} px RMS)"
+    )
+    return facts
+
+
+def read_lens(folder: Path, camera: str) -> tuple[Lens, tuple[int, int]]:
+    """OpenCV's lens of a calibrated camera, and width and height of its images (px)."""
+    try:
+        matrices = read_matrices(folder)
+        K = named_matrix(matrices, f"K_{camera}", (3, 3))
+        distortion = named_matrix(matrices, f"distortion_{camera}", (1, 5))
+        width_px, height_px = named_matrix(matrices, f"image_size_{camera}_px", (1, 2))[0]
+    except NotFoundError as error:
+        raise NotFoundError(
+            f"{error.message}. First: dextouch station calibrate camera --camera {camera} "
+            f"--to {folder} …"
+        ) from error
+    K[:2, 2] -= PIXEL_SHIFT_PX
+    return Lens(K, distortion[0]), (int(width_px), int(height_px))
+
+
+class Session:
+    """Growing set of views of one camera, with its coverage picture in the calibration folder.
+
+    Args:
+        options: of the command: board, calibration folder and camera.
+        live: folder in which images of a running station are kept, in new positions of a static
+            board; None for photos, which are kept already.
+        say: tells the operator something.
+
+    Attributes:
+        views: kept so far.
+        coverage: of these views; None before the first.
+        size_px: width and height of the newest image.
+        todo: what to do next; empty if the coverage is sufficient.
+        newest: board in the newest image; None if there is none.
+        hint: why the newest image was not kept; empty if it was.
+    """
+
+    def __init__(
+        self, options: argparse.Namespace, live: Path | None = None, *, say: Say = print
+    ) -> None:
+        self.views: list[BoardView] = []
+        self.coverage: Coverage | None = None
+        self.size_px = (0, 0)
+        self.newest: BoardView | None = None
+        self.hint = ""
+        self.todo: tuple[str, ...] = ("hold the board in front of the camera",)
+        self._options, self._board, self._live = options, parse_board(options.board), live
+        self._say = say
+        self._num_idle = 0
+        self._first = 0
+        if live is not None:
+            live.mkdir(parents=True, exist_ok=True)
+            self._first = len(list(live.glob("live_*.jpg")))
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether coverage is sufficient, or the maximum number of views is reached."""
+        return not self.todo or len(self.views) >= MAX_VIEWS
+
+    def collect(self, arrivals: Arrivals) -> None:
+        """Process photos or live images as they come, until coverage is sufficient."""
+        for name, data in arrivals:
+            self.add(name, data)
+            if self.is_enough:
+                return
+
+    def add(self, name: str, data: bytes) -> None:
+        """Process one photo or live image."""
+        photo = decode_photo(data, where=name)
+        self.size_px = (photo.shape[1], photo.shape[0])
+        view = find_board(name, photo, self._board)
+        self.hint, self.newest = self._why_not(view, photo), view
+        if view is None or self.hint:
+            self._tell(name, self.hint)
+            return
+        if self._live is not None:
+            (self._live / f"live_{self._first + len(self.views):04d}.jpg").write_bytes(data)
+        self._keep(view)
+
+    def _why_not(self, view: BoardView | None, photo: np.ndarray) -> str:
+        """Why a view is not kept; "" of one that is."""
+        if self._live is None:
+            return "no board" if view is None else "blurred, left out" * view.is_blurred
+        if view is None:
+            return "no board in the last image; does --board match this board?"
+        before = self.newest
+        if before is None or motion_px(view, before) > MAX_MOTION_PX or view.is_blurred:
+            return "the board in the last image moves or is blurred; hold it still"
+        needed_px = MIN_NEWS * float(np.hypot(*photo.shape))
+        is_new = all(motion_px(view, kept) > needed_px for kept in self.views)
+        return "" if is_new else "the board is where it was; hold it elsewhere"
+
+    def _tell(self, name: str, why: str) -> None:
+        """Name a photo that is left out; of live images give a hint now and then."""
+        self._num_idle += 1
+        if self._live is None:
+            self._say(f"{name}: {why}")
+        elif self._num_idle % TELL_AFTER_IMAGES == 0:
+            self._say(why)
+
+    def _keep(self, view: BoardView) -> None:
+        """Add a view, redraw the picture and print advice."""
+        self.views.append(view)
+        self._num_idle = 0
+        options = self._options
+        coverage, path = write_coverage(self.views, self.size_px, options.to, options.camera)
+        if coverage.todo != self.todo or len(self.views) == 1:
+            self._say(
+                f"{len(self.views)} views ({path}); next: {'; '.join(coverage.todo) or 'done'}"
+            )
+        self.coverage, self.todo = coverage, coverage.todo
+
+
+def motion_px(a: BoardView, b: BoardView) -> float:
+    """Mean displacement of common corners; infinity if there are none."""
+    pixels_b = dict(zip(map(tuple, b.points_board.tolist()), b.pixels, strict=True))
+    pairs = zip(map(tuple, a.points_board.tolist()), a.pixels, strict=True)
+    moved = [np.linalg.norm(pixel - pixels_b[at]) for at, pixel in pairs if at in pixels_b]
+    return float(np.mean(moved)) if moved else float("inf")
+
+
+def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:
+    """Yield the photos of a folder, then new ones, indefinitely."""
+    seen: set[Path] = set()
+    while True:
+        for path in photo_paths(folder):
+            if path not in seen:
+                seen.add(path)
+                yield path.name, path.read_bytes()
+        wait(WATCH_PERIOD_S)
+
+
+def station_arrivals(newest: Callable[[], bytes], *, wait: Wait = time.sleep) -> Arrivals:
+    """Yield new images of a station's camera at 5 Hz, indefinitely, skipping repeated ones.
+
+    `newest` requests the newest JPEG image, `wait` sleeps between requests.
+    """
+    last = b""
+    for number in count():
+        try:
+            data = newest()
+        except StaleDataError:
+            # The camera pauses; an old image would look like a static board.
+            data = b""
+        if data and data != last:
+            last = data
+            yield f"live image {number}", data
+        wait(LIVE_PERIOD_S)

@@ -1,0 +1,166 @@
+"""Calibration practised from the page on a mock board: the results against the mock's own truth."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from playwright.sync_api import expect
+
+from services.acquisition.app import create_app as create_station
+from services.acquisition.devices.tactile_glove.mock import GloveCalibration
+from services.acquisition.mocks import practice
+from services.acquisition.settings import AcquisitionSettings
+from services.alignment.app import create_app as create_alignment
+from services.alignment.settings import AlignmentSettings
+from services.dashboard.app import create_app as create_dashboard
+from services.dashboard.settings import DashboardSettings
+
+LONG_MS = 240_000
+SEED = 3
+# Four reported standard deviations of 25 views, and what they move a pixel of the image.
+MAX_FOCAL_SHARE, MAX_CENTRE_PX, MAX_MOVED_PX = 0.003, 1.2, 0.5
+# Half of a count is what the glove's rounding may hide without noise.
+MAX_TARE_COUNTS = 0.51
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Where calibrations of simulated devices are written."""
+    return tmp_path / "calibration" / "practice"
+
+
+@pytest.fixture
+def address(serve, tmp_path, monkeypatch):
+    """A dashboard over a station with a board before its camera and a glove at rest."""
+    whole = practice.pattern_streams
+    few = {"tactile_left", "head"}
+    monkeypatch.setattr(
+        practice,
+        "pattern_streams",
+        lambda round_s: [s for s in whole(round_s) if s.descriptor.name in few],
+    )
+    spool = tmp_path / "spool"
+    station = serve(
+        create_station(AcquisitionSettings(spool=spool, mock=True, mock_practice=True, seed=SEED))
+    )
+    alignment = AlignmentSettings(
+        store_url=str(tmp_path / "store"),
+        num_workers=1,
+        station_url=station,
+        station_spool=spool,
+        calibration_folder=tmp_path / "calibration",
+    )
+    urls = {"acquisition_url": station, "alignment_url": serve(create_alignment(alignment))}
+    return serve(create_dashboard(DashboardSettings(**urls)))
+
+
+def tab_to(page, selector):
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        if page.evaluate("(selector) => document.activeElement.matches(selector)", selector):
+            return
+    raise AssertionError(f"Tab does not reach {selector}")
+
+
+def state(page):
+    return page.locator("#run_state")
+
+
+def project(K, distortion, rays):
+    """OpenCV's documented model: pixels of rays [n, 2] (x/z, y/z)."""
+    x, y = rays.T
+    k1, k2, p1, p2, k3 = distortion
+    r2 = x**2 + y**2
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    seen_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+    seen_y = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+    return np.stack([K[0, 0] * seen_x + K[0, 2], K[1, 1] * seen_y + K[1, 2]], axis=-1)
+
+
+def moved_px(K, distortion):
+    """Largest distance between where the found and the true camera see a ray.
+
+    A shift of the centre and a turn of the camera are the same but for distortion, so the mean is
+    left out: the pose of the camera on its tracker takes it up.
+    """
+    grid = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 21), np.linspace(-0.36, 0.36, 15)), -1)
+    rays = grid.reshape(-1, 2)
+    difference = project(K, distortion, rays) - project(
+        practice.K, (*practice.DISTORTION, 0.0), rays
+    )
+    return float(np.linalg.norm(difference - difference.mean(axis=0), axis=1).max())
+
+
+def test_a_lens_is_calibrated_from_the_page_by_keyboard(page, address, folder, capsys):
+    page.goto(f"{address}/calibration")
+    row = page.locator("tr[data-name=K_head]")
+    expect(row).to_contain_text("missing")
+    tab_to(page, "tr[data-name=K_head] button")
+    page.keyboard.press("Enter")
+    expect(page.locator("#board")).to_be_focused()
+    page.keyboard.press("Control+a")
+    page.keyboard.type("chessboard:9x6:25mm")
+    page.keyboard.press("Enter")
+    expect(page.locator("#view_overlay circle")).to_have_count(54, timeout=LONG_MS)
+    expect(page.locator("#view_overlay polygon")).not_to_have_count(0, timeout=LONG_MS)
+    expect(state(page)).to_have_text("done", timeout=LONG_MS)
+    expect(row).to_contain_text("good")
+    expect(row.locator(".regions span[data-enough=true]")).to_have_count(9)
+
+    found = {
+        name: np.array(rows)
+        for name, rows in json.loads((folder / "calibration.json").read_text()).items()
+    }
+    K, distortion = found["K_head"], found["distortion_head"][0]
+    focal = np.abs(np.diag(K)[:2] / np.diag(practice.K)[:2] - 1).max()
+    centre_px = np.abs(K[:2, 2] - practice.K[:2, 2]).max()
+    moved = moved_px(K, distortion)
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\npractice camera: focal length off by {focal:.3%}, bound {MAX_FOCAL_SHARE:.1%} | "
+            f"centre {centre_px:.2f} px, bound {MAX_CENTRE_PX} | pixels {moved:.2f} px, bound "
+            f"{MAX_MOVED_PX}"
+        )
+    assert focal < MAX_FOCAL_SHARE
+    assert centre_px < MAX_CENTRE_PX
+    assert moved < MAX_MOVED_PX
+
+
+def test_the_zero_of_a_glove_is_measured_from_the_page_by_keyboard(page, address, folder, capsys):
+    page.goto(f"{address}/calibration")
+    expect(page.locator("tr[data-name=tactile_left_tare_counts]")).to_contain_text("missing")
+    tab_to(page, "tr[data-name=tactile_left_tare_counts] button")
+    page.keyboard.press("Enter")
+    page.keyboard.press("Enter")
+    expect(page.locator("#run_next")).to_contain_text("Lay the left glove down")
+    expect(page.locator("#answer")).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.locator("#run_next")).to_contain_text("Next pressure", timeout=LONG_MS)
+    expect(page.locator("#answer")).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(state(page)).to_have_text("done", timeout=LONG_MS)
+    tare = np.array(
+        json.loads((folder / "calibration.json").read_text())["tactile_left_tare_counts"]
+    )
+    error = np.abs(tare.ravel() - GloveCalibration.seeded("left", SEED).tare_counts)
+    with capsys.disabled():
+        sys.stdout.write(f"\npractice glove: zero off by {error.max():.2f} counts, bound 0.51")
+    assert error.max() < MAX_TARE_COUNTS
+
+
+def test_a_run_is_ended_and_what_is_wrong_is_said(page, address, folder):
+    page.goto(f"{address}/calibration")
+    page.locator("tr[data-name=K_head] button").click()
+    page.locator("#board").fill("<b>paper</b>")
+    page.keyboard.press("Enter")
+    expect(page.locator("#calibration_note")).to_contain_text("unknown board '<b>paper</b>'")
+    page.locator("#board").fill("chessboard:9x6:25mm")
+    page.keyboard.press("Enter")
+    expect(page.locator("#run_count_text")).to_contain_text("of 25 views", timeout=LONG_MS)
+    page.reload()
+    expect(state(page)).to_have_text("running")
+    page.locator("#run_cancel").click()
+    expect(state(page)).to_have_text("cancelled")
+    expect(page.locator("#run_next")).to_contain_text("nothing was written")
+    assert not (folder / "calibration.json").exists()
