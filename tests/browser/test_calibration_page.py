@@ -55,6 +55,12 @@ def address(serve, tmp_path, monkeypatch):
     return serve(create_dashboard(DashboardSettings(**urls)))
 
 
+@pytest.fixture
+def few_poses(monkeypatch):
+    """A board with few places, for tests that need no lens."""
+    monkeypatch.setattr(practice, "NUM_POSES", 4)
+
+
 def tab_to(page, selector):
     for _ in range(60):
         page.keyboard.press("Tab")
@@ -127,6 +133,7 @@ def test_a_lens_is_calibrated_from_the_page_by_keyboard(page, address, folder, c
     assert moved < MAX_MOVED_PX
 
 
+@pytest.mark.usefixtures("few_poses")
 def test_the_zero_of_a_glove_is_measured_from_the_page_by_keyboard(page, address, folder, capsys):
     page.goto(f"{address}/calibration")
     expect(page.locator("tr[data-name=tactile_left_tare_counts]")).to_contain_text("missing")
@@ -149,6 +156,7 @@ def test_the_zero_of_a_glove_is_measured_from_the_page_by_keyboard(page, address
     assert error.max() < MAX_TARE_COUNTS
 
 
+@pytest.mark.usefixtures("few_poses")
 def test_a_run_is_ended_and_what_is_wrong_is_said(page, address, folder):
     page.goto(f"{address}/calibration")
     page.locator("tr[data-name=K_head] button").click()

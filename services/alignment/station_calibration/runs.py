@@ -3,6 +3,7 @@
 import argparse
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -70,7 +71,8 @@ class StationPlace:
 
         Simulated devices have the folder `practice`, so that nobody records with their calibration.
         """
-        reply = self.link().request("GET", "/v1/health")
+        with closing(self.link()) as link:
+            reply = link.request("GET", "/v1/health")
         health = StationHealth.model_validate_json(reply.body, extra="ignore")
         streams = tuple(stream.stream for stream in health.streams)
         if any(device.simulated for device in health.devices):
@@ -180,9 +182,9 @@ class GuidedRun:
             pressure_sigma=PRESSURE_SIGMA,
             full_scale=FULL_SCALE_COUNTS,
         )
-        request = place.link().request
-        guide = Guide(options, request, ask=self._ask, say=self._say, wait=self._wait)
-        return glove.calibrate(options, guide, say=self._say)
+        with closing(place.link()) as link:
+            guide = Guide(options, link.request, ask=self._ask, say=self._say, wait=self._wait)
+            return glove.calibrate(options, guide, say=self._say)
 
     def _camera(self) -> dict[str, object]:
         camera, folder = self._request.subject, self._place.folder
@@ -191,17 +193,18 @@ class GuidedRun:
             camera=camera, board=self._request.board, to=folder, photos=photos, check=False
         )
         session = Session(options, photos, say=self._say)
-        link, path = self._place.link(), f"/v1/live/cameras/camera_{camera}"
+        path = f"/v1/live/cameras/camera_{camera}"
+        with closing(self._place.link()) as link:
 
-        def newest() -> bytes:
-            return link.request("GET", path, accept="image/jpeg").body
+            def newest() -> bytes:
+                return link.request("GET", path, accept="image/jpeg").body
 
-        for index, (name, data) in enumerate(station_arrivals(newest, wait=self._wait)):
-            session.add(name, data)
-            self.image = data
-            self._set(camera=_camera_view(index, session))
-            if session.is_enough or self._is_finished.is_set():
-                break
+            for index, (name, data) in enumerate(station_arrivals(newest, wait=self._wait)):
+                session.add(name, data)
+                self.image = data
+                self._set(camera=_camera_view(index, session))
+                if session.is_enough or self._is_finished.is_set():
+                    break
         self._say(f"{len(session.views)} views: solving")
         return calibrate_photos(options, say=self._say)
 

@@ -218,12 +218,3 @@ def test_job_that_killed_the_service_often_fails():
     job = job.started().crashed(max_attempts=3)
     assert job.state == "failed"
     assert "died 3 times" in job.problem.detail
-
-
-async def test_jobs_of_one_recording_are_listed(opened):
-    queue = await opened()
-    await queue.add([new_job("a"), new_job("b")])
-    page = queue.page(state=None, after=None, limit=10, recording_id="b")
-    assert [job.recording_id for job in page.alignments] == ["b"]
-    assert page.num_matching == 1
-    assert queue.page(state="done", after=None, limit=10, recording_id="b").alignments == ()
