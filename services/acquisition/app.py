@@ -14,7 +14,7 @@ from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.health import HealthCollector
 from services.acquisition.memory import keep_for_life
 from services.acquisition.metrics import RecorderCollector
-from services.acquisition.routes import recorder_router, station_router
+from services.acquisition.routes import recorder_router, station_router, uploads_router
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader, recover_spool
@@ -129,7 +129,11 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
     return create_service_app(
         name="acquisition",
         settings=settings,
-        routers=[recorder_router(station), station_router(station, uploads)],
+        routers=[
+            recorder_router(station),
+            station_router(station, uploads),
+            uploads_router(uploads),
+        ],
         lifespan=lifespan,
         readiness=missing,
     )

@@ -97,7 +97,7 @@ class HistoryQuery(FrozenModel):
 
 
 def station_router(station: Station, uploader: Uploader) -> APIRouter:
-    """Health, live views and uploads."""
+    """Health and live views."""
     disk = DiskJudge(station.recorder.spool_root, station.supervisors, station.clock.now_ns())
     station.health.watch(disk)
     station.health.watch(lambda evaluation: judge_uploads(evaluation, uploader.refused))
@@ -162,17 +162,26 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
         image = station.live.jpeg(name, station.clock.now_ns())
         return Response(image, media_type="image/jpeg")
 
-    @router.get("/uploads")
+    return router
+
+
+def uploads_router(uploader: Uploader) -> APIRouter:
+    """Saved takes on their way to the store."""
+    router = APIRouter(
+        prefix="/v1/uploads", tags=["station"], dependencies=[Depends(RequireScope(SCOPE))]
+    )
+
+    @router.get("")
     async def uploads(refused: Annotated[bool, Query()] = False) -> list[UploadStatus]:  # noqa: FBT002 - a query's flag
         """Saved takes and whether the store has them; with `refused`, those alone it refused."""
         return await run_in_threadpool(uploader.status, only_refused=refused)
 
-    @router.get("/uploads/{recording_id}")
+    @router.get("/{recording_id}")
     async def upload(recording_id: StoreId) -> UploadStatus:
         """One saved take and whether the store has it."""
         return await run_in_threadpool(uploader.status_of, recording_id)
 
-    @router.post("/uploads/{recording_id}/retry")
+    @router.post("/{recording_id}/retry")
     async def retry(recording_id: StoreId) -> UploadStatus:
         """Send a take again that the store refused."""
         return await run_in_threadpool(uploader.retry, recording_id)
