@@ -1,8 +1,10 @@
 """Entry point `dextouch COMMAND`: dispatches to commands and prints errors as one line."""
 
 import importlib
+import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from dextouch import __version__
@@ -108,6 +110,14 @@ COMMANDS = {
         "evaluation.rating.command_line:report_main",
     ),
     "dashboard": Command("serve the operators' page", "dashboard.app:main"),
+    "config": Command("show the effective settings, or an example of dextouch.toml"),
+    "config show": Command(
+        "show the effective settings and where each comes from", "cli.configuration:show_main"
+    ),
+    "config example": Command(
+        "print a dextouch.toml with all settings", "cli.configuration:example_main"
+    ),
+    "completion": Command("print the completion script of a shell", "cli.completion:main"),
 }
 
 EXIT_USAGE = 2
@@ -125,7 +135,8 @@ and evaluate policies in it.
 
 Every command has --help; commands that terminate write their result with
 --json PATH, or --json - for standard output. Services (serve, station serve, …) also
-read their flags from environment variables. All commands: docs/command_line.md
+read their flags from environment variables and dextouch.toml (see config).
+All commands: docs/command_line.md
 
 example:
   dextouch demo"""
@@ -191,6 +202,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"dextouch: {error.message}; see dextouch --help", file=sys.stderr)
         return EXIT_USAGE
     try:
+        if os.environ.get("DEXTOUCH_CONFIG") or Path("dextouch.toml").is_file():
+            from services.cli.configuration import check_sections
+
+            check_sections()
         with messages_aside(words):
             return run_command(words)
     except ModuleNotFoundError as error:

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Literal
 
 from fastapi import FastAPI
 from pydantic import AliasChoices, Field, ValidationError
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import SettingsConfigDict
 
 from dextouch.command_line import write_result
 from dextouch.data_folder import data_folder
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
-from dextouch.schemas import first_problems
-from dextouch.serving import configure_logging, load_settings
+from dextouch.serving import CommandSettings, configure_logging, explained, load_settings
 from services.cli.doctor import missing_package
 from services.cli.servers import Place, bind, serve_all, stop_on_signals
 
@@ -30,7 +29,7 @@ NEEDED = ("episode_store", "acquisition", "dashboard")
 Builder = Callable[["UpSettings", Mapping[str, str]], FastAPI]
 
 
-class UpSettings(BaseSettings):
+class UpSettings(CommandSettings):
     """Run every service in one process, with a dashboard and mock or real devices.
 
     An explicit port must be free; a default port in use is replaced by a free one. All data is
@@ -127,7 +126,7 @@ def _build(name: str, settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
     try:
         return BUILDERS[name](settings, urls)
     except ValidationError as error:
-        raise InvalidInputError(f"settings of {name}: {first_problems(error)}") from error
+        raise InvalidInputError(f"settings of {name}: {explained(error, name)}") from error
     except ModuleNotFoundError as error:
         otherwise = f", or leave this service out with --without {name}"
         refusal = missing_package(error, "" if name in NEEDED else otherwise)

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
-from pydantic_settings import BaseSettings
 
 from dextouch.command_line import JSON_HELP
 from dextouch.frozen_model import FrozenModel
-from dextouch.serving import service_config
+from dextouch.serving import CommandSettings, service_config
 from services.evaluation.direct_training import DirectSettings
 from services.evaluation.policies.cloning_training import CloningSettings
 from services.evaluation.success_probe_training import ProbeSettings
@@ -23,7 +22,7 @@ DEFAULT_PROBE = PRETRAINED / "success_probe.safetensors"
 _SEEDS = re.compile(r"(\d+):(\d+)")
 
 
-class TrainPolicySettings(BaseSettings):
+class TrainPolicySettings(CommandSettings):
     """Train a closed-loop policy on the successful robot episodes of some stores.
 
     Example:
@@ -57,7 +56,7 @@ class TrainPolicySettings(BaseSettings):
         return self.output.with_stem(f"{self.output.stem}_early")
 
 
-class TrainProbeSettings(BaseSettings):
+class TrainProbeSettings(CommandSettings):
     """Train the success probe on true and imagined robot episodes of some stores.
 
     Example:
@@ -81,7 +80,7 @@ class TrainProbeSettings(BaseSettings):
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
-class TrainDirectSettings(BaseSettings):
+class TrainDirectSettings(CommandSettings):
     """Train a baseline that predicts success from first observations and commands alone.
 
     Example:
@@ -107,7 +106,7 @@ class ServedWorld(FrozenModel):
     api_key: str | None = Field(default=None, description="API key, if required")
 
 
-class RunSettings(BaseSettings):
+class RunSettings(CommandSettings):
     r"""Roll out policies in a real and in imagined worlds and score them.
 
     docs/policies.md shows how to write and score a policy. The exit status is 1 if a rollout

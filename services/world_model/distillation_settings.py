@@ -3,10 +3,9 @@
 from pathlib import Path
 
 from pydantic import Field
-from pydantic_settings import BaseSettings
 
 from dextouch.command_line import JSON_HELP
-from dextouch.serving import service_config
+from dextouch.serving import CommandSettings, service_config
 from services.networks.training_settings import CpuBudget
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.settings import (
@@ -42,7 +41,7 @@ class DistillSettings(RunSettings):
         return TrainSettings(**given, init=self.init, network=few, self_forcing=True)
 
 
-class DistillCommand(BaseSettings, DistillSettings):
+class DistillCommand(CommandSettings, DistillSettings):
     """Train a world model in the paper's form to sample in few steps, by self-forcing.
 
     Example:

@@ -13,7 +13,7 @@ from pydantic_settings import (
 
 from dextouch.command_line import JSON_HELP
 from dextouch.frozen_model import FrozenModel
-from dextouch.serving import service_config
+from dextouch.serving import CommandSettings, file_source, service_config
 from dextouch.worlds import WorldServiceSettings
 from services.networks.training_settings import (
     AverageDecay,
@@ -289,7 +289,7 @@ class StateTrainSettings(FrozenModel):
     )
 
 
-class TrainStateCommand(BaseSettings, StateTrainSettings):
+class TrainStateCommand(CommandSettings, StateTrainSettings):
     """Train a state model, start readers and recurrent cores, on whole episodes.
 
     Example:
@@ -305,7 +305,7 @@ class TrainStateCommand(BaseSettings, StateTrainSettings):
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
-class TrainCommand(BaseSettings, TrainSettings):
+class TrainCommand(CommandSettings, TrainSettings):
     r"""Train the joint visuo-tactile flow-matching model on windows of episodes.
 
     Example:
@@ -337,11 +337,12 @@ class TrainCommand(BaseSettings, TrainSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Flags, then the environment, then the preset that either of them names."""
-        return init_settings, env_settings, PresetSource(settings_cls)
+        """Flags, the environment, the file, then the preset that one of them names."""
+        given = init_settings, env_settings, *file_source(settings_cls)
+        return (*given, PresetSource(settings_cls))
 
 
-class AdaptCommand(BaseSettings, AdaptSettings):
+class AdaptCommand(CommandSettings, AdaptSettings):
     """Adapt a world model in the paper's form to new tasks, from robot and human episodes.
 
     Example:
@@ -353,7 +354,7 @@ class AdaptCommand(BaseSettings, AdaptSettings):
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
-class ShowCommand(BaseSettings):
+class ShowCommand(CommandSettings):
     """Show the provenance and accuracy of a checkpoint, or of every checkpoint in a folder.
 
     Example:

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 from pydantic import Field
-from pydantic_settings import BaseSettings
 
 from dextouch.command_line import JSON_HELP
 from dextouch.frozen_model import FrozenModel
-from dextouch.serving import service_config
+from dextouch.serving import CommandSettings, service_config
 from services.networks.training_settings import (
     AverageDecay,
     Batch,
@@ -92,7 +91,7 @@ class TrainTokenizerSettings(FrozenModel):
         return " ".join(["dextouch train tokenizer", *stores, *flags_of(given)])
 
 
-class TrainTokenizerCommand(BaseSettings, TrainTokenizerSettings):
+class TrainTokenizerCommand(CommandSettings, TrainTokenizerSettings):
     """Train a tactile tokenizer on the touch of people and robots, for `--tokenizer`.
 
     Example:

@@ -5,17 +5,24 @@ import json
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
+from io import StringIO
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 STANDARD_OUTPUT = Path("-")
 JSON_HELP = "also write the result as JSON to this file; - for standard output"
 Item = TypeVar("Item")
 _result_stream: ContextVar[TextIO | None] = ContextVar("result_stream", default=None)
+_asked_parsers: ContextVar[list[argparse.ArgumentParser] | None] = ContextVar(
+    "asked_parsers", default=None
+)
 
 
 class HelpFormatter(argparse.HelpFormatter):
@@ -36,6 +43,30 @@ class CommandParser(argparse.ArgumentParser):
         kwargs.setdefault("formatter_class", HelpFormatter)
         kwargs.setdefault("allow_abbrev", False)
         super().__init__(**kwargs)
+
+    def print_help(self, file: "SupportsWrite[str] | None" = None) -> None:
+        """Print the help, or hand this parser to `parser_behind`."""
+        asked = _asked_parsers.get()
+        if asked is None:
+            super().print_help(file)
+        else:
+            asked.append(self)
+
+
+def parser_behind(show_help: Callable[[], object]) -> argparse.ArgumentParser | None:
+    """The parser that would print its help; None if no parser did.
+
+    Args:
+        show_help: runs a command with `--help`; it prints nothing here.
+    """
+    asked: list[argparse.ArgumentParser] = []
+    token = _asked_parsers.set(asked)
+    try:
+        with suppress(SystemExit), redirect_stdout(StringIO()):
+            show_help()
+    finally:
+        _asked_parsers.reset(token)
+    return asked[0] if asked else None
 
 
 def progress(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 from pydantic import Field
-from pydantic_settings import BaseSettings
 
 from dextouch.command_line import JSON_HELP
 from dextouch.data_folder import default_store
-from dextouch.serving import ServiceSettings, service_config
+from dextouch.serving import CommandSettings, ServiceSettings, service_config
 
 DEFAULT_MARKS = Path("runs/ratings.sqlite")
 _MARKS = "append-only SQLite file of the marks"
@@ -43,7 +42,7 @@ class RatingSettings(ServiceSettings):
     )
 
 
-class RatingReportSettings(BaseSettings):
+class RatingReportSettings(CommandSettings):
     """Print the scores of the rated rollouts of a store, and the agreement of raters.
 
     Example:

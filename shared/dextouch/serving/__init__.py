@@ -9,6 +9,13 @@ if TYPE_CHECKING:
     from dextouch.serving.child_process import Answer as Answer
     from dextouch.serving.child_process import ChildProcess as ChildProcess
     from dextouch.serving.child_process import serve_parent as serve_parent
+    from dextouch.serving.configuration_file import CommandSettings as CommandSettings
+    from dextouch.serving.configuration_file import configuration_path as configuration_path
+    from dextouch.serving.configuration_file import explained as explained
+    from dextouch.serving.configuration_file import file_source as file_source
+    from dextouch.serving.configuration_file import line_of as line_of
+    from dextouch.serving.configuration_file import read_configuration as read_configuration
+    from dextouch.serving.configuration_file import section_of as section_of
     from dextouch.serving.connections import timed as timed
     from dextouch.serving.guard import AS_SET as AS_SET
     from dextouch.serving.guard import FORM as FORM

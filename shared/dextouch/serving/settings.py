@@ -1,4 +1,4 @@
-"""Service settings from flags and environment, and running a service from them."""
+"""Service settings from flags, environment and file, and running a service from them."""
 
 import argparse
 import gc
@@ -21,7 +21,7 @@ from pydantic_settings import (
 
 from dextouch.command_line import CommandParser
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import first_problems
+from dextouch.serving.configuration_file import CommandSettings, explained, section_of
 from dextouch.serving.guard import ApiKey
 from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
 from dextouch.serving.logs import configure_logging
@@ -41,7 +41,7 @@ Origin = Annotated[str, AfterValidator(canonical_origin)]
 SettingsT = TypeVar("SettingsT", bound=BaseSettings)
 
 
-class ServiceSettings(BaseSettings):
+class ServiceSettings(CommandSettings):
     """Settings common to all services; each service subclasses it.
 
     `host` other than loopback needs `api_keys`. Port 0 selects a free port. Routes have their own
@@ -127,7 +127,7 @@ def service_config(service: str, command: str | None = None) -> SettingsConfigDi
 
 
 def load_settings(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
-    """Load settings from flags, then the environment, then defaults.
+    """Load settings from flags, the environment, `dextouch.toml` and defaults, in this order.
 
     The help describes the command with the docstring of the class, which holds an example. Flags
     have dashes (`--num-steps`, `--limits.max-chunks`), booleans are switches (`--mock`,
@@ -153,7 +153,8 @@ def load_settings(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
     try:
         return CliApp.run(cls, cli_args=arguments, cli_settings_source=source)
     except ValidationError as error:
-        raise InvalidInputError(f"settings of {cls.__name__}: {first_problems(error)}") from error
+        problems = explained(error, section_of(cls))
+        raise InvalidInputError(f"settings of {cls.__name__}: {problems}") from error
     except SettingsError as error:
         raise InvalidInputError(f"settings of {cls.__name__}: {error}; is it JSON?") from error
 

@@ -14,7 +14,8 @@ from services.cli import main
 
 COMMANDS = """
 align report, align retarget, align run, align serve,
-checkpoint, dashboard, demo, doctor, evaluate, evaluate prediction, export, generate, import,
+checkpoint, completion, config example, config show, dashboard, demo,
+doctor, evaluate, evaluate prediction, export, generate, import,
 rate report, rate serve, reproduce, serve,
 station calibrate camera, station calibrate glove, station calibrate hand-eye,
 station calibrate latency, station calibrate profile, station calibrate robot-base,
@@ -30,12 +31,15 @@ NAMES = [" ".join(name.split()) for name in COMMANDS.split(",")]
 # Services run until they are stopped and answer over HTTP: they have no result to write.
 WITHOUT_JSON = {
     "align serve", "dashboard", "rate serve", "serve", "station serve", "store serve", "twin serve",
+    # These print a file.
+    "completion", "config example",
 }  # fmt: skip
 GROUPS = {
     "": tuple(name for name in main.COMMANDS if " " not in name),
     "train": tuple(main.commands_of("train")),
     "station": tuple(main.commands_of("station")),
     "rate": tuple(main.commands_of("rate")),
+    "config": tuple(main.commands_of("config")),
 }
 EXAMPLE = re.compile(r"^examples?:\n((?:  .*(?:\n|$))+)", re.MULTILINE | re.IGNORECASE)
 DOCUMENT = Path(__file__).parents[3] / "docs" / "command_line.md"

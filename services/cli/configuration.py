@@ -1,0 +1,295 @@
+"""Commands `dextouch config show` and `config example`: the file dextouch.toml and what it sets."""
+
+import argparse
+import importlib
+import json
+import os
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple, get_args
+
+from pydantic import BaseModel, SecretStr, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined, to_jsonable_python
+from pydantic_settings import EnvSettingsSource, SettingsError
+
+from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.serving import (
+    CommandSettings,
+    configuration_path,
+    explained,
+    file_source,
+    line_of,
+    read_configuration,
+)
+
+# Settings class of each section, imported when it is asked for.
+SECTIONS: Final = {
+    "up": "cli.up:UpSettings",
+    "acquisition": "acquisition.settings:AcquisitionSettings",
+    "episode_store": "episode_store.settings:EpisodeStoreSettings",
+    "alignment": "alignment.settings:AlignmentSettings",
+    "dashboard": "dashboard.settings:DashboardSettings",
+    "twin": "twin.serving:TwinServiceSettings",
+    "world_model": "world_model.settings:WorldModelSettings",
+    "rating": "evaluation.rating.settings:RatingSettings",
+    "rating_report": "evaluation.rating.settings:RatingReportSettings",
+    "evaluation_run": "evaluation.settings:RunSettings",
+    "evaluation_train_policy": "evaluation.settings:TrainPolicySettings",
+    "evaluation_train_probe": "evaluation.settings:TrainProbeSettings",
+    "evaluation_train_direct_judge": "evaluation.settings:TrainDirectSettings",
+    "world_model_show": "world_model.settings:ShowCommand",
+    "world_model_train": "world_model.settings:TrainCommand",
+    "world_model_train_state": "world_model.settings:TrainStateCommand",
+    "world_model_train_tokenizer": "world_model.tokenizer_settings:TrainTokenizerCommand",
+    "world_model_distill": "world_model.distillation_settings:DistillCommand",
+    "world_model_adapt": "world_model.settings:AdaptCommand",
+}
+# Those of `config example` unless others are named.
+SERVICES: Final = tuple(SECTIONS)[:8]
+MASK: Final = "***"
+DEFAULT: Final = "default"
+REQUIRED: Final = "required"
+
+
+class Setting(NamedTuple):
+    """A setting with its value and where that comes from."""
+
+    keys: tuple[str, ...]
+    value: object
+    origin: str
+
+
+def settings_class(section: str) -> type[CommandSettings]:
+    """Settings class of a section.
+
+    Raises:
+        UnknownNameError: no such section.
+    """
+    if section not in SECTIONS:
+        raise UnknownNameError("section", section, list(SECTIONS))
+    module, _, name = SECTIONS[section].partition(":")
+    found: type[CommandSettings] = getattr(importlib.import_module(f"services.{module}"), name)
+    return found
+
+
+def check_sections() -> None:
+    """Refuse a configuration file with a section that no command has.
+
+    Raises:
+        InvalidInputError: an unknown section, or an unreadable file.
+    """
+    path = configuration_path()
+    if path is None:
+        return
+    for name in read_configuration(path):
+        if name not in SECTIONS:
+            raise InvalidInputError(
+                f"{path}:{line_of(path, (name,))}: unknown section [{name}], expected one of "
+                f"{', '.join(SECTIONS)}"
+            )
+
+
+def effective_settings(section: str) -> list[Setting]:
+    """Settings of a section as a command without flags would get them.
+
+    Raises:
+        InvalidInputError: an invalid or unknown setting; lines of the file are named.
+    """
+    kind = settings_class(section)
+    try:
+        kind()
+    except ValidationError as error:
+        if any(item["type"] != "missing" for item in error.errors()):
+            problems = explained(error, section)
+            raise InvalidInputError(f"settings of [{section}]: {problems}") from error
+    except SettingsError as error:
+        raise InvalidInputError(f"settings of [{section}]: {error}; is it JSON?") from error
+    path = configuration_path()
+    in_file = dict(_leaves(file_source(kind)[0]())) if file_source(kind) else {}
+    in_environment = dict(_leaves(EnvSettingsSource(kind)()))
+    known = dict(_defaults(kind))
+    prefix = str(kind.model_config.get("env_prefix"))
+    found = []
+    for keys in sorted(known | in_file | in_environment, key=lambda keys: _place(kind, keys)):
+        inner = any(other[: len(keys)] == keys and other != keys for other in in_file)
+        if keys in in_environment:
+            origin = prefix + "__".join(keys).upper()
+            origin = origin if origin in os.environ else prefix + keys[0].upper()
+            value = in_environment[keys]
+        elif keys in in_file:
+            line = line_of(path, (section, *keys)) if path else None
+            value, origin = in_file[keys], f"{path}:{line}"
+        elif inner:
+            continue
+        else:
+            value, origin = known[keys], DEFAULT
+        found.append(Setting(keys, _masked(value, keys, _secret_names(kind)), origin))
+    return found
+
+
+def example(sections: Sequence[str]) -> str:
+    """A configuration file with every setting of some sections, all of them commented out."""
+    lines = [
+        "# Settings of DexTouch. Every line is a default: remove the # to change it.",
+        "# Flags and environment variables (DEXTOUCH_<SECTION>_<SETTING>) come before this file.",
+    ]
+    for section in sections:
+        kind = settings_class(section)
+        lines += ["", f"[{section}]"]
+        tables: dict[tuple[str, ...], list[str]] = {(): []}
+        for keys, value in _defaults(kind):
+            is_given = value is not None and value != REQUIRED
+            tables.setdefault(keys[:-1], []).extend(
+                [
+                    *textwrap.wrap(f"# {_description(kind, keys)}", 100, subsequent_indent="# "),
+                    f"#{keys[-1]} = {toml_text(value) if is_given else '…'}",
+                ]
+            )
+        for table, settings in tables.items():
+            lines += ["", f"# [{'.'.join((section, *table))}]"] if table else []
+            lines += settings
+    return "\n".join(lines) + "\n"
+
+
+def toml_text(value: object) -> str:
+    """A value as TOML; tables are written inline."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {toml_text(one)}" for key, one in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(toml_text, value)) + "]"
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _leaves(values: Mapping[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[Any, Any]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, (*above, key))
+        else:
+            yield (*above, key), value
+
+
+def _defaults(
+    kind: type[BaseModel], given: BaseModel | None = None, above: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Defaults of all settings, also of nested ones."""
+    for name, field in kind.model_fields.items():
+        keys = (*above, field.alias or name)
+        value = _default(field) if given is None else getattr(given, name)
+        if isinstance(value, BaseModel):
+            yield from _defaults(type(value), value, keys)
+        else:
+            yield keys, to_jsonable_python(value, fallback=str)
+
+
+def _default(field: FieldInfo) -> object:
+    value = field.get_default(call_default_factory=True, validated_data={})
+    return REQUIRED if value is PydanticUndefined else value
+
+
+def _place(kind: type[BaseModel], keys: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:
+    """Order of a setting: as it is declared."""
+    names = [field.alias or name for name, field in kind.model_fields.items()]
+    return (names.index(keys[0]) if keys[0] in names else len(names)), keys
+
+
+def _description(kind: type[BaseModel], keys: tuple[str, ...]) -> str:
+    for name, field in kind.model_fields.items():
+        if keys[0] == (field.alias or name):
+            inner = [one for one in _models_in(field.annotation) if len(keys) > 1]
+            texts = [text for one in inner if (text := _description(one, keys[1:]))]
+            return texts[0] if texts else (field.description or "")
+    return ""
+
+
+def _models_in(annotation: object) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models_in(inner)
+
+
+def _secret_names(kind: type[BaseModel]) -> set[str]:
+    """Names of fields that hold secrets, at any depth."""
+    found = set()
+    for name, field in kind.model_fields.items():
+        if field.annotation is SecretStr or SecretStr in get_args(field.annotation):
+            found.add(name)
+        for inner in _models_in(field.annotation):
+            found |= _secret_names(inner)
+    return found
+
+
+def _masked(value: object, keys: tuple[str, ...], secret: set[str]) -> object:
+    if value is not None and keys and keys[-1] in secret:
+        return MASK
+    if isinstance(value, Mapping):
+        return {key: _masked(one, (*keys, key), secret) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_masked(one, (), secret) for one in value]
+    if isinstance(value, str) and "://" in value and "@" in value:
+        scheme, _, rest = value.partition("://")
+        return f"{scheme}://{MASK}@{rest.rpartition('@')[2]}"
+    return value
+
+
+def show_main(argv: Sequence[str]) -> int:
+    """Print effective settings with their origin."""
+    parser = CommandParser(
+        prog="dextouch config show",
+        description="Show the settings of a command and where each comes from; without a section "
+        "those of all sections that are not defaults. Secrets are masked.",
+        epilog="example:\n  dextouch config show dashboard",
+    )
+    names = f"one of {', '.join(SECTIONS)}"
+    parser.add_argument("section", nargs="?", choices=list(SECTIONS), metavar="SECTION", help=names)
+    add_json(parser)
+    options = parser.parse_args(list(argv))
+    path = configuration_path()
+    print(f"# {path.resolve() if path else 'no dextouch.toml here, and no DEXTOUCH_CONFIG'}")
+    result: dict[str, Any] = {}
+    for section in [options.section] if options.section else SECTIONS:
+        found = [
+            one
+            for one in effective_settings(section)
+            if options.section or one.origin not in {DEFAULT, REQUIRED}
+        ]
+        if found:
+            print(f"\n[{section}]")
+        for one in found:
+            text = f"{'.'.join(one.keys)} = {toml_text(one.value)}"
+            print(f"{text:<48} # {one.origin}")
+        result[section] = {
+            ".".join(one.keys): {"value": one.value, "origin": one.origin} for one in found
+        }
+    write_result(options.json, {"file": str(path) if path else None, "sections": result})
+    return 0
+
+
+def example_main(argv: Sequence[str]) -> int:
+    """Print an example of the configuration file."""
+    parser = CommandParser(
+        prog="dextouch config example",
+        description="Print a dextouch.toml with all settings of some sections, commented out.",
+        epilog="example:\n  dextouch config example acquisition > dextouch.toml",
+    )
+    parser.add_argument(
+        "sections",
+        nargs="*",
+        metavar="SECTION",
+        help=f"default: all services. Known: {', '.join(SECTIONS)}",
+    )
+    parser.add_argument("--output", type=Path, metavar="PATH", help="new file to write instead")
+    options: argparse.Namespace = parser.parse_args(list(argv))
+    text = example(options.sections or SERVICES)
+    if options.output is None:
+        print(text, end="")
+        return 0
+    try:
+        with options.output.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise InvalidInputError(f"{options.output}: cannot be written: {error}") from error
+    return 0

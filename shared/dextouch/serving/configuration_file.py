@@ -1,0 +1,145 @@
+"""The configuration file `dextouch.toml`, which every command and service reads its settings from.
+
+The section of a command is its prefix of environment variables in lower case: [dashboard] `port` is
+DEXTOUCH_DASHBOARD_PORT. Flags come before the environment, that before the file.
+"""
+
+import os
+import re
+import tomllib
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import ValidationError
+from pydantic_settings import (
+    BaseSettings,
+    PydanticBaseSettingsSource,
+    TomlConfigSettingsSource,
+)
+
+from dextouch.errors import InvalidInputError
+from dextouch.schemas import first_problems
+
+VARIABLE: Final = "DEXTOUCH_CONFIG"
+FILE_NAME: Final = "dextouch.toml"
+PREFIX: Final = "DEXTOUCH_"
+_HEADER = re.compile(r"\s*\[\[?\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?")
+_KEY = re.compile(r"\s*([\w.\"' -]+?)\s*=")
+
+
+class CommandSettings(BaseSettings):
+    """Base of all settings: flags, then the environment, then `dextouch.toml`, then defaults."""
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Sources in the order of their priority; flags come before all of them."""
+        return init_settings, env_settings, *file_source(settings_cls)
+
+
+def file_source(settings_cls: type[BaseSettings]) -> tuple[PydanticBaseSettingsSource, ...]:
+    """The section of a settings class in the configuration file; none where it has none."""
+    path, section = configuration_path(), section_of(settings_cls)
+    if path is None or section not in read_configuration(path):
+        return ()
+    return (TomlConfigSettingsSource(settings_cls, path, (section,)),)
+
+
+def section_of(settings_cls: type[BaseSettings]) -> str:
+    """Name of the section of a settings class; empty for a base class."""
+    prefix = settings_cls.model_config.get("env_prefix", "")
+    return prefix.removeprefix(PREFIX).removesuffix("_").lower()
+
+
+def configuration_path() -> Path | None:
+    """The file that DEXTOUCH_CONFIG names, or dextouch.toml in the working folder; None without.
+
+    Raises:
+        InvalidInputError: the named file does not exist.
+    """
+    named = os.environ.get(VARIABLE)
+    if not named:
+        path = Path(FILE_NAME)
+        return path if path.is_file() else None
+    path = Path(named).expanduser()
+    if not path.is_file():
+        raise InvalidInputError(f"{VARIABLE}: got {named!r}, which is not a file")
+    return path
+
+
+def read_configuration(path: Path) -> Mapping[str, Any]:
+    """Sections of a configuration file.
+
+    Raises:
+        InvalidInputError: it cannot be read, is no TOML, or has a setting outside of a section.
+    """
+    try:
+        return _read(path, path.stat().st_mtime_ns)
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InvalidInputError(f"{path}: cannot be read as TOML: {error}") from error
+
+
+@lru_cache(maxsize=8)
+def _read(path: Path, _: int) -> Mapping[str, Any]:
+    sections = tomllib.loads(path.read_text(encoding="utf-8"))
+    for name, values in sections.items():
+        if not isinstance(values, dict):
+            line = line_of(path, (name,))
+            raise InvalidInputError(
+                f"{path}:{line}: {name} stands outside of a section; expected it below [dashboard] "
+                "or another section, see dextouch config example"
+            )
+    return sections
+
+
+def line_of(path: Path, keys: Sequence[str]) -> int | None:
+    """Line of a section or setting, or of the nearest table around it."""
+    best: tuple[int, int] | None = None
+    for number, found in _keys(path):
+        depth = len(found) if list(found) == list(keys[: len(found)]) else 0
+        if depth and (best is None or depth > best[0]):
+            best = depth, number
+    return None if best is None else best[1]
+
+
+def _keys(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Tables and keys with their lines; elements of an array of tables have their number."""
+    table: list[str] = []
+    num_elements: Counter[str] = Counter()
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        if header := _HEADER.fullmatch(line):
+            table = _parts(header[1])
+            if line.lstrip().startswith("[["):
+                yield number, table
+                num_elements[header[1]] += 1
+                table = [*table, str(num_elements[header[1]] - 1)]
+            yield number, table
+        elif key := _KEY.match(line):
+            yield number, [*table, *_parts(key[1])]
+
+
+def _parts(text: str) -> list[str]:
+    return [part.strip().strip("\"'") for part in text.split(".")]
+
+
+def explained(error: ValidationError, section: str) -> str:
+    """Problems of settings in one line, with the lines of the configuration file they come from."""
+    text = first_problems(error)
+    path = configuration_path()
+    if path is None:
+        return text
+    values, places = read_configuration(path).get(section, {}), []
+    for item in error.errors(include_input=False, include_url=False):
+        keys = [section, *(str(part) for part in item["loc"])]
+        if item["loc"] and item["loc"][0] in values:
+            places.append(f"{path}:{line_of(path, keys)} [{section}] {'.'.join(keys[1:])}")
+    return f"{text}; see {', '.join(places)}" if places else text
