@@ -126,7 +126,7 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
     async def missing() -> Sequence[str]:
         return [s.driver.name for s in station.supervisors if not s.connected.is_set()]
 
-    return create_service_app(
+    app = create_service_app(
         name="acquisition",
         settings=settings,
         routers=[
@@ -137,6 +137,8 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
         lifespan=lifespan,
         readiness=missing,
     )
+    app.state.is_working = station.is_working
+    return app
 
 
 def main(argv: Sequence[str]) -> int:

@@ -105,6 +105,15 @@ class Station:
             stopper.join()
         self.recorder.close()
 
+    def is_working(self) -> bool:
+        """Whether health is evaluated, devices are read and a running take is written.
+
+        A device that is absent or lost is no stall: its thread waits for it.
+        """
+        take = self.recorder.take
+        is_read = all(supervisor.is_running for supervisor in self.supervisors)
+        return is_read and self.health.is_running and (take is None or take.is_working())
+
     def _device_events(self) -> DeviceEvents:
         return {s.driver.name: s.events() for s in self.supervisors}
 

@@ -110,6 +110,11 @@ class DeviceSupervisor:
         self._waiter_lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, name=f"read-{driver.name}", daemon=True)
 
+    @property
+    def is_running(self) -> bool:
+        """Whether the thread that reads the device, or waits for it, is there."""
+        return self._thread.is_alive()
+
     def start(self) -> None:
         """Start reading."""
         self._thread.start()

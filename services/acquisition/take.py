@@ -20,6 +20,8 @@ from services.acquisition.take_check import TakeWatch
 logger = structlog.get_logger(__name__)
 
 MEBIBYTE = 2**20
+# A disk may be slow for this long before the take counts as stalled.
+STALL_NS = 10_000_000_000
 
 
 def check_free_space(folder: Path, safety: SpoolSafety) -> None:
@@ -66,16 +68,28 @@ class Take:
         # for the first image that begins a group.
         self._waiting = {s.name for s in spool.attributes.streams if s.unit == H264_UNIT}
         self._safety = safety
+        self._clock = clock
+        self._flushed_ns = clock.now_ns()
+        self._flush_period_ns = round(safety.flush_period_s * 1e9)
         with disk_errors(f"open log of spool {spool.path.name!r}"):
             self._log = os.open(spool.path / LOG_FILE, os.O_RDONLY)
         # None once it has ended: it holds this take, and the two must not outlive it as a circle.
         self._flushes: PeriodicCall | None = PeriodicCall(
             self._flush,
-            period_ns=round(safety.flush_period_s * 1e9),
+            period_ns=self._flush_period_ns,
             clock=clock,
             name="flush-spool",
         )
         self._flushes.start()
+
+    def is_working(self) -> bool:
+        """Whether readings get through and flushes return; waits a moment for the disk."""
+        if self.watch.has_ended:
+            return True
+        if not self._lock.acquire(timeout=STALL_NS / 1e9):
+            return False
+        self._lock.release()
+        return self._clock.now_ns() - self._flushed_ns < STALL_NS + self._flush_period_ns
 
     def accept(self, readings: Readings) -> None:
         """Append new readings (called by the reader threads); nothing after the end.
@@ -146,6 +160,7 @@ class Take:
             check_free_space(self.spool.path, self._safety)
             with disk_errors(f"flush spool {self.spool.path.name!r}"):
                 os.fdatasync(self._log)
+            self._flushed_ns = self._clock.now_ns()
         except StorageError as error:
             self._end(error)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dextouch.command_line import write_result
+from dextouch.command_line import ProgressLines, write_result
 from dextouch.serving import load_settings
 from services.evaluation.reporting.charts import Line, line_chart, stand_alone
 from services.world_model.tokenizer_files import Reconstruction, TokenizerMetadata, read_tokenizer
@@ -25,11 +25,13 @@ def main(arguments: list[str]) -> int:
         TextColumn("step {task.fields[step]}  Contact-IoU {task.fields[iou]:.3f}"),
         TimeRemainingColumn(),
     )
+    lines = ProgressLines("training")
     with Progress(*columns) as bar:
         task = bar.add_task("training", total=1.0, step=0, iou=float("nan"))
 
         def on_evaluation(share: float, now: Reconstruction) -> None:
             bar.update(task, completed=share, step=now.step, iou=now.contact_iou)
+            lines.show(f"{100 * share:.0f} %  step {now.step}  Contact-IoU {now.contact_iou:.3f}")
 
         report = train_tokenizer(settings, on_evaluation)
     print(_table(report))

@@ -1,4 +1,4 @@
-"""Progress of a long job on standard error: a bar on a terminal, a line per tenth elsewhere."""
+"""Progress of a long job on standard error: a bar on a terminal, lines elsewhere."""
 
 from types import TracebackType
 
@@ -6,9 +6,11 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 
+from dextouch.command_line import ProgressLines
+
 
 class Progress:
-    """A progress bar on a terminal; elsewhere (a log, a pipe) a line at every tenth.
+    """A progress bar on a terminal; elsewhere a line at every tenth and every few seconds.
 
     Args:
         title: name of the job.
@@ -16,8 +18,9 @@ class Progress:
     """
 
     def __init__(self, title: str, total: int) -> None:
-        self._console = console = Console(stderr=True)
-        self._title, self._total, self._done = title, total, 0
+        console = Console(stderr=True)
+        self._lines = ProgressLines(title)
+        self._total, self._done = total, 0
         columns = (
             TextColumn(title),
             BarColumn(),
@@ -45,8 +48,5 @@ class Progress:
         self._bar.update(self._task, advance=1, text=text)
         tenths = self._done * 10 // self._total
         self._done += 1
-        if not self._console.is_terminal and self._done * 10 // self._total > tenths:
-            self._console.print(
-                f"   {self._title} {self._done} of {self._total}  {text}".rstrip(),
-                highlight=False,
-            )
+        is_tenth = self._done * 10 // self._total > tenths
+        self._lines.show(f"{self._done} of {self._total}  {text}", is_last=is_tenth)

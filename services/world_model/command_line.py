@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dextouch.command_line import write_result
+from dextouch.command_line import ProgressLines, write_result
 from dextouch.serving import load_settings
 from dextouch.worlds import World, serve_worlds
 from services.networks.weight_files import digest_of
@@ -72,6 +72,7 @@ def _train_together(settings: TrainSettings, processes: Processes) -> TrainingRe
         TextColumn("touch {task.fields[tactile]:.3f}"),
         TimeRemainingColumn(),
     )
+    lines = ProgressLines("training")
     with Progress(*columns, disable=not processes.is_first) as bar:
         task = bar.add_task("training", total=1.0, step=0, video=float("nan"), tactile=float("nan"))
 
@@ -83,6 +84,9 @@ def _train_together(settings: TrainSettings, processes: Processes) -> TrainingRe
                 video=now.loss_video,
                 tactile=now.loss_tactile,
             )
+            if processes.is_first:
+                losses = f"video {now.loss_video:.3f}  touch {now.loss_tactile:.3f}"
+                lines.show(f"{100 * now.share:.0f} %  step {now.step}  {losses}")
 
         return train(settings, on_progress, processes)
 

@@ -5,6 +5,7 @@ import json
 import re
 import sys
 import textwrap
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 STANDARD_OUTPUT = Path("-")
 JSON_HELP = "also write the result as JSON to this file; - for standard output"
+# Of lines in a log or pipe.
+LINE_PERIOD_S = 5.0
 Item = TypeVar("Item")
 _result_stream: ContextVar[TextIO | None] = ContextVar("result_stream", default=None)
 _asked_parsers: ContextVar[list[argparse.ArgumentParser] | None] = ContextVar(
@@ -69,15 +72,47 @@ def parser_behind(show_help: Callable[[], object]) -> argparse.ArgumentParser | 
     return asked[0] if asked else None
 
 
+class ProgressLines:
+    """Progress of a long job as lines on standard error, where no terminal shows a bar.
+
+    Args:
+        title: of the job.
+        period_s: shortest time between two lines.
+        clock_s: tells the time.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        *,
+        period_s: float = LINE_PERIOD_S,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._title, self._period_s, self._clock_s = title, period_s, clock_s
+        self._is_terminal = sys.stderr.isatty()
+        self._last_s = clock_s()
+
+    def show(self, text: str, *, is_last: bool = False) -> None:
+        """Print how far the job is, unless a terminal is there or a line has just been printed."""
+        now_s = self._clock_s()
+        if not self._is_terminal and (is_last or now_s - self._last_s >= self._period_s):
+            self._last_s = now_s
+            sys.stderr.write(f"   {self._title} {text}".rstrip() + "\n")
+            sys.stderr.flush()
+
+
 def progress(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:
-    """Iterate with a progress bar on standard error, if that is a terminal."""
+    """Iterate with a progress bar on standard error, or a line every few seconds elsewhere."""
     from rich.console import Console
     from rich.progress import track
 
-    console = Console(stderr=True)
-    yield from track(
+    console, lines = Console(stderr=True), ProgressLines(what)
+    shown = track(
         items, total=total, description=what, console=console, disable=not console.is_terminal
     )
+    for done, item in enumerate(shown, start=1):
+        yield item
+        lines.show(f"{done} of {total}", is_last=done == total)
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

@@ -6,7 +6,14 @@ import sys
 
 import pytest
 
-from dextouch.command_line import CommandParser, add_json, messages_aside, write_result
+from dextouch.command_line import (
+    CommandParser,
+    ProgressLines,
+    add_json,
+    messages_aside,
+    progress,
+    write_result,
+)
 
 
 def parser():
@@ -66,3 +73,18 @@ def test_messages_stay_where_they_are_without_a_dash(capsys):
     with messages_aside(["--json", "report.json"]):
         sys.stdout.write("a message\n")
     assert capsys.readouterr().out == "a message\n"
+
+
+def test_progress_prints_lines_where_no_terminal_is(capsys):
+    times_s = iter([0.0, 1.0, 4.9, 5.0, 6.0, 11.0])
+    lines = ProgressLines("export", clock_s=lambda: next(times_s))
+    for done in range(4):
+        lines.show(f"{done} of 9")
+    lines.show("9 of 9", is_last=True)
+    assert capsys.readouterr().err.splitlines() == ["   export 2 of 9", "   export 9 of 9"]
+
+
+def test_progress_of_items_ends_with_a_line(capsys):
+    assert list(progress(iter("abc"), "export mcap", 3)) == ["a", "b", "c"]
+    out, err = capsys.readouterr()
+    assert (out, err) == ("", "   export mcap 3 of 3\n")

@@ -45,6 +45,8 @@ from services.acquisition.supervisor import DeviceSupervisor
 
 TICK_NS = 100_000_000
 PERIOD_NS = 1_000_000_000
+# Without a tick for so long the monitor counts as stalled.
+STALL_NS = 10_000_000_000
 CONFIRM_NS = 200_000_000
 # A device may take this long after the start before its silence is an event.
 START_NS = 1_000_000_000
@@ -202,6 +204,7 @@ class HealthMonitor:
         self._started_ns = clock.now_ns()
         self._due_ns = self._started_ns + PERIOD_NS
         # One evaluates at a time; the other lock guards what a report reads.
+        self._ticked_ns = 0
         self._evaluating = threading.Lock()
         self._lock = threading.Lock()
         self._ticks = PeriodicCall(
@@ -214,9 +217,14 @@ class HealthMonitor:
 
     def start(self) -> None:
         """Start evaluating."""
-        self._started_ns = self._clock.now_ns()
+        self._started_ns = self._ticked_ns = self._clock.now_ns()
         self._due_ns = self._started_ns + PERIOD_NS
         self._ticks.start()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the evaluation is called, many times more often than this asks for."""
+        return self._clock.now_ns() - self._ticked_ns < STALL_NS
 
     def stop(self) -> None:
         """End the thread."""
@@ -232,7 +240,7 @@ class HealthMonitor:
 
     def tick(self) -> None:
         """Run what is due: silence detection, confirmations, regular evaluations."""
-        now_ns = self._clock.now_ns()
+        now_ns = self._ticked_ns = self._clock.now_ns()
         self._notice_silence(now_ns)
         if now_ns >= self._due_ns:
             # After a long stop of the process one evaluation is enough.

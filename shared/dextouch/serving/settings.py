@@ -216,7 +216,8 @@ def run(
     gc.freeze()
     options = server_options(settings, grace_s=settings.shutdown_grace_s)
     config = uvicorn.Config(app, host=settings.host, port=settings.port, **options)
-    server = DrainingServer(config, drain=drain, drain_s=drain_s)
+    is_working = getattr(app.state, "is_working", None)
+    server = DrainingServer(config, drain=drain, drain_s=drain_s, is_working=is_working)
     # After a graceful end uvicorn repeats the signal that ended it.
     with suppress(KeyboardInterrupt):
         server.run()

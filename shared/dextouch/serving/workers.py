@@ -1,5 +1,6 @@
 """Server processes: one that drains before it stops, or several workers that share one port."""
 
+import asyncio
 import gc
 import signal
 import socket
@@ -17,6 +18,7 @@ from uvicorn.config import STARTUP_FAILURE
 from uvicorn.supervisors import Multiprocess
 
 from dextouch.errors import DexTouchError, UnavailableError
+from dextouch.serving.service_manager import IsWorking, ServiceManager
 
 logger = structlog.get_logger(__name__)
 
@@ -33,15 +35,39 @@ class DrainingServer(uvicorn.Server):
         config: of uvicorn.
         drain: called at SIGTERM, in the event loop's thread; None shuts down at once.
         drain_s: time until the server shuts down; requests that run then still end.
+        is_working: whether the service does its work, for the watchdog of systemd.
     """
 
     def __init__(
-        self, config: uvicorn.Config, *, drain: Callable[[], object] | None, drain_s: float
+        self,
+        config: uvicorn.Config,
+        *,
+        drain: Callable[[], object] | None,
+        drain_s: float,
+        is_working: IsWorking | None = None,
     ) -> None:
         super().__init__(config)
+        self._manager = ServiceManager()
+        self._is_working = is_working
+        self._watchdog: asyncio.Task[None] | None = None
         self._drain = drain
         self._drain_s = drain_s
         self._stop_at_s: float | None = None
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, and report to systemd once the port is open."""
+        await super().startup(sockets)
+        if self.started:
+            self._manager.send("READY=1")
+            feeding = self._manager.feed_watchdog(self._is_working)
+            self._watchdog = asyncio.create_task(feeding)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop, while the watchdog still watches."""
+        self._manager.send("STOPPING=1")
+        await super().shutdown(sockets)
+        if self._watchdog is not None:
+            self._watchdog.cancel()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Begin to drain, or to shut down."""

@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from services.acquisition.take import STALL_NS
 from services.cli.main import COMMANDS, find_command
 
 ROOT = Path(__file__).parents[3]
@@ -142,7 +144,7 @@ def test_container_and_unit_let_in_the_same_devices():
     devices = yaml.safe_load((ROOT / "deploy/compose.devices.yml").read_text())
     rules = devices["services"]["acquisition"]["device_cgroup_rules"]
     numbers = set(re.findall(r"^c (\d+):", "\n".join(rules), re.M))
-    unit = (ROOT / "deploy/systemd/dextouch-station.service").read_text()
+    unit = (ROOT / "deploy/systemd/dextouch-station@.service").read_text()
     names = set(re.findall(r"^DeviceAllow=char-(\w+) rw$", unit, re.M))
     assert names == {*majors, "hidraw"}
     assert numbers == set(majors.values())
@@ -160,9 +162,38 @@ def test_prometheus_scrapes_every_service():
 
 def test_all_threads_of_a_station_share_one_heap_as_in_the_soak_test():
     """With more of them a station grows from take to take."""
-    unit = (ROOT / "deploy/systemd/dextouch-station.service").read_text()
+    unit = (ROOT / "deploy/systemd/dextouch-station@.service").read_text()
     assert "\nEnvironment=MALLOC_ARENA_MAX=1\n" in unit
     assert OURS["acquisition"]["environment"]["MALLOC_ARENA_MAX"] == "1"
     assert '"MALLOC_ARENA_MAX": "1"' in (ROOT / "tests/system/test_station_soak.py").read_text()
     # All other services: a few.
     assert re.search(r"\bMALLOC_ARENA_MAX=2\b", (ROOT / "deploy/Dockerfile").read_text())
+
+
+UNITS = sorted((ROOT / "deploy/systemd").glob("*.service"))
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze")
+@pytest.mark.parametrize("unit", UNITS, ids=[unit.name for unit in UNITS])
+def test_systemd_accepts_the_units(unit, tmp_path):
+    text = unit.read_text().replace("/opt/dextouch/bin/dextouch", "/bin/true")
+    (tmp_path / unit.name).write_text(text)
+    name = unit.name.replace("@", "@desk_3")
+    done = subprocess.run(
+        ["systemd-analyze", "verify", str(tmp_path / name)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_station_reports_to_systemd_that_it_works():
+    (unit,) = (one.read_text() for one in UNITS if one.name == "dextouch-station@.service")
+    assert "\nType=notify\n" in unit
+    watchdog_s = int(re.search(r"^WatchdogSec=(\d+)$", unit, re.M)[1])
+    # Two feeds a period, each after a look that may wait for the disk.
+    assert watchdog_s / 2 > STALL_NS / 1e9
+    assert "\nRestart=always\n" in unit
+    (command,) = re.findall(r"^ExecStart=/opt/dextouch/bin/dextouch (.+)$", unit, re.M)
+    assert find_command(command.split())[0] == "station serve"
