@@ -59,7 +59,7 @@ def test_commands_in_code_exist(page):
 
 
 def test_station_settings_of_the_guide_are_taken(monkeypatch):
-    text = block("docs/stations.md", "# /etc/dextouch/station.env")
+    text = block("docs/stations.md", "# /etc/dextouch/desk_3.env")
     pairs = [word.split("=", 1) for word in shlex.split(text, comments=True)]
     for name, value in pairs:
         monkeypatch.setenv(name, value)
