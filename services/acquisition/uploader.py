@@ -8,6 +8,7 @@ from pathlib import Path
 
 import structlog
 from pydantic import ValidationError
+from structlog.contextvars import bound_contextvars
 
 from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import disk_errors, replace_file
@@ -22,6 +23,7 @@ from dextouch.errors import (
 )
 from dextouch.schemas import ID_TAKEN, RecordingAttributes, RecordingStatus, UploadStatus
 from dextouch.streams import StreamDescriptor, frame_body
+from dextouch.tracing import in_trace
 from services.acquisition.memory import give_back_free_memory
 
 logger = structlog.get_logger(__name__)
@@ -164,7 +166,9 @@ class Uploader:
             if self._stopping.is_set():
                 break
             try:
-                if self._upload(path):
+                with in_trace() as trace, bound_contextvars(trace_id=trace.trace_id):
+                    is_done = self._upload(path)
+                if is_done:
                     done.append(path.name)
                     self._failures.pop(path.name, None)
                     give_back_free_memory()

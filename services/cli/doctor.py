@@ -20,7 +20,7 @@ _PACKAGES = {
     "store": "zarr zstandard google_crc32c av",
     "station": "serial fastcrc hid usb cv2",
     "serve": "fastapi uvicorn httptools rich redis httpx pydantic_settings structlog "
-    "prometheus_client jinja2 websockets",
+    "prometheus_client jinja2 websockets shtab",
     "align": "scipy numba",
     "model": "torch safetensors PIL",
     "full": "diffusers transformers",

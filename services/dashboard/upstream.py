@@ -11,6 +11,7 @@ from pydantic import SecretStr, TypeAdapter, ValidationError
 
 from dextouch.errors import UnavailableError
 from dextouch.schemas import Problem, error_from_problem, first_problems
+from dextouch.tracing import trace_headers
 
 Form = TypeVar("Form")
 SECONDS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
@@ -91,6 +92,7 @@ class Upstream:
 
     async def _sent(self, request: httpx.Request) -> httpx.Response:
         method, path = request.method, request.url.path
+        request.headers.update(trace_headers())
         began_s = time.perf_counter()
         outcome = "failed"
         try:

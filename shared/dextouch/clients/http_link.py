@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from dextouch.errors import InvalidInputError, UnavailableError
 from dextouch.schemas import CLASS_OF_STATUS, PROBLEM_MEDIA_TYPE, Problem, error_from_problem
+from dextouch.tracing import trace_headers
 
 # Pauses before each new attempt after a lost connection.
 RETRY_PAUSES_S = (0.05, 0.2, 0.8)
@@ -95,7 +96,7 @@ class HttpLink:
             UnavailableError: no response after all attempts.
             DexTouchError: the problem that the service reports, as its own class.
         """
-        headers = self._headers | {"Accept": accept}
+        headers = self._headers | {"Accept": accept} | trace_headers()
         if body is not None:
             headers["Content-Type"] = content_type
         if session is not None:

@@ -83,6 +83,7 @@ class Problem(BaseModel):
     detail: str
     instance: str = ""
     request_id: str = ""
+    trace_id: str = ""
     details: dict[str, Any] = {}
 
 

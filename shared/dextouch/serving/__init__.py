@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from dextouch.serving.settings import serve as serve
     from dextouch.serving.settings import server_options as server_options
     from dextouch.serving.settings import service_config as service_config
+    from dextouch.serving.spans import configure_spans as configure_spans
     from dextouch.serving.state import StateStore as StateStore
     from dextouch.serving.state import Versioned as Versioned
     from dextouch.serving.state import open_state as open_state

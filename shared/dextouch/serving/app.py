@@ -205,8 +205,8 @@ def _problem_response(
     problem: Problem = problem_from_error(
         error, instance=request.url.path, request_id=request.state.request_id
     )
-    if status is not None:
-        problem = problem.model_copy(update={"status": status})
+    changed = {"trace_id": request.state.trace_id}
+    problem = problem.model_copy(update=changed | ({} if status is None else {"status": status}))
     headers = {}
     if "retry_after_s" in error.details:
         headers["retry-after"] = str(error.details["retry_after_s"])

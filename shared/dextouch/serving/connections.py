@@ -27,6 +27,7 @@ from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
 from dextouch.schemas import PROBLEM_MEDIA_TYPE, problem_from_error
 from dextouch.serving.guard import Refuse
 from dextouch.serving.masking import masked
+from dextouch.serving.spans import traced
 
 logger = structlog.get_logger(__name__)
 
@@ -336,14 +337,19 @@ class RequestMiddleware:
                     (b"x-request-id", request_id.encode()),
                     (b"server-timing", ", ".join(timings).encode()),
                 ]
+                scope["state"]["status"] = message["status"]
                 self._count(scope, message["status"], duration_s, timings_s)
             await send(message)
 
-        tokens = structlog.contextvars.bind_contextvars(request_id=request_id)
-        try:
-            await self._app(scope, receive, send_with_headers)
-        finally:
-            structlog.contextvars.reset_contextvars(**tokens)
+        with traced(scope) as trace_id:
+            scope["state"]["trace_id"] = trace_id
+            tokens = structlog.contextvars.bind_contextvars(
+                request_id=request_id, trace_id=trace_id
+            )
+            try:
+                await self._app(scope, receive, send_with_headers)
+            finally:
+                structlog.contextvars.reset_contextvars(**tokens)
 
     async def _count_websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
         opened: list[Gauge] = []

@@ -25,6 +25,7 @@ from dextouch.serving.configuration_file import CommandSettings, explained, sect
 from dextouch.serving.guard import ApiKey
 from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
 from dextouch.serving.logs import configure_logging
+from dextouch.serving.spans import configure_spans
 
 # Keep-alive, so that a policy may take this long between two chunks.
 KEEP_ALIVE_S = 75
@@ -269,5 +270,6 @@ def serve(
     """
     settings = load_settings(kind, list(arguments))
     configure_logging(service=service, log_format=settings.log_format, level=settings.log_level)
+    configure_spans(service)
     run(create_app(settings), settings)
     return 0

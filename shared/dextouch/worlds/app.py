@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from dextouch.serving import (
     ServiceSettings,
     configure_logging,
+    configure_spans,
     create_service_app,
     open_state,
     run,
@@ -140,4 +141,5 @@ def create_serving_app(
 ) -> FastAPI:
     """The application of one of several processes, which computes a first chunk in each world."""
     configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
+    configure_spans(name)
     return create_world_app(open_worlds(), settings, name=name, reopen=reopen, warm_up=True)

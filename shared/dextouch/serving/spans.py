@@ -1,0 +1,101 @@
+"""Spans of requests for OpenTelemetry, exported by OTLP where its SDK is installed and configured.
+
+Configured means that OTEL_EXPORTER_OTLP_ENDPOINT (or …_TRACES_ENDPOINT) is set; the SDK is in the
+extra `tracing`. Without either, this module imports nothing.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+import structlog
+from starlette.types import Scope
+
+from dextouch.tracing import TraceContext, in_trace, new_trace, parse_traceparent
+
+if TYPE_CHECKING:
+    from opentelemetry.trace import Tracer
+
+logger = structlog.get_logger(__name__)
+
+ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
+
+
+class Spans:
+    """Where spans of requests go; `tracer` is None while they go nowhere."""
+
+    tracer: "Tracer | None" = None
+
+    def configure(self, service: str) -> None:
+        """Export spans if an endpoint is set and the SDK is installed."""
+        if not any(os.environ.get(name) for name in ENDPOINTS):
+            return
+        try:
+            # By name, since neither package is there to be type-checked.
+            sdk = import_module("opentelemetry.sdk.trace")
+            export = import_module("opentelemetry.sdk.trace.export")
+            resources = import_module("opentelemetry.sdk.resources")
+            otlp = import_module("opentelemetry.exporter.otlp.proto.http.trace_exporter")
+        except ModuleNotFoundError:
+            logger.warning("spans_not_exported", reason="pip install 'dextouch-wm[tracing]'")
+            return
+        resource = resources.Resource.create({"service.name": service})
+        provider = sdk.TracerProvider(resource=resource)
+        provider.add_span_processor(export.BatchSpanProcessor(otlp.OTLPSpanExporter()))
+        self.tracer = provider.get_tracer("dextouch")
+
+    @contextmanager
+    def of_request(self, scope: Scope, caller: TraceContext | None) -> Iterator[TraceContext]:
+        """Span of a request below its caller's; needs a tracer."""
+        from opentelemetry import trace
+
+        assert self.tracer is not None  # noqa: S101 - the caller looks
+        above = None
+        if caller is not None:
+            parent = trace.SpanContext(
+                int(caller.trace_id, 16),
+                int(caller.span_id, 16),
+                is_remote=True,
+                trace_flags=trace.TraceFlags(int(caller.flags, 16)),
+            )
+            above = trace.set_span_in_context(trace.NonRecordingSpan(parent))
+        with self.tracer.start_as_current_span(
+            scope["method"], context=above, kind=trace.SpanKind.SERVER
+        ) as span:
+            of_span = span.get_span_context()
+            yield TraceContext(
+                f"{of_span.trace_id:032x}", f"{of_span.span_id:016x}", f"{of_span.trace_flags:02x}"
+            )
+            # The template, which is known once the request was routed.
+            route = getattr(scope.get("route"), "path", "unmatched")
+            span.update_name(f"{scope['method']} {route}")
+            span.set_attributes({"http.request.method": scope["method"], "http.route": route})
+            status = scope["state"].get("status")
+            if status is not None:
+                span.set_attribute("http.response.status_code", status)
+
+
+SPANS = Spans()
+
+
+def configure_spans(service: str) -> None:
+    """Export spans of this process's requests if OpenTelemetry is installed and configured."""
+    SPANS.configure(service)
+
+
+@contextmanager
+def traced(scope: Scope) -> Iterator[str]:
+    """Continue the trace of a request's caller, or begin one; yields its id."""
+    caller = None
+    for name, value in scope["headers"]:
+        if name == b"traceparent":
+            caller = parse_traceparent(value.decode("latin-1"))
+            break
+    if SPANS.tracer is not None:
+        with SPANS.of_request(scope, caller) as context, in_trace(context):
+            yield context.trace_id
+        return
+    with in_trace(new_trace() if caller is None else caller.child()) as context:
+        yield context.trace_id

@@ -1,0 +1,84 @@
+"""W3C trace context of the current work, which services and clients accept, log and pass on.
+
+Only ids travel, in the header `traceparent`. Spans are exported where the SDK of OpenTelemetry is
+installed and configured (`dextouch.serving.spans`).
+"""
+
+import re
+import secrets
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
+from typing import Final
+
+TRACEPARENT: Final = "traceparent"
+NOT_SAMPLED: Final = "00"
+# Of later versions only these first fields are known; version ff is invalid.
+_FORM = re.compile(r"(?!ff)([0-9a-f]{2})-([0-9a-f]{32})-([0-9a-f]{16})-([0-9a-f]{2})(-.*)?")
+_current: ContextVar["TraceContext | None"] = ContextVar("trace_context", default=None)
+
+
+@dataclass(frozen=True)
+class TraceContext:
+    """A span of a trace: ids in hexadecimal, and the flags of W3C (01 is sampled)."""
+
+    trace_id: str
+    span_id: str
+    flags: str = NOT_SAMPLED
+
+    @property
+    def header(self) -> str:
+        """Value of the header `traceparent`."""
+        return f"00-{self.trace_id}-{self.span_id}-{self.flags}"
+
+    def child(self) -> "TraceContext":
+        """A new span of the same trace."""
+        return replace(self, span_id=secrets.token_hex(8))
+
+
+def new_trace() -> TraceContext:
+    """The first span of a new trace."""
+    return TraceContext(secrets.token_hex(16), secrets.token_hex(8))
+
+
+def parse_traceparent(text: str) -> TraceContext | None:
+    """The caller's span; None where the header is invalid, which starts a new trace."""
+    found = _FORM.fullmatch(text)
+    if found is None or (found[1] == "00" and found[5]):
+        return None
+    trace_id, span_id = found[2], found[3]
+    if not trace_id.strip("0") or not span_id.strip("0"):
+        return None
+    return TraceContext(trace_id, span_id, found[4])
+
+
+def current_trace() -> TraceContext | None:
+    """The span of the current work: ours, or the active one of OpenTelemetry; None without."""
+    context = _current.get()
+    if context is not None or "opentelemetry.trace" not in sys.modules:
+        return context
+    span = sys.modules["opentelemetry.trace"].get_current_span().get_span_context()
+    if not span.is_valid:
+        return None
+    return TraceContext(f"{span.trace_id:032x}", f"{span.span_id:016x}", f"{span.trace_flags:02x}")
+
+
+@contextmanager
+def in_trace(context: TraceContext | None = None) -> Iterator[TraceContext]:
+    """Work inside belongs to this span, by default to a new one of the current or a new trace."""
+    if context is None:
+        around = current_trace()
+        context = new_trace() if around is None else around.child()
+    token = _current.set(context)
+    try:
+        yield context
+    finally:
+        _current.reset(token)
+
+
+def trace_headers() -> dict[str, str]:
+    """Headers that pass the current trace on to another service; none without a trace."""
+    context = current_trace()
+    return {} if context is None else {TRACEPARENT: context.header}
