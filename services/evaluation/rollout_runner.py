@@ -110,14 +110,14 @@ class RolloutRunner:
         )
         return score, played
 
-    def _begin(self, start: MatchedStart, world: str, repeat: int) -> Rollout:
+    def _begin(self, start: MatchedStart, policy: str, world: str, repeat: int) -> Rollout:
         """Start a rollout from a matched start (by task and seed in the real world).
 
         Raises:
             ConflictError: the real world started differently than before.
         """
         address = self.worlds.addresses[world]
-        client = address.client.selecting(ReturnSelector(cameras=self.worlds.cameras))
+        client = address.client.selecting(ReturnSelector(cameras=self.worlds.cameras), name=policy)
         is_real = world == REAL
         rollout = client.start(
             world=address.world,
@@ -140,7 +140,7 @@ class RolloutRunner:
         """Run a policy in a rollout."""
         description = self.worlds.descriptions[world]
         where = f"policy {policy!r}, task {start.task!r}, seed {start.seed}"
-        with self._begin(start, world, repeat) as rollout:
+        with self._begin(start, policy, world, repeat) as rollout:
             seen = [rollout.observation]
             commanded = [rollout.observation.action_reached[-1:]]
             ask(actor.reset, start.for_policy(), where=f"{where}: reset")

@@ -84,29 +84,27 @@ class HttpLink:
         body: bytes | None = None,
         content_type: str = "application/json",
         accept: str = "application/json",
-        session: str | None = None,
+        headers: Mapping[str, str] | None = None,
     ) -> Reply:
         """Send a request, again after a lost connection: every request must be idempotent.
 
         A service that has ever responded may be away for `patience_s`: until then the request is
         also repeated after responses with `Retry-After`, not before the time it says, and after
-        errors of a proxy. Proxies that route by a header find `session` in `x-session-id`.
+        errors of a proxy.
 
         Raises:
             UnavailableError: no response after all attempts.
             DexTouchError: the problem that the service reports, as its own class.
         """
-        headers = self._headers | {"Accept": accept} | trace_headers()
+        sent = self._headers | (headers or {}) | {"Accept": accept} | trace_headers()
         if body is not None:
-            headers["Content-Type"] = content_type
-        if session is not None:
-            headers["x-session-id"] = session
+            sent["Content-Type"] = content_type
         began_s, paused_s = time.monotonic(), 0.0
         problem: Reply | OSError | http.client.HTTPException
         pauses_s = itertools.chain(RETRY_PAUSES_S, itertools.repeat(LAST_PAUSE_S))
         for attempt, pause_s in enumerate(pauses_s):
             try:
-                self._connection.request(method, self._prefix + path, body=body, headers=headers)
+                self._connection.request(method, self._prefix + path, body=body, headers=sent)
                 answer = self._connection.getresponse()
                 reply = Reply(answer.status, dict(answer.headers.items()), answer.read())
             except (OSError, http.client.HTTPException) as error:

@@ -9,7 +9,7 @@ with RolloutClient("http://127.0.0.1:8100") as client:
 from contextlib import nullcontext, suppress
 from copy import copy
 from typing import TypeVar
-from urllib.parse import urlencode
+from urllib.parse import quote, urlencode
 
 import numpy as np
 from jaxtyping import Float64
@@ -56,6 +56,7 @@ class RolloutClient:
         patience_s: how long a service that has ever responded may be full or away, as while
             another worker takes over; requests are repeated meanwhile.
         selector: cameras and steps to return for every rollout of this client.
+        name: shown to those who watch its rollouts, such as the policy's.
     """
 
     def __init__(
@@ -66,14 +67,17 @@ class RolloutClient:
         timeout_s: float = 60.0,
         patience_s: float = 30.0,
         selector: ReturnSelector = EVERYTHING,
+        name: str = "",
     ) -> None:
+        self.name = name
         self._link = HttpLink(url, api_key=api_key, timeout_s=timeout_s, patience_s=patience_s)
         self.selector = selector
 
-    def selecting(self, selector: ReturnSelector) -> "RolloutClient":
-        """A client on the same connection with another selector for new rollouts."""
+    def selecting(self, selector: ReturnSelector, *, name: str | None = None) -> "RolloutClient":
+        """A client on the same connection with another selector, or name, for new rollouts."""
         other = copy(self)
         other.selector = selector
+        other.name = self.name if name is None else name
         return other
 
     def worlds(self) -> list[WorldDescription]:
@@ -113,6 +117,7 @@ class RolloutClient:
             body=encode_start(request, start),
             content_type=MSGPACK,
             accept=MSGPACK,
+            headers={"dextouch-client": quote(self.name)} if self.name else None,
         )
         answer = decode_answer(reply.body, max_bytes=MAX_ANSWER_BYTES)
         if answer.origin is None:
@@ -190,7 +195,8 @@ class Rollout:
             body=checked.astype("<f8").tobytes(),
             content_type=ACTIONS_TYPE,
             accept=MSGPACK,
-            session=self.id,
+            # For proxies that route by it.
+            headers={"x-session-id": self.id},
         )
         answer = decode_answer(reply.body, max_bytes=MAX_ANSWER_BYTES)
         self.info, self.observation, self.told = answer.rollout, answer.observation, answer.info

@@ -90,6 +90,8 @@ if TYPE_CHECKING:
     from dextouch.schemas.rollouts import ForkRequest as ForkRequest
     from dextouch.schemas.rollouts import RolloutInfo as RolloutInfo
     from dextouch.schemas.rollouts import StartRequest as StartRequest
+    from dextouch.schemas.rollouts import WatchedRollout as WatchedRollout
+    from dextouch.schemas.rollouts import WatchedRollouts as WatchedRollouts
     from dextouch.schemas.rollouts import WorldDescription as WorldDescription
     from dextouch.schemas.rollouts import WorldKind as WorldKind
     from dextouch.schemas.rollouts import WorldList as WorldList

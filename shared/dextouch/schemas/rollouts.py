@@ -101,3 +101,41 @@ class Doubt(FrozenModel):
                 "outside is true and none where it is not"
             )
         return self
+
+
+class WatchedRollout(FrozenModel):
+    """A rollout as it is shown to those who watch it, and who can neither advance nor end it.
+
+    Attributes:
+        watch_id: to read its newest response with; the rollout's own id cannot be derived from it.
+        client: what the client says about itself, such as the name of a policy; may be empty.
+        key: name of the API key that began it; empty without keys.
+        age_s: since its start.
+        idle_s: since its newest chunk, or its start.
+        doubt: of the newest chunk; None where the world reports none.
+        success: at the newest step; None where unknown.
+    """
+
+    watch_id: str
+    world: str
+    world_digest: str
+    task: str
+    instruction: str
+    seed: int
+    next_chunk: int
+    last_step: int
+    ttl_s: float
+    ended: str | None = None
+    client: str = ""
+    key: str = ""
+    age_s: float
+    idle_s: float
+    doubt: Doubt | None = None
+    success: bool | None = None
+
+
+class WatchedRollouts(FrozenModel):
+    """Response of GET /v1/watch: the newest rollouts first, and how many there are."""
+
+    rollouts: tuple[WatchedRollout, ...]
+    num_open: int

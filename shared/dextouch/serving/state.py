@@ -24,11 +24,12 @@ Argument = str | bytes | int | float
 
 @dataclass(frozen=True)
 class Versioned:
-    """A value in two parts, and its version, which starts at 1 and counts writes."""
+    """A value in two parts, its version, which starts at 1 and counts writes, and a short note."""
 
     value: bytes
     version: int
     tail: bytes = b""
+    note: bytes = b""
 
 
 class MemoryState:
@@ -51,8 +52,24 @@ class MemoryState:
         stored = await self.get(key)
         return 0 if stored is None else stored.version
 
+    async def notes(self, prefix: str) -> dict[str, bytes]:
+        """Notes of all keys that begin with a prefix, without their values."""
+        self._expire()
+        return {
+            key: stored.note
+            for key, (stored, _) in self._entries.items()
+            if stored.note and key.startswith(prefix)
+        }
+
     async def set(
-        self, key: str, value: bytes, *, tail: bytes = b"", expected_version: int, ttl_s: float
+        self,
+        key: str,
+        value: bytes,
+        *,
+        tail: bytes = b"",
+        note: bytes = b"",
+        expected_version: int,
+        ttl_s: float,
     ) -> int:
         """Write if the version is the expected one (0: absent), and renew the time to live.
 
@@ -60,6 +77,7 @@ class MemoryState:
             key: of the entry.
             value: its first part.
             tail: its second part, such as megabytes that are not to be copied behind the first.
+            note: a few bytes about it, which `notes` lists without reading the value.
             expected_version: that the new value was computed from.
             ttl_s: seconds until it expires.
 
@@ -74,7 +92,7 @@ class MemoryState:
         version = 0 if stored is None else stored[0].version
         if version != expected_version:
             raise _version_conflict(key, expected=expected_version, got=version)
-        written = Versioned(bytes(value), version + 1, tail)
+        written = Versioned(bytes(value), version + 1, tail, note)
         until_s = self._clock_s() + _checked_ttl(ttl_s)
         self._expires_s = min(self._expires_s, until_s)
         self._entries[key] = (written, until_s)
@@ -128,11 +146,13 @@ class MemoryState:
         self._expires_s = min((until_s for _, until_s in self._entries.values()), default=math.inf)
 
 
-# KEYS[1] key · ARGV: expected version, value, tail, time to live in ms → {1, new} or {0, stored}
+# KEYS[1] key · ARGV: expected version, value, tail, time to live in ms, note
+# → {1, new} or {0, stored}
 COMPARE_AND_SET = """
 local version = tonumber(redis.call('HGET', KEYS[1], 'version') or '0')
 if version ~= tonumber(ARGV[1]) then return {0, version} end
-redis.call('HSET', KEYS[1], 'version', version + 1, 'value', ARGV[2], 'tail', ARGV[3])
+redis.call('HSET', KEYS[1], 'version', version + 1, 'value', ARGV[2], 'tail', ARGV[3],
+  'note', ARGV[5])
 redis.call('PEXPIRE', KEYS[1], ARGV[4])
 return {1, version + 1}
 """
@@ -147,6 +167,16 @@ end
 redis.call('HSET', KEYS[1], 'version', 1, 'value', ARGV[1])
 redis.call('PEXPIRE', KEYS[1], ARGV[2])
 return 1
+"""
+
+# ARGV: pattern of keys → key, note, key, note …
+NOTES = """
+local found = {}
+for _, key in ipairs(redis.call('KEYS', ARGV[1])) do
+  local note = redis.call('HGET', key, 'note')
+  if note and note ~= '' then table.insert(found, key) table.insert(found, note) end
+end
+return found
 """
 
 
@@ -174,24 +204,40 @@ class RedisState:
         self._where = url.rsplit("@", 1)[-1]
         self._compare_and_set = self._client.register_script(COMPARE_AND_SET)
         self._add = self._client.register_script(ADD)
+        self._notes = self._client.register_script(NOTES)
 
     async def get(self, key: str) -> Versioned | None:
         """See MemoryState."""
-        version, value, tail = await self._call(
-            "HMGET", REDIS_PREFIX + key, "version", "value", "tail"
+        version, value, tail, note = await self._call(
+            "HMGET", REDIS_PREFIX + key, "version", "value", "tail", "note"
         )
-        return None if version is None else Versioned(value, int(version), tail or b"")
+        if version is None:
+            return None
+        return Versioned(value, int(version), tail or b"", note or b"")
 
     async def version(self, key: str) -> int:
         """See MemoryState."""
         return int(await self._call("HGET", REDIS_PREFIX + key, "version") or 0)
 
+    async def notes(self, prefix: str) -> dict[str, bytes]:
+        """See MemoryState."""
+        found = await self._answer(self._notes(args=[_literal(REDIS_PREFIX + prefix) + "*"]))
+        keys = [key.decode().removeprefix(REDIS_PREFIX) for key in found[::2]]
+        return dict(zip(keys, found[1::2], strict=True))
+
     async def set(
-        self, key: str, value: bytes, *, tail: bytes = b"", expected_version: int, ttl_s: float
+        self,
+        key: str,
+        value: bytes,
+        *,
+        tail: bytes = b"",
+        note: bytes = b"",
+        expected_version: int,
+        ttl_s: float,
     ) -> int:
         """See MemoryState."""
         written, version = await self._run(
-            self._compare_and_set, key, expected_version, value, tail, _milliseconds(ttl_s)
+            self._compare_and_set, key, expected_version, value, tail, _milliseconds(ttl_s), note
         )
         if not written:
             raise _version_conflict(key, expected=expected_version, got=int(version))

@@ -20,8 +20,10 @@ from dextouch.serving import (
 )
 from dextouch.worlds.metrics import WorldMetrics
 from dextouch.worlds.openpi import openpi_router
+from dextouch.worlds.records import RecordStore
 from dextouch.worlds.rollouts import Reopen, RolloutLimits, RolloutService
-from dextouch.worlds.routes import ChunkShortcut, rollout_router
+from dextouch.worlds.routes import ChunkShortcut, rollout_router, watch_router
+from dextouch.worlds.watching import RolloutWatch
 from dextouch.worlds.world import World
 
 
@@ -77,6 +79,7 @@ def create_world_app(
     store = open_state(settings.state_url)
     service = RolloutService(worlds, store, settings.limits, reopen=reopen)
     shortcut = ChunkShortcut(service)
+    watch = RolloutWatch(RecordStore(store, ttl_s=settings.limits.ttl_s))
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -93,7 +96,7 @@ def create_world_app(
     app = create_service_app(
         name=name,
         settings=settings,
-        routers=[rollout_router(service, shortcut), openpi_router(service)],
+        routers=[rollout_router(service, shortcut), watch_router(watch), openpi_router(service)],
         lifespan=lifespan,
         readiness=readiness,
     )

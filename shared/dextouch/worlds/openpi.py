@@ -34,6 +34,8 @@ from dextouch.worlds.records import Answer
 from dextouch.worlds.rollouts import RolloutService
 
 SCOPE: Final = "rollout"
+# What these rollouts are called where they are watched.
+CLIENT: Final = "openpi"
 _REFUSED: Final = 1008
 _FORMS: Final = ("start", "resume", "actions", "end")
 _KNOWN: Final = {*_FORMS, "chunk", "return"}
@@ -100,7 +102,7 @@ class _Session:
     async def _start(self, message: dict[str, Any]) -> bytes:
         request = _validated(StartRequest, message["start"], "start")
         answer = await self._service.start(
-            request.world, start_from(request), self._selector, owner=self._owner
+            request.world, start_from(request), self._selector, owner=self._owner, client=CLIENT
         )
         return self._repacked(answer)
 

@@ -6,6 +6,7 @@ A record holds the progress, the world's snapshot, and the newest response.
 import asyncio
 import hashlib
 import secrets
+import time
 from collections.abc import AsyncIterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass, field
@@ -17,12 +18,13 @@ import numpy as np
 
 from dextouch.errors import (
     ConflictError,
+    EndedError,
     LimitExceededError,
     NotFoundError,
     StorageError,
     UnavailableError,
 )
-from dextouch.schemas import Observation, ReturnSelector, RolloutInfo, answer_parts
+from dextouch.schemas import Doubt, Observation, ReturnSelector, RolloutInfo, answer_parts
 from dextouch.serving import StateStore, Versioned
 
 KEY_PREFIX = "rollout:"
@@ -38,12 +40,36 @@ AnswerParts = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
+class WatchNote:
+    """What those who watch a rollout see beside its progress (see `WatchedRollout`)."""
+
+    client: str = ""
+    key: str = ""
+    begun_host_ns: int = 0
+    doubt: Doubt | None = None
+    success: bool | None = None
+
+    def to_bytes(self, info: Mapping[str, Any]) -> bytes:
+        """Serialize the note with the progress of its rollout and the time of this write."""
+        doubt = None if self.doubt is None else self.doubt.model_dump()
+        known = (self.client, self.key, self.begun_host_ns, doubt, self.success)
+        return msgpack.packb((info, time.time_ns(), known))
+
+    @staticmethod
+    def from_bytes(note: bytes) -> "tuple[dict[str, Any], int, WatchNote]":
+        """Progress, time of the write on the host clock (ns), and the note."""
+        info, written_host_ns, (client, key, begun_host_ns, doubt, success) = msgpack.unpackb(note)
+        doubted = None if doubt is None else Doubt.model_validate(doubt)
+        return info, written_host_ns, WatchNote(client, key, begun_host_ns, doubted, success)
+
+
+@dataclass(frozen=True)
 class RolloutRecord:
     """Everything that another process needs to continue a rollout.
 
     `request_sha256` and `payload` are request and response of the newest chunk, for a client that
     missed the response; None and empty before the first chunk. `version` is that of the store from
-    which the record was read or computed. Neither version nor payload are part of the bytes.
+    which the record was read or computed. Version, payload and note are not part of the bytes.
     """
 
     info: RolloutInfo
@@ -51,10 +77,10 @@ class RolloutRecord:
     request_sha256: str | None = None
     payload: bytes = b""
     version: int = 0
+    note: WatchNote = WatchNote()
 
-    def to_bytes(self) -> bytes:
-        """Serialize the record, except the payload, which is stored as it is."""
-        info = self.info.model_dump(mode="json")
+    def to_bytes(self, info: Mapping[str, Any]) -> bytes:
+        """Serialize the record with its info as JSON, except the payload, stored as it is."""
         fields = (RECORD_FORMAT, info, self.request_sha256, len(self.payload), self.snapshot)
         return msgpack.packb(fields)
 
@@ -95,9 +121,10 @@ class RolloutRecord:
                 f"rollout {info['id']}: got {len(stored.tail)} bytes of its newest response, "
                 f"expected {num_bytes}; start a new one"
             )
-        return RolloutRecord(
-            RolloutInfo.model_validate(info), snapshot, sha256, stored.tail, stored.version
-        )
+        # A process of an earlier version writes none.
+        note = WatchNote.from_bytes(stored.note)[2] if stored.note else WatchNote()
+        shown = RolloutInfo.model_validate(info)
+        return RolloutRecord(shown, snapshot, sha256, stored.tail, stored.version, note)
 
 
 def new_rollout_id(owner: str) -> str:
@@ -158,13 +185,20 @@ class RecordStore:
 
     async def write(self, record: RolloutRecord) -> int:
         """Replace the version that the record was computed from, and return the new one."""
+        info = record.info.model_dump(mode="json")
         return await self._store.set(
             KEY_PREFIX + record.info.id,
-            record.to_bytes(),
+            record.to_bytes(info),
             tail=record.payload,
+            note=record.note.to_bytes(info),
             expected_version=record.version,
             ttl_s=self._ttl_s,
         )
+
+    async def notes(self) -> dict[str, bytes]:
+        """Notes of all rollouts by id."""
+        found = await self._store.notes(KEY_PREFIX)
+        return {key.removeprefix(KEY_PREFIX): note for key, note in found.items()}
 
     async def delete(self, rollout_id: str) -> None:
         """Forget a rollout; raises NotFoundError where unknown, deleted or expired."""
@@ -175,6 +209,19 @@ class RecordStore:
 def _unknown(rollout_id: str) -> NotFoundError:
     return NotFoundError(
         f"rollout {rollout_id!r}: unknown, deleted or expired; start a new one", got=rollout_id
+    )
+
+
+def ended_error(info: RolloutInfo) -> EndedError:
+    """What a chunk of a rollout that has ended is refused with."""
+    last_chunk = info.next_chunk - 1 if info.next_chunk else None
+    return EndedError(
+        f"rollout {info.id}: has ended: {info.ended}; its last good chunk is "
+        f"{'none' if last_chunk is None else last_chunk} and its last good step {info.last_step}; "
+        "start a new one, or branch from there with other actions",
+        reason=str(info.ended),
+        last_chunk=last_chunk,
+        last_step=info.last_step,
     )
 
 

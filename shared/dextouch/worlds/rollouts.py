@@ -43,6 +43,8 @@ from dextouch.worlds.records import (
     Answer,
     RecordStore,
     RolloutRecord,
+    WatchNote,
+    ended_error,
     new_rollout_id,
     parts_of,
     selector_bytes,
@@ -151,9 +153,15 @@ class RolloutService:
                 logger.info("world_warmed_up", world=name, refused=error.message)
 
     async def start(
-        self, world: str, start: RolloutStart, selector: ReturnSelector, *, owner: str = ""
+        self,
+        world: str,
+        start: RolloutStart,
+        selector: ReturnSelector,
+        *,
+        owner: str = "",
+        client: str = "",
     ) -> Answer:
-        """Start a rollout; `owner` is the name of the caller's key."""
+        """Start a rollout; `owner` is the name of the caller's key, `client` what it is called."""
         self._refuse_while_draining()
         worker = self._worker(world)
         description = worker.world.description
@@ -180,13 +188,16 @@ class RolloutService:
                 last_step=0,
                 ttl_s=self.limits.ttl_s,
             )
-            version = await self._records.write(RolloutRecord(info, snapshot, version=placed))
-        self._keep(RolloutRecord(info, b"", version=version), started.state)
+            origin = RolloutOrigin(started.anchor, started.K_head)
+            shown = started.observation.selected(selector)
+            parts = await parts_of(info, shown, selector, origin=origin)
+            note = WatchNote(client, owner, time.time_ns(), shown.doubt, shown.success)
+            # No chunk has this response; it is kept for those who watch.
+            record = RolloutRecord(info, snapshot, None, pack(*parts), placed, note)
+            version = await self._records.write(record)
+        self._keep(RolloutRecord(info, b"", version=version, note=note), started.state)
         logger.info("rollout_started", rollout_id=info.id, world=world, task=info.task)
-        origin = RolloutOrigin(started.anchor, started.K_head)
-        shown = started.observation.selected(selector)
-        parts = await parts_of(info, shown, selector, origin=origin)
-        return Answer(pack(*parts), parts)
+        return Answer(record.payload, parts)
 
     async def get(self, rollout_id: str) -> RolloutInfo:
         """State of a rollout; does not renew its time to live."""
@@ -219,7 +230,7 @@ class RolloutService:
                 logger.info("chunk_replayed", rollout_id=rollout_id, chunk=chunk)
                 return replayed
             if record.info.ended is not None:
-                raise _over(record.info)
+                raise ended_error(record.info)
             if record.info.next_chunk >= self.limits.max_chunks:
                 raise LimitExceededError(
                     f"rollout {rollout_id}: has {record.info.next_chunk} chunks, expected at most "
@@ -252,7 +263,9 @@ class RolloutService:
             changed["seed"] = seed
         info = parent.info.model_copy(update=changed)
         async with self._place(info.id) as placed:
-            await self._records.write(RolloutRecord(info, parent.snapshot, version=placed))
+            note = replace(parent.note, key=owner, begun_host_ns=time.time_ns())
+            record = RolloutRecord(info, parent.snapshot, None, parent.payload, placed, note)
+            await self._records.write(record)
         logger.info("rollout_forked", rollout_id=info.id, parent_id=rollout_id)
         return info
 
@@ -311,9 +324,12 @@ class RolloutService:
         parts = await parts_of(info, seen, selector, info=outcome.stepped.info)
         payload = pack(*parts)
         encoded_s = time.perf_counter() - began_s
-        record = RolloutRecord(info, outcome.snapshot, request_sha256, payload, stored.version)
+        note = replace(stored.note, doubt=seen.doubt, success=seen.success)
+        record = RolloutRecord(
+            info, outcome.snapshot, request_sha256, payload, stored.version, note
+        )
         version = await self._records.write(record)
-        self._keep(RolloutRecord(info, b"", version=version), outcome.stepped.state)
+        self._keep(RolloutRecord(info, b"", version=version, note=note), outcome.stepped.state)
         stored_s = time.perf_counter() - began_s - encoded_s
         spent_s = {"queue": outcome.queued_s, "device": outcome.device_s}
         return Answer(payload, parts, spent_s=spent_s | {"encode": encoded_s, "store": stored_s})
@@ -325,7 +341,7 @@ class RolloutService:
         await self._records.write(replace(stored, info=info, version=record.version))
         self._live.pop(info.id, None)
         logger.info("rollout_ended", rollout_id=info.id, reason=error.reason)
-        return _over(info)
+        return ended_error(info)
 
     def _keep(self, record: RolloutRecord, state: object) -> None:
         self._live[record.info.id] = (record, state)
@@ -387,15 +403,3 @@ def chunk_seed(rollout_seed: int, chunk: int, world_digest: str) -> int:
     """Deterministic seed of a chunk's noise, independent of process and batching."""
     text = f"{rollout_seed}/{chunk}/{world_digest}".encode()
     return int.from_bytes(hashlib.sha256(text).digest()[:8], "big") & MAX_SEED
-
-
-def _over(info: RolloutInfo) -> EndedError:
-    last_chunk = info.next_chunk - 1 if info.next_chunk else None
-    return EndedError(
-        f"rollout {info.id}: has ended: {info.ended}; its last good chunk is "
-        f"{'none' if last_chunk is None else last_chunk} and its last good step {info.last_step}; "
-        "start a new one, or branch from there with other actions",
-        reason=str(info.ended),
-        last_chunk=last_chunk,
-        last_step=info.last_step,
-    )

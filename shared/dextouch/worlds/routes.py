@@ -10,9 +10,10 @@ import json
 import re
 import time
 from typing import Annotated, Any, Final
+from urllib.parse import unquote
 
 import numpy as np
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from jaxtyping import Shaped
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
@@ -28,6 +29,7 @@ from dextouch.schemas import (
     RolloutInfo,
     RolloutStart,
     StartRequest,
+    WatchedRollouts,
     WorldList,
     decode_start,
     start_from,
@@ -48,6 +50,7 @@ from dextouch.serving import (
 from dextouch.streams import unpack
 from dextouch.worlds.records import Answer
 from dextouch.worlds.rollouts import RolloutService
+from dextouch.worlds.watching import WATCH_ID_LETTERS, RolloutWatch
 
 MAX_BODY_BYTES = 2**28
 # Room for 1000 rows of float64, or some hundred rows as JSON.
@@ -58,6 +61,10 @@ MAX_ROWS = 4096
 MAX_INLINE_BYTES = 64 * KIB
 
 SCOPE: Final = "rollout"
+WATCH_SCOPE: Final = "watch"
+CLIENT_HEADER: Final = "dextouch-client"
+MAX_CLIENT_LETTERS: Final = 64
+MAX_WATCHED: Final = 200
 REPLAYED_HEADER: Final = "dextouch-replayed"
 DTYPES: Final = ("float32", "float64")
 _PATH: Final = re.compile(r"/v1/rollouts/([^/]+)/chunks/([0-9]{1,9})")
@@ -82,6 +89,7 @@ ANSWER: dict[str, Any] = {"content": {MSGPACK: {}, JSON: {}}}
 Selector = Annotated[ReturnSelector, Query()]
 # The name of the caller's key.
 Owner = Annotated[str, Depends(RequireScope(SCOPE))]
+WatchId = Annotated[str, Path(pattern=f"^[0-9a-f]{{{WATCH_ID_LETTERS}}}$")]
 
 
 class ChunkShortcut:
@@ -159,7 +167,8 @@ def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRoute
         with timed(request, "decode"):
             asked, begin = await _start_of(request)
         with timed(request, "world"):
-            answer = await service.start(asked.world, begin, selector, owner=owner)
+            client = client_name(request.headers.get(CLIENT_HEADER, ""))
+            answer = await service.start(asked.world, begin, selector, owner=owner, client=client)
         return _response(request, answer, status=201)
 
     @router.get("/rollouts/{rollout_id}")
@@ -195,6 +204,39 @@ def rollout_router(service: RolloutService, shortcut: ChunkShortcut) -> APIRoute
         return await service.fork(rollout_id, seed=asked.seed, owner=owner)
 
     return router
+
+
+def watch_router(watch: RolloutWatch) -> APIRouter:
+    """Router of those who watch open rollouts and cannot change them."""
+    may_watch = [Depends(RequireScope(WATCH_SCOPE))]
+    router = APIRouter(prefix="/v1/watch", tags=["watching"], dependencies=may_watch)
+
+    @router.get("")
+    async def listed(limit: Annotated[int, Query(ge=1, le=MAX_WATCHED)] = 100) -> WatchedRollouts:
+        """List the open rollouts, the newest first."""
+        return await watch.listed(limit)
+
+    @router.get(
+        "/{watch_id}",
+        response_class=Response,
+        responses={200: {"content": {MSGPACK: {}}}, 304: {}},
+    )
+    async def newest(request: Request, watch_id: WatchId) -> Response:
+        """The newest response of a rollout, as its client asked for it."""
+        known = request.headers.get("if-none-match", "").strip('"')
+        tag, payload = await watch.newest(watch_id, known)
+        headers = {"etag": f'"{tag}"', "cache-control": "no-store"}
+        if payload is None:
+            return Response(status_code=304, headers=headers)
+        return Response(payload, headers=headers, media_type=MSGPACK)
+
+    return router
+
+
+def client_name(header: str) -> str:
+    """What a client is called, of a percent-encoded header: printable, and not long."""
+    name = "".join(letter for letter in unquote(header) if letter.isprintable())
+    return name.strip()[:MAX_CLIENT_LETTERS]
 
 
 def _json_body(model: type[FrozenModel]) -> dict[str, Any]:
