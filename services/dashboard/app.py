@@ -13,6 +13,7 @@ from dextouch.serving import AccessControl, create_service_app, serve
 from services.dashboard.feeds import Feeds
 from services.dashboard.forwarding import forwarding_router
 from services.dashboard.pages import Sessions, page_router, refusal_page
+from services.dashboard.rollout_feeds import RolloutFeeds
 from services.dashboard.routes import api_router, live_router
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.upstream import Upstream, upstream_histogram
@@ -56,7 +57,7 @@ def create_app(
             page_router(settings, sessions),
             api_router(settings, feeds, sessions),
             forwarding_router(feeds, sessions),
-            live_router(feeds, sessions),
+            live_router([feeds.topics.get, RolloutFeeds(feeds, settings).topic], sessions),
         ],
         lifespan=lifespan,
         admits=sessions.allows,

@@ -162,6 +162,10 @@ class Feeds:
         ]
         self.topics = {topic.name: topic for topic in topics}
 
+    def has(self, name: str) -> bool:
+        """Whether this dashboard was started with the URL of a service."""
+        return name in self._upstreams
+
     def upstream(self, name: str) -> Upstream:
         """Client of a service by name.
 

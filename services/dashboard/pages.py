@@ -61,6 +61,7 @@ SCREENS: Final = (
     Screen("/review", "review.html", "Review"),
     Screen("/hours", "hours.html", "Hours"),
     Screen("/calibration", "calibration.html", "Calibration"),
+    Screen("/rollouts", "rollouts.html", "Rollouts"),
 )
 
 

@@ -1,6 +1,7 @@
 """HTTP and WebSocket routes of the page: data, live updates and recorder actions."""
 
 import asyncio
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Annotated, Any
 from urllib.parse import quote
@@ -26,6 +27,8 @@ SESSION_CHECK_S = 1.0
 SESSION = APIKeyCookie(name=COOKIE, scheme_name="session", auto_error=False)
 # Same pattern as stream names (dextouch.streams.StreamDescriptor).
 CameraName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
+# Finds a topic by its name; None where it knows none.
+TopicFinder = Callable[[str], Topic | None]
 
 
 class Subscription(FrozenModel):
@@ -80,7 +83,7 @@ def api_router(settings: DashboardSettings, feeds: Feeds, sessions: Sessions) ->
     return router
 
 
-def live_router(feeds: Feeds, sessions: Sessions) -> APIRouter:
+def live_router(finders: Sequence[TopicFinder], sessions: Sessions) -> APIRouter:
     """WebSocket router: the page subscribes to the topics in view and receives their updates."""
     router = APIRouter()
 
@@ -97,11 +100,13 @@ def live_router(feeds: Feeds, sessions: Sessions) -> APIRouter:
         try:
             with suppress(WebSocketDisconnect):
                 while websocket.application_state is WebSocketState.CONNECTED:
-                    wanted = feeds.topics.keys() & _view(await websocket.receive_text())
-                    for name in senders.keys() - wanted:
+                    names = _view(await websocket.receive_text())
+                    found = {name: _topic(name, finders) for name in names}
+                    wanted = {name: topic for name, topic in found.items() if topic is not None}
+                    for name in senders.keys() - wanted.keys():
                         senders.pop(name).cancel()
-                    for name in wanted - senders.keys():
-                        sending = _send(websocket, feeds.topics[name], sessions)
+                    for name in wanted.keys() - senders.keys():
+                        sending = _send(websocket, wanted[name], sessions)
                         senders[name] = asyncio.create_task(sending)
         finally:
             tasks = (session, *senders.values())
@@ -110,6 +115,10 @@ def live_router(feeds: Feeds, sessions: Sessions) -> APIRouter:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     return router
+
+
+def _topic(name: str, finders: Sequence[TopicFinder]) -> Topic | None:
+    return next((topic for find in finders if (topic := find(name)) is not None), None)
 
 
 async def _send(websocket: WebSocket, topic: Topic, sessions: Sessions) -> None:

@@ -1,0 +1,60 @@
+// Open rollouts → rows of the table, and the words for their state and doubt.
+
+import { element } from "./dom.js";
+import { age } from "./format.js";
+
+const IDLE_S = 30;
+const KINDS = { twin: "physics twin", model: "imagined", baseline: "baseline", robot: "robot" };
+
+export function stateOf(rollout) {
+  if (rollout.ended) return { level: "ERROR", word: "ended" };
+  if (rollout.doubt?.outside) return { level: "WARN", word: "unreliable" };
+  if (rollout.idle_s > IDLE_S) return { level: "STALE", word: "waiting" };
+  return { level: "OK", word: "running" };
+}
+
+// Doubt in words; `reason` is what to read beside a number that cannot be trusted.
+export function doubtOf(rollout) {
+  const { doubt, kind } = rollout;
+  if (doubt) {
+    const figures = `disagreement ${doubt.disagreement.toPrecision(2)}, distance ${doubt.distance.toPrecision(2)}`;
+    return { text: doubt.outside ? `above its bound: ${figures}` : `within its bound: ${figures}`, reason: doubt.reason ?? "" };
+  }
+  if (kind === "model") return { text: "not reported", reason: rollout.next_chunk === 0 ? "" : "This model has no doubt figure: nothing says how reliable these steps are." };
+  return { text: "–", reason: "" };
+}
+
+function why(text) {
+  return text ? element("span", { class: "why" }, text) : null;
+}
+
+export function badge({ level, word }) {
+  return element("span", { class: "level", "data-level": level }, word);
+}
+
+export function rolloutRow(rollout, isWatched, watch) {
+  const state = stateOf(rollout);
+  const doubt = doubtOf(rollout);
+  const button = element("button", { type: "button", "aria-pressed": isWatched }, isWatched ? "Watching" : "Watch");
+  button.addEventListener("click", () => watch(rollout));
+  return element("tr", { "data-level": state.level === "OK" ? null : state.level, "data-watch": rollout.watch_id },
+    element("td", {}, badge(state), why(rollout.ended)),
+    element("td", { class: "name" }, rollout.world, why(KINDS[rollout.kind] ?? rollout.service)),
+    element("td", {}, rollout.client || "not named", why(rollout.key ? `key ${rollout.key}` : "")),
+    element("td", { class: "task" }, rollout.task, why(rollout.instruction)),
+    element("td", { class: "number" }, String(rollout.next_chunk)),
+    element("td", { class: "number" }, String(rollout.last_step), why(rollout.model_rate_hz ? `${(rollout.last_step / rollout.model_rate_hz).toFixed(1)} s` : "")),
+    element("td", { class: "number" }, age(rollout.age_s)),
+    element("td", { class: "number" }, age(rollout.idle_s)),
+    element("td", { class: "doubt" }, doubt.text, why(doubt.reason)),
+    element("td", {}, button));
+}
+
+export function showRollouts(body, rollouts, watched, watch) {
+  const rows = rollouts.map((one) => rolloutRow(one, one.watch_id === watched, watch));
+  const empty = element("tr", {}, element("td", { colspan: 10, class: "free" },
+    "No open rollouts. A policy that is evaluated in one of the worlds appears here."));
+  const focused = document.activeElement?.closest?.("[data-watch]")?.dataset.watch;
+  body.replaceChildren(...(rows.length ? rows : [empty]));
+  if (focused) body.querySelector(`[data-watch="${focused}"] button`)?.focus();
+}

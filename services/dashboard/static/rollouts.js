@@ -1,0 +1,154 @@
+// The rollouts screen: open rollouts of all worlds, and the newest steps of the one that is watched.
+
+import { element, setText } from "./dom.js";
+import { HandCanvas } from "./hands.js";
+import { LiveLink } from "./live.js";
+import { drawRgb } from "./rgb_canvas.js";
+import { badge, doubtOf, showRollouts, stateOf } from "./rollout_rows.js";
+import { ask } from "./session.js";
+import { imageOf, readSteps, touchOf } from "./step_messages.js";
+import { StepPlayer } from "./step_player.js";
+import { startTheme } from "./theme.js";
+
+const find = (id) => document.getElementById(id);
+const heatmap = await (await ask("/v1/heatmap")).json();
+const hands = Object.fromEntries(["left", "right"].map((side) =>
+  [side, new HandCanvas(find(`hand_${side}`), find(`hand_${side}_text`), side, heatmap)]));
+
+let listed = { worlds: [], rollouts: [], problems: [], num_open: 0 };
+let watched = null; // { topic, rollout } of the rollout that is shown
+let steps = null;
+
+const player = new StepPlayer({ show: showStep });
+
+function topicOf(rollout) {
+  return `rollout/${rollout.service}/${rollout.watch_id}`;
+}
+
+function watch(rollout) {
+  if (watched) link.show(watched.topic, false);
+  watched = rollout ? { topic: topicOf(rollout), rollout } : null;
+  steps = null;
+  player.load(0);
+  find("watched").hidden = !watched;
+  find("watched_images").replaceChildren();
+  setText(find("step_text"), "");
+  for (const hand of Object.values(hands)) hand.clear("no steps yet");
+  note(watched ? "Waiting for the newest steps." : "");
+  history.replaceState(null, "", watched ? `#${watched.topic}` : location.pathname);
+  if (watched) {
+    about(rollout);
+    link.show(watched.topic, true);
+  }
+  showTable();
+}
+
+function note(text, level = "") {
+  const node = find("watched_note");
+  node.dataset.level = level;
+  setText(node, text);
+}
+
+function about(rollout) {
+  find("watched_about").replaceChildren(badge(stateOf(rollout)),
+    element("strong", {}, `${rollout.world}: ${rollout.task}`),
+    element("span", { class: "quiet" }, rollout.instruction),
+    element("span", { class: "quiet" }, `policy ${rollout.client || "not named"}, seed ${rollout.seed}`));
+}
+
+function showTable() {
+  showRollouts(find("rollout_rows"), listed.rollouts, watched?.rollout.watch_id, watch);
+}
+
+function showListed(view) {
+  listed = view;
+  setText(find("summary"), `${view.num_open} open`);
+  find("world_list").replaceChildren(...view.worlds.map((world) => element("li", { title: world.tasks.join(", ") },
+    element("strong", {}, world.name), element("span", { class: "quiet" }, `${world.kind}, ${world.tasks.length} tasks`))));
+  find("problems").replaceChildren(...view.problems.map((text) => element("p", { class: "note", "data-level": "WARN" }, text)));
+  const now = view.rollouts.find((one) => watched && topicOf(one) === watched.topic);
+  if (now) {
+    watched.rollout = now;
+    about(now);
+  } else if (!watched) {
+    const wanted = view.rollouts.find((one) => `#${topicOf(one)}` === location.hash);
+    if (wanted) {
+      watch(wanted);
+      return;
+    }
+  }
+  showTable();
+}
+
+function showSteps(message) {
+  if (message.header.topic !== watched?.topic) return;
+  steps = message;
+  const { observation, rollout } = message.header;
+  const reliability = doubtOf({ ...watched.rollout, ...rollout, doubt: observation.doubt });
+  if (rollout.ended) note(`The world ended this rollout: ${rollout.ended}`, "ERROR");
+  else if (observation.doubt?.outside) note(`Unreliable steps: ${reliability.reason}`, "WARN");
+  else if (reliability.reason) note(reliability.reason, "WARN");
+  else note(message.cameras.length ? "" : "The policy asks for no images, so none are shown: watching makes a world render nothing.");
+  const row = find("watched_images");
+  row.replaceChildren(...message.cameras.map((camera) => element("figure", {},
+    element("canvas", { class: "rgb", role: "img", "aria-label": `image of ${camera.name}`, "data-camera": camera.name }),
+    element("figcaption", {}, camera.name.replace(/^camera_/, "").replaceAll("_", " ")))));
+  const slider = find("step");
+  slider.max = message.header.steps.length - 1;
+  player.load(message.header.steps.length, watched.rollout.model_rate_hz);
+}
+
+function showStep(index) {
+  const { header, cameras } = steps;
+  for (const camera of cameras) {
+    const canvas = find("watched_images").querySelector(`[data-camera="${CSS.escape(camera.name)}"]`);
+    drawRgb(canvas, camera.height, camera.width, imageOf(camera, index));
+  }
+  for (const [side, hand] of Object.entries(hands)) {
+    const touch = touchOf(steps, index, side);
+    if (touch) hand.update(touch);
+    else hand.clear("the policy asks for no touch");
+  }
+  find("step").value = index;
+  const thinned = header.steps.length < header.num_steps ? `, ${header.steps.length} of ${header.num_steps} steps of the chunk are sent` : "";
+  const chunk = header.rollout.next_chunk;
+  setText(find("step_text"), `${chunk ? `chunk ${chunk - 1}` : "start"}, step ${header.steps[index]}${thinned}`);
+  find("watched").dataset.step = header.steps[index];
+}
+
+const link = new LiveLink({
+  onTopic: (topic, data) => {
+    if (topic === "rollouts") showListed(data);
+    else if (topic === watched?.topic) note(`${data.gone ? "This rollout is over: " : ""}${data.note}`, "WARN");
+  },
+  onBinary: (buffer) => {
+    const message = readSteps(buffer);
+    if (message) showSteps(message);
+  },
+  onState: (connected) => {
+    setText(find("link"), connected ? "live" : "dashboard not reachable, trying again");
+    if (!connected) showListed({ ...listed, problems: ["No link to the dashboard: what you see is old."] });
+  },
+});
+
+link.show("rollouts", true);
+document.addEventListener("visibilitychange", () => link.sendView());
+new IntersectionObserver((entries) => {
+  for (const entry of entries) if (watched) link.show(watched.topic, entry.isIntersecting);
+}).observe(find("watched"));
+find("stop_watching").addEventListener("click", () => watch(null));
+find("pause").addEventListener("click", () => {
+  player.pause(!player.paused);
+  setText(find("pause"), player.paused ? "Play" : "Pause");
+});
+find("step").addEventListener("input", (event) => {
+  player.pause(true);
+  setText(find("pause"), "Play");
+  player.goTo(Number(event.target.value));
+});
+const draw = () => {
+  player.tick();
+  requestAnimationFrame(draw);
+};
+requestAnimationFrame(draw);
+startTheme(find("theme"), () => Object.values(hands).forEach((hand) => hand.request()));
