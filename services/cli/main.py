@@ -98,6 +98,9 @@ COMMANDS = {
         "score policies in several worlds, defined in a file and resumable",
         "cli.study.command:main",
     ),
+    "study serve": Command(
+        "serve the results of studies to the dashboard", "evaluation.studies.app:main"
+    ),
     "reproduce": Command(
         "reproduce the paper's tables in miniature, in the twin", "cli.reproduce.command:main"
     ),

@@ -68,6 +68,7 @@ class UpSettings(CommandSettings):
     acquisition_port: int = Field(default=8083, ge=0, le=65535, description=PORT)
     twin_port: int = Field(default=8084, ge=0, le=65535, description=PORT)
     world_model_port: int = Field(default=8085, ge=0, le=65535, description=PORT)
+    studies_port: int = Field(default=8086, ge=0, le=65535, description=PORT)
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="warning", description="minimum level of log events"
     )
@@ -224,6 +225,12 @@ def _world_model(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
     return create_world_app({settings.world_name: world}, settings, name="world_model")
 
 
+def _studies(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
+    from services.evaluation.studies.app import StudyServiceSettings, create_app
+
+    return create_app(StudyServiceSettings(studies=settings.data / "studies"))
+
+
 def _dashboard(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
     from services.dashboard.app import create_app
     from services.dashboard.settings import DashboardSettings
@@ -240,5 +247,6 @@ BUILDERS: Mapping[str, Builder] = {
     "acquisition": _acquisition,
     "twin": _twin,
     "world_model": _world_model,
+    "studies": _studies,
     "dashboard": _dashboard,
 }

@@ -61,6 +61,9 @@ FORWARDED: Final = (
     Forwarded("alignment", "/calibration/run/answer", "POST"),
     Forwarded("alignment", "/calibration/run/finish", "POST"),
     Forwarded("alignment", "/calibration/run/cancel", "POST"),
+    Forwarded("studies", "/studies"),
+    Forwarded("studies", "/studies/{name}"),
+    Forwarded("studies", "/studies/{name}/rollouts"),
 )
 
 

@@ -62,6 +62,8 @@ SCREENS: Final = (
     Screen("/hours", "hours.html", "Hours"),
     Screen("/calibration", "calibration.html", "Calibration"),
     Screen("/rollouts", "rollouts.html", "Rollouts"),
+    Screen("/studies", "studies.html", "Studies"),
+    Screen("/studies/{name}", "study.html", "Study", within="Studies"),
 )
 
 
@@ -179,6 +181,7 @@ def _shown(
             tasks=tasks,
             settings=settings,
             goals=json.dumps(settings.goal_hours),
+            rating_url=settings.rating_url,
             signed_in=sessions.needs_key,
         )
 

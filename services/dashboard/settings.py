@@ -40,6 +40,12 @@ class DashboardSettings(ServiceSettings):
     alignment_url: str | None = Field(default=None, description="URL of the alignment service")
     twin_url: str | None = Field(default=None, description="URL of the twin")
     world_model_url: str | None = Field(default=None, description="URL of the world model")
+    studies_url: str | None = Field(default=None, description="URL of the results of studies")
+    rating_url: str | None = Field(
+        default=None,
+        pattern=r"^https?://",
+        description="address of the rating page in the users' browsers, for a link to it",
+    )
     upstream_key: SecretStr | None = Field(
         default=None, description="bearer key of the other services"
     )
@@ -64,6 +70,6 @@ class DashboardSettings(ServiceSettings):
 
     def upstream_urls(self) -> dict[str, str]:
         """Configured services by name, in the order of the data flow."""
-        names = ("acquisition", "episode_store", "alignment", "twin", "world_model")
+        names = ("acquisition", "episode_store", "alignment", "twin", "world_model", "studies")
         urls = {name: getattr(self, f"{name}_url") for name in names}
         return {name: url.rstrip("/") for name, url in urls.items() if url}

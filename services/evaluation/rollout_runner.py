@@ -18,12 +18,10 @@ from services.evaluation.matched_starts import (
     rollout_failure,
 )
 from services.evaluation.policies.asking import action_chunk, ask
-from services.evaluation.scores import REAL, RolloutFailure, RolloutScore
+from services.evaluation.scores import REAL, Outcome, RolloutScore
 from services.evaluation.study_worlds import StudyWorlds
 from services.evaluation.success_probe import SuccessProbe
 
-# Result of one rollout.
-Outcome = RolloutScore | RolloutFailure
 # Repeats of an imagined rollout differ by this in the seed of their noise.
 _REPEAT_STRIDE = 2**40
 

@@ -72,6 +72,10 @@ class RolloutFailure:
     repeat: int = 0
 
 
+# Result of one rollout.
+Outcome = RolloutScore | RolloutFailure
+
+
 @dataclass(frozen=True)
 class ClosedLoopReport:
     """Every rollout of an evaluation; the first imagined world, if any, is reported.

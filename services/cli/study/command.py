@@ -25,10 +25,10 @@ from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.scores import REAL
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.studies.definition import StudyDefinition, WorldChoice, read_definition
-from services.evaluation.studies.engine import StudyParts, cells_of, run_study
+from services.evaluation.studies.engine import StudyParts, run_study
 from services.evaluation.studies.policies import PolicyFactory, file_digest
 from services.evaluation.studies.reports import REPORT_FILE, write_reports
-from services.evaluation.studies.results import StudyHeader, StudyResults
+from services.evaluation.studies.results import StudyHeader, StudyResults, cells_of
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_probe import SuccessProbe
 from services.twin.scripted_actions import scripted_actions
@@ -74,6 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = CommandParser(
         prog="dextouch study",
         description="Score policies in real and imagined worlds from matched starts.",
+        epilog="`dextouch study serve` shows the results on the dashboard.",
     )
     words = parser.add_subparsers(required=True, metavar="COMMAND")
     run = words.add_parser(
@@ -89,6 +90,12 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="PATH",
         help="folder of results, rollouts and reports (default: the study file without .toml)",
+    )
+    run.add_argument(
+        "--store",
+        metavar="URL",
+        help="episode store of the rollouts; with the dashboard's store, it plays them "
+        "(default: rollouts/ in the folder)",
     )
     run.add_argument(
         "--retry-failed", action="store_true", help="run rollouts again that failed before"
@@ -125,7 +132,9 @@ def _run(options: argparse.Namespace) -> int:
         header = StudyHeader(definition.name, definition.model_dump(mode="json"), digests)
         results = StudyResults.create_or_resume(folder, header)
         num_cells = sum(1 for _ in cells_of(definition))
-        store = EpisodeStore(folder / "rollouts") if definition.keep_rollouts else None
+        store = (
+            EpisodeStore(options.store or folder / "rollouts") if definition.keep_rollouts else None
+        )
         if store is not None:
             # What a killed run left unfinished.
             store.sweep()

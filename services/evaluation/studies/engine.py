@@ -1,7 +1,7 @@
 """Runs the rollouts of a study, several of each world at a time."""
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -12,11 +12,11 @@ from dextouch.errors import UnavailableError
 from services.evaluation.closed_loop import EvaluationPlan, begin_matched
 from services.evaluation.matched_starts import FailedStart, MatchedStart
 from services.evaluation.progress import Progress
-from services.evaluation.rollout_runner import Outcome, RolloutRunner
-from services.evaluation.scores import REAL, ClosedLoopReport, RolloutFailure, RolloutScore
+from services.evaluation.rollout_runner import RolloutRunner
+from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure
 from services.evaluation.studies.definition import StudyDefinition
 from services.evaluation.studies.kept_rollouts import keep_rollout
-from services.evaluation.studies.results import Cell, StudyResults
+from services.evaluation.studies.results import Cell, StudyResults, cells_of, study_report
 from services.evaluation.study_worlds import StudyWorlds
 from services.evaluation.success_probe import SuccessProbe
 
@@ -43,16 +43,6 @@ class StudyParts:
     instructions: Mapping[str, str]
     trained_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     store: EpisodeStore | None = None
-
-
-def cells_of(definition: StudyDefinition) -> Iterator[Cell]:
-    """All rollouts of a study, in the order of its report."""
-    for world in (REAL, *definition.imagined):
-        repeats = 1 if world == REAL else definition.repeats
-        for task in definition.tasks:
-            for seed in definition.seeds:
-                for policy in definition.policies:
-                    yield from (Cell(world, task, seed, policy, n) for n in range(repeats))
 
 
 def run_study(
@@ -108,27 +98,6 @@ def _run_missing(
                     raise one.error
         by_key: dict[tuple[str, int], Start] = {(one.task, one.seed): one for one in starts}
         _Workers(definition, results, parts, by_key).run(missing)
-
-
-def study_report(definition: StudyDefinition, results: StudyResults) -> ClosedLoopReport:
-    """Scores of the finished rollouts, in an order that does not depend on when they ended.
-
-    Rollouts without a result count as failed, with the error `NotRunYet`.
-    """
-    ordered = [results.outcomes.get(c) or _not_run(c) for c in cells_of(definition)]
-    return ClosedLoopReport(
-        tuple(one for one in ordered if isinstance(one, RolloutScore)),
-        tuple(definition.imagined),
-        tuple(definition.policies),
-        tuple(one for one in ordered if isinstance(one, RolloutFailure)),
-    )
-
-
-def _not_run(cell: Cell) -> RolloutFailure:
-    message = "no result yet; `dextouch study run` continues the study"
-    return RolloutFailure(
-        cell.world, cell.policy, cell.task, cell.seed, "NotRunYet", message, repeat=cell.repeat
-    )
 
 
 class _Workers:

@@ -1,6 +1,5 @@
 """Rollouts of a study as episodes, to be played, rated or trained on."""
 
-import hashlib
 import re
 from typing import Final
 
@@ -15,20 +14,9 @@ from dextouch.schemas import (
 )
 from services.evaluation.matched_starts import MatchedStart
 from services.evaluation.rollout_runner import PlayedRollout
-from services.evaluation.studies.results import Cell, StudyHeader
+from services.evaluation.studies.results import Cell, StudyHeader, rollout_episode_id
 
 _ORIGINS: Final[dict[str, Origin]] = {"twin": "twin", "robot": "recorded"}
-_MAX_LABEL: Final = 64
-
-
-def rollout_episode_id(header: StudyHeader, cell: Cell) -> str:
-    """Id of the episode of one rollout, derived from the study's digests and the cell."""
-    digest = hashlib.sha256(repr((sorted(header.digests.items()), tuple(cell))).encode())
-    label = f"{cell.world}-{cell.policy}-{cell.task}-{cell.seed}"
-    if cell.repeat:
-        label += f"-{cell.repeat}"
-    label = re.sub(r"[^a-z0-9_-]+", "_", label.lower())[:_MAX_LABEL]
-    return f"rollout-{digest.hexdigest()[:10]}-{label}"
 
 
 def keep_rollout(

@@ -8,8 +8,7 @@ from services.evaluation.reporting import ReportPictures, write_report
 from services.evaluation.reporting.latex import latex_tables
 from services.evaluation.scores import ClosedLoopReport
 from services.evaluation.studies.definition import StudyDefinition
-from services.evaluation.studies.engine import study_report
-from services.evaluation.studies.results import StudyResults
+from services.evaluation.studies.results import StudyResults, study_report
 
 REPORT_FILE: Final = "report.json"
 TABLES_FILE: Final = "tables.tex"

@@ -1,8 +1,11 @@
 """Results of a study: an append-only file of one JSON line per rollout that can be resumed."""
 
 import fcntl
+import hashlib
 import json
 import os
+import re
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
@@ -12,10 +15,19 @@ from typing import Any, Final, NamedTuple
 from pydantic import TypeAdapter, ValidationError
 
 from dextouch.errors import ConflictError, CorruptDataError, StorageError
-from services.evaluation.rollout_runner import Outcome
-from services.evaluation.scores import RolloutFailure, RolloutScore
+from services.evaluation.scores import (
+    REAL,
+    ClosedLoopReport,
+    Outcome,
+    RolloutFailure,
+    RolloutScore,
+)
+from services.evaluation.studies.definition import StudyDefinition
 
 FILE: Final = "results.jsonl"
+_MAX_LABEL: Final = 64
+_LOCK_TRIES: Final = 10
+_LOCK_PAUSE_S: Final = 0.05
 
 
 class Cell(NamedTuple):
@@ -118,6 +130,16 @@ class StudyResults:
         """Context in which no other process may add results; raises ConflictError."""
         return _locked(self.path)
 
+    @staticmethod
+    def is_running(folder: Path) -> bool:
+        """Whether a process is adding results to a folder."""
+        with (folder / FILE).open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+        return False
+
     def keep(self, outcome: Outcome) -> None:
         """Append an outcome; it is on the disk when this returns.
 
@@ -137,19 +159,65 @@ class StudyResults:
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
     with path.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ConflictError(
-                f"results {path}: another process is running this study; wait for it, or choose "
-                "another --folder"
-            ) from error
+        # Those who only look (`StudyResults.is_running`) hold the lock for an instant.
+        for tries_left in reversed(range(_LOCK_TRIES)):
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if not tries_left:
+                    raise ConflictError(
+                        f"results {path}: another process is running this study; wait for it, or "
+                        "choose another --folder"
+                    ) from error
+                time.sleep(_LOCK_PAUSE_S)
         yield
 
 
 def cell_of(outcome: Outcome) -> Cell:
     """The cell that an outcome belongs to."""
     return Cell(outcome.world, outcome.task, outcome.seed, outcome.policy, outcome.repeat)
+
+
+def cells_of(definition: StudyDefinition) -> Iterator[Cell]:
+    """All rollouts of a study, in the order of its report."""
+    for world in (REAL, *definition.imagined):
+        repeats = 1 if world == REAL else definition.repeats
+        for task in definition.tasks:
+            for seed in definition.seeds:
+                for policy in definition.policies:
+                    yield from (Cell(world, task, seed, policy, n) for n in range(repeats))
+
+
+def study_report(definition: StudyDefinition, results: StudyResults) -> ClosedLoopReport:
+    """Scores of the finished rollouts, in an order that does not depend on when they ended.
+
+    Rollouts without a result count as failed, with the error `NotRunYet`.
+    """
+    ordered = [results.outcomes.get(c) or _not_run(c) for c in cells_of(definition)]
+    return ClosedLoopReport(
+        tuple(one for one in ordered if isinstance(one, RolloutScore)),
+        tuple(definition.imagined),
+        tuple(definition.policies),
+        tuple(one for one in ordered if isinstance(one, RolloutFailure)),
+    )
+
+
+def _not_run(cell: Cell) -> RolloutFailure:
+    message = "no result yet; `dextouch study run` continues the study"
+    return RolloutFailure(
+        cell.world, cell.policy, cell.task, cell.seed, "NotRunYet", message, repeat=cell.repeat
+    )
+
+
+def rollout_episode_id(header: StudyHeader, cell: Cell) -> str:
+    """Id of the episode of one rollout, derived from the study's digests and the cell."""
+    digest = hashlib.sha256(repr((sorted(header.digests.items()), tuple(cell))).encode())
+    label = f"{cell.world}-{cell.policy}-{cell.task}-{cell.seed}"
+    if cell.repeat:
+        label += f"-{cell.repeat}"
+    label = re.sub(r"[^a-z0-9_-]+", "_", label.lower())[:_MAX_LABEL]
+    return f"rollout-{digest.hexdigest()[:10]}-{label}"
 
 
 def _line(row: Mapping[str, object]) -> bytes:

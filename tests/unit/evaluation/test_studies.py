@@ -18,10 +18,16 @@ from services.evaluation.rating.rated_rollouts import rated_rollouts, state_scor
 from services.evaluation.rating.rubrics import Rubric
 from services.evaluation.scores import ClosedLoopReport, RolloutFailure, RolloutScore
 from services.evaluation.studies.definition import StudyDefinition, read_definition
-from services.evaluation.studies.engine import StudyParts, cells_of, run_study, study_report
-from services.evaluation.studies.kept_rollouts import rollout_episode_id
+from services.evaluation.studies.engine import StudyParts, run_study
 from services.evaluation.studies.policies import PolicyFactory
-from services.evaluation.studies.results import Cell, StudyHeader, StudyResults
+from services.evaluation.studies.results import (
+    Cell,
+    StudyHeader,
+    StudyResults,
+    cells_of,
+    rollout_episode_id,
+    study_report,
+)
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_probe import SuccessProbe
 from tests.unit.evaluation import toy

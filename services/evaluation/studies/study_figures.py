@@ -1,0 +1,251 @@
+"""What a study's page shows: rates by policy, task and world, agreement, and single rollouts."""
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, Final
+
+from pydantic import AwareDatetime
+
+from dextouch.frozen_model import FrozenModel
+from services.evaluation.comments import UNDEFINED
+from services.evaluation.scores import REAL, ClosedLoopReport, RolloutFailure, RolloutScore
+from services.evaluation.studies.definition import StudyDefinition
+from services.evaluation.studies.results import (
+    Cell,
+    StudyResults,
+    cells_of,
+    rollout_episode_id,
+    study_report,
+)
+
+# From this difference of success on, two worlds disagree about a start.
+DISAGREEMENT: Final = 0.5
+MEANINGS: Final = {
+    "rate": "Share of the starts from which the policy succeeded, with its 95 % Wilson interval. "
+    "In an imagined world success is what the success probe finds more likely.",
+    "pearson": "Pearson's r: 1 if the world's success rates of the policies are a straight line "
+    "over the real ones, 0 if they say nothing about them, negative if they reverse them.",
+    "mmrv": "Mean maximum rank violation: for each policy the largest real difference to a policy "
+    "that the world ranks the other way, averaged over the policies; 0 if it never does.",
+    "bias": "Mean of the world's success rates minus the real ones; above 0 it is too optimistic.",
+    "interval": "Intervals contain the true policies' figure with 95 % probability; with few "
+    "policies or starts they are wide.",
+    "unreliable": "The success probe abstains: its probability is too close to 0.5, or the world "
+    "doubts its own prediction. The likelier outcome is counted all the same.",
+}
+
+
+class StudySummary(FrozenModel):
+    """A study in the list; `problem` is why its results cannot be read, and there is no more."""
+
+    name: str
+    title: str = ""
+    tasks: tuple[str, ...] = ()
+    worlds: tuple[str, ...] = ()
+    policies: tuple[str, ...] = ()
+    num_rollouts: int = 0
+    num_done: int = 0
+    num_failed: int = 0
+    is_running: bool = False
+    changed_at: AwareDatetime
+    problem: str | None = None
+
+
+class StudyRate(FrozenModel):
+    """Success rate of a policy in a task of a world; None without finished rollouts.
+
+    Attributes:
+        interval: 95 % Wilson interval.
+        num_missing: rollouts without a result yet.
+        num_unreliable: rollouts on which the success probe abstains, and `reasons` why.
+        num_disagreements: starts whose outcome differs from the real one.
+    """
+
+    world: str
+    task: str
+    policy: str
+    rate: float | None
+    interval: tuple[float, float] | None
+    num_finished: int
+    num_failed: int
+    num_missing: int
+    num_unreliable: int
+    reasons: tuple[str, ...] = ()
+    num_disagreements: int = 0
+
+
+class StudyAgreement(FrozenModel):
+    """Agreement of an imagined world with the real one; `task` is empty for all tasks at once."""
+
+    world: str
+    task: str
+    figures: dict[str, float | None]
+    intervals: dict[str, tuple[float, float] | None]
+    chance: float | None
+    num_policies: int
+    num_starts: int
+    comments: tuple[str, ...] = ()
+
+
+class StudyRollout(FrozenModel):
+    """One rollout of a study; `real_success` is that of the same start and policy."""
+
+    world: str
+    task: str
+    policy: str
+    seed: int
+    repeat: int
+    success: bool | None = None
+    probability: float | None = None
+    unreliable: str | None = None
+    error: str | None = None
+    real_success: bool | None = None
+    disagrees: bool = False
+    episode_id: str | None = None
+
+
+class StudyFigures(FrozenModel):
+    """All figures of a study, those of unfinished ones so far."""
+
+    summary: StudySummary
+    rates: tuple[StudyRate, ...]
+    agreement: tuple[StudyAgreement, ...]
+    num_disagreements: int
+    meanings: dict[str, str] = MEANINGS
+
+
+def study_rollouts(definition: StudyDefinition, results: StudyResults) -> tuple[StudyRollout, ...]:
+    """All rollouts with a result, those first that disagree with the real world most."""
+    real = {
+        (cell.task, cell.seed, cell.policy): outcome.success
+        for cell, outcome in results.outcomes.items()
+        if cell.world == REAL and isinstance(outcome, RolloutScore)
+    }
+    found = [
+        _rollout(cell, outcome, real, results, is_kept=definition.keep_rollouts)
+        for cell in cells_of(definition)
+        if (outcome := results.outcomes.get(cell)) is not None
+    ]
+    # Stable, so that the order of the report stays among equals.
+    return tuple(sorted(found, key=_unlike))
+
+
+def _unlike(rollout: StudyRollout) -> tuple[bool, bool, float]:
+    """Disagreements first, and of these the ones that the probe is sure of."""
+    sureness = abs((rollout.probability or 0.0) - 0.5)
+    return not rollout.disagrees, rollout.unreliable is not None, -sureness * rollout.disagrees
+
+
+def _rollout(
+    cell: Cell,
+    outcome: RolloutScore | RolloutFailure,
+    real: dict[tuple[str, int, str], bool],
+    results: StudyResults,
+    *,
+    is_kept: bool,
+) -> StudyRollout:
+    if isinstance(outcome, RolloutFailure):
+        return StudyRollout(**cell._asdict(), error=f"{outcome.error}: {outcome.message}")
+    in_reality = real.get((cell.task, cell.seed, cell.policy))
+    return StudyRollout(
+        **cell._asdict(),
+        success=outcome.success,
+        probability=outcome.probability,
+        unreliable=outcome.cannot_tell,
+        real_success=in_reality,
+        disagrees=in_reality is not None and in_reality != outcome.success,
+        episode_id=rollout_episode_id(results.header, cell) if is_kept else None,
+    )
+
+
+def study_figures(
+    definition: StudyDefinition,
+    results: StudyResults,
+    rollouts: tuple[StudyRollout, ...],
+    summary: StudySummary,
+) -> StudyFigures:
+    """Rates and agreement, with the intervals of `ClosedLoopReport`."""
+    report = study_report(definition, results)
+    rates = tuple(_rates(report, rollouts))
+    agreement = [one for world in definition.imagined for one in _agreement(report, world)]
+    return StudyFigures(
+        summary=summary,
+        rates=rates,
+        agreement=tuple(agreement),
+        num_disagreements=sum(one.num_disagreements for one in rates),
+    )
+
+
+def _rates(report: ClosedLoopReport, rollouts: tuple[StudyRollout, ...]) -> Iterator[StudyRate]:
+    missing = Counter(
+        (one.world, one.task, one.policy) for one in report.failures if one.error == "NotRunYet"
+    )
+    reasons: dict[tuple[str, str, str], dict[str, None]] = {}
+    unlike: dict[tuple[str, str, str], dict[int, list[bool]]] = {}
+    for one in rollouts:
+        place = (one.world, one.task, one.policy)
+        if one.unreliable is not None:
+            reasons.setdefault(place, {})[one.unreliable] = None
+        if one.real_success is not None:
+            unlike.setdefault(place, {}).setdefault(one.seed, []).append(one.disagrees)
+    for row in report.policy_rows():
+        for world, name, fields in _worlds_of(row, report.imagined_worlds):
+            place = (world, row["task"], row["policy"])
+            rate, interval = fields[name], fields.get(f"{name}_interval")
+            yield StudyRate(
+                world=world,
+                task=row["task"],
+                policy=row["policy"],
+                rate=None if rate == UNDEFINED else rate,
+                interval=None if interval is None else (interval[0], interval[1]),
+                num_finished=fields[f"{name}_rollouts"],
+                num_failed=fields[f"{name}_failed"] - missing[place],
+                num_missing=missing[place],
+                num_unreliable=fields.get(f"{name}_undecided", 0),
+                reasons=tuple(reasons.get(place, ())),
+                num_disagreements=sum(
+                    sum(repeats) >= DISAGREEMENT * len(repeats)
+                    for repeats in unlike.get(place, {}).values()
+                ),
+            )
+
+
+def _worlds_of(
+    row: dict[str, Any], imagined: tuple[str, ...]
+) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """World, name of its entries, and where they are, in a row of `policy_rows`."""
+    yield REAL, REAL, row
+    if imagined:
+        yield imagined[0], "imagined", row
+    for world, fields in row["other_worlds"].items():
+        yield world, "success", fields
+
+
+def _agreement(report: ClosedLoopReport, world: str) -> Iterator[StudyAgreement]:
+    alone = ClosedLoopReport(report.scores, (world,), report.policies, report.failures).to_report()
+    for task, found in alone["agreement"].items():
+        yield _agreed(world, task, found, tuple(alone["comments"][task]))
+    if alone["agreement_of_all_tasks"]:
+        counts = [found["num_policies"] for found in alone["agreement"].values()]
+        starts = [found["num_starts"] for found in alone["agreement"].values()]
+        counted = {"num_policies": max(counts), "num_starts": sum(starts)}
+        yield _agreed(world, "", alone["agreement_of_all_tasks"] | counted, ())
+
+
+def _agreed(
+    world: str, task: str, found: dict[str, Any], comments: tuple[str, ...]
+) -> StudyAgreement:
+    names = ("pearson", "spearman", "kendall", "mmrv", "bias", "mean_absolute_error")
+    figures = {name: found[name] for name in names}
+    intervals = {name: found.get(f"{name}_interval", UNDEFINED) for name in names}
+    chance = found.get("pearson_chance", UNDEFINED)
+    return StudyAgreement(
+        world=world,
+        task=task,
+        figures={name: None if v == UNDEFINED else v for name, v in figures.items()},
+        intervals={n: None if v == UNDEFINED else tuple(v) for n, v in intervals.items()},
+        chance=None if chance == UNDEFINED else chance,
+        num_policies=found["num_policies"],
+        num_starts=found["num_starts"],
+        comments=comments,
+    )
