@@ -159,6 +159,7 @@ class Feeds:
             Topic.of_json("services", settings.list_period_s, self.services),
             Topic.of_json("takes", settings.list_period_s, self.takes),
             Topic.of_json("last_take", settings.list_period_s, self._last_take),
+            Topic.of_json("studies", settings.list_period_s, self._studies),
         ]
         self.topics = {topic.name: topic for topic in topics}
 
@@ -303,6 +304,13 @@ class Feeds:
         except DexTouchError:
             return ()  # reported by the station topic
         return listed.cameras
+
+    async def _studies(self) -> object:
+        """The service's list of studies, or why there is none."""
+        try:
+            return (await self.upstream("studies").send("GET", "/v1/studies")).json()
+        except DexTouchError as error:
+            return {"studies": (), "note": error.message}
 
     async def _taxel_messages(self) -> list[Message]:
         try:

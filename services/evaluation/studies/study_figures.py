@@ -88,7 +88,10 @@ class StudyAgreement(FrozenModel):
 
 
 class StudyRollout(FrozenModel):
-    """One rollout of a study; `real_success` is that of the same start and policy."""
+    """One rollout of a study; `real_…` are those of the same start and policy.
+
+    Ids are those under which the study keeps its rollouts; None where it keeps none.
+    """
 
     world: str
     task: str
@@ -102,6 +105,7 @@ class StudyRollout(FrozenModel):
     real_success: bool | None = None
     disagrees: bool = False
     episode_id: str | None = None
+    real_episode_id: str | None = None
 
 
 class StudyFigures(FrozenModel):
@@ -146,6 +150,7 @@ def _rollout(
 ) -> StudyRollout:
     if isinstance(outcome, RolloutFailure):
         return StudyRollout(**cell._asdict(), error=f"{outcome.error}: {outcome.message}")
+    real_cell = cell._replace(world=REAL, repeat=0)
     in_reality = real.get((cell.task, cell.seed, cell.policy))
     return StudyRollout(
         **cell._asdict(),
@@ -155,6 +160,11 @@ def _rollout(
         real_success=in_reality,
         disagrees=in_reality is not None and in_reality != outcome.success,
         episode_id=rollout_episode_id(results.header, cell) if is_kept else None,
+        real_episode_id=(
+            rollout_episode_id(results.header, real_cell)
+            if is_kept and in_reality is not None
+            else None
+        ),
     )
 
 

@@ -105,13 +105,13 @@ def pearson(task, world):
 
 
 def mmrv(task, world):
-    """Equation 1 of Li et al. 2024 (SIMPLER) by two loops."""
+    """Li et al. 2024 by two loops, with the ties of SimplerEnv."""
     real, imagined = matched_rates(task, world)
     worst = []
     for i in range(len(real)):
         largest = 0.0
         for j in range(len(real)):
-            if (imagined[i] < imagined[j]) != (real[i] < real[j]):
+            if (imagined[i] > imagined[j]) != (real[i] > real[j]):
                 largest = max(largest, abs(real[i] - real[j]))
         worst.append(largest)
     return math.fsum(worst) / len(worst)

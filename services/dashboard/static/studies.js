@@ -1,0 +1,38 @@
+// The list of studies, with the progress of those that run.
+
+import { element, setText } from "./dom.js";
+import { LiveLink } from "./live.js";
+import { badge, progress, stateOf, why } from "./study_parts.js";
+import { startTheme } from "./theme.js";
+
+const find = (id) => document.getElementById(id);
+
+function row(study) {
+  const title = study.problem ? element("strong", {}, study.name)
+    : element("a", { href: `/studies/${encodeURIComponent(study.name)}` }, study.title || study.name);
+  return element("tr", { "data-level": study.problem ? "ERROR" : null },
+    element("td", {}, badge(stateOf(study))),
+    element("td", { class: "name" }, title, study.title !== study.name ? why(study.name) : null, why(study.problem)),
+    element("td", {}, study.problem ? "–" : progress(study)),
+    element("td", { class: "number" }, study.problem ? "–" : String(study.num_failed)),
+    element("td", { class: "free" }, study.tasks.join(", ")),
+    element("td", { class: "free" }, study.worlds.join(", ")),
+    element("td", { class: "free" }, study.policies.join(", ")),
+    element("td", {}, new Date(study.changed_at).toLocaleString()));
+}
+
+function show({ studies, note }) {
+  setText(find("summary"), `${studies.length} studies, ${studies.filter((one) => one.is_running).length} running`);
+  const empty = note ?? "No studies yet. `dextouch study run` writes them into the folder that this dashboard's study service reads.";
+  find("study_rows").replaceChildren(...(studies.length ? studies.map(row)
+    : [element("tr", {}, element("td", { colspan: 8, class: "free" }, empty))]));
+}
+
+const link = new LiveLink({
+  onTopic: (topic, data) => { if (topic === "studies") show(data); },
+  onBinary: () => {},
+  onState: (connected) => setText(find("link"), connected ? "live" : "dashboard not reachable: what you see is old"),
+});
+link.show("studies", true);
+document.addEventListener("visibilitychange", () => link.sendView());
+startTheme(find("theme"), () => {});

@@ -1,0 +1,150 @@
+// One study: its tables, sorted as the operator wants, and its rollouts, disagreements first.
+
+import { element, setText } from "./dom.js";
+import { LiveLink } from "./live.js";
+import { ask } from "./session.js";
+import { sorted } from "./sorting.js";
+import { badge, progress, stateOf } from "./study_parts.js";
+import { agreementRow, rateCell, rateRows, rolloutRow } from "./study_tables.js";
+import { startTheme } from "./theme.js";
+
+const find = (id) => document.getElementById(id);
+const PAGE = 50;
+const name = decodeURIComponent(location.pathname.split("/").pop());
+const base = `/v1/studies/studies/${encodeURIComponent(name)}`;
+const playable = new Map(); // episode id → whether the dashboard's store has it
+let figures = null;
+let order = { key: "task", descending: false };
+let filter = { disagreements: true };
+let rows = [];
+
+async function read(path) {
+  const answer = await ask(path);
+  const body = await answer.json();
+  if (!answer.ok) throw new Error(body.detail ?? `refused (${answer.status})`);
+  return body;
+}
+
+function note(id, text, level = "") {
+  find(id).dataset.level = level;
+  setText(find(id), text);
+}
+
+function sortButton(key, label) {
+  const button = element("button", { type: "button", class: "sort" }, label);
+  button.addEventListener("click", () => {
+    order = { key, descending: order.key === key ? !order.descending : key.startsWith("world:") };
+    showRates();
+  });
+  const direction = order.key === key ? (order.descending ? "descending" : "ascending") : "none";
+  return element("th", { scope: "col", "aria-sort": direction }, button);
+}
+
+function showRates() {
+  const worlds = ["real", ...figures.summary.worlds];
+  const valueOf = order.key.startsWith("world:")
+    ? (row) => row.worlds[order.key.slice("world:".length)]?.rate : (row) => row[order.key];
+  find("rates").tHead.replaceChildren(element("tr", {}, sortButton("task", "Task"), sortButton("policy", "Policy"),
+    ...worlds.map((world) => sortButton(`world:${world}`, world === "real" ? "real" : `${world} (imagined)`))));
+  find("rates").tBodies[0].replaceChildren(...sorted(rateRows(figures.rates), valueOf, order.descending).map((row) =>
+    element("tr", { "data-task": row.task, "data-policy": row.policy }, element("td", {}, row.task), element("td", { class: "name" }, row.policy),
+      ...worlds.map((world) => rateCell(row.worlds[world], ({ world: of, task, policy }) => open({ world: of, task, policy }))))));
+}
+
+function showFigures() {
+  const { summary, meanings } = figures;
+  setText(find("study_title"), summary.title || summary.name);
+  find("study_state").replaceChildren(badge(stateOf(summary)), progress(summary));
+  setText(find("summary"), `${figures.num_disagreements} imagined outcomes differ from the real ones`);
+  setText(find("rate_meaning"), `${meanings.rate} Unreliable: ${meanings.unreliable}`);
+  const named = [["Pearson", "pearson"], ["MMRV", "mmrv"], ["Bias", "bias"], ["Intervals", "interval"]];
+  find("meanings").replaceChildren(...named.flatMap(([label, key]) => [element("dt", {}, label), element("dd", {}, meanings[key])]));
+  showRates();
+  const heads = [["World", ""], ["Task", ""], ["Pearson", "number"], ["MMRV", "number"], ["Bias", "number"], ["Chance", "number"], ["Policies × starts", "number"], ["", ""]];
+  const chance = "share of all pairings of the policies' rates that correlate at least as well";
+  find("agreement").tHead.replaceChildren(element("tr", {}, ...heads.map(([label, kind]) =>
+    element("th", { scope: "col", class: kind || null, title: label === "Chance" ? chance : null }, label))));
+  const shown = figures.agreement.map(agreementRow);
+  find("agreement").tBodies[0].replaceChildren(...(shown.length ? shown
+    : [element("tr", {}, element("td", { colspan: 8, class: "free" }, "This study has no imagined world."))]));
+}
+
+async function findPlayable(found) {
+  const ids = [...new Set(found.flatMap((one) => [one.episode_id, one.real_episode_id]))].filter((id) => id && !playable.has(id));
+  const next = async () => {
+    for (let id = ids.pop(); id; id = ids.pop()) {
+      const answer = await ask(`/v1/episode_store/episodes/${encodeURIComponent(id)}`).catch(() => null);
+      playable.set(id, Boolean(answer?.ok));
+    }
+  };
+  await Promise.all([next(), next(), next(), next()]);
+}
+
+function showRollouts(total) {
+  const kept = new Set([...playable].filter(([, has]) => has).map(([id]) => id));
+  const heads = ["", "World", "Task", "Policy", "Seed", "Outcome", "Real outcome", "Probe", "Unreliable", "Play"];
+  find("rollouts").tHead.replaceChildren(element("tr", {}, ...heads.map((label) =>
+    element("th", { scope: "col", class: ["Seed", "Probe"].includes(label) ? "number" : null }, label))));
+  find("rollouts").tBodies[0].replaceChildren(...rows.map((row) => rolloutRow(row, kept)));
+  const of = filter.world ? ` of ${filter.policy} in ${filter.world}, ${filter.task}` : "";
+  const what = filter.disagreements ? "outcomes that differ between a world and the real one" : "rollouts, those that differ from the real one first";
+  const missing = rows.some((row) => row.episode_id) && !rows.some((row) => kept.has(row.episode_id) || kept.has(row.real_episode_id))
+    ? " They are not in this dashboard's episode store, so they cannot be played here: run the study with --store." : "";
+  note("rollouts_note", `${rows.length} of ${total} ${what}${of}.${missing}`);
+  find("more").hidden = rows.length >= total;
+  find("only_disagreements").setAttribute("aria-pressed", String(Boolean(filter.disagreements)));
+  find("all_rollouts").setAttribute("aria-pressed", String(!filter.disagreements));
+}
+
+async function load(offset) {
+  const asked = filter;
+  const query = new URLSearchParams({ ...filter, limit: PAGE, offset });
+  try {
+    const { rollouts, num_matching } = await read(`${base}/rollouts?${query}`);
+    await findPlayable(rollouts);
+    if (asked !== filter) return;
+    rows = offset ? [...rows, ...rollouts] : rollouts;
+    showRollouts(num_matching);
+  } catch (error) {
+    note("rollouts_note", error.message, "ERROR");
+  }
+}
+
+function open(wanted) {
+  filter = wanted;
+  find("rollouts_title").scrollIntoView({ block: "start", behavior: "smooth" });
+  return load(0);
+}
+
+async function refresh() {
+  try {
+    figures = await read(base);
+    showFigures();
+    note("study_note", "");
+    if (rows.length <= PAGE) await load(0);
+  } catch (error) {
+    note("study_note", error.message, "ERROR");
+  }
+}
+
+let newest = "";
+const link = new LiveLink({
+  onTopic: (topic, data) => {
+    if (topic !== "studies") return;
+    const study = data.studies.find((one) => one.name === name);
+    if (!study && data.note) note("study_note", data.note, "ERROR");
+    const now = JSON.stringify(study ?? null);
+    if (now !== newest) {
+      newest = now;
+      refresh();
+    }
+  },
+  onBinary: () => {},
+  onState: (connected) => setText(find("link"), connected ? "live" : "dashboard not reachable: what you see is old"),
+});
+link.show("studies", true);
+document.addEventListener("visibilitychange", () => link.sendView());
+find("only_disagreements").addEventListener("click", () => open({ disagreements: true }));
+find("all_rollouts").addEventListener("click", () => open({}));
+find("more").addEventListener("click", () => load(rows.length));
+startTheme(find("theme"), () => {});
