@@ -12,7 +12,7 @@ function row(study) {
     : element("a", { href: `/studies/${encodeURIComponent(study.name)}` }, study.title || study.name);
   return element("tr", { "data-level": study.problem ? "ERROR" : null },
     element("td", {}, badge(stateOf(study))),
-    element("td", { class: "name" }, title, study.title !== study.name ? why(study.name) : null, why(study.problem)),
+    element("td", { class: "name" }, title, study.title && study.title !== study.name ? why(study.name) : null, why(study.problem)),
     element("td", {}, study.problem ? "–" : progress(study)),
     element("td", { class: "number" }, study.problem ? "–" : String(study.num_failed)),
     element("td", { class: "free" }, study.tasks.join(", ")),

@@ -1,7 +1,7 @@
 // Tables of one study: rates by policy, task and world, agreement, and rollouts.
 
 import { element } from "./dom.js";
-import { cautions, figure, interval, rateBar, why } from "./study_parts.js";
+import { badge, cautions, figure, interval, rateBar, why } from "./study_parts.js";
 
 // One row per task and policy, with its rates by world.
 export function rateRows(rates) {
@@ -30,10 +30,11 @@ export function rateCell(rate, open) {
   return cell;
 }
 
-function figureCell(one, name) {
+function figureCell(one, name, caution = "") {
   return element("td", { class: "number", "data-figure": name },
     element("strong", {}, figure(one.figures[name])), " ",
-    element("span", { class: "quiet" }, one.figures[name] === null ? "undefined" : interval(one.intervals[name])));
+    element("span", { class: "quiet" }, one.figures[name] === null ? "undefined" : interval(one.intervals[name])),
+    caution ? element("span", { class: "caution" }, caution) : null);
 }
 
 export function agreementRow(one) {
@@ -42,7 +43,7 @@ export function agreementRow(one) {
   return element("tr", { "data-world": one.world, "data-task": one.task },
     element("td", { class: "name" }, one.world),
     element("td", {}, one.task || "all tasks together"),
-    figureCell(one, "pearson"), figureCell(one, "mmrv"), figureCell(one, "bias"),
+    figureCell(one, "pearson", one.is_vague ? "too wide to tell a faithful world from a poor one" : ""), figureCell(one, "mmrv"), figureCell(one, "bias"),
     element("td", { class: "number" }, one.chance === null ? "–" : one.chance < 0.001 ? "< 0.001" : one.chance.toFixed(3)),
     element("td", { class: "number" }, `${one.num_policies} × ${one.num_starts}`),
     element("td", { class: "free" }, comments));
@@ -59,8 +60,8 @@ export function rolloutRow(rollout, playable) {
     ? element("a", { href: `/episodes/episode/${encodeURIComponent(id)}` }, label) : null);
   const links = [play(rollout.episode_id, rollout.world === "real" ? "Play" : `Play ${rollout.world}`),
     rollout.world === "real" ? null : play(rollout.real_episode_id, "Play real")].filter(Boolean);
-  return element("tr", { "data-level": rollout.disagrees ? "WARN" : null },
-    element("td", {}, rollout.disagrees ? "differs" : ""),
+  return element("tr", {},
+    element("td", {}, rollout.disagrees ? badge({ level: "WARN", word: "differs" }) : ""),
     element("td", {}, rollout.world), element("td", {}, rollout.task), element("td", {}, rollout.policy),
     element("td", { class: "number" }, String(rollout.seed), why(rollout.repeat ? `repeat ${rollout.repeat}` : "")),
     element("td", {}, rollout.error ? "failed to run" : outcome(rollout.success), why(rollout.error)),

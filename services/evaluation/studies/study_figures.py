@@ -7,7 +7,7 @@ from typing import Any, Final
 from pydantic import AwareDatetime
 
 from dextouch.frozen_model import FrozenModel
-from services.evaluation.comments import UNDEFINED
+from services.evaluation.comments import UNDEFINED, VAGUE_R
 from services.evaluation.scores import REAL, ClosedLoopReport, RolloutFailure, RolloutScore
 from services.evaluation.studies.definition import StudyDefinition
 from services.evaluation.studies.results import (
@@ -75,12 +75,16 @@ class StudyRate(FrozenModel):
 
 
 class StudyAgreement(FrozenModel):
-    """Agreement of an imagined world with the real one; `task` is empty for all tasks at once."""
+    """Agreement of an imagined world with the real one; `task` is empty for all tasks at once.
+
+    `is_vague`: Pearson's interval is too wide to tell a faithful world from a poor one.
+    """
 
     world: str
     task: str
     figures: dict[str, float | None]
     intervals: dict[str, tuple[float, float] | None]
+    is_vague: bool
     chance: float | None
     num_policies: int
     num_starts: int
@@ -254,6 +258,7 @@ def _agreed(
         task=task,
         figures={name: None if v == UNDEFINED else v for name, v in figures.items()},
         intervals={n: None if v == UNDEFINED else tuple(v) for n, v in intervals.items()},
+        is_vague=intervals["pearson"] != UNDEFINED and intervals["pearson"][0] < VAGUE_R,
         chance=None if chance == UNDEFINED else chance,
         num_policies=found["num_policies"],
         num_starts=found["num_starts"],
