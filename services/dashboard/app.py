@@ -10,11 +10,12 @@ from fastapi.staticfiles import StaticFiles
 from prometheus_client import Gauge
 
 from dextouch.serving import AccessControl, create_service_app, serve
+from services.dashboard.comparison import Comparisons
 from services.dashboard.feeds import Feeds
 from services.dashboard.forwarding import forwarding_router
 from services.dashboard.pages import Sessions, page_router, refusal_page
 from services.dashboard.rollout_feeds import RolloutFeeds
-from services.dashboard.routes import api_router, live_router
+from services.dashboard.routes import api_router, comparison_router, live_router
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.upstream import Upstream, upstream_histogram
 
@@ -38,6 +39,7 @@ def create_app(
             for name, url in settings.upstream_urls().items()
         }
     feeds = Feeds(upstreams, settings)
+    comparisons = Comparisons(feeds, period_s=settings.station_period_s)
     sessions = Sessions(
         AccessControl(settings.api_keys),
         needs_key=bool(settings.api_keys),
@@ -47,6 +49,7 @@ def create_app(
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         yield
+        await comparisons.stop()
         for upstream in upstreams.values():
             await upstream.close()
 
@@ -57,7 +60,11 @@ def create_app(
             page_router(settings, sessions),
             api_router(settings, feeds, sessions),
             forwarding_router(feeds, sessions),
-            live_router([feeds.topics.get, RolloutFeeds(feeds, settings).topic], sessions),
+            comparison_router(comparisons, sessions),
+            live_router(
+                [feeds.topics.get, comparisons.topics.get, RolloutFeeds(feeds, settings).topic],
+                sessions,
+            ),
         ],
         lifespan=lifespan,
         admits=sessions.allows,

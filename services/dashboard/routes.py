@@ -15,6 +15,8 @@ from starlette.websockets import WebSocketState
 
 from dextouch.errors import AccessDeniedError
 from dextouch.frozen_model import FrozenModel
+from dextouch.serving import JSON, KIB, OCTETS, takes
+from services.dashboard.comparison import Comparisons, ComparisonView, StartComparison
 from services.dashboard.feeds import Feeds, Topic, heatmap_layout
 from services.dashboard.pages import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
@@ -79,6 +81,36 @@ def api_router(settings: DashboardSettings, feeds: Feeds, sessions: Sessions) ->
         image = await feeds.upstream("acquisition").send("GET", f"/v1/live/cameras/{name}")
         media_type = image.headers.get("content-type", "image/jpeg")
         return Response(image.content, media_type=media_type, headers={"cache-control": "no-store"})
+
+    return router
+
+
+def comparison_router(comparisons: Comparisons, sessions: Sessions) -> APIRouter:
+    """Router of the replay of an episode in two worlds at once."""
+    guards = [Depends(sessions.guard), Depends(SESSION)]
+    router = APIRouter(prefix="/v1/comparisons", dependencies=guards, tags=["comparison"])
+
+    @router.post("", status_code=202)
+    @takes({JSON: KIB})
+    async def start(asked: StartComparison) -> ComparisonView:
+        """Replay an episode in the twin and in the world model; ends the comparison before."""
+        return await comparisons.start(asked.episode_id)
+
+    @router.post("/stop", status_code=204)
+    async def stop() -> None:
+        """End the running comparison and its rollouts."""
+        await comparisons.stop()
+
+    @router.get(
+        "/{comparison_id}/chunks/{number}",
+        response_class=Response,
+        responses={200: {"content": {OCTETS: {}}}},
+    )
+    async def chunk(comparison_id: str, number: int) -> Response:
+        """Images and touch of both worlds over one chunk."""
+        headers = {"cache-control": "no-store"}
+        content = comparisons.chunk(comparison_id, number)
+        return Response(content, headers=headers, media_type=OCTETS)
 
     return router
 

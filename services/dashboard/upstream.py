@@ -82,11 +82,21 @@ class Upstream:
         return await self._sent(self._client.build_request(method, path, json=body))
 
     async def forward(
-        self, method: str, path: str, headers: Mapping[str, str], content: bytes
+        self,
+        method: str,
+        path: str,
+        headers: Mapping[str, str],
+        content: bytes,
+        *,
+        timeout_s: float | None = None,
     ) -> httpx.Response:
         """Response to a request of a browser, also "304 Not Modified"; otherwise as `send`."""
         request = self._client.build_request(
-            method, path, headers=dict(headers), content=content or None
+            method,
+            path,
+            headers=dict(headers),
+            content=content or None,
+            timeout=httpx.USE_CLIENT_DEFAULT if timeout_s is None else timeout_s,
         )
         return await self._sent(request)
 

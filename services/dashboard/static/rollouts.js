@@ -1,5 +1,6 @@
 // The rollouts screen: open rollouts of all worlds, and the newest steps of the one that is watched.
 
+import { ComparisonPanel } from "./comparison.js";
 import { element, setText } from "./dom.js";
 import { HandCanvas } from "./hands.js";
 import { LiveLink } from "./live.js";
@@ -19,6 +20,7 @@ let listed = { worlds: [], rollouts: [], problems: [], num_open: 0 };
 let watched = null; // { topic, rollout } of the rollout that is shown
 let steps = null;
 
+const comparison = new ComparisonPanel(heatmap);
 const player = new StepPlayer({ show: showStep });
 
 function topicOf(rollout) {
@@ -119,6 +121,7 @@ function showStep(index) {
 const link = new LiveLink({
   onTopic: (topic, data) => {
     if (topic === "rollouts") showListed(data);
+    else if (topic === "comparison") comparison.show(data);
     else if (topic === watched?.topic) note(`${data.gone ? "This rollout is over: " : ""}${data.note}`, "WARN");
   },
   onBinary: (buffer) => {
@@ -132,6 +135,7 @@ const link = new LiveLink({
 });
 
 link.show("rollouts", true);
+link.show("comparison", true);
 document.addEventListener("visibilitychange", () => link.sendView());
 new IntersectionObserver((entries) => {
   for (const entry of entries) if (watched) link.show(watched.topic, entry.isIntersecting);
@@ -148,7 +152,11 @@ find("step").addEventListener("input", (event) => {
 });
 const draw = () => {
   player.tick();
+  comparison.player.tick();
   requestAnimationFrame(draw);
 };
 requestAnimationFrame(draw);
-startTheme(find("theme"), () => Object.values(hands).forEach((hand) => hand.request()));
+startTheme(find("theme"), () => {
+  for (const hand of Object.values(hands)) hand.request();
+  comparison.redraw();
+});

@@ -20,6 +20,17 @@ export class StepPlayer {
     else this.tick();
   }
 
+  // More steps behind the ones that are played; what is shown goes on.
+  extend(count, rate_hz) {
+    if (this.count === 0) {
+      this.load(count, rate_hz);
+      return;
+    }
+    // Where all were shown already, the new ones begin now.
+    if (this.index === this.count - 1) this.began_ms = this.now() - 1000 * this.index / this.rate_hz;
+    this.count = count;
+  }
+
   // Called for every drawn frame of the page.
   tick() {
     if (this.paused || this.count === 0) return;
