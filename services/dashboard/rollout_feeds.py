@@ -11,8 +11,14 @@ from pydantic_core import to_json
 
 from dextouch.errors import DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import WatchedRollout, WatchedRollouts, WorldKind, WorldList
-from dextouch.schemas.jpeg_images import IMAGE_PREFIX, decode_images
+from dextouch.schemas import (
+    IMAGE_PREFIX,
+    WatchedRollout,
+    WatchedRollouts,
+    WorldKind,
+    WorldList,
+    decode_images,
+)
 from dextouch.streams import unpack
 from services.dashboard.feeds import Feeds, Message, Topic, topic_message
 from services.dashboard.settings import DashboardSettings

@@ -135,7 +135,8 @@ def operations(app, *, unsafe):
         ]
     if unsafe and app.title == "dashboard":
         found += [("POST", path) for path in FORMS]
-    assert found
+    # The service of studies only reads.
+    assert found or (unsafe and app.title == "studies")
     return found
 
 

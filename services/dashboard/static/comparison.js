@@ -123,7 +123,7 @@ export class ComparisonPanel {
     setText(find("imagined_doubt"), said?.doubt?.outside ? `unreliable: ${doubt.reason}` : said ? `doubt ${doubt.text}` : doubt.text);
     const { pixel_error, pressure_error_kpa, contact_f1, in_contact } = this.view;
     setText(find("comparison_text"), `step ${step}: pixels ${number(pixel_error[step], 2)}, pressure ${number(pressure_error_kpa[step], 3, "kPa")}, `
-      + `contact F1 ${in_contact[step] ? number(contact_f1[step], 2) : "– (no contact)"}`);
+      + `contact F1 ${in_contact[step] ? number(contact_f1[step], 2) : "undefined (no contact)"}`);
     find("comparison_step").value = step;
     find("compared").dataset.step = step;
     this.charts.goTo(step);

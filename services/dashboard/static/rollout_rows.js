@@ -4,6 +4,8 @@ import { element } from "./dom.js";
 import { age } from "./format.js";
 
 const IDLE_S = 30;
+// What a service without keys calls everybody.
+const WITHOUT_KEYS = "loopback";
 const KINDS = { twin: "physics twin", model: "imagined", baseline: "baseline", robot: "robot" };
 
 export function stateOf(rollout) {
@@ -40,7 +42,7 @@ export function rolloutRow(rollout, isWatched, watch) {
   return element("tr", { "data-level": state.level === "OK" ? null : state.level, "data-watch": rollout.watch_id },
     element("td", {}, badge(state), why(rollout.ended)),
     element("td", { class: "name" }, rollout.world, why(KINDS[rollout.kind] ?? rollout.service)),
-    element("td", {}, rollout.client || "not named", why(rollout.key ? `key ${rollout.key}` : "")),
+    element("td", {}, rollout.client || "not named", why(rollout.key && rollout.key !== WITHOUT_KEYS ? `key ${rollout.key}` : "")),
     element("td", { class: "task" }, rollout.task, why(rollout.instruction)),
     element("td", { class: "number" }, String(rollout.next_chunk)),
     element("td", { class: "number" }, String(rollout.last_step), why(rollout.model_rate_hz ? `${(rollout.last_step / rollout.model_rate_hz).toFixed(1)} s` : "")),

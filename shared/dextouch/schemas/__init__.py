@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from dextouch.schemas.episodes import is_rollout as is_rollout
     from dextouch.schemas.episodes import json_ready as json_ready
     from dextouch.schemas.episodes import matrix_rows as matrix_rows
+    from dextouch.schemas.jpeg_images import IMAGE_PREFIX as IMAGE_PREFIX
+    from dextouch.schemas.jpeg_images import decode_images as decode_images
     from dextouch.schemas.observations import EVERYTHING as EVERYTHING
     from dextouch.schemas.observations import Observation as Observation
     from dextouch.schemas.observations import ReturnSelector as ReturnSelector

@@ -1,0 +1,173 @@
+"""An operator replays an episode in a real and an imagined world, and sees how far they part."""
+
+from dataclasses import replace
+
+import httpx
+import numpy as np
+import pytest
+from playwright.sync_api import expect
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import EndedError
+from dextouch.schemas import EVERYTHING, Doubt, RolloutStart
+from dextouch.worlds import SteppedRollout, WorldServiceSettings, create_world_app
+from services.dashboard.app import create_app
+from services.dashboard.settings import DashboardSettings
+from services.episode_store.app import create_app as create_store
+from services.episode_store.settings import EpisodeStoreSettings
+from tests.unit.evaluation import toy
+from tests.unit.evaluation.toy_store import write
+
+SEED = 3
+DOUBTED = "the hand is 20 mm from where it was sent"
+PIXELS = """canvas => [canvas.width, canvas.height,
+  [...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data]]"""
+
+
+class DoubtfulWorld(toy.ToyWorld):
+    """Doubts its third chunk, and may end the rollout at a later one."""
+
+    def __init__(self, *, ends_at=None):
+        super().__init__("dream", judge=False, drift_m=0.02)
+        self.ends_at = ends_at
+
+    def step(self, state, actions, *, seed, selector=EVERYTHING):
+        if self.ends_at is not None and state.step >= self.ends_at:
+            raise EndedError("dream: lost", reason="the spot is out of sight")
+        stepped = super().step(state, actions, seed=seed, selector=selector)
+        outside = state.step == 32
+        doubt = Doubt(
+            disagreement=0.02, distance=0.5, outside=outside, reason=DOUBTED if outside else None
+        )
+        return SteppedRollout(
+            stepped.state, replace(stepped.observation, doubt=doubt), stepped.info
+        )
+
+
+def steps_of(world, item, start):
+    """Images and touch of every step of a replay, by the world alone."""
+    begun = world.reset(start)
+    state, seen = begun.state, [begun.observation]
+    for first in range(1, toy.STEPS, 16):
+        stepped = world.step(state, item.commanded[first : first + 16], seed=0)
+        state = stepped.state
+        seen.append(stepped.observation)
+    images = np.concatenate([one.images["camera_head"] for one in seen])
+    return images, np.concatenate([one.tactile_kpa for one in seen]), begun
+
+
+@pytest.fixture
+def item():
+    return toy.demonstration("reach", SEED)
+
+
+@pytest.fixture
+def expected(item):
+    """Steps of both worlds, which the errors are computed from below."""
+    start = RolloutStart("reach", SEED, item.instruction)
+    images, touch, begun = steps_of(toy.ToyWorld("twin", judge=True), item, start)
+    given = replace(start, observation=begun.observation, anchor=begun.anchor, K_head=begun.K_head)
+    other_images, other_touch, _ = steps_of(DoubtfulWorld(), item, given)
+    return images, other_images, touch, other_touch
+
+
+@pytest.fixture
+def serve_dashboard(serve, tmp_path, item):
+    store = EpisodeStore(str(tmp_path / "store"))
+    write(store, item)
+    write(store, toy.demonstration("reach", 4, name="recorded-by-hand"), domain="human", seed=None)
+    store_url = serve(create_store(EpisodeStoreSettings(store_url=str(tmp_path / "store"))))
+    twin = serve(
+        create_world_app({"twin": toy.ToyWorld("twin", judge=True)}, WorldServiceSettings())
+    )
+
+    def start(**options):
+        model = serve(create_world_app({"dream": DoubtfulWorld(**options)}, WorldServiceSettings()))
+        urls = {"twin_url": twin, "world_model_url": model, "episode_store_url": store_url}
+        return serve(create_app(DashboardSettings(**urls))), twin, model
+
+    return start
+
+
+def replay(page, episode_id):
+    page.get_by_label("Episode").fill(episode_id)
+    page.get_by_role("button", name="Replay").click()
+
+
+def shown(page, name):
+    width, height, values = page.locator(f"#{name}").evaluate(PIXELS)
+    return np.array(values, np.uint8).reshape(height, width, 4)[..., :3]
+
+
+def loops(images, other_images, touch, other_touch):
+    """Errors of every step by plain loops over taxels; contact begins at 2 kPa."""
+    pixels = [
+        sum(abs(int(x) - int(y)) for x, y in zip(a.ravel(), b.ravel(), strict=True)) / a.size
+        for a, b in zip(images, other_images, strict=True)
+    ]
+    pressures, f1 = [], []
+    for truth, guess in zip(touch, other_touch, strict=True):
+        pairs = list(zip(truth.ravel().tolist(), guess.ravel().tolist(), strict=True))
+        pressures.append(sum(abs(x - y) for x, y in pairs) / len(pairs))
+        both = sum(x >= 2 and y >= 2 for x, y in pairs)
+        one = sum((x >= 2) != (y >= 2) for x, y in pairs)
+        f1.append(2 * both / (2 * both + one) if both + one else 1.0)
+    return pixels, pressures, f1
+
+
+def test_both_worlds_side_by_side_with_their_errors(page, serve_dashboard, item, expected):
+    address, twin, model = serve_dashboard()
+    problems = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.goto(f"{address}/rollouts")
+    replay(page, item.episode_id)
+    expect(page.locator("#comparison_state")).to_contain_text("finished")
+    expect(page.locator("#comparison_step")).to_have_attribute("max", "80")
+    images, other_images, touch, other_touch = expected
+    pixels, pressures, f1 = loops(*expected)
+    assert max(pixels) > 1
+    assert max(pressures) > 0.01
+    for step in (0, 20, 40, 80):
+        page.get_by_label("step of the comparison").fill(str(step))
+        expect(page.locator("#compared")).to_have_attribute("data-step", str(step))
+        assert np.array_equal(shown(page, "real_image"), images[step])
+        assert np.array_equal(shown(page, "imagined_image"), other_images[step])
+        apart = np.abs(images[step].astype(int) - other_images[step])
+        assert np.array_equal(shown(page, "difference_image"), apart)
+        touched = max(touch[step].max(), other_touch[step].max()) >= 2
+        contact = f"{f1[step]:.2f}" if touched else "undefined (no contact)"
+        words = f"step {step}: pixels {pixels[step]:.2f}, pressure {pressures[step]:.3f} kPa, "
+        expect(page.locator("#comparison_text")).to_have_text(f"{words}contact F1 {contact}")
+        for side, kpa in zip(("left", "right"), other_touch[step], strict=True):
+            count = int((kpa >= 2).sum())
+            said = f"{count} taxels in contact, peak {kpa.max():.0f} kPa" if count else "no contact"
+            expect(page.locator(f"#imagined_{side}_text")).to_have_text(said)
+        doubt = page.locator("#imagined_doubt")
+        said = "given" if not step else f"unreliable: {DOUBTED}" if step == 40 else "within"
+        expect(doubt).to_contain_text(said)
+    assert page.locator("#charts canvas").count() == 3
+    # Nothing is left behind in the worlds.
+    for url in (twin, model):
+        assert httpx.get(f"{url}/v1/watch").json()["num_open"] == 0
+    assert problems == []
+
+
+def test_a_world_that_ends_its_rollout_says_why(page, serve_dashboard, item):
+    address, *_ = serve_dashboard(ends_at=48)
+    page.goto(f"{address}/rollouts?replay={item.episode_id}")
+    page.get_by_role("button", name="Replay").click()
+    ended = "The world model ended its rollout: the spot is out of sight"
+    expect(page.locator("#comparison_note")).to_have_text(ended)
+    expect(page.locator("#comparison_step")).to_have_attribute("max", "48")
+
+
+@pytest.mark.parametrize(
+    ("episode_id", "says"),
+    [("recorded-by-hand", "expected a robot episode with a seed"), ("nothing", "nothing")],
+)
+def test_episodes_that_cannot_be_replayed_are_refused(page, serve_dashboard, episode_id, says):
+    address, *_ = serve_dashboard()
+    page.goto(f"{address}/rollouts")
+    replay(page, episode_id)
+    expect(page.locator("#comparison_note")).to_contain_text(says)
+    expect(page.locator("#compared")).to_be_hidden()
