@@ -181,7 +181,6 @@ def _shown(
             tasks=tasks,
             settings=settings,
             goals=json.dumps(settings.goal_hours),
-            rating_url=settings.rating_url,
             signed_in=sessions.needs_key,
         )
 

@@ -53,6 +53,12 @@ def worlds(_, **settings):
     return create_world_app(served, WorldServiceSettings(**settings))
 
 
+def studies(folder, **settings):
+    from services.evaluation.studies.app import StudyServiceSettings, create_app
+
+    return create_app(StudyServiceSettings(studies=folder, **settings))
+
+
 def rating(folder, **settings):
     from services.evaluation.rating.app import create_rating_app
 
@@ -70,6 +76,7 @@ UP = {
     "alignment": alignment,
     "dashboard": dashboard,
     "episode_store": episode_store,
+    "studies": studies,
     "twin": worlds,
     "world_model": worlds,
 }

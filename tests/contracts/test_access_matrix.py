@@ -20,6 +20,8 @@ SCOPES = (
     "align",
     "calibrate",
     "rollout",
+    "watch",
+    "study_read",
     "rate",
     "operate",
 )
@@ -95,6 +97,13 @@ TABLE = {
         "POST /v1/rollouts/{rollout_id}/chunks/{chunk}": "rollout",
         "POST /v1/rollouts/{rollout_id}/fork": "rollout",
         "WEBSOCKET /v1/openpi": "rollout",
+        "GET /v1/watch": "watch",
+        "GET /v1/watch/{watch_id}": "watch",
+    },
+    "studies": {
+        "GET /v1/studies": "study_read",
+        "GET /v1/studies/{name}": "study_read",
+        "GET /v1/studies/{name}/rollouts": "study_read",
     },
     "rating": {
         "GET /v1/rating/next": "rate",
@@ -105,7 +114,7 @@ TABLE = {
 # The page where raters enter their key, and its files.
 RATING_PAGE = {"GET /", "GET /rate.js", "GET /rate.css", "GET /rate.svg"}
 SIGN_IN = {"POST /sign_in", "POST /sign_out"}
-PATH_VALUES = {"number": "0", "chunk": "0", "step": "0", "token": "0" * 20}
+PATH_VALUES = {"number": "0", "chunk": "0", "step": "0", "token": "0" * 20, "watch_id": "0" * 32}
 WRONG_KEY = "wrong-key-of-some-length"
 
 

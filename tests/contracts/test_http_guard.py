@@ -36,53 +36,6 @@ FORM = "application/x-www-form-urlencoded"
 FORMS = ("/sign_in", "/sign_out")
 
 
-def acquisition(folder, **settings):
-    from services.acquisition.app import create_app
-
-    return create_app(AcquisitionSettings(mock=True, spool=folder / "spool", **settings))
-
-
-def alignment(folder, **settings):
-    from services.alignment.app import create_app
-
-    return create_app(AlignmentSettings(store_url=str(folder), **settings))
-
-
-def dashboard(_, **settings):
-    from services.dashboard.app import create_app
-
-    return create_app(DashboardSettings(**settings), {})
-
-
-def episode_store(folder, **settings):
-    from services.episode_store.app import create_app
-
-    return create_app(EpisodeStoreSettings(store_url=str(folder), **settings))
-
-
-def worlds(_, **settings):
-    world = SumWorld()
-    served = {"sum": world, "copy-first": CopyFirstWorld.beside(world.description)}
-    return create_world_app(served, WorldServiceSettings(**settings))
-
-
-def studies(folder, **settings):
-    from services.evaluation.studies.app import StudyServiceSettings, create_app
-
-    return create_app(StudyServiceSettings(studies=folder, **settings))
-
-
-APPS = {
-    "acquisition": acquisition,
-    "alignment": alignment,
-    "dashboard": dashboard,
-    "episode_store": episode_store,
-    "studies": studies,
-    "twin": worlds,
-    "world_model": worlds,
-}
-
-
 def test_every_service_of_the_project_is_here():
     assert set(UP) == set(BUILDERS)
 
