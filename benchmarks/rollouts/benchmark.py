@@ -4,6 +4,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Mapping
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +13,7 @@ from benchmarks.figures import Figure, Requirement
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rollouts.crowd import Crowd, crowd
+from benchmarks.rollouts.watcher import watched
 from benchmarks.rollouts.ways import MAX_CHUNKS, Chunk, Way, compared, opened
 from benchmarks.rollouts.worlds import MAX_STEPS, StillWorld, resting_actions
 from benchmarks.rounds import interleaved
@@ -25,6 +27,7 @@ JPEG: Final = ReturnSelector(steps="last", images="jpeg")
 ALL: Final = ReturnSelector(steps="all")
 MAX_OVER_ECHO: Final = {"HTTP": 1.5, "WebSocket": 1.3}
 MAX_DURABLE_MS: Final = 1.0
+MAX_WATCHED: Final = 1.1
 MIN_BATCHED: Final = 3.0
 MAX_TAIL: Final = 3.0
 # Those with a requirement, and others for comparison.
@@ -38,6 +41,7 @@ OTHERS: Final = (
     Way("HTTP", "last image", LAST),
     Way("HTTP", "last image, world in a thread", LAST, world="still in a thread"),
 )
+WATCHED: Final = Way("HTTP", "16 raw images, watched", ALL, is_watched=True)
 DURABLE: Final = Way("HTTP", "last image, in Redis", LAST, server="durable")
 DEVICES: Final = ("device", "batch device")
 NUM_ROLLOUTS: Final = 32
@@ -73,7 +77,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     child = ChildProcess("benchmarks.rollouts.server")
     try:
         urls = child.receive()
-        ways = [*WAYS, *OTHERS, *([DURABLE] if DURABLE.server in urls else [])]
+        ways = [*WAYS, *OTHERS, WATCHED, *([DURABLE] if DURABLE.server in urls else [])]
         times_s, sizes = timed(urls, ways, plan, bar)
         with bar("32 rollouts", len(DEVICES)) as step:
             crowds = {world: _crowd(urls, world, plan, step) for world in DEVICES}
@@ -113,7 +117,8 @@ def timed(
             sizes[way] = chunk()
 
     def ours(way: Way, _: int) -> float:
-        with opened(urls, way) as chunk:
+        watching = watched(urls[way.server]) if way.is_watched else nullcontext()
+        with watching, opened(urls, way) as chunk:
             return _median_s(chunk, plan["chunks"])
 
     def other(way: Way, _: int) -> float:
@@ -180,6 +185,7 @@ def _requirements(
     ]
     durable, memory = times_s.get(_name(DURABLE)), times_s[_name(OTHERS[0])]
     durable_ms = None if durable is None else 1e3 * (durable.median - memory.median)
+    unwatched = times_s[_name(WAYS[1])]
     alone, batched = (crowds[world] for world in DEVICES)
     return [
         *found,
@@ -189,6 +195,12 @@ def _requirements(
             "at most",
             MAX_DURABLE_MS,
             "ms",
+        ),
+        Requirement(
+            "read by a watcher five times a second: a chunk over an unwatched one, p50",
+            times_s[_name(WATCHED)].over(unwatched).median,
+            "at most",
+            MAX_WATCHED,
         ),
         Requirement(
             "32 rollouts on a device of 5 ms: chunks/s, batched over one by one",

@@ -24,13 +24,14 @@ Chunk = Callable[[], int]
 
 
 class Way(NamedTuple):
-    """How chunks are sent: protocol, what they return, and the server's world and state."""
+    """How chunks are sent: protocol, what they return, the server's world and state, watchers."""
 
     protocol: str
     answer: str
     selector: ReturnSelector
     world: str = "still"
     server: str = "ours"
+    is_watched: bool = False
 
     @property
     def query(self) -> str:

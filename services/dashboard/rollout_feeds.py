@@ -117,7 +117,9 @@ class RolloutFeeds:
                 upstream.read(WatchedRollouts, f"/v1/watch?limit={MAX_LISTED}"),
             )
         except DexTouchError as error:
-            return RolloutsView(problems=(f"{service}: {error.message}",))
+            # Failures of the connection name the service themselves.
+            reason = error.message.removeprefix(f"{service}: ")
+            return RolloutsView(problems=(f"{service}: {reason}",))
         worlds = {world.name: world for world in described.worlds}
         shown = ("name", "kind", "tasks", "model_rate_hz", "predicts_touch")
         return RolloutsView(
