@@ -161,7 +161,7 @@ def test_wrong_flags_are_named():
 
 async def test_what_cannot_be_left_out_is_named(tmp_path):
     settings = up.UpSettings(data=tmp_path, without=("dashboard",))
-    with pytest.raises(UnknownNameError, match="valid: alignment, twin, world_model"):
+    with pytest.raises(UnknownNameError, match="valid: alignment, studies, twin, world_model"):
         await up.run(settings, asyncio.Event())
 
 
@@ -172,7 +172,7 @@ async def test_without_worlds(tmp_path):
     stop = asyncio.Event()
     running = asyncio.create_task(up.run(settings, stop))
     urls = await asyncio.wait_for(written(tmp_path / "urls.json", running), START_LIMIT_S)
-    assert set(urls) == {"episode_store", "alignment", "acquisition", "dashboard"}
+    assert set(urls) == {"episode_store", "alignment", "acquisition", "studies", "dashboard"}
     stop.set()
     assert await running == 0
 
