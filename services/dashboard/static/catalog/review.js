@@ -19,6 +19,7 @@ const reasons = dialog.querySelector("form").elements;
 let rows = new Map();
 let asked = 0;
 let last = [];
+let rejected = [];
 
 function say(text, level = "OK") {
   find("message").dataset.level = level;
@@ -107,6 +108,8 @@ function meantItems() {
 function askReason() {
   const count = meant().length;
   if (!count) return;
+  // The rows may change while the dialog is open.
+  rejected = meantItems();
   setText(find("reject_title"), count === 1 ? `Reject ${meant()[0].item.id}` : `Reject ${count} items`);
   dialog.returnValue = "";
   dialog.showModal();
@@ -159,7 +162,7 @@ dialog.addEventListener("keydown", (event) => {
 dialog.addEventListener("change", showReason);
 dialog.addEventListener("close", () => {
   const reason = reasons.reason.value || reasons.other.value.trim();
-  if (dialog.returnValue === "reject" && reason) review(meantItems(), "rejected", reason);
+  if (dialog.returnValue === "reject" && reason) review(rejected, "rejected", reason);
   grid.focus();
 });
 for (const [id, key] of [["accept", "a"], ["reject", "r"], ["undo", "z"], ["lineage", "l"]]) find(id).addEventListener("click", () => KEYS[key]());
