@@ -17,6 +17,7 @@ from services.alignment.retargeting.hand_profile import calibrated_profile
 from services.alignment.retargeting.touch_transfer import transfer_by_touch
 from services.alignment.retargeting.wrist_frame import hand_axes_check
 from services.alignment.retargeting.wrist_transfer import NUM_PADS
+from services.alignment.synchronization.motion_figures import motion_figures
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import (
     GridPlacement,
@@ -114,6 +115,9 @@ def make_actions(
     if domain == "human" and wrist == "touch":
         trajectory, offsets = _moved_by_touch(gridded, trajectory)
         quality |= offsets
+    if len(gridded.grid_ns) > 1:
+        rate_hz = NS_PER_S / float(np.diff(gridded.grid_ns).mean())
+        quality = {**quality, **motion_figures(trajectory, rate_hz=rate_hz)}
     anchor = trajectory.anchor(0)
     commanded = None
     if all(name in gridded.streams for name in COMMANDED_STREAMS):

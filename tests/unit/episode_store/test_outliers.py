@@ -106,6 +106,11 @@ def test_figures_of_an_episode(settings):
         "retargeting_left_tip_error_p95_mm": 7.0,
         "retargeting_right_tip_error_p95_mm": 9.0,
         "retargeting_right_tip_error_mm": 90.0,
+        "wrist_left_peak_speed_m_s": 1.5,
+        "wrist_right_peak_speed_m_s": 0.5,
+        "wrist_left_jerk_p95_m_s3": 20.0,
+        "wrist_right_jerk_p95_m_s3": 30.0,
+        "static_share": 0.25,
     }
     clocks = [
         {"stream": "head", "residual_rms_ms": 0.2, "num_samples": 90, "num_dropped": 10},
@@ -118,6 +123,9 @@ def test_figures_of_an_episode(settings):
         "num_gaps": 5.0,
         "largest_gap_s": 0.4,
         "tip_error_mm": 9.0,
+        "peak_speed_m_s": 1.5,
+        "jerk_p95_m_s3": 30.0,
+        "static_share": 0.25,
         "clock_residual_ms": 0.5,
         "lost_share": 0.05,
     }
