@@ -98,10 +98,12 @@ class _Shelf(Generic[S]):
         """Current entries by id; the returned dictionary is never modified."""
         with self._guard:
             found = self._look()
-            if found is not None:
-                self._known = {name: self._read(name, now) for name, now in found.items()}
-                known = ((name, entry) for name, (_, entry) in self._known.items())
-                self._entries = {name: entry for name, entry in known if entry is not None}
+            known = None if found is None else {k: self._read(k, now) for k, now in found.items()}
+            # The same dictionary while nothing changed: lists that are made of it stay valid.
+            if known is not None and known != self._known:
+                self._known = known
+                rows = ((name, entry) for name, (_, entry) in known.items())
+                self._entries = {name: entry for name, entry in rows if entry is not None}
             return self._entries
 
     def forget(self, item_id: str) -> None:

@@ -4,6 +4,7 @@ A take is a recording together with the episodes that were made from it, or an e
 stored recording.
 """
 
+import threading
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
@@ -56,19 +57,22 @@ class ItemLists:
     """The lists of a catalog's items, made anew when its entries have changed."""
 
     def __init__(self) -> None:
+        self._guard = threading.Lock()
         self._made_of: tuple[Entries, Entries] = ({}, {})
         self._lists: dict[ItemsKind, dict[str, AnyEntry]] = {}
         self._groups: tuple[ComparedGroup, ...] = ()
 
     def entries(self, kind: ItemsKind, recordings: Entries, episodes: Entries) -> Entries:
         """Entries of a list by `ID/KIND`, made from the catalog's own ones by id."""
-        self._update(recordings, episodes)
-        return self._lists[kind]
+        with self._guard:
+            self._update(recordings, episodes)
+            return self._lists[kind]
 
     def groups(self, recordings: Entries, episodes: Entries) -> tuple[ComparedGroup, ...]:
         """The groups of items that are compared with each other."""
-        self._update(recordings, episodes)
-        return self._groups
+        with self._guard:
+            self._update(recordings, episodes)
+            return self._groups
 
     def _update(self, recordings: Entries, episodes: Entries) -> None:
         known = self._made_of
