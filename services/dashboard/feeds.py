@@ -6,7 +6,7 @@ A new panel is a topic here with the function that fetches it, a section in
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 import structlog
@@ -48,7 +48,7 @@ MAX_HISTORY_BYTES = 1024 * 1024
 # Of the small plots: two minutes, two rows a point.
 TREND_ROWS = 120
 TREND_PERIOD_S = 2.0
-NUM_TAKES = 6
+NEWEST = "sort=time&descending=true&limit=6"
 OUTCOMES = {True: "success", False: "failure", None: "not judged"}
 # Of the station's recorder, which checks their bodies.
 ACTIONS = ("arm", "record", "stop", "save", "discard", "rerecord", "session")
@@ -56,7 +56,6 @@ ACTIONS = ("arm", "record", "stop", "save", "discard", "rerecord", "session")
 FULL_SCALE_KPA = 40.0
 RAMP_STEPS = 128
 TAXEL_MESSAGE = 1
-Page = TypeVar("Page", EpisodeList, RecordingList)
 # A WebSocket message: text (JSON) or bytes.
 Message = str | bytes
 
@@ -244,8 +243,8 @@ class Feeds:
             )
         store = self._upstreams["episode_store"]
         try:
-            recordings = await _last_page(RecordingList, store, "/v1/recordings")
-            episodes = await _last_page(EpisodeList, store, "/v1/episodes")
+            recordings = await store.read(RecordingList, f"/v1/recordings?{NEWEST}")
+            episodes = await store.read(EpisodeList, f"/v1/episodes?{NEWEST}")
             # Episodes are immutable: each is queried once.
             self._clocks = {
                 item.episode_id: self._clocks[item.episode_id]
@@ -264,7 +263,7 @@ class Feeds:
                 clocks=self._clocks[item.episode_id],
                 **_labels(item),
             )
-            for item in reversed(episodes.episodes)
+            for item in episodes.episodes
         ]
         takes += [
             TakeView(
@@ -275,7 +274,7 @@ class Feeds:
                 consent=item.consent,
                 **_labels(item),
             )
-            for item in reversed(recordings.recordings)
+            for item in recordings.recordings
         ]
         return TakesView(takes=tuple(takes), note="" if takes else "Nothing stored yet.")
 
@@ -331,15 +330,6 @@ def _trend(shares: Float32[np.ndarray, " rows"]) -> list[float | None]:
     """The lower of every two rows, so that a short gap stays visible; the newest last."""
     pairs = shares[len(shares) % 2 :].reshape(-1, 2).min(axis=1)
     return [None if np.isnan(share) else round(float(share), 3) for share in pairs]
-
-
-async def _last_page(form: type[Page], store: Upstream, path: str) -> Page:
-    """Last page of a list, which the store sorts by id in ascending order."""
-    first = await store.read(form, f"{path}?limit={NUM_TAKES}")
-    offset = first.num_matching - NUM_TAKES
-    if offset <= 0:
-        return first
-    return await store.read(form, f"{path}?limit={NUM_TAKES}&offset={offset}")
 
 
 async def _clock_words(store: Upstream, episode_id: str) -> str:

@@ -79,9 +79,12 @@ class FakeServices:
         self.asked.append(request.url.path)
         return await call_next(request)
 
-    def _list_episodes(self, limit: int, offset: int = 0):
-        page = self.episodes[offset : offset + limit]
-        return {"episodes": page, "num_matching": len(self.episodes)}
+    def _list_episodes(self, limit: int, sort: str = "id", descending: str = "false"):
+        key = {"id": "episode_id", "time": "created_at"}[sort]
+        ordered = sorted(
+            self.episodes, key=lambda one: one.get(key, ""), reverse=descending == "true"
+        )
+        return {"episodes": ordered[:limit], "num_matching": len(self.episodes)}
 
     def _list_recordings(self):
         return {"recordings": self.recordings, "num_matching": len(self.recordings)}

@@ -179,9 +179,14 @@ async def test_an_episode_is_asked_about_once(feeds, services):
 
 async def test_the_newest_of_many_are_shown(feeds, services):
     (episode,) = services.episodes
-    services.episodes = [episode | {"episode_id": f"take-{n:04d}"} for n in range(20)]
+    # The last hours of a day, whose names are not in the order of time.
+    services.episodes = [
+        episode | {"episode_id": f"take-{n * 7 % 20:04d}", "created_at": f"2026-05-04T{n:02d}:00Z"}
+        for n in range(20)
+    ]
     takes = (await feeds.takes()).takes
-    assert [take.name for take in takes] == [f"take-{n:04d}" for n in range(19, 13, -1)]
+    names = ["take-0013", "take-0006", "take-0019", "take-0012", "take-0005", "take-0018"]
+    assert [take.name for take in takes] == names
 
 
 async def test_a_foreign_list_is_no_crash(feeds, services):

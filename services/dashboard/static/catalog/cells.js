@@ -37,6 +37,10 @@ export function length(value_s) {
   return `${Math.floor(value_s / 60)}:${String(Math.floor(value_s % 60)).padStart(2, "0")} min`;
 }
 
+export function size(num_bytes) {
+  return num_bytes < 1e6 ? `${Math.ceil(num_bytes / 1e3)} kB` : `${(num_bytes / 1e6).toFixed(1)} MB`;
+}
+
 export function timeCell(item) {
   return element("td", {}, day(item.at), under(clock(item.at)));
 }

@@ -51,7 +51,7 @@ function trashRow(item) {
   const at = item.deleted_at;
   return element("tr", {}, checkbox(item.id), element("td", {}, cells.day(at), cells.under(cells.clock(at))),
     element("td", { class: "item_name_cell" }, element("span", { class: "item_name" }, item.id), cells.under(item.kind)),
-    element("td", { class: "number" }, `${(item.num_bytes / 1e6).toFixed(1)} MB`));
+    element("td", { class: "number" }, cells.size(item.num_bytes)));
 }
 
 // Requests

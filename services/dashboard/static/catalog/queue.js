@@ -18,11 +18,6 @@ export function queueOf(flagged, { jobs, items }) {
   return [...failed, ...flagged.map((item) => ({ key: key(item), item })).filter((one) => !known.has(one.key))];
 }
 
-// The recording's name is in the row already.
-export function failureWords({ problem }) {
-  return `alignment failed: ${(problem?.detail ?? "no reason given").replace(/^recording '[^']*': /, "")}`;
-}
-
 // A verdict on a take is one on all its episodes, or on its recording while it has none.
 export function reviewedItems({ kind, id, episodes }) {
   return kind === "recording" && episodes.length ? episodes.map((one) => ({ kind: "episode", id: one })) : [{ kind, id }];

@@ -6,8 +6,8 @@ import { get, getIfServed, post } from "./api.js";
 import * as cells from "./cells.js";
 import { Grid, isFree } from "./grid.js";
 import { showLineage } from "./lineage.js";
-import { failedRecordings, failureWords, fewWords, queueOf, reviewedItems } from "./queue.js";
-import { playerPath, subjectOf } from "./stage.js";
+import { failedRecordings, fewWords, queueOf, reviewedItems } from "./queue.js";
+import { playerPath, reasonOf, subjectOf } from "./stage.js";
 
 const REFRESH_MS = 5000;
 const MAX_ROWS = 100;
@@ -28,7 +28,7 @@ function say(text, level = "OK") {
 
 function row({ item, job }) {
   const findings = item.findings.map((finding) => element("li", { "data-code": finding.code }, finding.message));
-  if (job) findings.unshift(element("li", { "data-code": "alignment_failed", title: job.problem?.detail }, failureWords(job)));
+  if (job) findings.unshift(element("li", { "data-code": "alignment_failed", title: job.problem?.detail }, `alignment failed: ${reasonOf(job)}`));
   const pick = element("td", { class: "pick" }, element("input", { type: "checkbox", tabindex: -1, "aria-label": `select ${item.id}` }));
   return element("tr", {}, pick, element("td", {}, element("ul", { class: "findings" }, ...findings)), cells.timeCell(item), cells.taskCell(item),
     cells.nameCell(item, playerPath(item)), cells.operatorCell(item), cells.outcomeCell(item), cells.lengthCell(item));

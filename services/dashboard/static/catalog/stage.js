@@ -5,9 +5,14 @@ const VERDICTS = { accepted: { label: "Accepted", level: "OK" }, rejected: { lab
 const JOBS = {
   waiting: () => ({ label: "Waiting to be aligned", level: "STALE" }),
   running: (job) => ({ label: `Aligning, ${Math.round(100 * job.progress)} %`, level: "STALE", share: job.progress }),
-  failed: (job) => ({ label: "Alignment failed", level: "ERROR", detail: job.problem?.detail ?? "" }),
+  failed: (job) => ({ label: "Alignment failed", level: "ERROR", detail: reasonOf(job) }),
   cancelled: () => ({ label: "Alignment cancelled", level: "WARN" }),
 };
+
+// Why a job failed; the recording's name is in the row already.
+export function reasonOf({ problem }) {
+  return (problem?.detail ?? "no reason given").replace(/^recording '[^']*': /, "");
+}
 
 // `done` counts the steps that are behind a take; an item that is no recording of a station has no steps.
 export function stageOf({ item, upload, job }) {
