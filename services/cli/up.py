@@ -170,7 +170,7 @@ def _alignment(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
         AlignmentSettings(
             store_url=settings.store_url,
             align_new=settings.align_new,
-            station_url=urls["acquisition"],
+            station_url=urls.get("acquisition"),
             station_spool=settings.data / "spool",
             calibration_folder=settings.data / "calibration",
             log_level=settings.log_level,
