@@ -96,7 +96,7 @@ class HttpLink:
             UnavailableError: no response after all attempts.
             DexTouchError: the problem that the service reports, as its own class.
         """
-        sent = self._headers | (headers or {}) | {"Accept": accept} | trace_headers()
+        sent = {**self._headers, **(headers or {}), "Accept": accept, **trace_headers()}
         if body is not None:
             sent["Content-Type"] = content_type
         began_s, paused_s = time.monotonic(), 0.0
