@@ -64,13 +64,13 @@ def body(num_steps, value=0.0, dtype="<f8") -> bytes:
 
 
 def shown(response):
-    """What must be equal both ways: all but the request id and times."""
+    """What must be equal both ways: all but the ids of request and trace, and times."""
     headers = dict(response.headers)
     headers.pop("x-request-id")
     timings = [part.split(";")[0] for part in headers.pop("server-timing").split(", ")]
     content = response.content
     if headers["content-type"] == "application/problem+json":
-        content = {**response.json(), "request_id": None}
+        content = {**response.json(), "request_id": None, "trace_id": None}
         headers.pop("content-length")
     return response.status_code, headers, timings, content
 
