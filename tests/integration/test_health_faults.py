@@ -25,8 +25,10 @@ QUICK = (
     "image blurred",
     "disk full in 20 min",
 )
-# Told to whoever asks while a sample is overdue; and what needs minutes of asking the device.
-TESTED_ELSEWHERE = {"late", "latency_calibration", "overload", "upload_refused"}
+# Told to whoever asks while a sample is overdue; what needs minutes of asking the device; and what
+# happens to the computer (test_health_chaos.py).
+TESTED_ELSEWHERE = {"late", "latency_calibration", "upload_refused"}
+TESTED_ELSEWHERE |= {"overload", "host_suspended", "wall_clock_set"}
 
 
 def judged(name, outcome):
