@@ -35,6 +35,7 @@ SECTIONS: Final = {
     "twin": "twin.serving:TwinServiceSettings",
     "world_model": "world_model.settings:WorldModelSettings",
     "rating": "evaluation.rating.settings:RatingSettings",
+    "studies": "evaluation.studies.app:StudyServiceSettings",
     "rating_report": "evaluation.rating.settings:RatingReportSettings",
     "evaluation_run": "evaluation.settings:RunSettings",
     "evaluation_train_policy": "evaluation.settings:TrainPolicySettings",
@@ -48,7 +49,7 @@ SECTIONS: Final = {
     "world_model_adapt": "world_model.settings:AdaptCommand",
 }
 # Those of `config example` unless others are named.
-SERVICES: Final = tuple(SECTIONS)[:8]
+SERVICES: Final = tuple(SECTIONS)[:9]
 MASK: Final = "***"
 DEFAULT: Final = "default"
 REQUIRED: Final = "required"

@@ -31,6 +31,7 @@ SCOPES = {
     "twin": ("rollout",),
     "dashboard": ("operate",),
     "rating": ("rate",),
+    "studies": ("study_read",),
 }
 # Of the service, by its name; the same for all that must know it.
 KEYS = {name: f"Ke9-of-{name}-3c5a7e" for name in SCOPES}
@@ -156,7 +157,7 @@ def outputs(tmp_path_factory):
     (folder / "rubrics.toml").write_text(RUBRICS)
     up = ["up", "--data", str(folder / "data"), "--json", str(addresses), "--log-level", "debug"]
     up += ["--without", "world_model"]
-    for name in ("dashboard", "episode-store", "alignment", "acquisition", "twin"):
+    for name in ("dashboard", "episode-store", "alignment", "acquisition", "twin", "studies"):
         up += [f"--{name}-port", "0"]
     rating = ["rate", "serve", "--store-url", str(folder / "rated")]
     rating += ["--marks", str(folder / "marks.sqlite"), "--rubrics", str(folder / "rubrics.toml")]

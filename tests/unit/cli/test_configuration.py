@@ -158,7 +158,9 @@ def test_show_refuses_what_the_command_would_refuse(write, capsys):
 def settings_classes():
     """All settings classes of commands, wherever they are."""
     for found in pkgutil.walk_packages(services.__path__, "services."):
-        if found.name.rpartition(".")[2] in {"up", "serving"} or found.name.endswith("settings"):
+        if found.name.rpartition(".")[2] in {"app", "up", "serving"} or found.name.endswith(
+            "settings"
+        ):
             importlib.import_module(found.name)
     todo = [CommandSettings]
     while todo:
