@@ -49,6 +49,8 @@ MAX_HISTORY_BYTES = 1024 * 1024
 TREND_ROWS = 120
 TREND_PERIOD_S = 2.0
 NEWEST = "sort=time&descending=true&limit=6"
+# Intervals of a study take seconds; its other routes wait meanwhile.
+STUDY_TIMEOUT_S = 60.0
 OUTCOMES = {True: "success", False: "failure", None: "not judged"}
 # Of the station's recorder, which checks their bodies.
 ACTIONS = ("arm", "record", "stop", "save", "discard", "rerecord", "session")
@@ -307,7 +309,9 @@ class Feeds:
     async def _studies(self) -> object:
         """The service's list of studies, or why there is none."""
         try:
-            return (await self.upstream("studies").send("GET", "/v1/studies")).json()
+            studies = self.upstream("studies")
+            answer = await studies.forward("GET", "/v1/studies", {}, b"", timeout_s=STUDY_TIMEOUT_S)
+            return answer.json()
         except DexTouchError as error:
             return {"studies": (), "note": error.message}
 

@@ -10,6 +10,7 @@ import { startTheme } from "./theme.js";
 
 const find = (id) => document.getElementById(id);
 const PAGE = 50;
+const RETRY_MS = 5000;
 const name = decodeURIComponent(location.pathname.split("/").pop());
 const base = `/v1/studies/studies/${encodeURIComponent(name)}`;
 const playable = new Map(); // episode id → whether the dashboard's store has it
@@ -124,6 +125,7 @@ async function refresh() {
     if (rows.length <= PAGE) await load(0);
   } catch (error) {
     note("study_note", error.message, "ERROR");
+    setTimeout(refresh, RETRY_MS);
   }
 }
 

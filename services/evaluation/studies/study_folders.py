@@ -103,11 +103,12 @@ class StudyFolders:
         """
         with self._lock:
             study = self._read(name)
-            began_s = time.monotonic()
+            if "figures" not in vars(study):
+                began_s, read = time.monotonic(), self._reads[name]
+                _ = study.figures
+                read.took_s += time.monotonic() - began_s
+                read.until_s = time.monotonic() + read.took_s / MAX_READING_SHARE
             figures = study.figures
-            read = self._reads[name]
-            read.took_s += time.monotonic() - began_s
-            read.until_s = time.monotonic() + read.took_s / MAX_READING_SHARE
         running = {"is_running": StudyResults.is_running(self._root / name)}
         summary = figures.summary.model_copy(update=running)
         return figures.model_copy(update={"summary": summary})
@@ -138,7 +139,9 @@ class StudyFolders:
         version = (status.st_mtime_ns, status.st_size)
         began_s = time.monotonic()
         last = self._reads.get(name)
-        if last is not None and (last.version == version or began_s < last.until_s):
+        if last is not None and last.version == version:
+            return last.study
+        if last is not None and began_s < last.until_s and StudyResults.is_running(path.parent):
             return last.study
         results = StudyResults.read(path.parent)
         try:

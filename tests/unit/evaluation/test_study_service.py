@@ -6,6 +6,7 @@ import os
 import httpx
 import pytest
 
+from services.evaluation.studies import study_folders
 from services.evaluation.studies.app import StudyServiceSettings, create_app
 from services.evaluation.studies.results import StudyResults
 from tests.unit.evaluation.study_rows import (
@@ -15,6 +16,7 @@ from tests.unit.evaluation.study_rows import (
     counted,
     disagreements,
     interval,
+    lines,
     mmrv,
     pearson,
     write_study,
@@ -132,6 +134,23 @@ async def test_new_rows_are_read_and_a_look_does_not_stop_a_study(root):
         assert not StudyResults.is_running(root / "touch")
     after = (await read(root, "/v1/studies"))["studies"][0]["num_done"]
     assert after == before - 3
+
+
+async def test_a_running_study_is_read_again_only_now_and_then(tmp_path, monkeypatch):
+    monkeypatch.setattr(study_folders, "MAX_READING_SHARE", 1e-6)
+    path = write_study(tmp_path / "touch", unfinished=("blurred",))
+    async with client(tmp_path) as opened:
+
+        async def num_done():
+            return (await opened.get("/v1/studies")).json()["studies"][0]["num_done"]
+
+        assert await num_done() == 96
+        path.write_text("".join(line + "\n" for line in lines()), encoding="utf-8")
+        with path.open("rb") as running:
+            fcntl.flock(running, fcntl.LOCK_EX)
+            assert await num_done() == 96
+        # Once it has ended, at once.
+        assert await num_done() == 143
 
 
 async def test_damaged_studies_are_listed_with_the_reason(root):
