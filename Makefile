@@ -13,7 +13,7 @@ DOCS_VENV ?= .venv-docs
 SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow kills vm fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor \
+.PHONY: demo test check slow kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -47,6 +47,10 @@ kills: $(VENV)/.dev      ## kill -9 one of two workers 20 times while 16 rollout
 
 vm: $(VENV)/.dev         ## real drivers on a Debian kernel's devices; apt-get install qemu-system-x86 busybox-static cpio kmod
 	$(BIN)/python -m pytest -q -s -m vm tests/vm
+
+# Keep the images for the next run (then seconds instead of minutes): DEXTOUCH_CONTAINERS=FOLDER make containers
+containers: $(VENV)/.dev   ## build both images and run the compose file from them, as root without a daemon; 10 GB; docs/images.md
+	$(BIN)/python -m pytest -q -m containers tests/containers $(ARGS)
 
 fuzz: $(VENV)/.dev       ## fuzz glove packets, guided by coverage, then requests to all services; ARGS="--seconds 600"
 	PYTHONPATH=.:shared $(BIN)/python -m tests.fuzz.mutate $(ARGS)

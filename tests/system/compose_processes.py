@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import yaml
@@ -39,6 +40,40 @@ def interpolate(value, variables):
         raise KeyError(f"{name}: {text or 'not set'}")
 
     return VARIABLE.sub(fill, value)
+
+
+def start_order(services):
+    """Names of services so that each comes after what it depends on."""
+    return list(
+        TopologicalSorter({n: s.get("depends_on", {}) for n, s in services.items()}).static_order()
+    )
+
+
+def wait_for(what, limit_s, condition, logs):
+    """Poll other processes; fails with their logs."""
+    deadline_s = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < deadline_s, f"{what} not within {limit_s} s\n{logs()}"
+        time.sleep(0.1)
+
+
+def record_take(ask, take_s, logs):
+    """Record and save one take of the mock station; its id and the number of samples by stream."""
+    prompt = {"task": "stand_bottle", "instruction": "stand the bottle up", "consent": True}
+    ask("POST", "acquisition", "/v1/recorder/arm", json=prompt)
+    started = ask("POST", "acquisition", "/v1/recorder/record")
+    wait_for(
+        f"{take_s} s of recording",
+        3 * take_s,
+        lambda: ask("GET", "acquisition", "/v1/recorder")["duration_s"] >= take_s,
+        logs,
+    )
+    stopped = ask("POST", "acquisition", "/v1/recorder/stop")
+    assert stopped["state"] == "checking"
+    save = {"success": True, "accept_incomplete": True}
+    assert ask("POST", "acquisition", "/v1/recorder/save", json=save)["state"] == "saved"
+    num_samples = {take["stream"]: take["num_samples"] for take in stopped["check"]["streams"]}
+    return started["recording_id"], num_samples
 
 
 @dataclass
@@ -78,24 +113,9 @@ class ComposeProcesses:
         }
         self.ports = {name: free_port() for name in self.services}
 
-    def order(self):
-        """Names so that each comes after what it depends on."""
-        done = []
-
-        def visit(name, path=()):
-            assert name not in path, f"depends_on runs in a circle: {path}"
-            for other in self.services[name].get("depends_on", {}):
-                visit(other, (*path, name))
-            if name not in done:
-                done.append(name)
-
-        for name in self.services:
-            visit(name)
-        return done
-
     def start(self):
         """Start all, waiting for the health of what others depend on."""
-        for name in self.order():
+        for name in start_order(self.services):
             depends_on = self.services[name].get("depends_on", {})
             for other, rule in depends_on.items():
                 if rule["condition"] == "service_healthy":

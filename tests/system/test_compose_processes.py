@@ -1,9 +1,6 @@
 """docker-compose.yml as plain processes: a recording goes in, an episode and a rollout come out."""
 
-import importlib.util
 import shutil
-import sys
-import time
 from pathlib import Path
 
 import httpx
@@ -12,6 +9,7 @@ import pytest
 
 from dextouch.clients import RolloutClient
 from dextouch.hands.actions import ACTION_DIM
+from tests.system.compose_processes import ComposeProcesses, record_take, wait_for
 
 ROOT = Path(__file__).parents[2]
 KEY = "0123456789abcdef-of-the-system-test"
@@ -25,14 +23,6 @@ WITHOUT = () if list(PRETRAINED.glob("*.safetensors")) else ("world_model",)
 # It finds its workers by the names of a compose network; test_worker_kills.py runs it here.
 OTHERWISE_TESTED = ("gateway",)
 
-# importlib mode has no test packages: load the harness beside this file by path.
-_SPEC = importlib.util.spec_from_file_location(
-    "compose_processes", Path(__file__).with_name("compose_processes.py")
-)
-compose_processes = importlib.util.module_from_spec(_SPEC)
-sys.modules["compose_processes"] = compose_processes
-_SPEC.loader.exec_module(compose_processes)
-
 pytestmark = [
     pytest.mark.system,
     pytest.mark.skipif(
@@ -45,7 +35,7 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def composed(tmp_path_factory):
     """All lasting services of the compose file, healthy."""
-    processes = compose_processes.ComposeProcesses(
+    processes = ComposeProcesses(
         ROOT / "docker-compose.yml",
         tmp_path_factory.mktemp("compose"),
         {"DEXTOUCH_KEY": KEY},
@@ -72,31 +62,10 @@ def ask(composed):
         yield ask
 
 
-def wait_for(what, limit_s, condition, logs):
-    """Poll other processes; fails with their logs."""
-    deadline_s = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < deadline_s, f"{what} not within {limit_s} s\n{logs()}"
-        time.sleep(0.1)
-
-
 @pytest.fixture(scope="module")
 def recording_id(composed, ask):
     """One take of the mock station, uploaded to the store."""
-    prompt = {"task": "stand_bottle", "instruction": "stand the bottle up", "consent": True}
-    ask("POST", "acquisition", "/v1/recorder/arm", json=prompt)
-    started = ask("POST", "acquisition", "/v1/recorder/record")
-    wait_for(
-        f"{TAKE_S} s of recording",
-        3 * TAKE_S,
-        lambda: ask("GET", "acquisition", "/v1/recorder")["duration_s"] >= TAKE_S,
-        composed.logs,
-    )
-    stopped = ask("POST", "acquisition", "/v1/recorder/stop")
-    assert stopped["state"] == "checking"
-    save = {"success": True, "accept_incomplete": True}
-    assert ask("POST", "acquisition", "/v1/recorder/save", json=save)["state"] == "saved"
-    recording_id = started["recording_id"]
+    recording_id, _ = record_take(ask, TAKE_S, composed.logs)
 
     def stored():
         recordings = ask("GET", "episode_store", "/v1/recordings")["recordings"]

@@ -156,7 +156,7 @@ def start_container(image):
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(mode=0o700)
     os.chown(temporary, IMAGE_UID, IMAGE_UID)
-    entry = [word.replace("/opt/dextouch", str(image)) for word in json.loads(line)]
+    entry = [word.replace("/opt/code", str(image)) for word in json.loads(line)]
     # Twice, as where a container is started again.
     for _ in range(2):
         done = subprocess.run(
