@@ -1,6 +1,5 @@
 """Services of compose files as containers of podman, which read every key that the files use."""
 
-import json
 import os
 import time
 from dataclasses import dataclass, field
@@ -52,7 +51,8 @@ class Composed:
 
     def __post_init__(self):
         self.services = merged(self.paths)
-        self.engine.podman("network", "create", "--ignore", NETWORK)
+        if self.engine.podman("network", "exists", NETWORK, check=False).returncode != 0:
+            self.engine.podman("network", "create", NETWORK)
         for service in self.services.values():
             for port in service.get("ports", []):
                 variable = port.split("{")[1].partition(":")[0]
@@ -95,10 +95,9 @@ class Composed:
         words += ["--user", service["user"]] if "user" in service else []
         words += ["--stop-timeout", service["stop_grace_period"].removesuffix("s")]
         words += ["--restart", service["restart"]]
-        check = service.get("healthcheck", {})
-        if "test" in check:
-            words += ["--health-cmd", json.dumps(check["test"]), "--health-interval", "disable"]
-        return [*words, *flags, _full(service["image"]), *service.get("command", [])]
+        # Without systemd, podman runs none by itself: wait_healthy does.
+        words += ["--no-healthcheck", *flags]
+        return [*words, _full(service["image"]), *service.get("command", [])]
 
     def up(self, name, **changes):
         """Start a service and wait for its own health check; seconds that it took."""
@@ -117,7 +116,9 @@ class Composed:
     def wait_healthy(self, name):
         """Run the health check of a container until it passes."""
         deadline_s = time.monotonic() + HEALTH_TIMEOUT_S
-        while self.engine.podman("healthcheck", "run", name, check=False).returncode != 0:
+        kind, *command = self.services[name]["healthcheck"]["test"]
+        assert kind == "CMD"
+        while self.engine.podman("exec", name, *command, check=False).returncode != 0:
             assert time.monotonic() < deadline_s, f"{name} is not healthy\n{self.log(name)}"
             time.sleep(0.5)
 

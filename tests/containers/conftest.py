@@ -6,6 +6,7 @@ end). Without it, everything is made in a temporary folder.
 
 import os
 import secrets
+import signal
 
 import httpx
 import pytest
@@ -37,6 +38,8 @@ def engine():
     """An engine that shares nothing with others of this user."""
     if reason := missing():
         pytest.skip(reason)
+    # So that containers end with this process, however it is ended.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     with engine_in(os.environ.get("DEXTOUCH_CONTAINERS")) as engine:
         yield engine
 

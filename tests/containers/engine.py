@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import shutil
 import subprocess
 import tempfile
@@ -28,7 +29,7 @@ tmp_dir = "{folder}/tmp"
 network_backend = "netavark"
 network_config_dir = "{folder}/networks"
 [containers]
-default_ulimits = ["nofile=4096:4096", "nproc=4096:4096"]
+default_ulimits = ["nofile={files}:{files}", "nproc=4096:4096"]
 """
 STORAGE_CONF = """
 [storage]
@@ -58,11 +59,13 @@ class Engine:
 
     def __init__(self, folder):
         self.folder = folder
+        files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+        settings = {"folder": folder, "driver": _driver(folder), "files": files}
         for name, text in (
             ("containers.conf", CONTAINERS_CONF),
             ("storage.conf", STORAGE_CONF),
         ):
-            (folder / name).write_text(text.format(folder=folder, driver=_driver(folder)))
+            (folder / name).write_text(text.format_map(settings))
         self.environment = os.environ | {
             "CONTAINERS_CONF": str(folder / "containers.conf"),
             "CONTAINERS_STORAGE_CONF": str(folder / "storage.conf"),

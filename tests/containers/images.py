@@ -19,6 +19,7 @@ RUN apt-get update && apt-get install -y --no-install-recommends redis-server ha
 FROM debian AS redis
 RUN install --directory --owner=999 --group=1000 /data
 WORKDIR /data
+ENTRYPOINT ["sh", "-c", "exec \\"$@\\" --protected-mode no", "redis"]
 USER 999:1000
 FROM debian AS haproxy
 USER 99:99

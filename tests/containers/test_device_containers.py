@@ -55,9 +55,11 @@ def test_the_station_may_open_its_kinds_of_devices_only(engine, built, key, node
     }
     paths = (ROOT / "docker-compose.yml", ROOT / "deploy/compose.devices.yml")
     composed = Composed(engine, variables, paths)
+    words = composed.words("acquisition")
+    command = len(composed.services["acquisition"]["command"])
+    words = [word for word in words[:-command] if word != "--detach"]
     try:
-        composed.up("acquisition")
-        done = engine.podman("exec", "acquisition", "python", "-c", OPENED, *nodes)
+        done = engine.podman("run", *words, "python", "-c", OPENED, *nodes)
     finally:
         composed.down("acquisition")
     *theirs, other = done.stdout.split()
