@@ -99,6 +99,16 @@ class Composed:
         words += ["--no-healthcheck", *flags]
         return [*words, _full(service["image"]), *service.get("command", [])]
 
+    def run_once(self, name, *command, network="none", environment=()):
+        """Run a service, or another command as it, beside the others until it ends."""
+        words = self.words(name, environment=environment)
+        for flag in ("--name", "--network", "--publish", "--restart"):
+            at = words.index(flag)
+            del words[at : at + 2]
+        own = self.services[name]["command"]
+        words = [*words[1 : -len(own)], *(command or own)]
+        return self.engine.podman("run", "--rm", "--network", network, *words, check=False)
+
     def up(self, name, **changes):
         """Start a service and wait for its own health check; seconds that it took."""
         started_s = time.monotonic()

@@ -163,16 +163,11 @@ def test_a_full_disk_of_the_station_refuses_takes_in_words(composed, engine, key
     composed.up("acquisition")
 
 
-def test_a_taken_port_is_named(composed, engine, key):
+def test_a_taken_port_is_named(composed):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        composed.variables["DEXTOUCH_KEY"] = key
         environment = {"DEXTOUCH_DASHBOARD_PORT": str(port), "DEXTOUCH_DASHBOARD_HOST": "127.0.0.1"}
-        words = [w for w in composed.words("dashboard", environment=environment) if w != "--detach"]
-        for flag in ("--name", "--network", "--publish", "--restart"):
-            at = words.index(flag)
-            del words[at : at + 2]
-        done = engine.podman("run", "--rm", "--network", "host", *words, check=False)
+        done = composed.run_once("dashboard", network="host", environment=environment)
     assert done.returncode != 0
     text = done.stdout + done.stderr
     assert str(port) in text

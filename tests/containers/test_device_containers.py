@@ -55,13 +55,7 @@ def test_the_station_may_open_its_kinds_of_devices_only(engine, built, key, node
     }
     paths = (ROOT / "docker-compose.yml", ROOT / "deploy/compose.devices.yml")
     composed = Composed(engine, variables, paths)
-    words = composed.words("acquisition")
-    command = len(composed.services["acquisition"]["command"])
-    words = [word for word in words[:-command] if word != "--detach"]
-    try:
-        done = engine.podman("run", *words, "python", "-c", OPENED, *nodes)
-    finally:
-        composed.down("acquisition")
+    done = composed.run_once("acquisition", "python", "-c", OPENED, *nodes)
     *theirs, other = done.stdout.split()
     assert other == "EPERM"
     assert not {"EPERM", "EACCES"} & set(theirs), done.stdout
