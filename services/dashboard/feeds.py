@@ -30,7 +30,7 @@ from dextouch.schemas import (
 )
 from dextouch.streams import unpack
 from dextouch.tactile import CONTACT_THRESHOLD_KPA, colour, hand_canvas
-from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
+from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, SIDES, Side, raw_indices
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import (
     RecorderView,
@@ -367,6 +367,8 @@ def heatmap_layout() -> dict[str, object]:
         "columns": columns,
         # NaN sorts last: the first 320 are the cells of the taxels in their order.
         "cells": {s: np.argsort(c.ravel())[:NUM_TAXELS].tolist() for s, c in canvases.items()},
+        "num_raw_cells": NUM_RAW_TAXELS,
+        "raw_cells": {s: raw_indices(side=s).tolist() for s in SIDES},
         "ramp": colour(pressures_kpa, full_scale_kpa=FULL_SCALE_KPA).tolist(),
         "full_scale_kpa": FULL_SCALE_KPA,
         "contact_kpa": CONTACT_THRESHOLD_KPA,

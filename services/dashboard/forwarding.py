@@ -47,6 +47,7 @@ FORWARDED: Final = (
     Forwarded("episode_store", "/playback/{kind}/{item_id}"),
     Forwarded("episode_store", "/playback/{kind}/{item_id}/images/{camera}"),
     Forwarded("episode_store", "/playback/{kind}/{item_id}/signals"),
+    Forwarded("episode_store", "/playback/episode/{item_id}/robot_hands"),
     Forwarded("episode_store", "/episodes/{item_id}/streams/{stream}"),
     Forwarded("episode_store", "/recordings/{item_id}/streams/{stream}"),
     Forwarded("episode_store", "/trash"),

@@ -58,6 +58,7 @@ SCREENS: Final = (
     Screen("/", "station.html", "Station"),
     Screen("/health", "health.html", "Health"),
     Screen("/episodes", "episodes.html", "Episodes"),
+    Screen("/episodes/{kind}/{item_id}", "player.html", "Player", within="Episodes"),
     Screen("/review", "review.html", "Review"),
     Screen("/hours", "hours.html", "Hours"),
     Screen("/calibration", "calibration.html", "Calibration"),

@@ -14,6 +14,7 @@ from dextouch.schemas import ItemKind, Playback, PlayedStream
 from dextouch.serving import MSGPACK, RequireScope
 from dextouch.streams import JPEG_UNIT, StreamDescriptor, pack
 from services.episode_store.reading import SAMPLES, IfNoneMatch, SpanQuery, etag_of, response
+from services.episode_store.robot_hands import RobotHandsQuery, robot_hands
 from services.episode_store.settings import EpisodeStoreSettings
 from services.episode_store.signals import SignalsQuery, reduce_signals
 
@@ -68,6 +69,17 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
         read: Callable[[], bytes] = partial(reduce_signals, reader, query)
         return response(etag_of(reader, "signals", query), if_none_match, read, MSGPACK)
 
+    @router.get("/episode/{item_id}/robot_hands", **SAMPLES)
+    def hands(
+        item_id: str,
+        query: Annotated[RobotHandsQuery, Query()],
+        if_none_match: IfNoneMatch = None,
+    ) -> Response:
+        """Points of both robot hands in the world, from the actions of a span."""
+        reader = store.open(item_id)
+        read = partial(robot_hands, reader, query)
+        return response(etag_of(reader, "robot_hands", query), if_none_match, read, MSGPACK)
+
     return router
 
 
@@ -111,6 +123,7 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
         shape=stream.shape,
         unit=stream.unit,
         side=stream.side,
+        frame=stream.frame,
         nominal_rate_hz=stream.nominal_rate_hz,
         num_samples=len(stamps_ns),
         first_ns=int(stamps_ns[0]) if len(stamps_ns) else None,

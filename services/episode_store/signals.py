@@ -1,6 +1,7 @@
 """Signals of streams reduced to the lowest and highest value per bin of time, for plots."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float64
@@ -17,13 +18,14 @@ MAX_SIGNALS = 16
 MAX_READ_BYTES = 256 * 2**20
 BLOCK_BYTES = 4 * 2**20
 INTERVAL = "interval_ms"
+MAX = "max"
 
 
 class SignalsQuery(FrozenModel):
     """Query of signals, a comma-separated list, in `points` bins of [start_ns, stop_ns).
 
-    `STREAM` is the sum of a sample's values, `STREAM.K` its value K, `STREAM.interval_ms` the time
-    since the sample before.
+    `STREAM` is the sum of a sample's values, `STREAM.max` the largest of them, `STREAM.K` its value
+    K, `STREAM.interval_ms` the time since the sample before.
     """
 
     names: str = Field(min_length=1, max_length=2000)
@@ -97,27 +99,28 @@ def _blocks(
         yield stamps_ns[before:stop], np.diff(stamps_ns[before - 1 : stop]) / 1e6
         return
     descriptor = reader.streams[stream]
-    column = _column(descriptor, what)
+    reduced = _reduction(descriptor, what)
     rows = max(1, BLOCK_BYTES // descriptor.sample_bytes())
     for low in range(first, stop, rows):
         high = min(low + rows, stop)
         samples = reader.values(stream, low, high).reshape(high - low, -1).astype(np.float64)
-        yield stamps_ns[low:high], samples.sum(axis=1) if column is None else samples[:, column]
+        yield stamps_ns[low:high], reduced(samples)
 
 
-def _column(descriptor: StreamDescriptor, what: str) -> int | None:
-    """Index of a signal's value in a flat sample; None for the sum of all."""
+def _reduction(descriptor: StreamDescriptor, what: str) -> Callable[[np.ndarray], np.ndarray]:
+    """The signal of flat samples [n, size]."""
     size = int(np.prod(descriptor.shape))
     if descriptor.kind == "image":
         raise InvalidInputError(
             f"signal {descriptor.name}: is an image stream, whose only signal is "
             f"{descriptor.name}.{INTERVAL}"
         )
-    if not what:
-        return None
+    if what in ("", MAX):
+        return partial(np.sum if not what else np.max, axis=1)
     if not (what.isdecimal() and what.isascii() and len(what) < 7 and int(what) < size):
         raise InvalidInputError(
-            f"signal {descriptor.name}: got {what[:40]!r}, expected {INTERVAL} or an index in "
-            f"0 … {size - 1}"
+            f"signal {descriptor.name}: got {what[:40]!r}, expected {INTERVAL}, {MAX} or an index "
+            f"in 0 … {size - 1}"
         )
-    return int(what)
+    index = int(what)
+    return lambda samples: samples[:, index]

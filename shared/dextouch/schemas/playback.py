@@ -22,6 +22,7 @@ class PlayedStream(FrozenModel):
     shape: tuple[int, ...]
     unit: str
     side: Literal["left", "right"] | None = None
+    frame: str | None = None
     nominal_rate_hz: float
     num_samples: int
     first_ns: int | None = None

@@ -240,7 +240,8 @@ async def test_signals_are_extremes_of_their_bins(http, store):
     reader = write_episode(store, "e-1")
     sums = reader.read("tactile_left").values.astype(float).sum(axis=1)
     # Nine samples at 15 Hz in ten bins of 100 ms: two of the bins hold two samples, three none.
-    query = {"names": "tactile_left,tactile_left.7,action.interval_ms", "points": 10}
+    names = "tactile_left,tactile_left.7,tactile_left.max,action.interval_ms"
+    query = {"names": names, "points": 10}
     query |= {"start_ns": 0, "stop_ns": 10**9}
     answer = await http.get("/v1/playback/episode/e-1/signals", params=query)
     assert answer.status_code == 200, answer.text
@@ -254,4 +255,5 @@ async def test_signals_are_extremes_of_their_bins(http, store):
         else:
             assert np.isnan([low, high]).all()
     assert arrays["tactile_left.7/low"][0] == min(reader.read("tactile_left").values[:2, 7])
+    assert arrays["tactile_left.max/high"][0] == reader.read("tactile_left").values[:2].max()
     np.testing.assert_allclose(np.nanmax(arrays["action.interval_ms/high"]), 66.7, atol=0.1)

@@ -1,0 +1,118 @@
+// The 67-D action at the playhead as bars in its five blocks; commanded values are ticks beside them.
+
+import { element, setText } from "../dom.js";
+import { secondsText, stampOf } from "./times.js";
+
+const POSE = ["x", "y", "z", "r00", "r10", "r20", "r01", "r11", "r21"];
+const POSE_UNITS = ["m", "m", "m", "", "", "", "", "", ""];
+// Value at the full height of a bar: metres, entries of a rotation matrix, radians.
+const FULL = { m: 0.5, "": 1, rad: 2 };
+const BLOCKS = [
+  { name: "left wrist", first: 0, count: 9 },
+  { name: "right wrist", first: 9, count: 9 },
+  { name: "left joints", first: 18, count: 20 },
+  { name: "right joints", first: 38, count: 20 },
+  { name: "head", first: 58, count: 9 },
+];
+export const ACTION_SIZE = 67;
+
+export function describe(index) {
+  const block = BLOCKS.find(({ first, count }) => index >= first && index < first + count);
+  const place = index - block.first;
+  return block.count === 9 ? { text: `${block.name} ${POSE[place]}`, unit: POSE_UNITS[place] } : { text: `${block.name} ${place}`, unit: "rad" };
+}
+
+function css(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+}
+
+export class ActionPane {
+  constructor(root, tracks, onPick) {
+    this.root = root;
+    this.tracks = tracks;
+    this.canvas = root.querySelector("canvas");
+    this.readout = root.querySelector(".readout");
+    this.time = root.querySelector(".own_time");
+    this.values = {};
+    this.hovered = null;
+    this.canvas.addEventListener("pointermove", (event) => this.hover(this.indexAt(event)));
+    this.canvas.addEventListener("pointerleave", () => this.hover(null));
+    this.canvas.addEventListener("click", (event) => onPick(`action.${this.indexAt(event)}`));
+    new ResizeObserver(() => this.draw()).observe(this.canvas);
+  }
+
+  indexAt(event) {
+    const share = event.offsetX / Math.max(this.canvas.clientWidth, 1);
+    return Math.min(Math.max(Math.floor(share * ACTION_SIZE), 0), ACTION_SIZE - 1);
+  }
+
+  hover(index) {
+    this.hovered = index;
+    this.read();
+  }
+
+  show(t_ns) {
+    let changed = false;
+    for (const [kind, track] of Object.entries(this.tracks)) {
+      const found = track.sampleAt(t_ns);
+      if (found.state === "loading") {
+        this.root.dataset.state = "loading";
+        continue;
+      }
+      const values = found.values ?? null;
+      changed ||= this.values[kind] !== values;
+      this.values[kind] = values;
+      if (kind !== "measured") continue;
+      this.root.dataset.state = values ? "shown" : "none";
+      setText(this.time, values ? `${secondsText(Math.round(found.t_ns / 1e5) * 1e5)} s` : "");
+      if (values) this.root.dataset.stamp = stampOf(found.t_ns, track.item.zero);
+      else delete this.root.dataset.stamp;
+    }
+    if (changed) this.draw();
+  }
+
+  read() {
+    const { measured, commanded } = this.values;
+    if (!measured) setText(this.readout, "no sample");
+    else if (this.hovered === null) setText(this.readout, "Point at a bar to read it, click to plot it");
+    else {
+      const { text, unit } = describe(this.hovered);
+      const more = commanded ? `, commanded ${commanded[this.hovered].toFixed(4)}` : "";
+      setText(this.readout, `${this.hovered} · ${text}: ${measured[this.hovered].toFixed(4)}${more} ${unit}`);
+    }
+  }
+
+  draw() {
+    const scale = window.devicePixelRatio || 1;
+    const width = Math.round(this.canvas.clientWidth * scale);
+    const height = Math.round(this.canvas.clientHeight * scale);
+    if (!width || !height) return;
+    Object.assign(this.canvas, { width, height });
+    const context = this.canvas.getContext("2d");
+    const bar = width / ACTION_SIZE;
+    const label_px = 14 * scale;
+    const middle = (height - label_px) / 2;
+    const quiet = css("--quiet");
+    context.font = `${11 * scale}px system-ui, sans-serif`;
+    BLOCKS.forEach(({ name, first, count }, place) => {
+      context.fillStyle = css(place % 2 ? "--panel" : "--hand");
+      context.fillRect(first * bar, 0, count * bar, height - label_px);
+      context.fillStyle = quiet;
+      context.textAlign = "center";
+      context.fillText(name, (first + count / 2) * bar, height - 3 * scale, count * bar);
+    });
+    const draw = (values, colour, paint) => {
+      if (!values) return;
+      context.fillStyle = colour;
+      values.forEach((value, index) => {
+        const share = Math.min(Math.max(value / FULL[describe(index).unit], -1), 1);
+        if (Number.isFinite(share)) paint(index * bar, -share * (middle - 2 * scale));
+      });
+    };
+    draw(this.values.measured, css("--accent"), (x, size) => context.fillRect(x + 0.15 * bar, middle, 0.7 * bar, size || scale));
+    draw(this.values.commanded, css("--ink"), (x, size) => context.fillRect(x, middle + size - scale, bar, 2 * scale));
+    context.fillStyle = css("--line");
+    context.fillRect(0, middle, width, scale);
+    this.read();
+  }
+}

@@ -1,0 +1,114 @@
+// Facts about the item: what was done by whom, how it ended, its quality, clocks, lineage and exports.
+
+import { element, levelBadge } from "../dom.js";
+import { number } from "../format.js";
+import { fetchFacts } from "./item.js";
+
+const OUTCOMES = { true: ["OK", "success"], false: ["ERROR", "failure"], null: ["STALE", "not judged"] };
+
+export function outcomeBadge(success) {
+  const [level, text] = OUTCOMES[String(success)];
+  const badge = levelBadge(level);
+  badge.textContent = text;
+  return badge;
+}
+
+function rows(pairs) {
+  return element("dl", { class: "facts" }, ...pairs.filter(([, value]) => value !== null && value !== undefined && value !== "")
+    .flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value instanceof Node ? value : String(value))]));
+}
+
+function table(heads, lines) {
+  return element("div", { class: "table_frame" }, element("table", {},
+    element("thead", {}, element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head)))),
+    element("tbody", {}, ...lines.map((line) => element("tr", {}, ...line.map((cell) => element("td", {}, cell)))))));
+}
+
+function block(title, ...children) {
+  return element("section", { class: "fact_block" }, element("h3", {}, title), ...children);
+}
+
+function about(item) {
+  const { about: facts } = item;
+  return block("About", rows([
+    ["Task", facts.task],
+    ["Instruction", facts.instruction],
+    ["Operator", facts.operator],
+    ["Outcome", outcomeBadge(facts.success)],
+    ["Domain, origin", `${facts.domain}, ${facts.origin}`],
+    ["Station", facts.station],
+    ["Time", facts.at ? new Date(facts.at).toLocaleString() : null],
+    ["Length", `${((item.stop_ns - item.start_ns) / 1e9).toFixed(3)} s`],
+    ["Model steps", facts.num_steps ? `${facts.num_steps} at ${facts.model_rate_hz} Hz` : null],
+    ["Incomplete", facts.recovered ? "yes: its writer did not finish it" : null],
+  ]));
+}
+
+function clocks(reports) {
+  const lines = reports.map((report) => [report.stream, report.method ?? "unknown", number(report.skew_ppm, 2), number(report.latency_ms, 2),
+    number(report.residual_rms_ms, 3), `${report.num_dropped} of ${report.num_samples}`, report.warnings.join(", ") || "none"]);
+  const heads = ["Stream", "Stamps by", "Skew ppm", "Latency ms", "Residual ms", "Dropped", "Warnings"];
+  if (!lines.length) return null;
+  const found = block("Clocks", table(heads, lines));
+  found.classList.add("wide");
+  return found;
+}
+
+function quality(figures) {
+  const lines = Object.entries(figures ?? {}).map(([name, value]) => [name, String(Number(value.toPrecision(6)))]);
+  if (!lines.length) return null;
+  return block("Quality", element("details", {}, element("summary", {}, `${lines.length} figures`), table(["Figure", "Value"], lines)));
+}
+
+function ledger(entries) {
+  const lines = (entries ?? []).map((entry) => [entry.stream, entry.event, String(entry.count)]);
+  return lines.length ? block("Faults noticed at the station", table(["Stream", "Event", "Count"], lines)) : null;
+}
+
+const RELATIONS = { source: "made from", product: "used in" };
+
+function lineage(nodes) {
+  const others = nodes.filter((node) => node.relation !== "self");
+  if (!others.length) return null;
+  const link = ({ kind, id, is_stored }) => (is_stored && ["recording", "episode"].includes(kind)
+    ? element("a", { href: `/episodes/${kind}/${encodeURIComponent(id)}` }, id) : element("span", {}, `${id}${is_stored ? "" : " (not in this store)"}`));
+  return block("Lineage", element("ul", { class: "lineage" },
+    ...others.map((node) => element("li", {}, `${RELATIONS[node.relation]} ${node.kind} `, link(node), node.summary ? element("span", { class: "quiet" }, ` ${node.summary}`) : null))));
+}
+
+function command(text) {
+  const copy = element("button", { type: "button", class: "plain" }, "Copy");
+  const code = element("code", {}, text);
+  copy.addEventListener("click", async () => {
+    try {
+      await navigator.clipboard.writeText(text);
+      copy.textContent = "Copied";
+    } catch {
+      // Pages that are not served from loopback or by HTTPS have no clipboard.
+      getSelection().selectAllChildren(code);
+      copy.textContent = "Selected";
+    }
+  });
+  return element("p", { class: "command" }, code, copy);
+}
+
+function exports({ kind, id }) {
+  const of_kind = kind === "recording" ? "--kind recording " : "";
+  return block("Open in other tools",
+    element("p", {}, "Foxglove: export, open the file, and import ", element("a", { href: "/static/player/foxglove_layout.json", download: "dextouch_layout.json" }, "this layout"), "."),
+    command(`dextouch export --format mcap ${of_kind}${id} --to ${id}.mcap`),
+    element("p", {}, "Rerun: export and open; the file contains its layout."),
+    command(`dextouch export --format rrd ${of_kind}${id} --to ${id}.rrd && rerun ${id}.rrd`));
+}
+
+export async function showFacts(root, item) {
+  const { kind, id } = item.about;
+  const path = `${kind}s/${encodeURIComponent(id)}${kind === "recording" ? "/attributes" : ""}`;
+  const [detail, found] = await Promise.all([
+    fetchFacts(`/${path}`).catch(() => ({})),
+    fetchFacts(`/catalog/lineage/${item.path}`).catch(() => ({ nodes: [] })),
+  ]);
+  const attributes = detail.attributes ?? detail;
+  const blocks = [about(item), lineage(found.nodes), clocks(attributes.clocks ?? []), quality(attributes.quality), ledger(attributes.ledger), exports(item.about)];
+  root.replaceChildren(...blocks.filter((one) => one));
+}

@@ -1,0 +1,361 @@
+// Panes, timeline, plots and keys around one playhead.
+
+import { element, setText } from "../dom.js";
+import { ActionPane, ACTION_SIZE } from "./action_pane.js";
+import { CameraPane } from "./camera_pane.js";
+import { isSignal, signalParts } from "./curves.js";
+import { FetchQueue } from "./fetch_queue.js";
+import { Item } from "./item.js";
+import { PlayClock, SPEEDS } from "./play_clock.js";
+import { Plots } from "./plots.js";
+import { SpacePane } from "./space_pane.js";
+import { clockText, secondsText } from "./times.js";
+import { Timeline } from "./timeline.js";
+import { TouchPane } from "./touch_pane.js";
+import { ImageTrack, RobotTrack, SampleTrack } from "./tracks.js";
+import { formatState } from "./url_state.js";
+
+const BUDGET_BYTES = 96e6;
+const AHEAD_S = 2;
+const STEP_NS = 1e9;
+const URL_MS = 400;
+const RETRY_MS = 1000;
+const ACTIONS = { measured: "action", commanded: "action_commanded" };
+const find = (id) => document.getElementById(id);
+
+export class Player {
+  constructor(item, heatmap, state) {
+    this.item = item;
+    this.heatmap = heatmap;
+    this.clock = new PlayClock(item.start_ns, item.stop_ns);
+    this.clock.speed = SPEEDS.includes(state.speed) ? state.speed : 1;
+    this.clock.seek(state.at_ns ?? item.start_ns);
+    this.queue = new FetchQueue({ budget_bytes: BUDGET_BYTES, onLoaded: () => this.request() });
+    this.hidden = new Set(state.hidden);
+    this.raw = null;
+    this.makePanes(state);
+    this.plots = new Plots(find("plots"), item, {
+      onSeek: (t_ns) => this.seek(t_ns),
+      onRemove: (name) => this.setSignals(this.signals.filter((one) => one !== name)),
+      rawName: (raw, name) => this.rawName(raw, name),
+    });
+    this.timeline = new Timeline(find("timeline"), item, {
+      range: state.zoom_ns,
+      onSeek: (t_ns) => this.seek(t_ns),
+      onRange: (range) => this.ranged(range),
+    });
+    this.plots.setRange(this.timeline.range);
+    const wanted = state.signals ?? this.usualSignals();
+    this.setSignals(wanted.filter((name) => isSignal(name, item.streams)));
+    this.listen();
+    if (state.raw) this.compareRaw();
+  }
+
+  makePanes(state) {
+    const { item, queue } = this;
+    const samples = (stream) => new SampleTrack(queue, item, stream);
+    const cameras = item.ofKind("image");
+    this.cameras = cameras.map((stream) => new CameraPane(new ImageTrack(queue, item, stream), () => this.enlarge(stream.name)));
+    this.shown = new Set(state.cameras ?? cameras.map((stream) => stream.name));
+    find("cameras").hidden = !cameras.length;
+    find("camera_row").append(...this.cameras.map((pane) => pane.root));
+    find("camera_choice").append(...cameras.map((stream) => this.choice(stream.name, this.shown, () => this.chosen())));
+
+    const hands = item.ofKind("tactile").filter((stream) => ["left", "right"].includes(stream.side) && [320, 360].includes(stream.size));
+    this.touch = hands.map((stream) => new TouchPane(samples(stream), stream.side, this.heatmap));
+    find("touch").hidden = !hands.length;
+    find("hands").append(...this.touch.map((pane) => pane.root));
+
+    const actions = Object.entries(ACTIONS).filter(([, name]) => item.streams.get(name)?.size === ACTION_SIZE);
+    const action_tracks = Object.fromEntries(actions.map(([kind, name]) => [kind, samples(item.streams.get(name))]));
+    find("action").hidden = !action_tracks.measured;
+    this.action = action_tracks.measured ? new ActionPane(find("action"), action_tracks, (name) => this.addSignal(name)) : null;
+
+    const isHuman = item.about.domain === "human" && item.about.origin === "twin";
+    const robots = item.about.kind === "episode" && !isHuman ? actions.map(([kind, name]) => new RobotTrack(queue, item, item.streams.get(name), kind)) : [];
+    const poses = item.ofKind("pose").filter((stream) => stream.shape.at(-1) === 7).map(samples);
+    const keypoints = item.ofKind("keypoints").filter((stream) => stream.shape.at(-1) === 3).map(samples);
+    find("space").hidden = !(poses.length + keypoints.length + robots.length);
+    this.space = new SpacePane(find("space"), { poses, keypoints, robots }, { hidden: this.hidden, view: state.view, onChange: () => this.noteUrl() });
+    for (const box of find("layers").querySelectorAll("input")) {
+      const has = box.value === "measured_hands" ? keypoints.length : robots.some((track) => track.action_kind === box.value);
+      box.closest("label").hidden = !has;
+    }
+    this.tracks = [...this.touch.map((pane) => pane.track), ...Object.values(action_tracks), ...poses, ...keypoints, ...robots];
+    this.chosen();
+  }
+
+  choice(name, set, onChange) {
+    const box = element("input", { type: "checkbox", value: name });
+    box.checked = set.has(name);
+    box.addEventListener("change", () => {
+      if (box.checked) set.add(name);
+      else set.delete(name);
+      onChange();
+    });
+    return element("label", { class: "check" }, box, name);
+  }
+
+  chosen() {
+    for (const pane of this.cameras) pane.root.hidden = !this.shown.has(pane.track.name);
+    const lead = this.stepTrack();
+    setText(find("step_note"), lead ? `← → ${lead.stream.name}` : "");
+    this.noteUrl();
+    this.request();
+  }
+
+  enlarge(name) {
+    for (const pane of this.cameras) pane.root.classList.toggle("large", pane.track.name === name && !pane.root.classList.contains("large"));
+    this.request();
+  }
+
+  get visibleCameras() {
+    return this.cameras.filter((pane) => this.shown.has(pane.track.name));
+  }
+
+  // The stream whose samples the arrow keys step through.
+  stepTrack() {
+    return this.visibleCameras[0]?.track ?? this.tracks[0];
+  }
+
+  usualSignals() {
+    const names = this.item.ofKind("tactile").map((stream) => stream.name);
+    if (this.item.streams.has("action")) names.push("action.0", "action.9");
+    return names.length ? names.slice(0, 4) : [...this.item.streams.values()].slice(0, 2).map((stream) => (stream.kind === "image" ? `${stream.name}.interval_ms` : stream.name));
+  }
+
+  setSignals(names) {
+    this.signals = names;
+    this.plots.setSignals(names);
+    this.noteUrl();
+  }
+
+  addSignal(name) {
+    if (isSignal(name, this.item.streams) && !this.signals.includes(name)) this.setSignals([...this.signals, name]);
+  }
+
+  rawName(raw, name) {
+    const { stream, what } = signalParts(name);
+    const [ours, theirs] = [this.item.streams.get(stream), raw.streams.get(stream)];
+    if (!theirs) return null;
+    if (ours.size === theirs.size || !/^\d/.test(what)) return name;
+    const cells = theirs.size === this.heatmap.num_raw_cells ? this.heatmap.raw_cells[ours.side] : null;
+    return cells && ours.size === cells.length ? `${stream}.${cells[Number(what)]}` : null;
+  }
+
+  async compareRaw() {
+    const box = find("raw");
+    box.checked = true;
+    const { item, reason } = await Item.openSource(this.item);
+    if (!box.checked) return;
+    setText(find("raw_note"), item ? `raw: ${item.about.id}, by its arrivals` : `no raw signals: ${reason}`);
+    this.raw = item;
+    this.plots.setRaw(item);
+    this.noteUrl();
+  }
+
+  listen() {
+    const click = (id, act) => find(id).addEventListener("click", act);
+    click("play", () => this.toggle());
+    click("back", () => this.step(-1));
+    click("forward", () => this.step(1));
+    click("zoom_in", () => this.timeline.zoom(0.5, this.clock.t_ns));
+    click("zoom_out", () => this.timeline.zoom(2, this.clock.t_ns));
+    click("zoom_fit", () => this.timeline.fit());
+    click("copy_link", () => this.copyLink());
+    const speed = find("speed");
+    speed.append(...SPEEDS.map((one) => element("option", { value: one }, `${one}×`)));
+    speed.value = String(this.clock.speed);
+    speed.addEventListener("change", () => this.setSpeed(Number(speed.value)));
+    const raw = find("raw");
+    raw.closest("label").hidden = this.item.about.kind !== "episode";
+    raw.addEventListener("change", () => {
+      if (raw.checked) {
+        this.compareRaw();
+        return;
+      }
+      this.raw = null;
+      setText(find("raw_note"), "");
+      this.plots.setRaw(null);
+      this.noteUrl();
+    });
+    for (const box of find("layers").querySelectorAll("input")) {
+      box.checked = !this.hidden.has(box.value);
+      box.addEventListener("change", () => {
+        if (box.checked) this.hidden.delete(box.value);
+        else this.hidden.add(box.value);
+        this.noteUrl();
+        this.request();
+      });
+    }
+    const stream = find("signal_stream");
+    stream.append(...[...this.item.streams.keys()].map((name) => element("option", { value: name }, name)));
+    find("signal_form").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.submitSignal(stream.value, find("signal_value").value.trim());
+    });
+    document.addEventListener("keydown", (event) => this.pressed(event));
+    document.addEventListener("pointerup", (event) => event.target.closest?.("button")?.blur());
+    setInterval(() => {
+      if (this.queue.failures.size) this.request();
+    }, RETRY_MS);
+  }
+
+  submitSignal(stream, value) {
+    const name = value && value !== "sum" ? `${stream}.${value === "interval" ? "interval_ms" : value}` : stream;
+    const isKnown = isSignal(name, this.item.streams);
+    const { size, kind } = this.item.streams.get(stream);
+    const choices = kind === "image" ? "interval" : `sum, max, interval or 0 … ${size - 1}`;
+    setText(find("signal_note"), isKnown ? "" : `${stream}: got “${value}”, expected ${choices}`);
+    if (isKnown) this.addSignal(name);
+  }
+
+  pressed(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input:not([type=checkbox]), select, textarea")) return;
+    const jumps = { ArrowLeft: -1, ArrowRight: 1 };
+    const acts = {
+      " ": () => this.toggle(),
+      Home: () => this.seek(this.clock.start_ns),
+      End: () => this.seek(this.clock.stop_ns),
+      "+": () => this.timeline.zoom(0.5, this.clock.t_ns),
+      "-": () => this.timeline.zoom(2, this.clock.t_ns),
+      0: () => this.timeline.fit(),
+    };
+    const act = event.key in jumps
+      ? () => (event.shiftKey ? this.seek(this.clock.t_ns + jumps[event.key] * STEP_NS) : this.step(jumps[event.key]))
+      : Object.hasOwn(acts, event.key) ? acts[event.key] : null;
+    if (!act || (event.key === " " && event.target.closest("input, summary"))) return;
+    event.preventDefault();
+    act();
+  }
+
+  toggle() {
+    this.clock.toggle();
+    this.noteUrl();
+    this.request();
+  }
+
+  setSpeed(speed) {
+    this.clock.speed = speed;
+    this.noteUrl();
+    this.request();
+  }
+
+  seek(t_ns) {
+    this.clock.seek(t_ns);
+    this.timeline.follow(this.clock.t_ns);
+    this.noteUrl();
+    this.request();
+  }
+
+  // To the next or previous sample of the leading camera; presses during the search are added to it.
+  async step(direction) {
+    this.clock.pause();
+    this.steps = (this.steps ?? 0) + direction;
+    if (this.isStepping) return;
+    this.isStepping = true;
+    try {
+      while (this.steps) {
+        const one = Math.sign(this.steps);
+        this.steps -= one;
+        const found_ns = await this.stepTrack()?.neighbour(this.clock.t_ns, one);
+        if (found_ns !== null && found_ns !== undefined) this.seek(found_ns);
+      }
+    } catch (error) {
+      setText(find("status"), error.message);
+    }
+    this.steps = 0;
+    this.isStepping = false;
+  }
+
+  ranged(range) {
+    this.timeline?.note(find("zoom_note"));
+    this.plots.setRange(range);
+    this.noteUrl();
+  }
+
+  start() {
+    this.timeline.draw();
+    this.timeline.note(find("zoom_note"));
+    this.request();
+  }
+
+  request() {
+    if (this.frame_asked) return;
+    this.frame_asked = true;
+    requestAnimationFrame((now_ms) => {
+      this.frame_asked = false;
+      this.frame(now_ms);
+    });
+  }
+
+  frame(now_ms) {
+    const tracks = [...this.visibleCameras.map((pane) => pane.track), ...this.tracks];
+    const isReadyAt = (t_ns) => tracks.every((track) => track.isReadyAt(t_ns));
+    for (const pane of this.visibleCameras) pane.chooseSize(this.clock.speed);
+    const wasPlaying = this.clock.playing;
+    if (this.clock.tick(now_ms, isReadyAt)) this.timeline.follow(this.clock.t_ns);
+    const { t_ns, playing } = this.clock;
+    for (const pane of [...this.visibleCameras, ...this.touch, this.space, ...(this.action ? [this.action] : [])]) pane.show(t_ns);
+    this.timeline.show(t_ns);
+    this.plots.show(t_ns);
+    setText(find("clock"), clockText(t_ns));
+    find("clock").title = `${secondsText(t_ns)} s`;
+    setText(find("play_text"), playing ? "Pause" : "Play");
+    setText(find("status"), isReadyAt(t_ns) ? "" : "loading");
+    this.load(tracks);
+    if (playing) this.request();
+    if (wasPlaying) this.noteUrl();
+  }
+
+  load(tracks) {
+    const { t_ns, speed, stop_ns } = this.clock;
+    const until_ns = Math.min(t_ns + AHEAD_S * Math.max(speed, 1) * 1e9, stop_ns);
+    const now = tracks.flatMap((track) => track.now(t_ns));
+    const ahead = tracks.flatMap((track) => track.ahead(t_ns, until_ns).map((entry, place) => ({ place, entry })));
+    ahead.sort((one, other) => one.place - other.place);
+    this.queue.want([...now, ...ahead.map(({ entry }) => entry)]);
+  }
+
+  // The query that shows this moment elsewhere.
+  query() {
+    const all = this.cameras.length === this.shown.size;
+    return formatState({
+      at_ns: this.clock.t_ns,
+      cameras: all ? null : this.visibleCameras.map((pane) => pane.track.name),
+      signals: this.signals,
+      zoom_ns: this.timeline.isZoomed ? this.timeline.range : null,
+      view: this.space.view(),
+      raw: find("raw").checked,
+      hidden: [...this.hidden],
+      speed: this.clock.speed,
+    });
+  }
+
+  // Browsers refuse addresses that change too often.
+  noteUrl() {
+    if (this.url_timer) return;
+    this.url_timer = setTimeout(() => {
+      this.url_timer = null;
+      history.replaceState(null, "", `?${this.query()}`);
+    }, URL_MS);
+  }
+
+  async copyLink() {
+    const link = `${location.origin}${location.pathname}?${this.query()}`;
+    try {
+      await navigator.clipboard.writeText(link);
+      setText(find("status"), "link copied");
+    } catch {
+      history.replaceState(null, "", link);
+      setText(find("status"), "copy the link from the address bar");
+    }
+  }
+
+  recolour() {
+    this.space.draw();
+    this.plots.recolour();
+    this.action?.draw();
+    for (const pane of this.touch) if (pane.shown_ns !== null) pane.drawHand();
+  }
+}
