@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+
 from dextouch.episodes import EpisodeReader
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.frozen_model import FrozenModel

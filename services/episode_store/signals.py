@@ -1,7 +1,6 @@
 """Signals of streams reduced to the lowest and highest value per bin of time, for plots."""
 
 from collections.abc import Callable, Iterator
-from functools import partial
 
 import numpy as np
 from jaxtyping import Float64
@@ -115,8 +114,10 @@ def _reduction(descriptor: StreamDescriptor, what: str) -> Callable[[np.ndarray]
             f"signal {descriptor.name}: is an image stream, whose only signal is "
             f"{descriptor.name}.{INTERVAL}"
         )
-    if what in ("", MAX):
-        return partial(np.sum if not what else np.max, axis=1)
+    if not what:
+        return lambda samples: samples.sum(axis=1)
+    if what == MAX:
+        return lambda samples: samples.max(axis=1)
     if not (what.isdecimal() and what.isascii() and len(what) < 7 and int(what) < size):
         raise InvalidInputError(
             f"signal {descriptor.name}: got {what[:40]!r}, expected {INTERVAL}, {MAX} or an index "

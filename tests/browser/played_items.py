@@ -1,7 +1,7 @@
 """A recording and an episode whose every sample says which one it is, and the arrays they hold.
 
-Images show their index as twelve black or white cells, which survives JPEG and H.264; taxels 80 to 91
-are 0 or 40 kPa in the same way. What the tests expect comes from these arrays, not from the store.
+Images show their index as twelve black or white cells, which survives JPEG and H.264; taxels 80 to
+91 are 0 or 40 kPa in the same way. What the tests expect comes from these arrays.
 """
 
 from types import SimpleNamespace
@@ -118,7 +118,9 @@ def write_episode(
         frame = f"wrist_{side}"
         add(f"keypoints_{side}", "keypoints", t_ns, points, "m", 120, frame=frame)
     t_ns = stamps(rng, 100)
-    add("head", "pose", t_ns, poses(t_ns, 0.0) + [0, 0.3, 0.3, 0, 0, 0, 0], "pose_m_wxyz", 100)
+    head = poses(t_ns, 0.0)
+    head[:, 1:3] += 0.3
+    add("head", "pose", t_ns, head, "pose_m_wxyz", 100)
     t_ns = np.rint(np.arange(DURATION_S * 15) * 1e9 / 15).astype(np.int64)
     rows = np.tile(act.IDENTITY_POSE_9D, (len(t_ns), 1))
     rows[:, 0] = 0.2 * np.sin(1e-9 * t_ns)

@@ -1,0 +1,165 @@
+// Pure modules of the player; `node --test` runs this beside a copy of the page's static files.
+
+import assert from "node:assert/strict";
+import { readdirSync, readFileSync } from "node:fs";
+import { test } from "node:test";
+
+import { Blocks, lastAtOrBefore } from "./static/player/blocks.js";
+import { binCentres, isSignal, withGaps } from "./static/player/curves.js";
+import { FetchQueue } from "./static/player/fetch_queue.js";
+import { BONES, frameOfMatrix, frameOfPose, Orbit, toWorld } from "./static/player/geometry.js";
+import { unpack } from "./static/player/packed.js";
+import { PlayClock } from "./static/player/play_clock.js";
+import { allAfter, clockText, parseSeconds, secondsText, stampOf, ticks, tickText } from "./static/player/times.js";
+import { formatState, parseState } from "./static/player/url_state.js";
+
+const near = (found, expected) => found.forEach((value, k) => assert.ok(Math.abs(value - expected[k]) < 1e-12, `${found} is not ${expected}`));
+
+// Bodies that Python packed, beside what they contain; bigints and NaN as text.
+function plain(value) {
+  if (typeof value === "bigint" || Number.isNaN(value) || value === Infinity) return String(value);
+  if (ArrayBuffer.isView(value)) return Array.from(value, plain);
+  if (Array.isArray(value)) return value.map(plain);
+  if (value && typeof value === "object") return Object.fromEntries(Object.entries(value).map(([name, one]) => [name, plain(one)]));
+  return value;
+}
+
+for (const name of readdirSync("packed").filter((one) => one.endsWith(".bin"))) {
+  test(`a body that Python packed: ${name}`, () => {
+    const bytes = readFileSync(`packed/${name}`);
+    const buffer = bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength);
+    assert.deepEqual(plain(unpack(buffer)), JSON.parse(readFileSync(`packed/${name.replace(".bin", ".json")}`, "utf8")));
+    for (const length of [0, 1, Math.floor(buffer.byteLength / 2), buffer.byteLength - 1]) assert.throws(() => unpack(buffer.slice(0, length)));
+  });
+}
+
+test("a body of another form is refused", () => {
+  for (const bytes of [[0xc1], [0x80], [0x82, 0xa6], [0x92, 1, 2], [0xc0]]) assert.throws(() => unpack(Uint8Array.from(bytes).buffer));
+});
+
+test("times are exact beyond 2^53", () => {
+  const zero = 1_760_000_000_123_456_789n;
+  assert.deepEqual([...allAfter(BigInt64Array.of(zero, zero + 1n, zero - 5n), zero)], [0, 1, -5]);
+  assert.equal(stampOf(7, zero), "1760000000123456796");
+  for (const [ns, text] of [[0, "0"], [1_500_000_000, "1.5"], [12_345_678_901, "12.345678901"], [-20_000_000, "-0.02"]]) {
+    assert.equal(secondsText(ns), text);
+    assert.equal(parseSeconds(text), ns);
+  }
+  for (const text of ["", "x", "1e3", "1.2.3", null, "99999999"]) assert.equal(parseSeconds(text), null);
+  assert.equal(clockText(83_456_700_000), "1:23.457");
+  assert.equal(clockText(59_999_900_000), "1:00.000");
+});
+
+test("a ruler has round marks", () => {
+  const { at_ns, step_ns } = ticks(0, 20e9, 8);
+  assert.deepEqual(at_ns.map((ns) => tickText(ns, step_ns)), ["0", "5", "10", "15", "20"]);
+  assert.equal(tickText(1.25e9, 5e7), "1.25");
+});
+
+test("the sample that is valid at a time", () => {
+  const blocks = new Blocks({ first_ns: 100, last_ns: 990, period_ns: 10, block_ns: 100 });
+  assert.equal(blocks.count, 9);
+  const held = { 0: [100, 110, 195], 1: [], 2: [300, 310], 8: [985, 990] };
+  const get = (index) => held[index] && { t_ns: held[index] };
+  const at = (t_ns) => blocks.sampleAt(t_ns, get);
+  assert.deepEqual(at(99), { state: "none" });
+  assert.deepEqual(at(109.5), { state: "sample", block: 0, index: 0, t_ns: 100 });
+  // 15 ns are one and a half periods.
+  assert.deepEqual(at(125), { state: "sample", block: 0, index: 1, t_ns: 110 });
+  assert.deepEqual(at(126), { state: "none" });
+  // The block of this time holds nothing yet, the sample of the block before is valid.
+  assert.deepEqual(at(205), { state: "sample", block: 0, index: 2, t_ns: 195 });
+  assert.deepEqual(at(250), { state: "none" });
+  assert.deepEqual(at(450), { state: "loading", block: 3 });
+  assert.deepEqual(at(1005), { state: "sample", block: 8, index: 1, t_ns: 990 });
+  assert.deepEqual(at(1006), { state: "none" });
+  assert.deepEqual(new Blocks({ first_ns: null, last_ns: null, period_ns: 10, block_ns: 10 }).sampleAt(5, get), { state: "none" });
+  assert.equal(lastAtOrBefore([1, 2, 2, 3], 2), 2);
+});
+
+test("the queue stays within its budget and loads what is urgent first", async () => {
+  const loaded = [];
+  const queue = new FetchQueue({ budget_bytes: 30, concurrency: 1 });
+  const entry = (key, urgent = false) => ({ key, bytes: 10, urgent, load: async () => { loaded.push(key); return { value: key, bytes: 10 }; } });
+  const idle = async () => { while (queue.running.size) await new Promise((done) => setTimeout(done)); };
+  queue.want([entry("a", true), entry("b"), entry("c"), entry("d")]);
+  await idle();
+  assert.deepEqual(loaded, ["a", "b", "c"]);
+  queue.want([entry("c", true), entry("e"), entry("f")]);
+  await idle();
+  assert.deepEqual(loaded, ["a", "b", "c", "e", "f"]);
+  assert.equal(queue.kept_bytes, 30);
+  assert.deepEqual([...queue.kept.keys()].sort(), ["c", "e", "f"]);
+});
+
+test("what is not wanted any more is aborted; failures are kept and tried again later", async () => {
+  let now_ms = 0;
+  let aborted = 0;
+  let tries = 0;
+  const queue = new FetchQueue({ budget_bytes: 30, now_ms: () => now_ms });
+  const slow = { key: "slow", bytes: 1, load: (signal) => new Promise((_, fail) => signal.addEventListener("abort", () => { aborted += 1; fail(new Error("aborted")); })) };
+  const broken = { key: "broken", bytes: 1, load: async () => { tries += 1; throw new Error("no store"); } };
+  const turn = () => new Promise((done) => setTimeout(done));
+  queue.want([slow]);
+  queue.want([broken]);
+  await turn();
+  assert.deepEqual([aborted, tries, queue.failure("broken").message, queue.failure("slow")], [1, 1, "no store", undefined]);
+  queue.want([broken]);
+  await turn();
+  assert.equal(tries, 1);
+  now_ms = 5000;
+  queue.want([broken]);
+  await turn();
+  assert.equal(tries, 2);
+});
+
+test("the clock waits for what is loading, and ends at the end", () => {
+  const clock = new PlayClock(0, 1e9);
+  clock.speed = 2;
+  clock.toggle();
+  assert.equal(clock.tick(0, () => true), false);
+  assert.equal(clock.tick(100, () => false), false);
+  assert.equal(clock.tick(200, () => true), true);
+  assert.equal(clock.t_ns, 2e8);
+  for (let now_ms = 300; now_ms < 1000; now_ms += 100) clock.tick(now_ms, () => true);
+  assert.deepEqual([clock.t_ns, clock.playing], [1e9, false]);
+  clock.toggle();
+  assert.equal(clock.t_ns, 0);
+});
+
+test("a link is read as it was written", () => {
+  const state = { at_ns: 12_345_678_901, cameras: ["camera_head"], signals: ["action.3", "tactile_left"], zoom_ns: [-5e6, 2e9], view: [1.5, -0.25, 0.8], raw: true, hidden: ["measured"], speed: 0.5 };
+  assert.deepEqual(parseState(formatState(state)), state);
+  const usual = parseState("?at=soon&zoom=5~1&speed=90&view=1~x~2&cameras=");
+  assert.deepEqual(usual, { at_ns: null, cameras: [], signals: null, zoom_ns: null, view: null, raw: false, hidden: [], speed: 1 });
+});
+
+test("curves break at gaps, and only there", () => {
+  assert.deepEqual(binCentres(0, 4e9, 4), [0.5, 1.5, 2.5, 3.5]);
+  // Bins of 1 at a period of 2: every second bin is empty; after a gap two more are.
+  assert.deepEqual(withGaps([NaN, 1, NaN, 2, NaN, NaN, NaN, NaN, 3, NaN], 1, 2), [null, 1, undefined, 2, null, null, null, null, 3, null]);
+  const streams = new Map([["action", { kind: "robot_state", shape: [67] }], ["camera", { kind: "image", shape: [4, 4, 3] }]]);
+  for (const name of ["action", "action.66", "action.max", "camera.interval_ms"]) assert.ok(isSignal(name, streams), name);
+  for (const name of ["action.67", "action.x", "camera", "constructor", "", "action."]) assert.equal(isSignal(name, streams), name === "action.", name);
+});
+
+test("a pose moves points as a quarter turn about z does", () => {
+  const half = Math.SQRT1_2;
+  const frame = frameOfPose([1, 2, 3, half, 0, 0, half]);
+  near(toWorld(frame, [1, 0, 0]), [1, 3, 3]);
+  near(toWorld(frame, [0, 1, 0]), [0, 2, 3]);
+  near(toWorld(frameOfMatrix([0, -1, 0, 1, 1, 0, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1]), [1, 0, 0]), [1, 3, 3]);
+  assert.equal(frameOfPose([NaN, 0, 0, 1, 0, 0, 0]), null);
+  assert.equal(frameOfPose([0, 0, 0, 0, 0, 0, 0]), null);
+});
+
+test("the orbit sees its target in the middle, and up above", () => {
+  const orbit = new Orbit({ azimuth: 0, elevation: 0, distance_m: 2, target: [0, 0, 1] });
+  const project = orbit.projector(400, 200);
+  assert.deepEqual(project([0, 0, 1]), { x: 200, y: 100, depth: 2 });
+  assert.ok(project([0, 0, 1.1]).y < 100);
+  // From +x, the axis y points to the right.
+  assert.ok(project([0, 0.1, 1]).x > 200);
+  assert.equal(project([3, 0, 1]), null);
+  assert.equal(BONES.length, 24);
+});
