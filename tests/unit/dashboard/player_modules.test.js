@@ -8,7 +8,7 @@ import { Blocks, lastAtOrBefore } from "./static/player/blocks.js";
 import { binCentres, isSignal, withGaps } from "./static/player/curves.js";
 import { FetchQueue } from "./static/player/fetch_queue.js";
 import { BONES, frameOfMatrix, frameOfPose, Orbit, toWorld } from "./static/player/geometry.js";
-import { unpack } from "./static/player/packed.js";
+import { unpack } from "./static/packed.js";
 import { PlayClock } from "./static/player/play_clock.js";
 import { allAfter, clockText, parseSeconds, secondsText, stampOf, ticks, tickText } from "./static/player/times.js";
 import { formatState, parseState } from "./static/player/url_state.js";

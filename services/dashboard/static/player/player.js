@@ -16,7 +16,9 @@ import { ImageTrack, RobotTrack, SampleTrack } from "./tracks.js";
 import { formatState } from "./url_state.js";
 
 const BUDGET_BYTES = 96e6;
+// While paused, little is loaded ahead: the store is free for the next place on the timeline.
 const AHEAD_S = 2;
+const AHEAD_PAUSED_S = 0.3;
 const STEP_NS = 1e9;
 const URL_MS = 400;
 const RETRY_MS = 1000;
@@ -309,8 +311,9 @@ export class Player {
   }
 
   load(tracks) {
-    const { t_ns, speed, stop_ns } = this.clock;
-    const until_ns = Math.min(t_ns + AHEAD_S * Math.max(speed, 1) * 1e9, stop_ns);
+    const { t_ns, speed, stop_ns, playing } = this.clock;
+    const ahead_s = playing ? AHEAD_S * Math.max(speed, 1) : AHEAD_PAUSED_S;
+    const until_ns = Math.min(t_ns + 1e9 * ahead_s, stop_ns);
     const now = tracks.flatMap((track) => track.now(t_ns));
     const ahead = tracks.flatMap((track) => track.ahead(t_ns, until_ns).map((entry, place) => ({ place, entry })));
     ahead.sort((one, other) => one.place - other.place);
