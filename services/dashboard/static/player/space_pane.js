@@ -104,7 +104,7 @@ export class SpacePane {
     const tips = this.measured(scene, frames, t_ns);
     const robot_tips = this.robots(scene, t_ns);
     const pairs = SIDES.filter((side) => tips[side] && robot_tips[side]);
-    setText(this.distances, pairs.map((side) => `${side} ${distanceText(robot_tips[side], tips[side])}`).join(" · "));
+    setText(this.distances, (pairs.length ? "Fingertips apart: " : "") + pairs.map((side) => `${side} ${distanceText(robot_tips[side], tips[side])}`).join(" · "));
     this.scene = scene;
     if (!this.isPlaced && scene.points.length + scene.frames.length > 0) this.place();
     this.draw();
