@@ -13,6 +13,8 @@ from services.dashboard.pages import Sessions
 
 # Headers of a response that a browser needs to show and to cache it.
 PASSED_HEADERS: Final = ("content-type", "etag", "cache-control", "location")
+# What a user asked for may take longer to compute than the state that pages fetch again and again.
+TIMEOUT_S: Final = 30.0
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,7 @@ def _forwarder(feeds: Feeds, route: Forwarded) -> Callable[[Request], Awaitable[
             sent["content-type"] = JSON
         answer = await feeds.upstream(route.service).forward(
             route.method, path, sent, content, timeout_s=route.timeout_s
+            route.method, path, sent, content, timeout_s=TIMEOUT_S
         )
         passed = {name: answer.headers[name] for name in PASSED_HEADERS if name in answer.headers}
         return Response(answer.content, answer.status_code, headers=passed)
