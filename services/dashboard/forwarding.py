@@ -8,27 +8,23 @@ from urllib.parse import quote
 from fastapi import APIRouter, Depends, Request, Response
 
 from dextouch.serving import JSON, KIB, takes
-from services.dashboard.feeds import STUDY_TIMEOUT_S, Feeds
+from services.dashboard.feeds import Feeds
 from services.dashboard.pages import Sessions
 
 # Headers of a response that a browser needs to show and to cache it.
 PASSED_HEADERS: Final = ("content-type", "etag", "cache-control", "location")
 # What a user asked for may take longer to compute than the state that pages fetch again and again.
-TIMEOUT_S: Final = 30.0
+TIMEOUT_S: Final = 60.0
 
 
 @dataclass(frozen=True)
 class Forwarded:
-    """A route of a service, `path` below its /v1, offered as /v1/SERVICE/PATH.
-
-    `timeout_s`: of routes that compute for longer than `upstream_timeout_s`.
-    """
+    """A route of a service, `path` below its /v1, offered as /v1/SERVICE/PATH."""
 
     service: str
     path: str
     method: Literal["GET", "POST", "DELETE"] = "GET"
     max_body_bytes: int = 64 * KIB
-    timeout_s: float | None = None
 
 
 FORWARDED: Final = (
@@ -68,9 +64,9 @@ FORWARDED: Final = (
     Forwarded("alignment", "/calibration/run/answer", "POST"),
     Forwarded("alignment", "/calibration/run/finish", "POST"),
     Forwarded("alignment", "/calibration/run/cancel", "POST"),
-    Forwarded("studies", "/studies", timeout_s=STUDY_TIMEOUT_S),
-    Forwarded("studies", "/studies/{name}", timeout_s=STUDY_TIMEOUT_S),
-    Forwarded("studies", "/studies/{name}/rollouts", timeout_s=STUDY_TIMEOUT_S),
+    Forwarded("studies", "/studies"),
+    Forwarded("studies", "/studies/{name}"),
+    Forwarded("studies", "/studies/{name}/rollouts"),
 )
 
 
@@ -102,7 +98,6 @@ def _forwarder(feeds: Feeds, route: Forwarded) -> Callable[[Request], Awaitable[
         if content:
             sent["content-type"] = JSON
         answer = await feeds.upstream(route.service).forward(
-            route.method, path, sent, content, timeout_s=route.timeout_s
             route.method, path, sent, content, timeout_s=TIMEOUT_S
         )
         passed = {name: answer.headers[name] for name in PASSED_HEADERS if name in answer.headers}
