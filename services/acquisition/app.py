@@ -53,10 +53,10 @@ def _mock_station(settings: AcquisitionSettings) -> "MockStation":
         from services.acquisition.mocks.practice import practice_streams
 
         streams, known = practice_streams(settings.seed), {}
-    is_disturbed = settings.mock_faults == "first_light"
+    scripts = {"first_light": FaultScript.first_light, "worn_glove": FaultScript.worn_glove}
     return MockStation(
         streams,
-        FaultScript.first_light() if is_disturbed else FaultScript(),
+        scripts.get(settings.mock_faults, FaultScript)(),
         settings.seed,
         StationClock(),
         spool_root=settings.spool,

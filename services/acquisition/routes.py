@@ -147,6 +147,13 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
         pressures = station.live.pressures_kpa(station.clock.now_ns())
         return Response(pack({}, pressures), media_type=MSGPACK)
 
+    @router.get("/live/poses", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
+    async def poses() -> Response:
+        """Newest poses and keypoints that are at most 0.5 s old, and the age of each stream's."""
+        now_ns = station.clock.now_ns()
+        ages_s = station.live.ages_s({"pose", "keypoints"}, now_ns)
+        return Response(pack({"age_s": ages_s}, station.live.poses(now_ns)), media_type=MSGPACK)
+
     @router.get("/live/cameras")
     async def cameras() -> CameraList:
         """Cameras that have sent an image."""

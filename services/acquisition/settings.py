@@ -54,8 +54,10 @@ class AcquisitionSettings(ServiceSettings, SpoolSafety):
     mock_episode_id: str | None = Field(
         default=None, description="episode that mock devices replay (default: a synthetic pattern)"
     )
-    mock_faults: Literal["none", "first_light"] = Field(
-        default="none", description="first_light: losses, delays and drifts of an ordinary station"
+    mock_faults: Literal["none", "first_light", "worn_glove"] = Field(
+        default="none",
+        description="first_light: losses, delays and drifts of an ordinary station; worn_glove: a "
+        "left glove with dead, stuck, saturated and drifted taxels",
     )
     mock_practice: bool = Field(
         default=False,

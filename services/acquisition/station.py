@@ -1,16 +1,17 @@
 """A running station: supervisors of its devices, recorder, health and what viewers see."""
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 
 from dextouch.errors import DeviceError, NotFoundError, StaleDataError
+from dextouch.geometry import apply, invert, transform_from_pose
 from dextouch.images import encode_jpeg
 from dextouch.schemas import CameraLive, Matrix
-from dextouch.streams import H264_UNIT, Sample
+from dextouch.streams import H264_UNIT, Sample, StreamDescriptor, StreamKind
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import GroupPreview
@@ -23,7 +24,15 @@ from services.acquisition.supervisor import DeviceSupervisor
 from services.acquisition.take_check import DeviceEvents
 
 CONNECT_TIMEOUT_S = 10.0
+# Of a quaternion that says where a body points.
+LEAST_NORM = 1e-6
 MAX_AGE_NS = 500_000_000
+# Calibration of each tracker's mount on its body (docs/streams.md).
+MOUNTS = {
+    "wrist_left": "T_tracker_left_wrist_left",
+    "wrist_right": "T_tracker_right_wrist_right",
+    "head": "T_tracker_head_camera_head",
+}
 
 
 class Station:
@@ -141,6 +150,11 @@ class LiveView:
             for name, d in self._descriptors.items()
             if d.unit == H264_UNIT
         }
+        self._calibration = {
+            name: np.array(matrix)
+            for name, matrix in calibration.items()
+            if name.startswith("T_") and np.shape(matrix) == (4, 4)
+        }
         # Without a calibration the station starts all the same: it records the takes for one.
         self._gloves = {
             name: glove
@@ -171,6 +185,40 @@ class LiveView:
             taxels = np.where(glove.cells == NO_CELL, 0.0, cells_kpa[glove.cells])
             pressures[name] = np.maximum(np.nan_to_num(taxels), 0.0).astype(np.float32)
         return pressures
+
+    def ages_s(self, kinds: Container[StreamKind], now_ns: int) -> dict[str, float | None]:
+        """Age of the newest sample of each stream of these kinds; None where none ever came."""
+        return {
+            name: (now_ns - self._newest[name].t_host_ns) / 1e9 if name in self._newest else None
+            for name, descriptor in self._descriptors.items()
+            if descriptor.kind in kinds
+        }
+
+    def poses(self, now_ns: int) -> dict[str, Float32[np.ndarray, "n m"]]:
+        """Newest poses and keypoints by stream, of those heard within the last 0.5 s.
+
+        Returns:
+            Of a body its pose T_world_NAME [4, 4], of a hand its keypoints [25, 3] in wrist axes,
+            metres; a node that is not seen is NaN. The mounts of the calibration are applied.
+        """
+        found: dict[str, np.ndarray] = {}
+        for name, descriptor in self._descriptors.items():
+            sample = self._newest.get(name)
+            if sample is None or now_ns - sample.t_host_ns > MAX_AGE_NS:
+                continue
+            values = np.asarray(sample.values, dtype=np.float64)
+            if descriptor.kind == "keypoints":
+                mount = self._calibration.get(f"T_{name}_wrist_{descriptor.side}")
+                found[name] = values if mount is None else apply(invert(mount), values)
+            elif descriptor.kind == "pose" and _is_pose(values):
+                found[name] = self._in_world(descriptor, transform_from_pose(values))
+        return {name: values.astype(np.float32) for name, values in found.items()}
+
+    def _in_world(self, descriptor: StreamDescriptor, T: np.ndarray) -> np.ndarray:
+        if descriptor.frame == "base" and "T_world_base" in self._calibration:
+            T = self._calibration["T_world_base"] @ T
+        mount = self._calibration.get(MOUNTS.get(descriptor.name, ""))
+        return T if mount is None else T @ mount
 
     def cameras(self, now_ns: int) -> list[CameraLive]:
         """Cameras that have sent an image."""
@@ -208,3 +256,7 @@ class LiveView:
         if camera in self._previews:
             return encode_jpeg(self._previews[camera].image())
         return encode_jpeg(sample.values)
+
+
+def _is_pose(values: np.ndarray) -> bool:
+    return bool(np.isfinite(values).all() and np.linalg.norm(values[3:]) > LEAST_NORM)

@@ -6,6 +6,7 @@ A new panel is a topic here with the function that fetches it, a section in
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ from pydantic_core import to_json
 
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.frozen_model import FrozenModel
+from dextouch.hands import CHAINS, WRIST_NODE, chain_indices
 from dextouch.schemas import (
     CameraList,
     CameraLive,
@@ -43,7 +45,7 @@ from services.dashboard.upstream import Upstream
 
 logger = structlog.get_logger(__name__)
 
-MAX_TAXEL_BYTES = 64 * 1024
+MAX_LIVE_BYTES = 64 * 1024
 MAX_HISTORY_BYTES = 1024 * 1024
 # Of the small plots: two minutes, two rows a point.
 TREND_ROWS = 120
@@ -57,7 +59,8 @@ ACTIONS = ("arm", "record", "stop", "save", "discard", "rerecord", "session")
 # Of the taxel maps.
 FULL_SCALE_KPA = 40.0
 RAMP_STEPS = 128
-TAXEL_MESSAGE = 1
+# First byte of a binary message.
+TAXEL_MESSAGE, POSE_MESSAGE = 1, 2
 # A WebSocket message: text (JSON) or bytes.
 Message = str | bytes
 
@@ -151,11 +154,13 @@ class Feeds:
 
     def __init__(self, upstreams: Mapping[str, Upstream], settings: DashboardSettings) -> None:
         self._upstreams = upstreams
+        self._live_timeout_s = settings.live_timeout_s
         self._clocks: dict[str, str] = {}
         topics = [
             Topic.of_json("station", settings.station_period_s, self.station),
             Topic.of_json("trends", TREND_PERIOD_S, self._trends),
             Topic("taxels", settings.taxel_period_s, self._taxel_messages),
+            Topic("poses", settings.pose_period_s, self._pose_messages),
             Topic.of_json("cameras", settings.station_period_s, self._cameras),
             Topic.of_json("services", settings.list_period_s, self.services),
             Topic.of_json("takes", settings.list_period_s, self.takes),
@@ -186,8 +191,8 @@ class Feeds:
         try:
             acquisition = self.upstream("acquisition")
             health, recorder = await asyncio.gather(
-                acquisition.read(StationHealth, "/v1/health"),
-                acquisition.read(RecorderStatus, "/v1/recorder"),
+                acquisition.read(StationHealth, "/v1/health", timeout_s=self._live_timeout_s),
+                acquisition.read(RecorderStatus, "/v1/recorder", timeout_s=self._live_timeout_s),
             )
         except DexTouchError as error:
             return StationView(note=error.message)
@@ -301,7 +306,9 @@ class Feeds:
 
     async def _cameras(self) -> tuple[CameraLive, ...]:
         try:
-            listed = await self.upstream("acquisition").read(CameraList, "/v1/live/cameras")
+            listed = await self.upstream("acquisition").read(
+                CameraList, "/v1/live/cameras", timeout_s=self._live_timeout_s
+            )
         except DexTouchError:
             return ()  # reported by the station topic
         return listed.cameras
@@ -317,12 +324,24 @@ class Feeds:
 
     async def _taxel_messages(self) -> list[Message]:
         try:
-            answer = await self.upstream("acquisition").send("GET", "/v1/live/taxels")
-            _, arrays = unpack(answer.content, max_bytes=MAX_TAXEL_BYTES)
+            _, arrays = await self._live("taxels")
         except DexTouchError as error:
             return [topic_message("taxels_lost", error.message)]
-        pressures = {side: arrays.get(f"tactile_{side}") for side in SIDES}
-        return [taxel_message(side, kpa) for side, kpa in pressures.items() if kpa is not None]
+        return [taxel_message(side, arrays.get(f"tactile_{side}")) for side in SIDES]
+
+    async def _pose_messages(self) -> list[Message]:
+        try:
+            fields, arrays = await self._live("poses")
+            return [pose_message(fields["age_s"], arrays)]
+        except DexTouchError as error:
+            return [topic_message("poses_lost", error.message)]
+
+    async def _live(self, what: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """What the station shows now; it counts as unreachable if it takes too long."""
+        answer = await self.upstream("acquisition").send(
+            "GET", f"/v1/live/{what}", timeout_s=self._live_timeout_s
+        )
+        return unpack(answer.content, max_bytes=MAX_LIVE_BYTES)
 
 
 def _labels(item: EpisodeSummary | RecordingSummary) -> dict[str, Any]:
@@ -356,6 +375,12 @@ def topic_message(topic: str, data: object) -> str:
     return to_json({"topic": topic, "data": data}, inf_nan_mode="null").decode()
 
 
+def skeleton_bones() -> list[tuple[int, int]]:
+    """Pairs of keypoints that a bone connects, from `dextouch.hands`."""
+    chains = [[WRIST_NODE, *chain_indices(chain)] for chain in CHAINS]
+    return [bone for chain in chains for bone in pairwise(chain)]
+
+
 def heatmap_layout() -> dict[str, object]:
     """Positions of the 320 taxels and the colour map, from `dextouch.tactile`."""
     taxels = np.arange(NUM_TAXELS, dtype=np.float32)
@@ -375,7 +400,24 @@ def heatmap_layout() -> dict[str, object]:
     }
 
 
-def taxel_message(side: Side, pressures_kpa: np.ndarray) -> bytes:
-    """Encode pressures: uint8 kind, uint8 side, uint16 count, then float32 kPa, little endian."""
-    header = bytes([TAXEL_MESSAGE, SIDES.index(side)]) + len(pressures_kpa).to_bytes(2, "little")
-    return header + np.ascontiguousarray(pressures_kpa, dtype="<f4").tobytes()
+def taxel_message(side: Side, pressures_kpa: np.ndarray | None) -> bytes:
+    """Encode pressures: uint8 kind, uint8 side, uint16 count, then float32 kPa, little endian.
+
+    None, of a glove that is not heard, has the count 0: an old picture must not stay.
+    """
+    values = np.empty(0) if pressures_kpa is None else pressures_kpa
+    header = bytes([TAXEL_MESSAGE, SIDES.index(side)]) + len(values).to_bytes(2, "little")
+    return header + np.ascontiguousarray(values, dtype="<f4").tobytes()
+
+
+def pose_message(ages_s: Mapping[str, float | None], arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Encode poses: uint8 kind, uint8 0, uint16 length of a list in JSON, the list, float32 values.
+
+    The list holds name, age and number of values of each stream; spaces make its length a multiple
+    of 4. Streams without a pose at this moment have 0 values.
+    """
+    values = {name: np.ravel(arrays.get(name, ())).astype("<f4") for name in ages_s}
+    rows = to_json([(name, age_s, values[name].size) for name, age_s in ages_s.items()])
+    rows += b" " * (-len(rows) % 4)
+    header = bytes([POSE_MESSAGE, 0]) + len(rows).to_bytes(2, "little")
+    return header + rows + b"".join(part.tobytes() for part in values.values())

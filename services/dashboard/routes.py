@@ -17,7 +17,7 @@ from dextouch.errors import AccessDeniedError
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import JSON, KIB, OCTETS, takes
 from services.dashboard.comparison import Comparisons, ComparisonView, StartComparison
-from services.dashboard.feeds import Feeds, Topic, heatmap_layout
+from services.dashboard.feeds import Feeds, Topic, heatmap_layout, skeleton_bones
 from services.dashboard.pages import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView
@@ -43,11 +43,11 @@ def api_router(settings: DashboardSettings, feeds: Feeds, sessions: Sessions) ->
     """Router of the page's data and actions."""
     guards = [Depends(sessions.guard), Depends(SESSION)]
     router = APIRouter(prefix="/v1", dependencies=guards, tags=["dashboard"])
-    layout = heatmap_layout()
+    layout = {**heatmap_layout(), "bones": skeleton_bones()}
 
     @router.get("/heatmap")
     async def heatmap() -> JSONResponse:
-        """Layout and colours of the taxel maps."""
+        """Layout and colours of the taxel maps, and the bones of a hand's keypoints."""
         return JSONResponse(layout)
 
     @router.get("/overview")

@@ -52,11 +52,20 @@ class DashboardSettings(ServiceSettings):
     upstream_timeout_s: float = Field(
         default=2.0, gt=0, le=30, description="seconds until a silent service counts as unavailable"
     )
+    live_timeout_s: float = Field(
+        default=0.7,
+        ge=0.05,
+        le=10,
+        description="seconds until a station that does not answer is shown as STALE",
+    )
     station_period_s: float = Field(
         default=0.2, ge=0.05, le=10, description="seconds between updates of the station's state"
     )
     taxel_period_s: float = Field(
-        default=0.1, ge=0.02, le=10, description="seconds between updates of the taxel maps"
+        default=1 / 30, ge=0.02, le=10, description="seconds between updates of the taxel maps"
+    )
+    pose_period_s: float = Field(
+        default=1 / 30, ge=0.02, le=10, description="seconds between updates of hands and poses"
     )
     list_period_s: float = Field(
         default=2.0, ge=0.2, le=60, description="seconds between listings of takes and episodes"

@@ -1,6 +1,6 @@
 """Panels of devices and recorder: the station's answers in the page's words and display units."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
@@ -81,11 +81,18 @@ class RecorderView(FrozenModel):
     session: RecorderSession | None = None
 
 
+class GloveView(FrozenModel):
+    """Taxels of a glove that are out of order, by their state, and the age of its tare."""
+
+    taxels: dict[str, tuple[int, ...]]
+    tare_age_s: float | None
+
+
 class StationView(FrozenModel):
     """Overview of the station; by default of one that does not respond, for the reason `note`."""
 
     reachable: bool = False
-    level: HealthLevel = "ERROR"
+    level: HealthLevel = "STALE"
     summary: str = "acquisition does not respond"
     note: str
     note_level: HealthLevel = "ERROR"
@@ -93,6 +100,7 @@ class StationView(FrozenModel):
     causes: tuple[CauseView, ...] = ()
     streams: tuple[StreamView, ...] = ()
     recorder: RecorderView = RecorderView(state="unknown", level="ERROR")
+    gloves: Mapping[str, GloveView] = {}
 
 
 def station_view(station: StationHealth, recorder: RecorderStatus) -> StationView:
@@ -112,6 +120,11 @@ def station_view(station: StationHealth, recorder: RecorderStatus) -> StationVie
         causes=causes,
         streams=streams,
         recorder=recorder_view(recorder),
+        gloves={
+            item.hand: GloveView(taxels=dict(item.taxels), tare_age_s=item.tare_age_s)
+            for item in station.streams
+            if item.hand is not None and item.stream == f"tactile_{item.hand}"
+        },
     )
 
 

@@ -53,14 +53,15 @@ class Upstream:
         *,
         method: str = "GET",
         body: Mapping[str, Any] | None = None,
+        timeout_s: float | None = None,
     ) -> Form:
-        """Response to a request as this model, or tuple of models; `body` is sent as JSON.
+        """Response to a request as this model, or tuple of models; otherwise as `send`.
 
         Raises:
             UnavailableError: no response, or one of another form.
             DexTouchError: a refusal of the service, as its own class.
         """
-        response = await self.send(method, path, body)
+        response = await self.send(method, path, body, timeout_s=timeout_s)
         try:
             # A service of a later release may say more.
             return TypeAdapter(form).validate_json(response.content, extra="ignore")
@@ -71,15 +72,21 @@ class Upstream:
             ) from error
 
     async def send(
-        self, method: str, path: str, body: Mapping[str, Any] | None = None
+        self,
+        method: str,
+        path: str,
+        body: Mapping[str, Any] | None = None,
+        *,
+        timeout_s: float | None = None,
     ) -> httpx.Response:
-        """Response to a request, with `body` as JSON.
+        """Response to a request, with `body` as JSON; `timeout_s` replaces that of the client.
 
         Raises:
             UnavailableError: no response, or a refusal without a reason.
             DexTouchError: a refusal of the service, as its own class.
         """
-        return await self._sent(self._client.build_request(method, path, json=body))
+        limit = httpx.USE_CLIENT_DEFAULT if timeout_s is None else timeout_s
+        return await self._sent(self._client.build_request(method, path, json=body, timeout=limit))
 
     async def forward(
         self,

@@ -7,8 +7,12 @@ page ends after 30 s, so that a loaded machine is slow and a broken page is stil
 import asyncio
 import os
 import shutil
+import signal
+import subprocess
+import sys
 import threading
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import Error, expect, sync_playwright
@@ -145,3 +149,44 @@ def serve_station(serve, monkeypatch):
         return serve(create_station(AcquisitionSettings(spool=spool, mock=True, **settings)))
 
     return start
+
+
+class StationProcess:
+    """A station with mock devices that a test can stop; `url` is its address."""
+
+    def __init__(self, spool, name, streams):
+        child = Path(__file__).with_name("station_child.py")
+        self._process = subprocess.Popen(
+            [sys.executable, child, spool, name, *streams],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        self.url = self._process.stdout.readline().strip()
+        assert self.url, f"station {name} did not start"
+
+    def stop(self):
+        """Stop it in the middle of whatever it does: it accepts connections and never answers."""
+        self._process.send_signal(signal.SIGSTOP)
+
+    def go_on(self):
+        self._process.send_signal(signal.SIGCONT)
+
+    def end(self):
+        self._process.kill()
+        self._process.wait(PATIENCE_S)
+        self._process.stdout.close()
+
+
+@pytest.fixture
+def station_process(tmp_path):
+    """Start a station in a process of its own: its name and the streams of its mock devices."""
+    started = []
+
+    def start(name, *streams):
+        started.append(StationProcess(tmp_path / f"spool_{name}", name, streams))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.end()

@@ -9,15 +9,25 @@ cell that never changed may be an unused position.
 
 import math
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import Matrix
+from dextouch.schemas import Matrix, TaxelState
+from dextouch.streams import StreamDescriptor
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
-from dextouch.tactile.layout import NUM_TAXELS, Side, join_pads, raw_indices, split_pads
+from dextouch.tactile.layout import (
+    NUM_RAW_TAXELS,
+    NUM_TAXELS,
+    Side,
+    join_pads,
+    raw_indices,
+    split_pads,
+)
 from services.acquisition.devices.tactile_glove.driver import FULL_SCALE_COUNTS
 from services.acquisition.drivers.base import CellLayout, Decoder
 from services.acquisition.glove_record import NO_CELL, GloveRecord, mapped_cells
@@ -45,6 +55,10 @@ MIN_TARE_COUNTS = 20.0
 # A tare without a stated scatter is good to one count.
 TARE_SIGMA_COUNTS = 1.0
 MAX_TOUCHED_SHARE = 0.25
+DRIFT_NS = 10_000_000_000
+# Evaluations come once a second; one may be late.
+MAX_STEP_NS = 1_500_000_000
+PINNED_STATES: Final[tuple[TaxelState, ...]] = ("dead", "stuck", "saturated")
 _SCAN_COLUMNS = 20
 
 
@@ -109,6 +123,26 @@ class _CellCheck(ABC):
         self._silent = self._silent | is_same & (around >= STRONG_SHARE) | slow
         return self._silent
 
+    def _mark(
+        self,
+        evaluation: Evaluation,
+        states: Mapping[TaxelState, np.ndarray],
+        cells: np.ndarray | None = None,
+    ) -> None:
+        """Name the taxels in each state; a taxel has the first of the states that it is in.
+
+        Args:
+            evaluation: gets them.
+            states: masks of the taxels, or of the cells.
+            cells: the cell of each taxel where the masks are those of cells.
+        """
+        left = np.ones(NUM_TAXELS, dtype=np.bool_)
+        for state, mask in states.items():
+            taxels = mask if cells is None else mask[cells] & (cells != NO_CELL)
+            if (marked := np.flatnonzero(taxels & left)).size:
+                evaluation.taxels[state] = tuple(marked.tolist())
+            left &= ~taxels
+
     def _report(
         self,
         evaluation: Evaluation,
@@ -129,17 +163,25 @@ class _CellCheck(ABC):
 class TaxelJudge(_CellCheck):
     """Checks the 320 taxels of our own glove from its raw counts.
 
+    A taxel drifts if for 10 s it read 2 kPa or more above its tare, or below it, while three
+    quarters of its neighbours read less than half of that: what presses there would press them,
+    too. This is only marked and raises nothing, because a point that presses one taxel looks alike.
+
     Args:
         record: calibration of the glove.
+        refused: taxels whose gain the calibration refused.
     """
 
-    def __init__(self, record: GloveRecord) -> None:
+    def __init__(self, record: GloveRecord, refused: Bool[np.ndarray, "320"] | None = None) -> None:
         super().__init__(float(FULL_SCALE_COUNTS), "taxels")
         self._indices = record.cells
         self._tare_counts = record.tare_counts[self._indices]
         self._gain_counts_per_kpa = record.gain_counts_per_kpa[self._indices]
         sigma_counts = float(np.median(record.tare_sigma_counts[self._indices]))
         self._sigma_counts = max(TARE_SIGMA_COUNTS, sigma_counts)
+        self._refused = np.zeros(NUM_TAXELS, dtype=np.bool_) if refused is None else refused
+        # Least reading of each half second of the last 10 s, with its time.
+        self._lows: deque[tuple[int, np.ndarray]] = deque()
 
     def _readings(self, values: np.ndarray) -> np.ndarray:
         return values[:, self._indices].astype(np.int64)
@@ -158,7 +200,34 @@ class TaxelJudge(_CellCheck):
         parts = {code: part for code, taxels in found.items() if (part := self._part(taxels))}
         self._report(evaluation, found, NUM_TAXELS, parts)
         evaluation.suspicious |= bool((at_top & ~saturated).any())
+        self._mark(
+            evaluation,
+            {
+                **{state: found[f"taxels_{state}"] for state in PINNED_STATES},
+                "drifting": self._drifting(evaluation.now_ns, low),
+                "refused": self._refused,
+                "absent": self._indices == NO_CELL,
+            },
+        )
         self._judge_drift(evaluation)
+
+    def _drifting(self, now_ns: int, low: np.ndarray) -> Bool[np.ndarray, "320"]:
+        """Taxels whose own zero has moved; none before 10 s are known."""
+        lows = self._lows
+        lows.append((now_ns, low))
+        while now_ns - lows[0][0] > DRIFT_NS:
+            lows.popleft()
+        if now_ns - lows[0][0] < DRIFT_NS - MAX_STEP_NS:
+            return np.zeros(NUM_TAXELS, dtype=np.bool_)
+        rows_kpa = (np.stack([row for _, row in lows]) - self._tare_counts) / (
+            self._gain_counts_per_kpa
+        )
+        rest_kpa = rows_kpa.min(axis=0)
+        rest_kpa -= np.median(rest_kpa)
+        below_kpa = np.median(rows_kpa, axis=0) - np.median(rows_kpa)
+        moved = (rest_kpa >= CONTACT_THRESHOLD_KPA) | (below_kpa <= -CONTACT_THRESHOLD_KPA)
+        still = np.abs(rest_kpa) < CONTACT_THRESHOLD_KPA / 2
+        return moved & (neighbour_share(still) >= STRONG_SHARE)
 
     def _judge_drift(self, evaluation: Evaluation) -> None:
         """Common offset of the taxels at rest; none while much of the hand is touched."""
@@ -212,7 +281,17 @@ def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellJudg
         )
     cells = mapped_cells(descriptor, calibration)
     used = None if cells is None else np.isin(np.arange(num_cells), cells[cells != NO_CELL])
-    return CellJudge(layout, used)
+    return CellJudge(layout, used, cells)
+
+
+def refused_taxels(
+    descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]
+) -> Bool[np.ndarray, "320"] | None:
+    """Taxels of our own glove whose gain the calibration refused; None where it does not say."""
+    states = np.array(calibration.get(f"{descriptor.name}_taxel_state", ())).ravel()
+    if states.shape != (NUM_RAW_TAXELS,) or descriptor.side is None:
+        return None
+    return states[raw_indices(side=descriptor.side)] > 0
 
 
 class CellJudge(_CellCheck):
@@ -226,11 +305,18 @@ class CellJudge(_CellCheck):
     Args:
         layout: full scale and grid of its cells.
         used: which of them measure a taxel; None where no map tells.
+        taxel_cells: the cell of each taxel, -1 for none; None where no map tells.
     """
 
-    def __init__(self, layout: CellLayout, used: Bool[np.ndarray, " cells"] | None = None) -> None:
+    def __init__(
+        self,
+        layout: CellLayout,
+        used: Bool[np.ndarray, " cells"] | None = None,
+        taxel_cells: Int64[np.ndarray, "320"] | None = None,
+    ) -> None:
         super().__init__(layout.full_scale, "cells")
         self._full_scale, self._grid, self.used = layout.full_scale, layout.grid, used
+        self._taxel_cells = taxel_cells
         self._lowest = self._highest = np.full(1, np.nan)
 
     def _readings(self, values: np.ndarray) -> np.ndarray:
@@ -264,6 +350,12 @@ class CellJudge(_CellCheck):
             "taxels_saturated": saturated & judged,
         }
         self._report(evaluation, found, num_cells)
+        if self._taxel_cells is not None:
+            states: dict[TaxelState, np.ndarray] = {"gone": gone}
+            states |= {state: found[f"taxels_{state}"] for state in PINNED_STATES}
+            self._mark(evaluation, states, self._taxel_cells)
+            if (absent := np.flatnonzero(self._taxel_cells == NO_CELL)).size:
+                evaluation.taxels["absent"] = tuple(absent.tolist())
         if num_gone:
             is_error = num_gone / num_cells >= CODES["nan"].error
             text = f"{num_gone} cells without a number"

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
-from dextouch.schemas import HealthEvent, HealthLevel, RaisedFinding
+from dextouch.schemas import HealthEvent, HealthLevel, RaisedFinding, TaxelState
 from services.acquisition.health.codes import CODES, NEVER, SEVERITY
 
 WINDOW_NS = 10_000_000_000
@@ -119,6 +119,7 @@ class Evaluation:
         block: samples since the last evaluation; none of the station itself.
         findings: what is wrong.
         figures: numbers by metric name.
+        taxels: which taxels of a glove are out of order, in anatomical order, by their state.
         suspicious: asks for another evaluation before the regular one, for faults that must last a
             while before they count.
     """
@@ -127,6 +128,7 @@ class Evaluation:
     block: Block = NO_SAMPLES
     findings: list[Finding] = field(default_factory=list)
     figures: dict[str, float] = field(default_factory=dict)
+    taxels: dict[TaxelState, tuple[int, ...]] = field(default_factory=dict)
     suspicious: bool = False
 
     def judge(

@@ -1,6 +1,7 @@
 """Health monitor of a station, which evaluates all of its streams once a second."""
 
 import threading
+import time
 from collections.abc import Mapping, Sequence
 
 from dextouch.schemas import (
@@ -17,7 +18,7 @@ from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.drivers.base import Driver
 from services.acquisition.glove_record import glove_record, is_ours
 from services.acquisition.health.causes import SIMULATED_ADVICE, find_causes
-from services.acquisition.health.cells import TaxelJudge, cell_judge
+from services.acquisition.health.cells import TaxelJudge, cell_judge, refused_taxels
 from services.acquisition.health.clock import ClockJudge, CountingJudge
 from services.acquisition.health.codes import CODES, SEVERITY
 from services.acquisition.health.evaluation import (
@@ -32,7 +33,12 @@ from services.acquisition.health.evaluation import (
 from services.acquisition.health.history import STATION_FIGURES, HealthHistory, StreamMeter
 from services.acquisition.health.host import HostClockJudge, HostJudge
 from services.acquisition.health.queues import SampleQueue
-from services.acquisition.health.station import CalibrationJudge, PathJudge
+from services.acquisition.health.station import (
+    CALIBRATED_AT,
+    CalibrationJudge,
+    PathJudge,
+    number,
+)
 from services.acquisition.health.streams import (
     CameraJudge,
     FiniteJudge,
@@ -94,6 +100,7 @@ class _WatchedStream(_Watched):
         self.meter = StreamMeter(
             lambda: supervisor.driver.statistics, descriptor, self.queue.capacity
         )
+        self.tared_unix_s: float | None = None
         # As the event log knows it.
         self.stale: StaleCode | None = None
 
@@ -146,7 +153,13 @@ class _WatchedStream(_Watched):
             lost=driver.statistics.lost,
             skew_ppm=None if skew is None else skew * 1e6,
             clock_residual_ms=None if residual_s is None else residual_s * 1e3,
+            taxels={} if stale else self.latest.taxels,
+            tare_age_s=self.tare_age_s(),
         )
+
+    def tare_age_s(self) -> float | None:
+        """Age of a glove's tare; None where the calibration does not say when it was made."""
+        return None if self.tared_unix_s is None else time.time() - self.tared_unix_s
 
     def _stale_words(self, stale: StaleCode, age_ns: int | None) -> str:
         if self._supervisor.last_error is not None:
@@ -349,7 +362,10 @@ def _watch(
             judges.append(TrackingJudge(supervisor.events))
         if paths is not None and paths.num_failures(descriptor.name) is not None:
             judges.append(PathJudge(descriptor.name, paths, calibration))
-        watched.append(_WatchedStream(supervisor, descriptor, judges))
+        stream = _WatchedStream(supervisor, descriptor, judges)
+        if descriptor.kind == "tactile":
+            stream.tared_unix_s = number(calibration, f"{descriptor.name}_{CALIBRATED_AT}")
+        watched.append(stream)
     return watched
 
 
@@ -359,7 +375,11 @@ def _value_judges(
     """Checks of sample values, by the kind of the stream."""
     if descriptor.kind == "tactile":
         record = glove_record(descriptor, calibration) if is_ours(descriptor) else None
-        cells = TaxelJudge(record) if record else cell_judge(driver.decoder, calibration)
+        cells = (
+            TaxelJudge(record, refused_taxels(descriptor, calibration))
+            if record
+            else cell_judge(driver.decoder, calibration)
+        )
         nan = FiniteJudge("nan", "taxels are no numbers")
         return [nan] if cells is None else [nan, cells]
     if descriptor.kind == "keypoints":

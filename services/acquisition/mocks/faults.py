@@ -65,7 +65,8 @@ class DeviceFaults(FrozenModel):
     comes. From `wrong_side_from_s` on the other hand's device answers, from `version_from_s` on one
     of another packet version. The counter starts at `first_sequence` and wraps at 2^32.
     `dead_taxels` are raw cells that always read zero, stuck ones a constant, saturated ones full
-    scale. `nan_probability` puts a NaN into a packet of numbers.
+    scale; the zero of drifted ones is `drift_counts` from where it was at the tare (our glove
+    only). `nan_probability` puts a NaN into a packet of numbers.
 
     Trackers only, counted from the start of every round: during `occluded_s` a pose tracker says
     that it is out of range and drifts, a finger tracker does not see the thumb; during
@@ -90,6 +91,8 @@ class DeviceFaults(FrozenModel):
     dead_taxels: tuple[int, ...] = ()
     stuck_taxels: tuple[int, ...] = ()
     saturated_taxels: tuple[int, ...] = ()
+    drifted_taxels: tuple[int, ...] = ()
+    drift_counts: int = Field(default=300, ge=-65_535, le=65_535)
     occluded_s: tuple[tuple[float, float], ...] = ()
     not_running_s: tuple[tuple[float, float], ...] = ()
     jumped_s: tuple[tuple[float, float], ...] = ()
@@ -140,6 +143,17 @@ class FaultScript(FrozenModel):
         devices["camera_head"] = devices["camera_wrist_left"]
         devices["robot_state"] = base.model_copy(update={"path_delay_ms": 1.0})
         return FaultScript(devices=devices, others=base)
+
+    @staticmethod
+    def worn_glove() -> "FaultScript":
+        """A left glove with taxels out of order, as raw cells; all else is in order."""
+        worn = DeviceFaults(
+            dead_taxels=(148, 272, 9),
+            stuck_taxels=(225, 235),
+            saturated_taxels=(99, 255),
+            drifted_taxels=(300, 143),
+        )
+        return FaultScript(devices={"glove_left": worn})
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ export function age(value_s) {
   if (value_s === null || value_s === undefined || !Number.isFinite(value_s)) return MISSING;
   if (value_s < 1) return `${Math.round(value_s * 1000)} ms`;
   if (value_s < 120) return `${value_s.toFixed(1)} s`;
-  return `${Math.round(value_s / 60)} min`;
+  if (value_s < 2 * 3600) return `${Math.round(value_s / 60)} min`;
+  return value_s < 48 * 3600 ? `${Math.round(value_s / 3600)} h` : `${Math.round(value_s / 86400)} days`;
 }
 
 export function stopwatch(value_s) {

@@ -1,11 +1,16 @@
 // Pressures of one hand → a canvas in hand layout. Layout and colours come from the server, which
 // takes them from dextouch.tactile.heatmap, so that report and page show the same picture.
 
+import { setText } from "./dom.js";
+import { number } from "./format.js";
+import { drawMark } from "./taxel_marks.js";
+import { PADS, padForces, STATES, statesOf, taxelName, trusted } from "./taxels.js";
+
 const GAP = 0.09;
 const TIP_TAXELS = 16;
 const NUM_TIPS = 5;
 
-function css(name) {
+export function css(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
@@ -17,9 +22,10 @@ function box(cells, columns) {
 }
 
 export class HandCanvas {
-  constructor(canvas, text, side, heatmap) {
+  // `texts` may hold elements for a summary, the forces of the pads, and the taxel under the pointer.
+  constructor(canvas, texts, side, heatmap) {
     this.canvas = canvas;
-    this.text = text;
+    this.texts = texts;
     this.heatmap = heatmap;
     this.cells = heatmap.cells[side];
     this.pads = [];
@@ -28,20 +34,55 @@ export class HandCanvas {
     }
     this.palm = box(this.cells.slice(NUM_TIPS * TIP_TAXELS), heatmap.columns);
     this.pressures_kpa = null;
+    this.states = new Map();
+    this.hovered = null;
     this.waiting = false;
+    for (const name of ["pointermove", "pointerdown"]) canvas.addEventListener(name, (event) => this.hover(event));
+    canvas.addEventListener("pointerleave", () => this.hover(null));
     new ResizeObserver(() => this.request()).observe(canvas);
     this.request();
   }
 
   update(pressures_kpa) {
+    if (pressures_kpa.length === 0) {
+      this.clear("no glove is heard");
+      return;
+    }
     this.pressures_kpa = pressures_kpa;
     this.request();
   }
 
   clear(words) {
     this.pressures_kpa = null;
-    this.text.textContent = words;
+    if (this.texts.summary) setText(this.texts.summary, words);
     this.request();
+  }
+
+  // Taxels that are out of order, by their state.
+  mark(taxels) {
+    this.states = statesOf(taxels);
+    this.request();
+  }
+
+  hover(event) {
+    this.hovered = event === null ? null : this.taxelAt(event.offsetX, event.offsetY);
+    this.request();
+  }
+
+  // The taxel at a place of the canvas in CSS pixels; null between taxels.
+  taxelAt(x_px, y_px) {
+    const { cell_px, left_px, top_px } = this.placement(this.canvas.clientWidth, this.canvas.clientHeight);
+    const [column, row] = [Math.floor((x_px - left_px) / cell_px), Math.floor((y_px - top_px) / cell_px)];
+    if (column < 0 || column >= this.heatmap.columns) return null;
+    const taxel = this.cells.indexOf(row * this.heatmap.columns + column);
+    return taxel < 0 ? null : taxel;
+  }
+
+  placement(width, height) {
+    const margin = 1;
+    const { columns, rows } = this.heatmap;
+    const cell_px = Math.min(width / (columns + 2 * margin), height / (rows + 2 * margin));
+    return { cell_px, left_px: (width - cell_px * columns) / 2, top_px: (height - cell_px * rows) / 2 };
   }
 
   request() {
@@ -62,15 +103,15 @@ export class HandCanvas {
       this.canvas.width = width;
       this.canvas.height = height;
     }
-    const margin = 1;
-    const cell_px = Math.min(width / (this.heatmap.columns + 2 * margin), height / (this.heatmap.rows + 2 * margin));
+    const { cell_px, left_px, top_px } = this.placement(width, height);
     const context = this.canvas.getContext("2d");
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.clearRect(0, 0, width, height);
-    context.setTransform(cell_px, 0, 0, cell_px,
-      (width - cell_px * this.heatmap.columns) / 2, (height - cell_px * this.heatmap.rows) / 2);
+    context.setTransform(cell_px, 0, 0, cell_px, left_px, top_px);
     this.drawSilhouette(context);
     this.drawTaxels(context);
+    this.drawMarks(context, { cell_px, left_px, top_px });
+    this.showTexts();
   }
 
   drawSilhouette(context) {
@@ -99,16 +140,12 @@ export class HandCanvas {
   drawTaxels(context) {
     const { ramp, columns, full_scale_kpa, contact_kpa } = this.heatmap;
     const empty = css("--cell");
-    let peak_kpa = 0;
-    let touching = 0;
     this.cells.forEach((cell, taxel) => {
       const pressure_kpa = this.pressures_kpa ? this.pressures_kpa[taxel] : NaN;
       if (Number.isFinite(pressure_kpa) && pressure_kpa >= contact_kpa / 2) {
         const share = Math.min(pressure_kpa / full_scale_kpa, 1);
         const [red, green, blue] = ramp[Math.round(share * (ramp.length - 1))];
         context.fillStyle = `rgb(${red} ${green} ${blue})`;
-        peak_kpa = Math.max(peak_kpa, pressure_kpa);
-        if (pressure_kpa >= contact_kpa) touching += 1;
       } else {
         context.fillStyle = empty;
       }
@@ -118,8 +155,40 @@ export class HandCanvas {
       context.roundRect(column + GAP, row + GAP, 1 - 2 * GAP, 1 - 2 * GAP, 0.24);
       context.fill();
     });
-    if (this.pressures_kpa) {
-      this.text.textContent = touching === 0 ? "no contact" : `${touching} taxels in contact, peak ${peak_kpa.toFixed(0)} kPa`;
+  }
+
+  drawMarks(context, { cell_px, left_px, top_px }) {
+    const place = (taxel) => {
+      const [row, column] = [Math.floor(this.cells[taxel] / this.heatmap.columns), this.cells[taxel] % this.heatmap.columns];
+      context.setTransform(cell_px, 0, 0, cell_px, left_px + column * cell_px, top_px + row * cell_px);
+    };
+    for (const [taxel, state] of this.states) {
+      place(taxel);
+      drawMark(context, state, css);
+    }
+    if (this.hovered === null) return;
+    place(this.hovered);
+    context.strokeStyle = css("--ink");
+    context.lineWidth = 0.18;
+    context.strokeRect(0, 0, 1, 1);
+  }
+
+  showTexts() {
+    const { summary, forces, taxel } = this.texts;
+    const pressures_kpa = this.pressures_kpa;
+    const known_kpa = pressures_kpa && trusted(pressures_kpa, this.states);
+    if (summary && known_kpa) {
+      const touching = known_kpa.filter((value) => value >= this.heatmap.contact_kpa);
+      setText(summary, touching.length === 0 ? "no contact" : `${touching.length} taxels in contact, peak ${Math.max(...touching).toFixed(0)} kPa`);
+    }
+    if (forces) {
+      const forces_n = known_kpa ? padForces(known_kpa, this.heatmap.contact_kpa) : PADS.map(() => null);
+      [...forces.children].forEach((value, pad) => setText(value.lastElementChild, number(forces_n[pad], 1, "N")));
+    }
+    if (taxel) {
+      const state = STATES[this.states.get(this.hovered)]?.text ?? "in order";
+      const pressure = number(pressures_kpa?.[this.hovered], 1, "kPa");
+      setText(taxel, this.hovered === null ? "" : `${taxelName(this.hovered)}: ${pressure} · ${state}`);
     }
   }
 }
@@ -133,7 +202,8 @@ export function drawScale(canvas, heatmap) {
   });
 }
 
-// Binary message: uint8 kind (1), uint8 side (0 left, 1 right), uint16 count, count × float32 kPa, little endian.
+// Binary message: uint8 kind (1), uint8 side (0 left, 1 right), uint16 count (0 of a glove that is not heard), count × float32 kPa,
+// little endian.
 export function readTaxels(buffer) {
   const view = new DataView(buffer);
   if (view.getUint8(0) !== 1) return null;

@@ -1,7 +1,6 @@
-// Services, newest takes and camera thumbnails → short lists.
+// Services and newest takes → short lists.
 
 import { element, levelBadge } from "./dom.js";
-import { age } from "./format.js";
 import { ask } from "./session.js";
 
 export function showServices(list, services) {
@@ -55,18 +54,4 @@ export function showRefused(list, refused) {
 export function showTakes(body, { takes, note }) {
   const empty = element("tr", {}, element("td", { colspan: 5, class: "free" }, note));
   body.replaceChildren(...(takes.length ? takes.map(takeRow) : [empty]));
-}
-
-export function showCameras(section, row, cameras) {
-  section.hidden = cameras.length === 0;
-  const known = new Map([...row.children].map((figure) => [figure.dataset.name, figure]));
-  for (const camera of cameras) {
-    const figure = known.get(camera.name) ?? row.appendChild(element("figure", { "data-name": camera.name },
-      element("img", { alt: `newest image of ${camera.name}` }), element("figcaption", {})));
-    figure.querySelector("img").src = `/v1/cameras/${encodeURIComponent(camera.name)}.jpg?at=${camera.image_index}`;
-    const caption = figure.querySelector("figcaption");
-    caption.replaceChildren(camera.name.replace(/^camera_/, "").replaceAll("_", " "), element("span", { class: "quiet" }, age(camera.age_s)));
-    known.delete(camera.name);
-  }
-  for (const figure of known.values()) figure.remove();
 }

@@ -1,24 +1,67 @@
 // The page: one live link feeds the panels; a panel that is out of sight is not sent.
 
+import { CameraPanel } from "./cameras.js";
 import { DevicesPanel } from "./devices.js";
-import { setText } from "./dom.js";
-import { drawScale, HandCanvas, readTaxels } from "./hands.js";
-import { showCameras, showRefused, showServices, showTakes } from "./lists.js";
+import { element, setText } from "./dom.js";
+import { age } from "./format.js";
+import { Freshness } from "./freshness.js";
+import { css, drawScale, HandCanvas, readTaxels } from "./hands.js";
+import { showRefused, showServices, showTakes } from "./lists.js";
 import { LiveLink } from "./live.js";
+import { PoseView } from "./pose_view.js";
+import { readPoses } from "./poses.js";
 import { RecorderPanel } from "./recorder.js";
 import { ask } from "./session.js";
+import { showLegend } from "./taxel_marks.js";
+import { PADS } from "./taxels.js";
 import { startTheme } from "./theme.js";
 
 const find = (id) => document.getElementById(id);
 const heatmap = await (await ask("/v1/heatmap")).json();
 const hands = {
-  left: new HandCanvas(find("hand_left"), find("hand_left_text"), "left", heatmap),
-  right: new HandCanvas(find("hand_right"), find("hand_right_text"), "right", heatmap),
+  left: new HandCanvas(find("hand_left"), textsOf("left"), "left", heatmap),
+  right: new HandCanvas(find("hand_right"), textsOf("right"), "right", heatmap),
 };
+
+function textsOf(side) {
+  const forces = find(`hand_${side}_forces`);
+  forces.replaceChildren(...PADS.map((pad) => element("div", {}, element("dt", {}, pad), element("dd", {}, "–"))));
+  return { summary: find(`hand_${side}_text`), forces, taxel: find(`hand_${side}_taxel`) };
+}
+
+const poses = new PoseView(find("pose_canvas"), find("pose_list"), heatmap.bones);
+const cameras = new CameraPanel(find("cameras"), find("camera_row"), find("camera_larger"));
 const recorder = new RecorderPanel(find("recorder"));
 const devices = new DevicesPanel(find("devices"));
 drawScale(find("scale"), heatmap);
 setText(find("scale_end"), `${heatmap.full_scale_kpa} kPa`);
+
+// Nothing of what moves stays on the page for longer than this after its last update.
+const STALE_MS = 800;
+const clearTouch = (reason) => Object.values(hands).forEach((hand) => hand.clear(reason));
+const fresh = {
+  station: new Freshness(STALE_MS, () => showNoStation("The dashboard sends no updates: what you saw is old.")),
+  taxels: new Freshness(STALE_MS, () => clearTouch("no updates")),
+  poses: new Freshness(STALE_MS, () => poses.clear("no updates")),
+  cameras: new Freshness(STALE_MS, () => cameras.show([])),
+};
+
+function showNoStation(note) {
+  showStation({ level: "STALE", summary: "", note, note_level: "ERROR", reachable: false, host: null, causes: [], streams: [],
+    recorder: { state: "unknown", actions: [], elapsed_s: null, problems: [], level: "STALE" } });
+}
+
+// Marks of taxels, and the age of each glove's tare.
+function showGloves(gloves) {
+  const counts = {};
+  for (const [side, hand] of Object.entries(hands)) {
+    const glove = gloves[side];
+    hand.mark(glove?.taxels ?? {});
+    for (const [state, taxels] of Object.entries(glove?.taxels ?? {})) counts[state] = (counts[state] ?? 0) + taxels.length;
+    setText(find(`hand_${side}_tare`), glove ? `tared ${glove.tare_age_s === null ? "at an unknown time" : `${age(glove.tare_age_s)} ago`}` : "");
+  }
+  showLegend(find("taxel_legend"), counts, css);
+}
 
 function showStation(station) {
   const overall = find("overall");
@@ -27,10 +70,16 @@ function showStation(station) {
   setText(find("summary"), station.summary);
   devices.show(station);
   recorder.show(station.recorder, station.level);
+  showGloves(station.gloves ?? {});
 }
 
 const topics = {
-  station: showStation,
+  station: (station) => {
+    // The view of a station that answers changes every time, by the ages of its samples.
+    if (station.streams.length > 0) fresh.station.note();
+    else fresh.station.stop();
+    showStation(station);
+  },
   trends: (trends) => devices.showTrends(trends),
   services: (services) => showServices(find("service_list"), services),
   takes: (takes) => {
@@ -38,22 +87,36 @@ const topics = {
     showRefused(find("refused_list"), takes.refused);
   },
   last_take: (take) => recorder.showLast(take),
-  cameras: (cameras) => showCameras(find("cameras"), find("camera_row"), cameras),
-  taxels_lost: (reason) => Object.values(hands).forEach((hand) => hand.clear(reason)),
+  cameras: (shown) => {
+    if (shown.length > 0) fresh.cameras.note();
+    cameras.show(shown);
+  },
+  taxels_lost: clearTouch,
+  poses_lost: (reason) => poses.clear(reason),
 };
 
 const link = new LiveLink({
   onTopic: (topic, data) => topics[topic]?.(data),
   onBinary: (buffer) => {
     const taxels = readTaxels(buffer);
-    if (taxels) hands[taxels.side].update(taxels.pressures_kpa);
+    if (taxels) {
+      fresh.taxels.note();
+      hands[taxels.side].update(taxels.pressures_kpa);
+    }
+    const streams = readPoses(buffer);
+    if (streams) {
+      fresh.poses.note();
+      poses.update(streams);
+    }
   },
   onState: (connected) => {
     setText(find("link"), connected ? "live" : "dashboard not reachable, trying again");
     if (!connected) {
-      showStation({ level: "STALE", summary: "", note: "No link to the dashboard: what you see is old.", note_level: "ERROR", reachable: false,
-        host: null, causes: [], streams: [], recorder: { state: "unknown", actions: [], elapsed_s: null, problems: [], level: "STALE" } });
-      Object.values(hands).forEach((hand) => hand.clear("no link"));
+      fresh.station.stop();
+      showNoStation("No link to the dashboard: what you see is old.");
+      clearTouch("no link");
+      poses.clear("no link");
+      cameras.show([]);
     }
   },
 });
@@ -70,4 +133,4 @@ for (const section of document.querySelectorAll("[data-view]")) {
   if (!["station", "cameras"].includes(section.dataset.view)) observer.observe(section);
 }
 document.addEventListener("visibilitychange", () => link.sendView());
-startTheme(find("theme"), () => Object.values(hands).forEach((hand) => hand.request()));
+startTheme(find("theme"), () => [...Object.values(hands), poses].forEach((picture) => picture.request()));

@@ -124,6 +124,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.station import TakeProblem as TakeProblem
     from dextouch.schemas.station import TakePrompt as TakePrompt
     from dextouch.schemas.station import TakeSpan as TakeSpan
+    from dextouch.schemas.station import TaxelState as TaxelState
     from dextouch.schemas.station import UploadStatus as UploadStatus
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)

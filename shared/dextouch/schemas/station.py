@@ -12,6 +12,7 @@ RecorderAction = Literal["arm", "record", "stop", "save", "discard", "rerecord"]
 HealthLevel = Literal["OK", "WARN", "ERROR", "STALE"]
 StaleCode = Literal["unplugged", "silent"]
 LinkKind = Literal["hub", "network", "bridge"]
+TaxelState = Literal["dead", "stuck", "saturated", "drifting", "gone", "refused", "absent"]
 CauseCode = Literal["host", "hub", "network", "bridge", "gone", "clock", "device", "station"]
 
 
@@ -161,7 +162,9 @@ class StreamHealth(FrozenModel):
 
     `stale` says why nothing is known; it is the first of the findings then. `reasons` are their
     messages. `figures` are the numbers behind them by their Prometheus names, none while the
-    stream is stale.
+    stream is stale. Of a glove, `taxels` are those out of order by their state, in anatomical
+    order (`dextouch.tactile.layout`), and `tare_age_s` is the age of its tare where the calibration
+    says when it was made.
     """
 
     stream: str
@@ -180,6 +183,8 @@ class StreamHealth(FrozenModel):
     lost: int
     skew_ppm: float | None = None
     clock_residual_ms: float | None = None
+    taxels: dict[TaxelState, tuple[int, ...]] = Field(default_factory=dict)
+    tare_age_s: float | None = None
 
 
 class SharedLink(FrozenModel):

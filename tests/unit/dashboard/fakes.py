@@ -67,7 +67,9 @@ class FakeServices:
         self.history = pack({"stream_series": ["rate_hz"], "nominal_rate_hz": {}}, {})
         self.app.get("/v1/health/history")(lambda: Response(self.history))
         self.app.get("/v1/recorder")(lambda: self.recorder)
+        self.pressures = dict(PRESSURES)
         self.app.get("/v1/live/taxels")(self._taxels)
+        self.app.get("/v1/live/poses")(self._poses)
         self.app.post("/v1/recorder/{action}")(self._act)
         self.episodes = [EPISODE]
         self.app.get("/v1/episodes")(self._list_episodes)
@@ -90,8 +92,13 @@ class FakeServices:
         return {"recordings": self.recordings, "num_matching": len(self.recordings)}
 
     def _taxels(self):
-        arrays = {f"tactile_{side}": values for side, values in PRESSURES.items()}
+        arrays = {f"tactile_{side}": values for side, values in self.pressures.items()}
         return Response(pack({}, arrays), media_type="application/msgpack")
+
+    def _poses(self):
+        ages_s = {"head": None, "wrist_left": 0.02}
+        arrays = {"wrist_left": np.eye(4, dtype=np.float32)}
+        return Response(pack({"age_s": ages_s}, arrays), media_type="application/msgpack")
 
     def _act(self, action: str, wanted: dict):
         if action == "record" and self.recorder["state"] != "armed":

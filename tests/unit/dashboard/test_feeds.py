@@ -142,7 +142,7 @@ async def test_absent_station_shows_no_numbers():
     view = await Feeds(
         {"acquisition": broken_upstream("acquisition")}, DashboardSettings()
     ).station()
-    assert (view.reachable, view.level, view.streams) == (False, "ERROR", ())
+    assert (view.reachable, view.level, view.streams) == (False, "STALE", ())
     assert "acquisition: no answer to GET" in view.note
 
 
@@ -262,17 +262,34 @@ async def test_taxel_messages_carry_the_pressures(feeds):
         np.testing.assert_array_equal(np.frombuffer(message[4:], "<f4"), PRESSURES[side])
 
 
-async def test_lost_taxels_are_said():
+async def test_a_glove_that_is_not_heard_clears_its_map(feeds, services):
+    services.pressures.pop("left")
+    left, right = await feeds.topics["taxels"].newest()
+    assert left == bytes([1, 0, 0, 0])
+    assert len(right) == 4 + 4 * 320
+
+
+@pytest.mark.parametrize("topic", ["taxels", "poses"])
+async def test_lost_live_data_is_said(topic):
     feeds = Feeds({"acquisition": broken_upstream("acquisition")}, DashboardSettings())
-    (message,) = await feeds.topics["taxels"].newest()
-    assert json.loads(message)["topic"] == "taxels_lost"
+    (message,) = await feeds.topics[topic].newest()
+    assert json.loads(message)["topic"] == f"{topic}_lost"
+
+
+async def test_pose_messages_say_the_age_of_every_tracker(feeds):
+    (message,) = await feeds.topics["poses"].newest()
+    length = int.from_bytes(message[2:4], "little")
+    assert (message[0], length % 4) == (2, 0)
+    rows = json.loads(message[4 : 4 + length])
+    assert rows == [["head", None, 0], ["wrist_left", 0.02, 16]]
+    np.testing.assert_array_equal(np.frombuffer(message[4 + length :], "<f4"), np.eye(4).ravel())
 
 
 def test_the_page_draws_every_topic(feeds):
     page = Path(app.STATIC / "main.js").read_text(encoding="utf-8")
     handlers = page.split("const topics = {")[1].split("\n};")[0]
-    # Taxels are bytes, with a handler of their own; studies are on other pages.
-    assert set(feeds.topics) - {"taxels", "studies"} <= set(
+    # Taxels and poses are bytes, with handlers of their own; studies are on other pages.
+    assert set(feeds.topics) - {"taxels", "poses", "studies"} <= set(
         re.findall(r"^  (\w+):", handlers, re.MULTILINE)
     )
 

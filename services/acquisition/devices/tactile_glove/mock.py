@@ -1,6 +1,6 @@
 """Simulated glove of our own protocol, with its own offsets and gains, that answers requests."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +29,7 @@ from services.acquisition.drivers.packets import (
     PacketDecoder,
     encode_packet,
 )
-from services.acquisition.mocks.faults import OurPacketEdits, Pinned
+from services.acquisition.mocks.faults import DeviceFaults, OurPacketEdits, Pinned
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.mocks.replay import (
     MockDevice,
@@ -138,7 +138,7 @@ def mock_glove(
         place.stream,
         side=told,
         calibration=glove,
-        dead_taxels=place.faults.dead_taxels,
+        faults=place.faults,
     )
     # The device is made of its port, and tells its time to what answers there.
     answers = GloveAnswers(
@@ -157,7 +157,7 @@ class TactileGloveSource(PacketSource):
         stream: float32 [n, 320] in kPa.
         side: which hand.
         calibration: of this glove.
-        dead_taxels: raw cells that read zero.
+        faults: whose dead and drifted raw cells are planted.
     """
 
     edits = OurPacketEdits(PINNED)
@@ -168,7 +168,7 @@ class TactileGloveSource(PacketSource):
         *,
         side: Side,
         calibration: GloveCalibration,
-        dead_taxels: Sequence[int] = (),
+        faults: DeviceFaults | None = None,
     ) -> None:
         if stream.descriptor.shape != (NUM_TAXELS,):
             raise ShapeError(
@@ -177,7 +177,11 @@ class TactileGloveSource(PacketSource):
         self.t_ns = stream.t_ns
         self._side = side
         self._counts = calibration.counts(stream.values, side=side)
-        self._counts[:, list(dead_taxels)] = 0
+        faults = faults or DeviceFaults()
+        drifted = list(faults.drifted_taxels)
+        moved = self._counts[:, drifted].astype(np.int64) + faults.drift_counts
+        self._counts[:, drifted] = np.clip(moved, 0, FULL_SCALE_COUNTS)
+        self._counts[:, list(faults.dead_taxels)] = 0
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet."""

@@ -1,0 +1,56 @@
+// Names, states and forces of a hand's 320 taxels; no DOM, so that node can test it.
+
+export const PADS = ["thumb", "index", "middle", "ring", "little", "palm"];
+const TIP_TAXELS = 16;
+const NUM_TIPS = 5;
+const COLUMNS = { tip: 4, palm: 16 };
+const AREAS_MM2 = { tip: 16, palm: 30 };
+
+// In the order of the legend; the first one of a taxel is shown.
+export const STATES = {
+  dead: { level: "ERROR", mark: "cross", text: "dead: reads nothing" },
+  saturated: { level: "ERROR", mark: "triangle", text: "saturated: at full scale" },
+  stuck: { level: "WARN", mark: "bar", text: "stuck: keeps one load" },
+  drifting: { level: "WARN", mark: "diamond", text: "drifting: its own zero has moved" },
+  gone: { level: "ERROR", mark: "cross", text: "gone: sends no number" },
+  refused: { level: "STALE", mark: "ring", text: "refused by the calibration, which gives it the gain of its pad" },
+  absent: { level: "STALE", mark: "dot", text: "absent: no cell of this glove measures it" },
+};
+
+// States in which a taxel still measures; undefined is one in order.
+const MEASURES = new Set([undefined, "refused"]);
+
+function placeOf(taxel) {
+  const isTip = taxel < NUM_TIPS * TIP_TAXELS;
+  const pad = isTip ? Math.floor(taxel / TIP_TAXELS) : NUM_TIPS;
+  return { pad, kind: isTip ? "tip" : "palm", inPad: taxel - pad * TIP_TAXELS };
+}
+
+// Pad, row from distal to proximal and column from the thumb's side, counted from 1.
+export function taxelName(taxel) {
+  const { pad, kind, inPad } = placeOf(taxel);
+  const columns = COLUMNS[kind];
+  return `${PADS[pad]}${kind === "tip" ? " tip" : ""}, row ${Math.floor(inPad / columns) + 1}, column ${(inPad % columns) + 1}`;
+}
+
+// Pressures without those of taxels that are out of order: what they read is no touch.
+export function trusted(pressures_kpa, states) {
+  return pressures_kpa.map((pressure_kpa, taxel) => (MEASURES.has(states.get(taxel)) ? pressure_kpa : 0));
+}
+
+// Force on each pad in newton: pressure times area of the taxels in contact.
+export function padForces(pressures_kpa, contact_kpa) {
+  const forces_n = new Array(PADS.length).fill(0);
+  pressures_kpa.forEach((pressure_kpa, taxel) => {
+    const { pad, kind } = placeOf(taxel);
+    if (pressure_kpa >= contact_kpa) forces_n[pad] += pressure_kpa * AREAS_MM2[kind] * 1e-3;
+  });
+  return forces_n;
+}
+
+// State of each taxel that is out of order, from {state: [taxel, …]}; unknown states of later releases are left out.
+export function statesOf(taxels) {
+  const found = new Map();
+  for (const state of Object.keys(STATES)) for (const taxel of taxels[state] ?? []) if (!found.has(taxel)) found.set(taxel, state);
+  return found;
+}
