@@ -14,7 +14,12 @@ from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.health import HealthCollector
 from services.acquisition.memory import keep_for_life
 from services.acquisition.metrics import RecorderCollector
-from services.acquisition.routes import recorder_router, station_router, uploads_router
+from services.acquisition.routes import (
+    live_router,
+    recorder_router,
+    station_router,
+    uploads_router,
+)
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader, recover_spool
@@ -133,6 +138,7 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
             recorder_router(station),
             station_router(station, uploads),
             uploads_router(uploads),
+            live_router(station),
         ],
         lifespan=lifespan,
         readiness=missing,

@@ -14,6 +14,7 @@ from dextouch.schemas import (
     RecorderStatus,
     SaveTake,
     StationHealth,
+    StationOverview,
     StoreId,
     TakeName,
     TakePrompt,
@@ -139,36 +140,6 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
             return Response(packed_history(facts, rows), media_type=MSGPACK)
         return Response(json_history(facts, rows), media_type=JSON)
 
-    @router.get(
-        "/live/taxels", response_class=Response, responses={200: {"content": {MSGPACK: {}}}}
-    )
-    async def taxels() -> Response:
-        """Newest pressures (kPa, float32 [320]) of the gloves that are heard, packed."""
-        pressures = station.live.pressures_kpa(station.clock.now_ns())
-        return Response(pack({}, pressures), media_type=MSGPACK)
-
-    @router.get("/live/poses", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
-    async def poses() -> Response:
-        """Newest poses and keypoints that are at most 0.5 s old, and the age of each stream's."""
-        now_ns = station.clock.now_ns()
-        ages_s = station.live.ages_s({"pose", "keypoints"}, now_ns)
-        return Response(pack({"age_s": ages_s}, station.live.poses(now_ns)), media_type=MSGPACK)
-
-    @router.get("/live/cameras")
-    async def cameras() -> CameraList:
-        """Cameras that have sent an image."""
-        return CameraList(cameras=tuple(station.live.cameras(station.clock.now_ns())))
-
-    @router.get(
-        "/live/cameras/{name}",
-        response_class=Response,
-        responses={200: {"content": {"image/jpeg": {}}}},
-    )
-    async def camera(name: str) -> Response:
-        """Newest image as JPEG."""
-        image = station.live.jpeg(name, station.clock.now_ns())
-        return Response(image, media_type="image/jpeg")
-
     return router
 
 
@@ -194,3 +165,65 @@ def uploads_router(uploader: Uploader) -> APIRouter:
         return await run_in_threadpool(uploader.retry, recording_id)
 
     return router
+
+
+def live_router(station: Station) -> APIRouter:
+    """What a station shows at this moment: taxels, poses, cameras, and a tile of a wall."""
+    router = APIRouter(
+        prefix="/v1/live", tags=["station"], dependencies=[Depends(RequireScope(SCOPE))]
+    )
+
+    @router.get("/overview", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
+    async def overview() -> Response:
+        """A `StationOverview` and the newest pressures of the gloves that are heard, packed."""
+        fields = await run_in_threadpool(station_overview, station)
+        pressures = station.live.pressures_kpa(station.clock.now_ns())
+        return Response(pack(fields.model_dump(mode="json"), pressures), media_type=MSGPACK)
+
+    @router.get("/taxels", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
+    async def taxels() -> Response:
+        """Newest pressures (kPa, float32 [320]) of the gloves that are heard, packed."""
+        pressures = station.live.pressures_kpa(station.clock.now_ns())
+        return Response(pack({}, pressures), media_type=MSGPACK)
+
+    @router.get("/poses", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
+    async def poses() -> Response:
+        """Newest poses and keypoints that are at most 0.5 s old, and the age of each stream's."""
+        now_ns = station.clock.now_ns()
+        ages_s = station.live.ages_s({"pose", "keypoints"}, now_ns)
+        return Response(pack({"age_s": ages_s}, station.live.poses(now_ns)), media_type=MSGPACK)
+
+    @router.get("/cameras")
+    async def cameras() -> CameraList:
+        """Cameras that have sent an image."""
+        return CameraList(cameras=tuple(station.live.cameras(station.clock.now_ns())))
+
+    @router.get(
+        "/cameras/{name}",
+        response_class=Response,
+        responses={200: {"content": {"image/jpeg": {}}}},
+    )
+    async def camera(name: str) -> Response:
+        """Newest image as JPEG."""
+        image = station.live.jpeg(name, station.clock.now_ns())
+        return Response(image, media_type="image/jpeg")
+
+    return router
+
+
+def station_overview(station: Station) -> StationOverview:
+    """The station in a few values, for a page that shows many stations."""
+    health, recorder = station.health.report(), station.recorder.status()
+    ages_s = [stream.age_s for stream in health.streams if stream.age_s is not None]
+    return StationOverview(
+        station=station.name,
+        level=health.level,
+        cause=next((c.message for c in health.causes if c.level == health.level), ""),
+        recorder=recorder.state,
+        task=recorder.prompt.task if recorder.prompt else None,
+        duration_s=recorder.duration_s,
+        age_s=min(ages_s, default=None),
+        disk_left_s=health.figures.get("disk_left_seconds"),
+        disk_free_bytes=health.figures.get("disk_free_bytes"),
+        cameras=tuple(station.live.cameras(station.clock.now_ns())),
+    )

@@ -12,6 +12,7 @@ from prometheus_client import Gauge
 from dextouch.serving import AccessControl, create_service_app, serve
 from services.dashboard.comparison import Comparisons
 from services.dashboard.feeds import Feeds
+from services.dashboard.fleet import Fleet
 from services.dashboard.forwarding import forwarding_router
 from services.dashboard.pages import Sessions, page_router, refusal_page
 from services.dashboard.rollout_feeds import RolloutFeeds
@@ -32,14 +33,24 @@ def create_app(
         upstreams: clients of the services; created from the settings' URLs by default.
     """
     if upstreams is None:
-        upstreams = {
-            name: Upstream.connect(
-                name, url, key=settings.upstream_key, timeout_s=settings.upstream_timeout_s
-            )
-            for name, url in settings.upstream_urls().items()
+        connect = partial(
+            Upstream.connect, key=settings.upstream_key, timeout_s=settings.upstream_timeout_s
+        )
+        upstreams = {name: connect(name, url) for name, url in settings.upstream_urls().items()}
+        stations = {
+            name: connect("acquisition", url) for name, url in settings.station_urls().items()
         }
-    feeds = Feeds(upstreams, settings)
-    comparisons = Comparisons(feeds, period_s=settings.station_period_s)
+    else:
+        stations = (
+            {settings.station: upstreams["acquisition"]} if "acquisition" in upstreams else {}
+        )
+    feeds = {
+        name: Feeds({"acquisition": client, **upstreams}, settings)
+        for name, client in stations.items()
+    }
+    fleet = Fleet(feeds or {settings.station: Feeds(upstreams, settings)}, settings)
+    shared = fleet.of()
+    comparisons = Comparisons(shared, period_s=settings.station_period_s)
     sessions = Sessions(
         AccessControl(settings.api_keys),
         needs_key=bool(settings.api_keys),
@@ -50,7 +61,7 @@ def create_app(
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         yield
         await comparisons.stop()
-        for upstream in upstreams.values():
+        for upstream in (*upstreams.values(), *stations.values()):
             await upstream.close()
 
     app = create_service_app(
@@ -58,19 +69,18 @@ def create_app(
         settings=settings,
         routers=[
             page_router(settings, sessions),
-            api_router(settings, feeds, sessions),
-            forwarding_router(feeds, sessions),
+            api_router(settings, fleet, sessions),
+            forwarding_router(fleet, sessions),
             comparison_router(comparisons, sessions),
             live_router(
-                [feeds.topics.get, comparisons.topics.get, RolloutFeeds(feeds, settings).topic],
-                sessions,
+                fleet, [comparisons.topics.get, RolloutFeeds(shared, settings).topic], sessions
             ),
         ],
         lifespan=lifespan,
         admits=sessions.allows,
     )
     seconds = upstream_histogram()
-    for upstream in upstreams.values():
+    for upstream in (*upstreams.values(), *stations.values()):
         upstream.seconds = seconds
     app.state.registry.register(seconds)
     text = "Signed-in browsers."

@@ -6,9 +6,10 @@ from typing import Final, Literal
 from urllib.parse import quote
 
 from fastapi import APIRouter, Depends, Request, Response
+from starlette.datastructures import QueryParams
 
 from dextouch.serving import JSON, KIB, takes
-from services.dashboard.feeds import Feeds
+from services.dashboard.fleet import Fleet
 from services.dashboard.pages import Sessions
 
 # Headers of a response that a browser needs to show and to cache it.
@@ -70,7 +71,7 @@ FORWARDED: Final = (
 )
 
 
-def forwarding_router(feeds: Feeds, sessions: Sessions) -> APIRouter:
+def forwarding_router(fleet: Fleet, sessions: Sessions) -> APIRouter:
     """Create the forwarded routes; the services' own documents describe their bodies."""
     router = APIRouter(
         prefix="/v1", dependencies=[Depends(sessions.guard)], include_in_schema=False
@@ -78,19 +79,25 @@ def forwarding_router(feeds: Feeds, sessions: Sessions) -> APIRouter:
     for route in FORWARDED:
         router.add_api_route(
             f"/{route.service}{route.path}",
-            _forwarder(feeds, route),
+            _forwarder(fleet, route),
             methods=[route.method],
             response_class=Response,
         )
     return router
 
 
-def _forwarder(feeds: Feeds, route: Forwarded) -> Callable[[Request], Awaitable[Response]]:
+def _forwarder(fleet: Fleet, route: Forwarded) -> Callable[[Request], Awaitable[Response]]:
     async def forward(request: Request) -> Response:
         names = {name: quote(value, safe="") for name, value in request.path_params.items()}
         path = f"/v1{route.path}".format(**names)
-        if request.url.query:
-            path += f"?{request.url.query}"
+        query, feeds = request.query_params, fleet.of()
+        if route.service == "acquisition":
+            feeds = fleet.of(query.get("station"))
+            query = QueryParams(
+                [(key, value) for key, value in query.multi_items() if key != "station"]
+            )
+        if query:
+            path += f"?{query}"
         sent = {
             name: request.headers[name] for name in ("if-none-match",) if name in request.headers
         }

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
-from urllib.parse import parse_qs
+from urllib.parse import parse_qs, urlencode
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment, FileSystemLoader
 from starlette.requests import HTTPConnection
 
-from dextouch.errors import AccessDeniedError, DexTouchError
+from dextouch.errors import AccessDeniedError, DexTouchError, NotFoundError
 from dextouch.schemas import status_of
 from dextouch.serving import FORM, KIB, AccessControl, not_signed_in, takes
 from services.dashboard.settings import DashboardSettings
@@ -45,18 +45,22 @@ TEMPLATES = Environment(
 class Screen:
     """A page of the dashboard: where it is, its template, and its name in the navigation.
 
-    Screens that belong to another one, such as the player, have that one's name in `within`.
+    Screens that belong to another one, such as the player, have that one's name in `within`. Those
+    of one station keep `?station=` in the navigation; the wall is offered to those with several.
     """
 
     path: str
     template: str
     title: str
     within: str = ""
+    of_station: bool = False
+    of_several: bool = False
 
 
 SCREENS: Final = (
-    Screen("/", "station.html", "Station"),
-    Screen("/health", "health.html", "Health"),
+    Screen("/", "station.html", "Station", of_station=True),
+    Screen("/fleet", "fleet.html", "Fleet", of_several=True),
+    Screen("/health", "health.html", "Health", of_station=True),
     Screen("/episodes", "episodes.html", "Episodes"),
     Screen("/episodes/{kind}/{item_id}", "player.html", "Player", within="Episodes"),
     Screen("/review", "review.html", "Review"),
@@ -174,11 +178,17 @@ def _shown(
         if not sessions.allows(request):
             wanted = _own_path(f"{request.url.path}?{request.url.query}".rstrip("?"))
             return _page(settings.station, "sign_in.html", reason="", wanted=wanted)
+        names, chosen = list(settings.station_urls()), request.query_params.get("station")
+        if chosen is not None and chosen not in names:
+            raise NotFoundError(f"station {chosen!r}: this dashboard shows {', '.join(names)}")
         return _page(
-            settings.station,
+            chosen or (names[0] if names else settings.station),
             screen.template,
             screen=screen,
-            screens=[one for one in SCREENS if not one.within],
+            screens=[
+                one for one in SCREENS if not one.within and (len(names) > 1 or not one.of_several)
+            ],
+            query=f"?{urlencode({'station': chosen})}" if chosen else "",
             tasks=tasks,
             settings=settings,
             goals=json.dumps(settings.goal_hours),

@@ -13,11 +13,12 @@ from pydantic import Field, ValidationError
 from pydantic_core import to_jsonable_python
 from starlette.websockets import WebSocketState
 
-from dextouch.errors import AccessDeniedError
+from dextouch.errors import AccessDeniedError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import JSON, KIB, OCTETS, takes
 from services.dashboard.comparison import Comparisons, ComparisonView, StartComparison
 from services.dashboard.feeds import Feeds, Topic, heatmap_layout, skeleton_bones
+from services.dashboard.fleet import Fleet
 from services.dashboard.pages import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView
@@ -39,10 +40,11 @@ class Subscription(FrozenModel):
     view: tuple[Annotated[str, Field(max_length=64)], ...] = Field(max_length=16)
 
 
-def api_router(settings: DashboardSettings, feeds: Feeds, sessions: Sessions) -> APIRouter:
+def api_router(settings: DashboardSettings, fleet: Fleet, sessions: Sessions) -> APIRouter:
     """Router of the page's data and actions."""
     guards = [Depends(sessions.guard), Depends(SESSION)]
     router = APIRouter(prefix="/v1", dependencies=guards, tags=["dashboard"])
+    Station = Annotated[Feeds, Depends(fleet.of)]
     layout = {**heatmap_layout(), "bones": skeleton_bones()}
 
     @router.get("/heatmap")
@@ -51,7 +53,7 @@ def api_router(settings: DashboardSettings, feeds: Feeds, sessions: Sessions) ->
         return JSONResponse(layout)
 
     @router.get("/overview")
-    async def overview() -> JSONResponse:
+    async def overview(feeds: Station) -> JSONResponse:
         """Everything that the page shows, as JSON."""
         station, services, takes = await asyncio.gather(
             feeds.station(), feeds.services(), feeds.takes()
@@ -61,12 +63,14 @@ def api_router(settings: DashboardSettings, feeds: Feeds, sessions: Sessions) ->
         return JSONResponse(to_jsonable_python(shown))
 
     @router.post("/recorder/{action}")
-    async def operate(action: str, body: Annotated[dict[str, Any], Body()]) -> RecorderView:
+    async def operate(
+        action: str, body: Annotated[dict[str, Any], Body()], feeds: Station
+    ) -> RecorderView:
         """Arm, record, stop, save (`success` required) or discard; the recorder's new state."""
         return await feeds.operate(action, body)
 
     @router.post("/uploads/{recording_id}/retry", status_code=204)
-    async def retry(recording_id: str) -> None:
+    async def retry(recording_id: str, feeds: Station) -> None:
         """Upload a refused take again."""
         path = f"/v1/uploads/{quote(recording_id, safe='')}/retry"
         await feeds.upstream("acquisition").send("POST", path)
@@ -76,7 +80,7 @@ def api_router(settings: DashboardSettings, feeds: Feeds, sessions: Sessions) ->
         response_class=Response,
         responses={200: {"content": {"image/jpeg": {}}}},
     )
-    async def camera(name: CameraName) -> Response:
+    async def camera(name: CameraName, feeds: Station) -> Response:
         """The newest image of one camera."""
         image = await feeds.upstream("acquisition").send("GET", f"/v1/live/cameras/{name}")
         media_type = image.headers.get("content-type", "image/jpeg")
@@ -115,7 +119,9 @@ def comparison_router(comparisons: Comparisons, sessions: Sessions) -> APIRouter
     return router
 
 
-def live_router(finders: Sequence[TopicFinder], sessions: Sessions) -> APIRouter:
+def live_router(
+    fleet: Fleet, finders: Sequence[TopicFinder], sessions: Sessions
+) -> APIRouter:
     """WebSocket router: the page subscribes to the topics in view and receives their updates."""
     router = APIRouter()
 
@@ -126,6 +132,11 @@ def live_router(finders: Sequence[TopicFinder], sessions: Sessions) -> APIRouter
         except AccessDeniedError as error:
             await websocket.close(WEBSOCKET_REFUSED, error.message[:120])
             return
+        try:
+            topics = fleet.topics(websocket.query_params.get("station"))
+        except NotFoundError as error:
+            await websocket.close(WEBSOCKET_REFUSED, error.message[:120])
+            return
         await websocket.accept()
         session = asyncio.create_task(_close_with_session(websocket, sessions))
         senders: dict[str, asyncio.Task[None]] = {}
@@ -133,7 +144,7 @@ def live_router(finders: Sequence[TopicFinder], sessions: Sessions) -> APIRouter
             with suppress(WebSocketDisconnect):
                 while websocket.application_state is WebSocketState.CONNECTED:
                     names = _view(await websocket.receive_text())
-                    found = {name: _topic(name, finders) for name in names}
+                    found = {name: _topic(name, [topics.get, *finders]) for name in names}
                     wanted = {name: topic for name, topic in found.items() if topic is not None}
                     for name in senders.keys() - wanted.keys():
                         senders.pop(name).cancel()

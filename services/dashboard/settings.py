@@ -36,6 +36,11 @@ class DashboardSettings(ServiceSettings):
     acquisition_url: str | None = Field(
         default=None, description="URL of the station; services without a URL are not shown"
     )
+    stations: dict[str, str] = Field(
+        default={},
+        max_length=64,
+        description='URLs of further stations by name: {"desk_2": "http://…"}; /fleet shows all',
+    )
     episode_store_url: str | None = Field(default=None, description="URL of the episode store")
     alignment_url: str | None = Field(default=None, description="URL of the alignment service")
     twin_url: str | None = Field(default=None, description="URL of the twin")
@@ -67,6 +72,9 @@ class DashboardSettings(ServiceSettings):
     pose_period_s: float = Field(
         default=1 / 30, ge=0.02, le=10, description="seconds between updates of hands and poses"
     )
+    fleet_period_s: float = Field(
+        default=0.2, ge=0.05, le=10, description="seconds between updates of the wall of stations"
+    )
     list_period_s: float = Field(
         default=2.0, ge=0.2, le=60, description="seconds between listings of takes and episodes"
     )
@@ -77,8 +85,13 @@ class DashboardSettings(ServiceSettings):
         default=12.0, gt=0, le=24 * 30, description="hours until an operator must sign in again"
     )
 
+    def station_urls(self) -> dict[str, str]:
+        """URLs of the stations by name; the one of `acquisition_url` is the first."""
+        own = {self.station: self.acquisition_url} if self.acquisition_url else {}
+        return {name: url.rstrip("/") for name, url in {**own, **self.stations}.items()}
+
     def upstream_urls(self) -> dict[str, str]:
-        """Configured services by name, in the order of the data flow."""
-        names = ("acquisition", "episode_store", "alignment", "twin", "world_model", "studies")
+        """Configured services beside the stations by name, in the order of the data flow."""
+        names = ("episode_store", "alignment", "twin", "world_model", "studies")
         urls = {name: getattr(self, f"{name}_url") for name in names}
         return {name: url.rstrip("/") for name, url in urls.items() if url}

@@ -12,6 +12,7 @@ from dextouch.schemas import (
     StationHealth,
     StreamHealth,
     TakePrompt,
+    TaxelState,
 )
 
 # From harmless to grave: an ERROR of one stream outranks the silence of another.
@@ -84,7 +85,7 @@ class RecorderView(FrozenModel):
 class GloveView(FrozenModel):
     """Taxels of a glove that are out of order, by their state, and the age of its tare."""
 
-    taxels: dict[str, tuple[int, ...]]
+    taxels: dict[TaxelState, tuple[int, ...]]
     tare_age_s: float | None
 
 
@@ -121,7 +122,7 @@ def station_view(station: StationHealth, recorder: RecorderStatus) -> StationVie
         streams=streams,
         recorder=recorder_view(recorder),
         gloves={
-            item.hand: GloveView(taxels=dict(item.taxels), tare_age_s=item.tare_age_s)
+            item.hand: GloveView(taxels=item.taxels, tare_age_s=item.tare_age_s)
             for item in station.streams
             if item.hand is not None and item.stream == f"tactile_{item.hand}"
         },

@@ -154,12 +154,8 @@ class _WatchedStream(_Watched):
             skew_ppm=None if skew is None else skew * 1e6,
             clock_residual_ms=None if residual_s is None else residual_s * 1e3,
             taxels={} if stale else self.latest.taxels,
-            tare_age_s=self.tare_age_s(),
+            tare_age_s=None if self.tared_unix_s is None else time.time() - self.tared_unix_s,
         )
-
-    def tare_age_s(self) -> float | None:
-        """Age of a glove's tare; None where the calibration does not say when it was made."""
-        return None if self.tared_unix_s is None else time.time() - self.tared_unix_s
 
     def _stale_words(self, stale: StaleCode, age_ns: int | None) -> str:
         if self._supervisor.last_error is not None:

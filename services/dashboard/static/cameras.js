@@ -2,6 +2,7 @@
 
 import { element, setText } from "./dom.js";
 import { age } from "./format.js";
+import { stationPath } from "./session.js";
 
 const STALE_S = 0.7;
 
@@ -72,5 +73,5 @@ export function showImage(place, camera, url = imageUrl) {
 }
 
 function imageUrl(camera) {
-  return `/v1/cameras/${encodeURIComponent(camera.name)}.jpg?at=${camera.image_index}`;
+  return stationPath(`/v1/cameras/${encodeURIComponent(camera.name)}.jpg?at=${camera.image_index}`);
 }

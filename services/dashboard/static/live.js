@@ -1,6 +1,6 @@
 // The one websocket: tells the server what is in view, hands out what comes back, reconnects by itself.
 
-import { ask } from "./session.js";
+import { ask, stationPath } from "./session.js";
 
 const FIRST_RETRY_MS = 500;
 const LONGEST_RETRY_MS = 8000;
@@ -18,7 +18,7 @@ export class LiveLink {
 
   open() {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    const socket = new WebSocket(`${scheme}://${location.host}/v1/live`);
+    const socket = new WebSocket(`${scheme}://${location.host}${stationPath("/v1/live")}`);
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
       this.retry_ms = FIRST_RETRY_MS;

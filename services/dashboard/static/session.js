@@ -1,7 +1,15 @@
 // Requests of the page; without a session it is loaded anew, which shows the sign-in.
 
+// What belongs to one station: the page's own, of several the one that its address names.
+const OF_STATION = /^\/v1\/(acquisition|recorder|uploads|cameras|overview|live)\b/;
+
+export function stationPath(path, station = new URLSearchParams(location.search).get("station")) {
+  if (station === null || !OF_STATION.test(path)) return path;
+  return `${path}${path.includes("?") ? "&" : "?"}station=${encodeURIComponent(station)}`;
+}
+
 export async function ask(path, options) {
-  const answer = await fetch(path, options);
+  const answer = await fetch(stationPath(path), options);
   if (answer.status === 401) location.reload();
   return answer;
 }

@@ -116,6 +116,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.station import SharedLink as SharedLink
     from dextouch.schemas.station import StaleCode as StaleCode
     from dextouch.schemas.station import StationHealth as StationHealth
+    from dextouch.schemas.station import StationOverview as StationOverview
     from dextouch.schemas.station import StreamHealth as StreamHealth
     from dextouch.schemas.station import StreamTake as StreamTake
     from dextouch.schemas.station import TakeCause as TakeCause

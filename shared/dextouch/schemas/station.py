@@ -255,6 +255,24 @@ class StationHealth(FrozenModel):
     devices: tuple[DeviceHealth, ...]
 
 
+class StationOverview(FrozenModel):
+    """A station in a few values.
+
+    `cause` is the widest cause of its level, `age_s` that of the newest sample of any stream.
+    """
+
+    station: str
+    level: HealthLevel
+    cause: str
+    recorder: RecorderState
+    task: str | None = None
+    duration_s: float | None = None
+    age_s: float | None = None
+    disk_left_s: float | None = None
+    disk_free_bytes: float | None = None
+    cameras: tuple[CameraLive, ...] = ()
+
+
 class HealthEvent(FrozenModel):
     """A code of a stream (or of the `station`) reached a level; OK is its end."""
 

@@ -1,0 +1,124 @@
+// Wall of stations: a tile each, trouble first; a tile opens its station's page.
+
+import { showImage } from "./cameras.js";
+import { element, levelBadge, setText } from "./dom.js";
+import { number, stopwatch } from "./format.js";
+import { Freshness } from "./freshness.js";
+import { HandCanvas } from "./hands.js";
+import { LiveLink } from "./live.js";
+import { ask, stationPath } from "./session.js";
+import { startTheme } from "./theme.js";
+
+const STALE_MS = 800;
+const IMAGE_PERIOD_MS = 1000;
+const NUM_TAXELS = 320;
+const SIDES = ["left", "right"];
+const NOTHING = new Float32Array(0);
+const find = (id) => document.getElementById(id);
+const heatmap = await (await ask("/v1/heatmap")).json();
+
+function hoursLeft(seconds) {
+  return seconds < 3600 ? `${number(seconds / 60, 0)} min` : `${number(seconds / 3600, 0)} h`;
+}
+
+function diskText({ disk_left_s, disk_free_bytes }) {
+  const free = disk_free_bytes === null ? "–" : `${number(disk_free_bytes / 1e9, 0)} GB`;
+  return disk_left_s === null ? free : `${free}, ${hoursLeft(disk_left_s)} of recording`;
+}
+
+class StationTile {
+  constructor(name) {
+    const canvases = SIDES.map((side) => element("canvas", { class: "hand", role: "img", "aria-label": `taxels of the ${side} hand` }));
+    this.badge = element("span", {});
+    this.timer = element("span", { class: "timer" });
+    this.task = element("span", { class: "task" });
+    this.cause = element("p", { class: "cause" });
+    this.facts = { today: element("dd", {}), disk: element("dd", {}) };
+    this.camera = element("div", { class: "picture" });
+    this.image_ms = 0;
+    this.node = element("li", { class: "tile", "data-station": name }, element("a", { href: `/?station=${encodeURIComponent(name)}` },
+      element("div", { class: "tile_head" }, this.badge, element("strong", {}, name), this.timer),
+      element("p", { class: "doing" }, this.task),
+      this.cause,
+      element("div", { class: "pictures" }, ...canvases, this.camera),
+      element("dl", {}, element("div", {}, element("dt", {}, "today"), this.facts.today), element("div", {}, element("dt", {}, "disk"), this.facts.disk))));
+    this.hands = Object.fromEntries(SIDES.map((side, index) => [side, new HandCanvas(canvases[index], {}, side, heatmap)]));
+  }
+
+  show(tile) {
+    this.tile = tile;
+    this.node.dataset.level = tile.level;
+    if (this.badge.firstChild?.textContent !== tile.level) this.badge.replaceChildren(levelBadge(tile.level));
+    this.node.dataset.recorder = tile.recorder;
+    const recording = tile.recorder === "recording";
+    setText(this.timer, recording ? `● ${stopwatch(tile.duration_s)}` : tile.recorder);
+    setText(this.task, tile.task ?? "no task");
+    setText(this.cause, tile.cause);
+    this.cause.title = tile.cause;
+    setText(this.facts.today, number(tile.hours_today, 2, "h"));
+    setText(this.facts.disk, diskText(tile));
+    this.showCamera(tile.camera);
+    for (const side of SIDES) if (!tile.gloves.includes(side)) this.hands[side].update(NOTHING);
+  }
+
+  showCamera(camera) {
+    const now_ms = performance.now();
+    if (camera === null) this.camera.replaceChildren();
+    else if (now_ms - this.image_ms > IMAGE_PERIOD_MS || !this.camera.firstChild) {
+      this.image_ms = now_ms;
+      showImage(this.camera, camera, ({ name, image_index }) => stationPath(`/v1/cameras/${encodeURIComponent(name)}.jpg?at=${image_index}`, this.tile.name));
+    }
+  }
+
+  showTaxels(pressures_kpa) {
+    SIDES.forEach((side, index) => {
+      if (this.tile.gloves.includes(side)) this.hands[side].update(pressures_kpa.subarray(index * NUM_TAXELS, (index + 1) * NUM_TAXELS));
+    });
+  }
+
+  clear(cause) {
+    this.show({ name: this.tile.name, level: "STALE", cause, recorder: "unknown", task: null, duration_s: null, hours_today: null,
+      disk_left_s: null, disk_free_bytes: null, camera: null, gloves: [] });
+  }
+}
+
+const tiles = new Map();
+let order = [];
+
+function show(shown) {
+  for (const tile of shown) {
+    if (!tiles.has(tile.name)) tiles.set(tile.name, new StationTile(tile.name));
+    tiles.get(tile.name).show(tile);
+  }
+  const names = shown.map(({ name }) => name);
+  if (names.join("\n") !== order.join("\n")) find("tiles").replaceChildren(...names.map((name) => tiles.get(name).node));
+  order = names;
+  const counts = ["ERROR", "STALE", "WARN", "OK"].map((level) => [shown.filter((tile) => tile.level === level).length, level]);
+  setText(find("summary"), counts.filter(([count]) => count > 0).map(([count, level]) => `${count} ${level}`).join(" · "));
+}
+
+const clearAll = (cause) => tiles.forEach((tile) => tile.clear(cause));
+const fresh = new Freshness(STALE_MS, () => clearAll("The dashboard sends no updates."));
+
+const link = new LiveLink({
+  onTopic: (topic, shown) => {
+    if (topic !== "fleet") return;
+    fresh.note();
+    show(shown);
+  },
+  onBinary: (buffer) => {
+    // uint8 kind (3), uint8 place in the list, uint16 0, float32 kPa of the left, then of the right hand.
+    const view = new DataView(buffer);
+    if (view.getUint8(0) === 3) tiles.get(order[view.getUint8(1)])?.showTaxels(new Float32Array(buffer, 4));
+  },
+  onState: (connected) => {
+    setText(find("link"), connected ? "live" : "dashboard not reachable, trying again");
+    if (!connected) {
+      fresh.stop();
+      clearAll("No link to the dashboard.");
+    }
+  },
+});
+link.show("fleet", true);
+document.addEventListener("visibilitychange", () => link.sendView());
+startTheme(find("theme"), () => tiles.forEach((tile) => Object.values(tile.hands).forEach((hand) => hand.request())));
