@@ -172,6 +172,7 @@ class Feeds:
     def has(self, name: str) -> bool:
         """Whether this dashboard was started with the URL of a service."""
         return name in self._upstreams
+
     @property
     def store(self) -> Upstream | None:
         """The episode store, if this dashboard has one."""

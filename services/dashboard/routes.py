@@ -119,9 +119,7 @@ def comparison_router(comparisons: Comparisons, sessions: Sessions) -> APIRouter
     return router
 
 
-def live_router(
-    fleet: Fleet, finders: Sequence[TopicFinder], sessions: Sessions
-) -> APIRouter:
+def live_router(fleet: Fleet, finders: Sequence[TopicFinder], sessions: Sessions) -> APIRouter:
     """WebSocket router: the page subscribes to the topics in view and receives their updates."""
     router = APIRouter()
 

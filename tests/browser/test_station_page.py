@@ -102,7 +102,11 @@ def test_dragging_turns_and_a_double_click_resets(live, station):
 
 def test_pictures_out_of_view_are_not_sent(page, serve, station):
     kinds = []
-    page.on("websocket", lambda ws: ws.on("framereceived", lambda data: kinds.append(data))  # noqa: PLW0108 - playwright marks it)
+
+    def note(data):
+        kinds.append(data)
+
+    page.on("websocket", lambda socket: socket.on("framereceived", note))
     page.set_viewport_size({"width": 1366, "height": 2000})
     page.goto(serve(create_dashboard(DashboardSettings(acquisition_url=station.url))))
     expect_moving(page)
