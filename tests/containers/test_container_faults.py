@@ -121,7 +121,7 @@ def test_a_store_that_stands_still_delays_uploads_only(composed, ask, arrived):
 
 
 def test_a_full_disk_of_the_store_is_named_and_the_take_waits(composed, engine, ask, arrived):
-    volumes = {"/data/store": ("--tmpfs", "/data/store:size=1m,mode=1777")}
+    volumes = {"/data/store": ("--tmpfs", "/data/store:size=1m,mode=1777,notmpcopyup")}
     environment = {"DEXTOUCH_EPISODE_STORE_MIN_FREE_BYTES": "0"}
     composed.down("episode_store")
     composed.up("episode_store", volumes=volumes, environment=environment)
@@ -147,7 +147,7 @@ def test_a_full_disk_of_the_store_is_named_and_the_take_waits(composed, engine, 
 
 
 def test_a_full_disk_of_the_station_refuses_takes_in_words(composed, engine, key):
-    volumes = {"/data/spool": ("--tmpfs", "/data/spool:size=32m,mode=1777")}
+    volumes = {"/data/spool": ("--tmpfs", "/data/spool:size=32m,mode=1777,notmpcopyup")}
     composed.stop("acquisition")
     composed.down("acquisition")
     composed.up("acquisition", volumes=volumes)

@@ -40,6 +40,7 @@ def nodes():
         ):
             path = folder / name
             os.mknod(path, 0o020660, os.makedev(major, 229))
+            path.chmod(0o660)  # whatever the umask
             os.chown(path, 0, GROUP)
             paths.append(str(path))
         yield paths
