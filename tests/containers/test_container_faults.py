@@ -120,49 +120,6 @@ def test_a_store_that_stands_still_delays_uploads_only(composed, ask, arrived):
     arrived(recording_id, num_samples)
 
 
-def test_a_full_disk_of_the_store_is_named_and_the_take_waits(composed, engine, ask, arrived):
-    volumes = {"/data/store": ("--tmpfs", "/data/store:size=1m,mode=1777,notmpcopyup")}
-    environment = {"DEXTOUCH_EPISODE_STORE_MIN_FREE_BYTES": "0"}
-    composed.down("episode_store")
-    composed.up("episode_store", volumes=volumes, environment=environment)
-    recording_id, num_samples = record_take(ask, TAKE_S, composed.logs)
-
-    def reason():
-        found = ask("GET", "acquisition", "/v1/uploads")
-        (mine,) = [item for item in found if item["recording_id"] == recording_id]
-        assert not mine["uploaded"]
-        return mine["error"] or ""
-
-    wait_for(
-        "refusal",
-        ARRIVAL_TIMEOUT_S,
-        lambda: "disk" in reason() or "space" in reason(),
-        composed.logs,
-    )
-    # Alive and ready to tell it; then with a larger disk everything arrives.
-    composed.wait_healthy("episode_store")
-    composed.down("episode_store")
-    composed.up("episode_store")
-    arrived(recording_id, num_samples)
-
-
-def test_a_full_disk_of_the_station_refuses_takes_in_words(composed, engine, key):
-    volumes = {"/data/spool": ("--tmpfs", "/data/spool:size=32m,mode=1777,notmpcopyup")}
-    composed.stop("acquisition")
-    composed.down("acquisition")
-    composed.up("acquisition", volumes=volumes)
-    prompt = {"task": "stand_bottle", "instruction": "stand the bottle up", "consent": True}
-    headers = {"authorization": f"Bearer {key}"}
-    url = composed.url("acquisition") + "/v1/recorder"
-    with httpx.Client(headers=headers, timeout=30, trust_env=False) as client:
-        client.post(url + "/arm", json=prompt)
-        refused = client.post(url + "/record")
-    assert refused.status_code == 507
-    assert "free" in refused.json()["detail"]
-    composed.down("acquisition")
-    composed.up("acquisition")
-
-
 def test_a_taken_port_is_named(composed):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
