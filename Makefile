@@ -13,7 +13,7 @@ DOCS_VENV ?= .venv-docs
 SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor \
+.PHONY: demo test check slow kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -102,6 +102,9 @@ reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's st
 fix: $(VENV)/.dev        ## format the code and apply automatic lint fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+release: $(VENV)/.dev    ## make a release: VERSION=0.2.0 writes version and changelog, commits, tags and builds the wheel in dist
+	$(BIN)/python deploy/release.py $(VERSION)
 
 vendor:                  ## fetch the vendored files of the dashboard again (needs npm); git diff shows whether they changed
 	$(PYTHON) deploy/fetch_vendored.py services/dashboard/static/vendor

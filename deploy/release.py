@@ -1,0 +1,107 @@
+"""Make a release: `make release VERSION=0.2.0`.
+
+Writes the version into the package and the changelog, commits, tags, and builds the wheel with its
+SHA-256 in `dist`. Nothing is pushed. Run `.ci/run` first.
+"""
+
+import argparse
+import hashlib
+import re
+import subprocess
+import sys
+from datetime import UTC, date, datetime
+from pathlib import Path
+
+from packaging.version import InvalidVersion, Version
+
+_UNRELEASED = "## Unreleased\n"
+_PLACES = (
+    ("pyproject.toml", r'(?m)^version = "(.+)"$'),
+    ("shared/dextouch/__init__.py", r'(?m)^__version__ = "(.+)"$'),
+)
+
+
+class ReleaseError(Exception):
+    """Why no release can be made; nothing was changed."""
+
+
+def main() -> int:
+    """Make a release in the checkout of the current folder."""
+    parser = argparse.ArgumentParser(prog="make release", description=__doc__)
+    parser.add_argument("version", help="the new version, such as 0.2.0")
+    options = parser.parse_args()
+    root = Path.cwd()
+    try:
+        changed = prepare(root, options.version, datetime.now(UTC).date())
+    except ReleaseError as error:
+        print(f"no release: {error}", file=sys.stderr)  # noqa: T201
+        return 1
+    for name, text in changed.items():
+        (root / name).write_text(text, encoding="utf-8")
+    _git(root, "commit", "--quiet", "--message", f"Release {options.version}", *changed)
+    tag = f"v{options.version}"
+    _git(root, "tag", "--annotate", tag, "--message", f"DexTouch {options.version}")
+    wheel = _build(root)
+    print(f"made {tag} and {wheel}\npush them with: git push origin main {tag}")  # noqa: T201
+    return 0
+
+
+def prepare(root: Path, version: str, today: date) -> dict[str, str]:
+    """New texts of the files that name the version, by path.
+
+    Raises:
+        ReleaseError: another branch than main, changes that are not committed, a version that is
+            not newer, a tag that exists, or an empty section Unreleased.
+    """
+    try:
+        new = Version(version)
+    except InvalidVersion as error:
+        raise ReleaseError(f"got version {version!r}, expected one such as 0.2.0") from error
+    branch = _git(root, "rev-parse", "--abbrev-ref", "HEAD")
+    if branch != "main":
+        raise ReleaseError(f"got branch {branch!r}, expected main")
+    if dirty := _git(root, "status", "--porcelain"):
+        raise ReleaseError(f"commit or undo these changes first:\n{dirty}")
+    if _git(root, "tag", "--list", f"v{version}"):
+        raise ReleaseError(f"the tag v{version} exists")
+    changed = {}
+    for name, pattern in _PLACES:
+        text = (root / name).read_text(encoding="utf-8")
+        found = re.search(pattern, text)
+        if found is None:
+            raise ReleaseError(f"{name}: found no version")
+        if Version(found[1]) >= new:
+            raise ReleaseError(f"{name}: has {found[1]}, expected a version before {version}")
+        changed[name] = text[: found.start(1)] + version + text[found.end(1) :]
+    log = (root / "CHANGELOG.md").read_text(encoding="utf-8")
+    before, heading, after = log.partition(_UNRELEASED)
+    if not heading or not re.split(r"(?m)^## ", after)[0].strip():
+        raise ReleaseError("CHANGELOG.md: found nothing below '## Unreleased'")
+    changed["CHANGELOG.md"] = f"{before}{heading}\n## {version} - {today.isoformat()}\n{after}"
+    return changed
+
+
+def _build(root: Path) -> Path:
+    """Build the wheel, and write its SHA-256 beside it."""
+    target = root / "dist"
+    words = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir"]
+    subprocess.run([*words, str(target), str(root)], check=True)  # noqa: S603 - own words
+    wheel = max(target.glob("*.whl"), key=lambda path: path.stat().st_mtime)
+    digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+    wheel.with_suffix(".whl.sha256").write_text(f"{digest}  {wheel.name}\n", encoding="utf-8")
+    return wheel
+
+
+def _git(root: Path, *words: str) -> str:
+    done = subprocess.run(  # noqa: S603 - own words
+        ["git", *words],  # noqa: S607
+        cwd=root,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    return done.stdout.strip()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
