@@ -17,8 +17,9 @@ from dextouch.errors import AccessDeniedError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import JSON, KIB, OCTETS, takes
 from services.dashboard.comparison import Comparisons, ComparisonView, StartComparison
-from services.dashboard.feeds import Feeds, Topic, heatmap_layout, skeleton_bones
+from services.dashboard.feeds import Feeds, Topic
 from services.dashboard.fleet import Fleet
+from services.dashboard.live_messages import heatmap_layout, skeleton_bones
 from services.dashboard.pages import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView

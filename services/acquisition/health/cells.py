@@ -24,7 +24,6 @@ from dextouch.tactile.layout import (
     NUM_RAW_TAXELS,
     NUM_TAXELS,
     Side,
-    join_pads,
     raw_indices,
     split_pads,
 )
@@ -33,6 +32,7 @@ from services.acquisition.drivers.base import CellLayout, Decoder
 from services.acquisition.glove_record import NO_CELL, GloveRecord, mapped_cells
 from services.acquisition.health.codes import CODES
 from services.acquisition.health.evaluation import Evaluation, Finding
+from services.acquisition.health.neighbours import neighbour_share, share_around
 
 RECENT_NS = 500_000_000
 MIN_RECENT_SPAN_NS = 400_000_000
@@ -391,25 +391,7 @@ def count_taxels(low_counts: np.ndarray, high_counts: np.ndarray, *, side: Side)
     return {f"{word}_taxels": int(taxels.sum()) for word, taxels in found.items()}
 
 
-def neighbour_share(moved: Bool[np.ndarray, "320"]) -> Float64[np.ndarray, "320"]:
-    """Share of the up to 8 neighbours on its pad that moved, for each taxel."""
-    tips, palm = (share_around(pads, np.ones_like(pads)) for pads in split_pads(moved))
-    return join_pads(tips, palm)
-
-
 def _latest_ns(flags: np.ndarray, t_ns: np.ndarray, before_ns: np.ndarray) -> np.ndarray:
     """When each cell was flagged last; what it was before where it is not flagged now."""
     last_ns = t_ns[len(t_ns) - 1 - np.argmax(flags[::-1], axis=0)]
     return np.where(flags.any(axis=0), last_ns, before_ns)
-
-
-def share_around(moved: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Share of the up to 8 existing neighbours that moved, of each cell [..., rows, columns].
-
-    A cell that moved exists.
-    """
-    edges = [(0, 0)] * (moved.ndim - 2) + [(1, 1), (1, 1)]
-    padded = np.pad(np.stack([moved, exists]).astype(np.float64), [(0, 0), *edges])
-    blocks = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(-2, -1))
-    num_moved, num = blocks.sum(axis=(-2, -1)) - blocks[..., 1, 1]
-    return num_moved / np.maximum(num, 1.0)

@@ -33,12 +33,7 @@ from services.acquisition.health.evaluation import (
 from services.acquisition.health.history import STATION_FIGURES, HealthHistory, StreamMeter
 from services.acquisition.health.host import HostClockJudge, HostJudge
 from services.acquisition.health.queues import SampleQueue
-from services.acquisition.health.station import (
-    CALIBRATED_AT,
-    CalibrationJudge,
-    PathJudge,
-    number,
-)
+from services.acquisition.health.station import CalibrationJudge, PathJudge, tared_unix_s
 from services.acquisition.health.streams import (
     CameraJudge,
     FiniteJudge,
@@ -359,8 +354,7 @@ def _watch(
         if paths is not None and paths.num_failures(descriptor.name) is not None:
             judges.append(PathJudge(descriptor.name, paths, calibration))
         stream = _WatchedStream(supervisor, descriptor, judges)
-        if descriptor.kind == "tactile":
-            stream.tared_unix_s = number(calibration, f"{descriptor.name}_{CALIBRATED_AT}")
+        stream.tared_unix_s = tared_unix_s(descriptor, calibration)
         watched.append(stream)
     return watched
 

@@ -94,6 +94,12 @@ class CalibrationJudge:
             evaluation.judge("calibration_age", age_s, text)
 
 
+def tared_unix_s(descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]) -> float | None:
+    """When a glove was tared; None of other streams, and where the calibration does not say."""
+    is_glove = descriptor.kind == "tactile"
+    return number(calibration, f"{descriptor.name}_{CALIBRATED_AT}") if is_glove else None
+
+
 class PathJudge:
     """Compares a stream's measured path delay with the station's calibration.
 

@@ -10,7 +10,8 @@ from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder,
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.image_quality import ImageQuality
 from services.acquisition.glove_record import GloveRecord
-from services.acquisition.health.cells import TaxelJudge, count_taxels, neighbour_share
+from services.acquisition.health.cells import TaxelJudge, count_taxels
+from services.acquisition.health.neighbours import neighbour_share
 from services.acquisition.health.queues import SampleQueue
 from services.acquisition.health.streams import CameraJudge, FiniteJudge, PoseJudge, TrackingJudge
 from services.acquisition.mocks.ports import HidPort
