@@ -52,7 +52,7 @@ async def count_updates(url: str, topics: list[str], seconds: float) -> Counter[
     updates: Counter[str] = Counter()
     newest: dict[str, str | bytes] = {}
     address = url.replace("http", "ws", 1) + "/v1/live"
-    async with websockets.connect(address, origin=url) as socket:
+    async with websockets.connect(address, origin=websockets.Origin(url)) as socket:
         await socket.send(json.dumps({"view": topics}))
         stop_s = time.monotonic() + seconds
         while time.monotonic() < stop_s:
