@@ -244,10 +244,7 @@ def show(report: Mapping[str, Any]) -> None:
     console = Console()
     stages = [(row["name"], f"{row['seconds']:.1f}") for row in report["stages"]]
     console.print(_table("Stages", ("stage", "seconds"), stages))
-    # Of the clocks only the worst one.
-    clocks = report["errors"]["clock_rms_ms"]
-    worst = max(clocks, key=lambda name: clocks[name])
-    errors = error_rows({**report["errors"], "clock_rms_ms": {f"{worst} (worst)": clocks[worst]}})
+    errors = error_rows(report["errors"])
     rows = [(row.name, f"{figure(row.value)} {row.unit}".strip(), row.bound) for row in errors]
     title = "Recording path against the twin's truth"
     console.print(_table(title, ("error", "value", "bound"), rows))

@@ -20,6 +20,7 @@ from services.evaluation.reporting.drawings import (
 )
 from services.evaluation.reporting.pictures import ReportPictures
 from services.evaluation.reporting.sections import (
+    clock_rows,
     comparison_bars,
     error_rows,
     failure_rows,
@@ -59,6 +60,7 @@ def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
         tiles=tiles(report),
         stages=stage_bars(report.get("stages", [])),
         errors=error_rows(report.get("errors", {})),
+        clocks=clock_rows(report.get("errors", {})),
         clock_chart=clock_chart(pictures),
         action_charts=action_charts(pictures.actions),
         comparisons=comparison_bars(report.get("world_model", {})),

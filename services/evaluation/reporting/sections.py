@@ -152,7 +152,14 @@ def figure(value: object, digits: int = 3) -> str:
 def stage_bars(stages: Sequence[Mapping[str, Any]]) -> list[Bar]:
     """Seconds of every stage."""
     longest = max((float(s["seconds"]) for s in stages), default=1.0) or 1.0
-    return [Bar(str(s["name"]), float(s["seconds"]), float(s["seconds"]) / longest) for s in stages]
+    return [
+        Bar(
+            str(s["name"]).replace("_", " ").capitalize(),
+            float(s["seconds"]),
+            float(s["seconds"]) / longest,
+        )
+        for s in stages
+    ]
 
 
 def comparison_bars(figures: Mapping[str, Any]) -> list[BarGroup]:
@@ -173,9 +180,11 @@ def comparison_bars(figures: Mapping[str, Any]) -> list[BarGroup]:
 def error_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
     """Errors of the recording path against the twin's ground truth, with their bounds."""
     rows = []
-    for stream, value in dict(errors.get("clock_rms_ms", {})).items():
-        holds = value <= CLOCK_BOUND_MS if is_number(value) else None
-        rows.append(ErrorRow(f"Clock of {stream}, RMS", value, "ms", "≤ 1", holds))
+    if clocks := clock_rows(errors):
+        # The one without a figure, or the worst one; the page folds the others.
+        worst = max(clocks, key=lambda row: row.value if is_number(row.value) else math.inf)
+        name = f"{worst.name}, the worst of {len(clocks)}"
+        rows.append(replace(worst, name=name))
     for key, name, unit, bound in ERRORS:
         if key not in errors:
             continue
@@ -184,6 +193,20 @@ def error_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
             holds = value >= bound[1] if bound[0] == "≥" else value <= bound[1]
         rows.append(ErrorRow(name, value, unit, f"{bound[0]} {bound[1]:g}" if bound else "", holds))
     return rows
+
+
+def clock_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
+    """Errors of the clock fits of all streams."""
+    return [
+        ErrorRow(
+            f"Clock of {stream.replace('_', ' ')}, RMS",
+            value,
+            "ms",
+            f"≤ {CLOCK_BOUND_MS:g}",
+            value <= CLOCK_BOUND_MS if is_number(value) else None,
+        )
+        for stream, value in dict(errors.get("clock_rms_ms", {})).items()
+    ]
 
 
 def agreement_figures(agreement: Mapping[str, Any]) -> list[AgreementFigure]:
@@ -217,7 +240,7 @@ def tiles(report: Mapping[str, Any]) -> list[Tile]:
         found.append(Tile("from bytes to score", f"{figure(total)} s", f"{len(stages)} stages"))
     clocks = [v for v in dict(errors.get("clock_rms_ms", {})).values() if is_number(v)]
     if clocks:
-        found.append(Tile("worst clock", f"{figure(max(clocks))} ms", "RMS, delay removed"))
+        found.append(Tile("worst clock", f"{figure(max(clocks), 2)} ms", "RMS, delay removed"))
     if is_number(errors.get("taxel_iou")):
         note = "contact IoU with the ground truth"
         found.append(Tile("touch recorded", figure(errors["taxel_iou"]), note))
