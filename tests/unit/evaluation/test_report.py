@@ -186,7 +186,7 @@ def test_headlines():
     shown = {tile.name: tile.value for tile in tiles(REPORT)}
     assert shown == {
         "from bytes to score": "52.5 s",
-        "worst clock": "1.70 ms",
+        "worst clock": "1.7 ms",
         "touch recorded": "0.991",
         "images predicted": "+0.9 dB",
         "touch predicted": "50%",
