@@ -19,7 +19,7 @@ export class ComparisonPanel {
     this.chunks = [];
     this.loading = false;
     this.hands = Object.fromEntries(SIDES.map((world) => [world, Object.fromEntries(["left", "right"].map((side) =>
-      [side, new HandCanvas(find(`${world}_${side}`), find(`${world}_${side}_text`), side, heatmap)]))]));
+      [side, new HandCanvas(find(`${world}_${side}`), { summary: find(`${world}_${side}_text`) }, side, heatmap)]))]));
     this.charts = new ComparisonCharts(find("charts"), (step) => this.goTo(step));
     this.player = new StepPlayer({ show: (step) => this.showStep(step) });
     find("replay").addEventListener("submit", (event) => {

@@ -14,7 +14,7 @@ import { startTheme } from "./theme.js";
 const find = (id) => document.getElementById(id);
 const heatmap = await (await ask("/v1/heatmap")).json();
 const hands = Object.fromEntries(["left", "right"].map((side) =>
-  [side, new HandCanvas(find(`hand_${side}`), find(`hand_${side}_text`), side, heatmap)]));
+  [side, new HandCanvas(find(`hand_${side}`), { summary: find(`hand_${side}_text`) }, side, heatmap)]));
 
 let listed = { worlds: [], rollouts: [], problems: [], num_open: 0 };
 let watched = null; // { topic, rollout } of the rollout that is shown

@@ -18,7 +18,8 @@ export class TouchPane {
     this.time = element("time", { class: "own_time" });
     this.root = element("figure", { class: "touch_pane", "data-stream": track.stream.name, "data-state": "loading" },
       canvas, element("figcaption", {}, element("span", { class: "name" }, track.stream.name), this.time, this.text));
-    this.hand = new HandCanvas(canvas, this.text, side, { ...heatmap });
+    // Raw counts have a text of their own.
+    this.hand = new HandCanvas(canvas, this.isRaw ? {} : { summary: this.text }, side, { ...heatmap });
     this.shown_ns = null;
     if (this.isRaw) this.scaleRaw();
   }
@@ -45,6 +46,11 @@ export class TouchPane {
     if (this.isRaw) setText(this.text, `largest ${Math.max(...this.hand.pressures_kpa)} ${this.track.stream.unit}`);
   }
 
+  clear(words) {
+    this.hand.clear(words);
+    setText(this.text, words);
+  }
+
   show(t_ns) {
     const found = this.track.sampleAt(t_ns);
     if (found.state === "sample") {
@@ -58,12 +64,12 @@ export class TouchPane {
     } else if (found.state === "none") {
       this.root.dataset.state = "none";
       this.shown_ns = null;
-      this.hand.clear("no sample");
+      this.clear("no sample");
       setText(this.time, "");
       delete this.root.dataset.stamp;
     } else {
       this.root.dataset.state = found.error ? "failed" : "loading";
-      if (found.error) this.hand.clear(found.error.message);
+      if (found.error) this.clear(found.error.message);
     }
   }
 }
