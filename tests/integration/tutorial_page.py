@@ -43,6 +43,17 @@ class TutorialPage:
         return shlex.split(line)
 
 
+def readme_commands(quick):
+    """The commands of README's "Try it" in order, with others in place of those in `quick`."""
+    section = (ROOT / "README.md").read_text(encoding="utf-8").split("## Try it")[1]
+    lines = "".join(_blocks(section.split("\n## ")[0], "")).splitlines()
+    typed = [shlex.split(line, comments=True) for line in lines]
+    wanted = [
+        quick.get(tuple(words), [Path(words[0]).name, *words[1:]]) for words in typed if words
+    ]
+    return [words for words in wanted if words]
+
+
 def run_command(words, addresses=None):
     """Run `dextouch …` of a page here, its services at other addresses than the page says."""
     assert words[0] == "dextouch"

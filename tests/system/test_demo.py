@@ -3,29 +3,21 @@
 import json
 import os
 import re
-import shlex
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import httpx
 import pytest
 
+from tests.integration.tutorial_page import readme_commands
+
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 
-README = Path(__file__).parents[2] / "README.md"
+# The commands without what `make` installs.
+QUICK = {("make", "demo"): ["dextouch", "demo", "--seeds", "1"], ("make", "test"): []}
 DEXTOUCH = [sys.executable, "-m", "services.cli.main"]
-
-
-def commands_of_the_readme():
-    """The commands of its first two blocks, without what `make` installs."""
-    section = README.read_text(encoding="utf-8").split("## Try it")[1].split("\n## ")[0]
-    lines = "".join(re.findall(r"```\n(.*?)```", section, re.DOTALL)).splitlines()
-    typed = [shlex.split(line, comments=True) for line in lines]
-    quick = {("make", "demo"): ["dextouch", "demo", "--seeds", "1"], ("make", "test"): []}
-    return [quick.get(tuple(words), [Path(words[0]).name, *words[1:]]) for words in typed if words]
 
 
 def in_folder(folder, words, **more):
@@ -54,7 +46,7 @@ def episodes_of_up(folder):
 
 
 def test_commands_of_the_readme_run_in_order_and_twice(tmp_path):
-    wanted = [words for words in commands_of_the_readme() if words]
+    wanted = readme_commands(QUICK)
     assert ["dextouch", "up"] in wanted
     for _ in range(2):
         listed = []

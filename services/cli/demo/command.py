@@ -98,7 +98,7 @@ def main(argv: Sequence[str]) -> int:
     print(f"store:  {default_store()}, with both takes as recordings and as episodes; go on with")
     print("  dextouch store list")
     print(f"  dextouch export --format mcap --to {plan.output / 'robot.mcap'} {robot}")
-    print("  dextouch up")
+    print("  dextouch up    # dashboard: Episodes plays both takes, Station records new ones")
     return 0
 
 

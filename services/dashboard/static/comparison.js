@@ -51,7 +51,9 @@ export class ComparisonPanel {
     const answer = await ask("/v1/episode_store/episodes?domain=robot&limit=50").catch(() => null);
     if (!answer?.ok) return;
     const { episodes } = await answer.json();
-    find("episodes").replaceChildren(...episodes.map((one) => element("option", { value: one.episode_id }, one.task)));
+    // Those of a station have no seed, by which the twin places its objects.
+    const seeded = episodes.filter((one) => one.origin !== "recorded");
+    find("episodes").replaceChildren(...seeded.map((one) => element("option", { value: one.episode_id }, one.task)));
   }
 
   note(text, level = "") {

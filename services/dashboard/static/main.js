@@ -68,6 +68,7 @@ function showStation(station) {
   overall.dataset.level = station.level;
   setText(overall, station.level);
   setText(find("summary"), station.summary);
+  find("summary").title = station.summary;
   devices.show(station);
   recorder.show(station.recorder, station.level);
   showGloves(station.gloves ?? {});

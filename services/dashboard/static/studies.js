@@ -18,14 +18,15 @@ function row(study) {
     element("td", { class: "free" }, study.tasks.join(", ")),
     element("td", { class: "free" }, study.worlds.join(", ")),
     element("td", { class: "free" }, study.policies.join(", ")),
-    element("td", {}, new Date(study.changed_at).toLocaleString()));
+    element("td", {}, new Date(study.changed_at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" })));
 }
 
 function show({ studies, note }) {
   setText(find("summary"), `${studies.length} studies, ${studies.filter((one) => one.is_running).length} running`);
-  const empty = note ?? "No studies yet. `dextouch study run` writes them into the folder that this dashboard's study service reads.";
+  const empty = note ? [note] : ["No studies yet. Run one with ", element("code", {}, "dextouch study run study.toml --folder data/studies/NAME --store data/store"),
+    "; ", element("code", {}, "dextouch study run --help"), " has an example of study.toml."];
   find("study_rows").replaceChildren(...(studies.length ? studies.map(row)
-    : [element("tr", {}, element("td", { colspan: 8, class: "free" }, empty))]));
+    : [element("tr", {}, element("td", { colspan: 8, class: "free" }, ...empty))]));
 }
 
 const link = new LiveLink({

@@ -75,6 +75,13 @@ async function listed() {
   return { made: found.map((row) => ({ ...row, build: () => (row.item ? itemRow(row) : uploadRow(row)) })), total: page.num_matching };
 }
 
+function nothing() {
+  if (query.view === "trash") return ["The trash is empty."];
+  if (isFiltered(query)) return ["Nothing matches these filters."];
+  return ["Nothing is stored yet. Record a take on ", element("a", { href: "/" }, "Station"), ", or run ",
+    element("code", {}, "dextouch demo"), " with the same data folder: its episodes appear here."];
+}
+
 async function refresh() {
   const number = ++asked;
   try {
@@ -84,8 +91,7 @@ async function refresh() {
     rows = new Map(made.map((row) => [row.key, row]));
     grid.show(made.map(({ key, build, ...state }) => ({ key, build, state: JSON.stringify([query.view, state]) })));
     find("empty").hidden = made.length > 0;
-    const nothing = query.view === "trash" ? "The trash is empty." : "Nothing is stored yet.";
-    setText(find("empty"), isFiltered(query) && query.view !== "trash" ? "Nothing matches these filters." : nothing);
+    find("empty").replaceChildren(...nothing());
     find("list_error").hidden = true;
     showPager();
   } catch (error) {
@@ -146,7 +152,7 @@ function chosen() {
 
 function showSelection() {
   const count = grid.selected.size;
-  setText(find("selected"), count ? `${count} selected` : "none selected: keys mean the row in focus");
+  setText(find("selected"), count ? `${count} selected` : "none selected: keys act on the focused row");
   const aligned = alignable();
   find("align").disabled = !aligned.length;
   setText(find("align").firstElementChild, aligned.some((row) => row.job) ? "Align again" : "Align");

@@ -86,7 +86,7 @@ async function refresh() {
     const shown = FIELDS.map((field, index) => show(field, answers[index].rows));
     const sum = (of) => shown[0].reduce((total, one) => total + of(one), 0);
     const kept = plural(sum((one) => one.num_episodes), "episode");
-    setText(find("total"), `${hours(sum(counted))} in ${kept}, hours without rejected ones`);
+    setText(find("total"), shown[0].length ? `${hours(sum(counted))} in ${kept}, hours without rejected ones` : "no episodes");
     find("list_error").hidden = true;
   } catch (error) {
     if (number !== asked) return;

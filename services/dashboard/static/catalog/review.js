@@ -133,7 +133,7 @@ const KEYS = {
 
 const grid = new Grid(find("rows"), {
   onChange: () => {
-    setText(find("selected"), grid.selected.size ? `${grid.selected.size} selected` : "none selected: keys mean the row in focus");
+    setText(find("selected"), grid.selected.size ? `${grid.selected.size} selected` : "none selected: keys act on the focused row");
     for (const id of ["accept", "reject", "lineage"]) find(id).disabled = !grid.meant().length;
   },
   onOpen: (key) => location.assign(playerPath(rows.get(key).item)),

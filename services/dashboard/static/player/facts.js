@@ -28,6 +28,12 @@ function block(title, ...children) {
   return element("section", { class: "fact_block" }, element("h3", {}, title), ...children);
 }
 
+function wideBlock(title, ...children) {
+  const found = block(title, ...children);
+  found.classList.add("wide");
+  return found;
+}
+
 function about(item) {
   const { about: facts } = item;
   return block("About", rows([
@@ -37,7 +43,7 @@ function about(item) {
     ["Outcome", outcomeBadge(facts.success)],
     ["Domain, origin", `${facts.domain}, ${facts.origin}`],
     ["Station", facts.station],
-    ["Time", facts.at ? new Date(facts.at).toLocaleString() : null],
+    ["Time", facts.at ? new Date(facts.at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" }) : null],
     ["Length", `${((item.stop_ns - item.start_ns) / 1e9).toFixed(3)} s`],
     ["Model steps", facts.num_steps ? `${facts.num_steps} at ${facts.model_rate_hz} Hz` : null],
     ["Incomplete", facts.recovered ? "yes: its writer did not finish it" : null],
@@ -49,9 +55,7 @@ function clocks(reports) {
     number(report.residual_rms_ms, 3), `${report.num_dropped} of ${report.num_samples}`, report.warnings.join(", ") || "none"]);
   const heads = ["Stream", "Stamps by", "Skew ppm", "Latency ms", "Residual ms", "Dropped", "Warnings"];
   if (!lines.length) return null;
-  const found = block("Clocks", table(heads, lines));
-  found.classList.add("wide");
-  return found;
+  return wideBlock("Clocks", table(heads, lines));
 }
 
 function quality(figures) {
@@ -94,7 +98,7 @@ function command(text) {
 
 function exports({ kind, id }) {
   const of_kind = kind === "recording" ? "--kind recording " : "";
-  return block("Open in other tools",
+  return wideBlock("Open in other tools",
     element("p", {}, "Foxglove: export, open the file, and import ", element("a", { href: "/static/player/foxglove_layout.json", download: "dextouch_layout.json" }, "this layout"), "."),
     command(`dextouch export --format mcap ${of_kind}${id} --to ${id}.mcap`),
     element("p", {}, "Rerun: export and open; the file contains its layout."),

@@ -5,6 +5,7 @@ import { unpack } from "../packed.js";
 import { after, allAfter, parseExact, stampOf } from "./times.js";
 
 const STORE = "/v1/episode_store";
+const LATEST_BEGIN_NS = 1e9;
 
 async function answered(path, signal) {
   const answer = await ask(path, { signal });
@@ -60,6 +61,13 @@ export class Item {
     } catch (error) {
       return { item: null, reason: error.message };
     }
+  }
+
+  // Where playing begins: once every stream has a sample, but soon.
+  get begin_ns() {
+    const firsts_ns = [...this.streams.values()].map((stream) => stream.first_ns);
+    const latest_ns = this.start_ns + LATEST_BEGIN_NS;
+    return Math.max(this.start_ns, ...firsts_ns.filter((first_ns) => first_ns !== null && first_ns <= latest_ns));
   }
 
   ofKind(...kinds) {

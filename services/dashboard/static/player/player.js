@@ -31,7 +31,7 @@ export class Player {
     this.heatmap = heatmap;
     this.clock = new PlayClock(item.start_ns, item.stop_ns);
     this.clock.speed = SPEEDS.includes(state.speed) ? state.speed : 1;
-    this.clock.seek(state.at_ns ?? item.start_ns);
+    this.clock.seek(state.at_ns ?? item.begin_ns);
     this.queue = new FetchQueue({ budget_bytes: BUDGET_BYTES, onLoaded: () => this.request() });
     this.hidden = new Set(state.hidden);
     this.raw = null;
