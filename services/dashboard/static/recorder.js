@@ -209,7 +209,7 @@ export class RecorderPanel {
     const pedal = this.pedal.key === null ? "" : " or pedal";
     if (this.changed()) return `The fields changed since this take was armed: arm again (A${pedal}).`;
     const state = this.recorder?.state;
-    if (state === "checking" && this.outcome() === undefined) return "How did this take end? Success (Y), failure (N) or not judged (U).";
+    if (state === "checking" && this.outcome() === undefined) return "How did this take end? Success: Y, failure: N, not judged: U";
     if (this.reset.running) return "Reset the scene.";
     const next = { idle: "Choose a task, then arm: A", armed: "Record: R", recording: "Stop: S", checking: "Save: V", saved: "Next take, arm: A", discarded: "Next take, arm: A" };
     return next[state] ? next[state] + pedal : "";

@@ -58,7 +58,7 @@ export function nameCell(item, path) {
 }
 
 export function operatorCell(item) {
-  return element("td", {}, element("span", { class: "clipped" }, item.operator ?? "–"), under(CONSENT.get(item.consent)));
+  return element("td", {}, element("span", { class: "clipped" }, item.operator ?? "–"), under(item.origin === "recorded" ? CONSENT.get(item.consent) : null));
 }
 
 export function stationCell(item) {
