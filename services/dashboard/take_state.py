@@ -84,7 +84,10 @@ def _reported(report: _Report | None) -> tuple[HealthLevel, str]:
     words = f"{report.duration_s:.1f} s, {report.num_steps} steps"
     if not report.refused_parts:
         return "OK", words
-    return "WARN", f"{words}; stretches left out: {len(report.refused_parts)}, listed by dextouch align report"
+    return (
+        "WARN",
+        f"{words}; stretches left out: {len(report.refused_parts)} (dextouch align report)",
+    )
 
 
 def _view(

@@ -76,7 +76,7 @@ async def test_on_the_way_to_the_store(service, facts, upload, expected):
         ({"state": "done", "report": REPORT}, ("aligned", "OK", "5.4 s, 81 steps")),
         (
             {"state": "done", "report": REPORT | {"refused_parts": [{}, {}]}},
-            ("aligned", "WARN", "5.4 s, 81 steps; stretches left out: 2, listed by dextouch align report"),
+            ("aligned", "WARN", "5.4 s, 81 steps; stretches left out: 2 (dextouch align report)"),
         ),
         (
             {"state": "failed", "problem": PROBLEM | {"detail": "K_head is missing"}},
