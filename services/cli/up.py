@@ -237,7 +237,8 @@ def _dashboard(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
 
     station = _station(settings).station
     upstreams = {f"{name}_url": url for name, url in urls.items() if name != "dashboard"}
-    return create_app(DashboardSettings.model_validate({"station": station} | upstreams))
+    given = {"station": station, "audit_folder": settings.data / "audit"}
+    return create_app(DashboardSettings.model_validate(given | upstreams))
 
 
 # In the order of the data flow; stopped in reverse.

@@ -10,14 +10,17 @@ from fastapi.staticfiles import StaticFiles
 from prometheus_client import Gauge
 
 from dextouch.serving import AccessControl, create_service_app, serve
+from services.dashboard.audit import AuditLog
+from services.dashboard.audit_trail import AuditTrail
 from services.dashboard.comparison import Comparisons
 from services.dashboard.feeds import Feeds
 from services.dashboard.fleet import Fleet
 from services.dashboard.forwarding import forwarding_router
 from services.dashboard.pages import Sessions, page_router, refusal_page
 from services.dashboard.rollout_feeds import RolloutFeeds
-from services.dashboard.routes import api_router, comparison_router, live_router
+from services.dashboard.routes import api_router, comparison_router, live_router, system_router
 from services.dashboard.settings import DashboardSettings
+from services.dashboard.system import System
 from services.dashboard.upstream import Upstream, upstream_histogram
 
 STATIC = Path(__file__).parent / "static"
@@ -51,6 +54,8 @@ def create_app(
     fleet = Fleet(feeds or {settings.station: Feeds(upstreams, settings)}, settings)
     shared = fleet.of()
     comparisons = Comparisons(shared, period_s=settings.station_period_s)
+    system = System(stations, upstreams)
+    audit_log = AuditLog(settings.audit_folder, max_bytes=settings.audit_max_bytes)
     sessions = Sessions(
         AccessControl(settings.api_keys),
         needs_key=bool(settings.api_keys),
@@ -72,12 +77,22 @@ def create_app(
             api_router(settings, fleet, sessions),
             forwarding_router(fleet, sessions),
             comparison_router(comparisons, sessions),
+            system_router(system, audit_log, sessions),
             live_router(
-                fleet, [comparisons.topics.get, RolloutFeeds(shared, settings).topic], sessions
+                fleet,
+                [
+                    comparisons.topics.get,
+                    RolloutFeeds(shared, settings).topic,
+                    {system.topic.name: system.topic}.get,
+                ],
+                sessions,
             ),
         ],
         lifespan=lifespan,
         admits=sessions.allows,
+    )
+    app.add_middleware(
+        AuditTrail, log=audit_log, sessions=sessions, station=next(iter(fleet.names))
     )
     seconds = upstream_histogram()
     for upstream in (*upstreams.values(), *stations.values()):

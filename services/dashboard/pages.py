@@ -69,6 +69,7 @@ SCREENS: Final = (
     Screen("/rollouts", "rollouts.html", "Rollouts"),
     Screen("/studies", "studies.html", "Studies"),
     Screen("/studies/{name}", "study.html", "Study", within="Studies"),
+    Screen("/system", "system.html", "System"),
 )
 
 
@@ -87,13 +88,14 @@ class Sessions:
         self.lifetime_s = lifetime_s
         self._access = access
         self._clock_s = clock_s
-        self._ends_s: dict[str, float] = {}
+        # Name of the key and end of the session, by its token.
+        self._open: dict[str, tuple[str, float]] = {}
 
     @property
     def num_open(self) -> int:
         """Sessions that have not ended."""
         now_s = self._clock_s()
-        return sum(end > now_s for end in tuple(self._ends_s.values()))
+        return sum(end_s > now_s for _, end_s in tuple(self._open.values()))
 
     def sign_in(self, key: str) -> str:
         """Open a session with a key of scope `operate` and return its token.
@@ -101,24 +103,33 @@ class Sessions:
         Raises:
             AccessDeniedError: an unknown key or one without the scope.
         """
-        self._access.check(f"Bearer {key}", SCOPE)
+        person = self._access.check(f"Bearer {key}", SCOPE)
         now_s = self._clock_s()
-        self._ends_s = {token: end for token, end in self._ends_s.items() if end > now_s}
-        while len(self._ends_s) >= MAX_SESSIONS:
-            self._ends_s.pop(next(iter(self._ends_s)))
+        self._open = {token: one for token, one in self._open.items() if one[1] > now_s}
+        while len(self._open) >= MAX_SESSIONS:
+            self._open.pop(next(iter(self._open)))
         token = secrets.token_urlsafe(32)
-        self._ends_s[token] = now_s + self.lifetime_s
+        self._open[token] = person, now_s + self.lifetime_s
         return token
 
     def sign_out(self, connection: HTTPConnection) -> None:
         """End the session of this browser and invalidate its cookie."""
-        self._ends_s.pop(connection.cookies.get(COOKIE, ""), None)
+        self._open.pop(connection.cookies.get(COOKIE, ""), None)
 
     def allows(self, connection: HTTPConnection) -> bool:
         """Whether a request or WebSocket belongs to an open session."""
         if not self.needs_key:
             return True
-        return self._ends_s.get(connection.cookies.get(COOKIE, ""), 0.0) > self._clock_s()
+        return self.person(connection) is not None
+
+    def person(self, connection: HTTPConnection) -> str | None:
+        """Name of the key that opened the session of this browser; None without a session."""
+        return self.person_of(connection.cookies.get(COOKIE, ""))
+
+    def person_of(self, token: str) -> str | None:
+        """Name of the key that opened a session; None if it is not open."""
+        person, end_s = self._open.get(token, (None, 0.0))
+        return person if end_s > self._clock_s() else None
 
     def guard(self, connection: HTTPConnection) -> None:
         """Refuse browsers that are not signed in."""
@@ -144,6 +155,7 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
             token = sessions.sign_in(fields.get("key", [""])[0])
         except AccessDeniedError as error:
             return page("sign_in.html", 401, reason=error.message, wanted=wanted)
+        request.state.person = sessions.person_of(token)
         answer = RedirectResponse(wanted, 303)
         answer.set_cookie(
             COOKIE,

@@ -6,7 +6,7 @@ from contextlib import suppress
 from typing import Annotated, Any
 from urllib.parse import quote
 
-from fastapi import APIRouter, Body, Depends, Path, Response, WebSocket, WebSocketDisconnect
+from fastapi import APIRouter, Body, Depends, Path, Query, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import JSONResponse
 from fastapi.security import APIKeyCookie
 from pydantic import Field, ValidationError
@@ -16,6 +16,8 @@ from starlette.websockets import WebSocketState
 from dextouch.errors import AccessDeniedError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import JSON, KIB, OCTETS, takes
+from services.dashboard.audit import AuditLog, AuditPage
+from services.dashboard.audit_trail import ALL_ACTIONS
 from services.dashboard.comparison import Comparisons, ComparisonView, StartComparison
 from services.dashboard.feeds import Feeds, Topic
 from services.dashboard.fleet import Fleet
@@ -23,6 +25,7 @@ from services.dashboard.live_messages import heatmap_layout, skeleton_bones
 from services.dashboard.pages import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView
+from services.dashboard.system import System, SystemView
 
 WEBSOCKET_REFUSED = 1008
 # Interval at which a WebSocket checks that its session is still valid.
@@ -116,6 +119,29 @@ def comparison_router(comparisons: Comparisons, sessions: Sessions) -> APIRouter
         headers = {"cache-control": "no-store"}
         content = comparisons.chunk(comparison_id, number)
         return Response(content, headers=headers, media_type=OCTETS)
+
+    return router
+
+
+def system_router(system: System, log: AuditLog, sessions: Sessions) -> APIRouter:
+    """Router of the state of all services, and of the audit log."""
+    guards = [Depends(sessions.guard), Depends(SESSION)]
+    router = APIRouter(prefix="/v1", dependencies=guards, tags=["system"])
+
+    @router.get("/system")
+    async def state() -> SystemView:
+        """Services, disks and queues."""
+        return await system.read()
+
+    @router.get("/audit")
+    def audit(
+        limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+        action: Annotated[str | None, Query(max_length=200)] = None,
+        person: Annotated[str | None, Query(max_length=64)] = None,
+    ) -> AuditPage:
+        """Requests that changed something, or were refused, newest first."""
+        found = log.newest(limit, action=action, person=person)
+        return found.model_copy(update={"actions": ALL_ACTIONS})
 
     return router
 

@@ -85,6 +85,14 @@ class DashboardSettings(ServiceSettings):
         default=12.0, gt=0, le=24 * 30, description="hours until an operator must sign in again"
     )
 
+    audit_folder: Path | None = Field(
+        default=None,
+        description="folder of the audit log, of this dashboard alone (default: in memory only)",
+    )
+    audit_max_bytes: int = Field(
+        default=16 * 2**20, ge=2**20, description="largest size of the audit log, all files"
+    )
+
     def station_urls(self) -> dict[str, str]:
         """URLs of the stations by name; the one of `acquisition_url` is the first."""
         own = {self.station: self.acquisition_url} if self.acquisition_url else {}

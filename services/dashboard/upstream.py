@@ -36,6 +36,11 @@ class Upstream:
         self.seconds = upstream_histogram()
         self._client = client
 
+    @property
+    def address(self) -> str:
+        """URL of the service, without credentials."""
+        return str(self._client.base_url.copy_with(username=None, password=None)).rstrip("/")
+
     @staticmethod
     def connect(name: str, url: str, *, key: SecretStr | None, timeout_s: float) -> "Upstream":
         """Create a client with a bounded connection pool, without sending a request."""
@@ -116,11 +121,7 @@ class Upstream:
             response = await self._client.send(request)
             outcome = "refused" if response.is_error else "answered"
         except httpx.HTTPError as error:
-            raise UnavailableError(
-                f"{self.name}: no answer to {method} {path} ({type(error).__name__}); "
-                "is the service running?",
-                service=self.name,
-            ) from error
+            raise self._no_answer(method, path, error) from error
         finally:
             self.seconds.labels(self.name, outcome).observe(time.perf_counter() - began_s)
         if response.is_success or response.status_code == HTTPStatus.NOT_MODIFIED:
@@ -133,6 +134,24 @@ class Upstream:
                 service=self.name,
             ) from error
         raise error_from_problem(problem)
+
+    async def answer(self, path: str) -> httpx.Response:
+        """Any response to a GET request, also a refusal.
+
+        Raises:
+            UnavailableError: no response.
+        """
+        try:
+            return await self._client.get(path)
+        except httpx.HTTPError as error:
+            raise self._no_answer("GET", path, error) from error
+
+    def _no_answer(self, method: str, path: str, error: httpx.HTTPError) -> UnavailableError:
+        return UnavailableError(
+            f"{self.name}: no answer to {method} {path} ({type(error).__name__}); "
+            "is the service running?",
+            service=self.name,
+        )
 
     async def ready(self) -> tuple[bool, str]:
         """Readiness of the service, and what is missing otherwise."""

@@ -87,7 +87,7 @@ def test_a_page_that_lost_session_and_link_goes_to_the_sign_in(page, address, ap
     page.goto(address)
     sign_in(page, KEY)
     expect(page.locator("#link")).to_have_text("live")
-    app.state.sessions._ends_s.clear()
+    app.state.sessions._open.clear()
     links[-1].close(code=1001)
     expect(page.get_by_label("Key")).to_be_visible()
 
@@ -103,7 +103,7 @@ def test_a_button_of_a_session_that_ended_goes_to_the_sign_in(page, serve, serve
     sign_in(page, KEY)
     expect(page.locator("#recorder_state")).to_have_text("idle")
     page.locator("#operator").fill("p7")
-    app.state.sessions._ends_s.clear()
+    app.state.sessions._open.clear()
     page.get_by_role("button", name="Arm").click()
     expect(page.get_by_label("Key")).to_be_visible()
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from dextouch.serving.guard import takes as takes
     from dextouch.serving.json_bodies import JsonBody as JsonBody
     from dextouch.serving.logs import configure_logging as configure_logging
+    from dextouch.serving.masking import masked as masked
     from dextouch.serving.settings import MAX_WEBSOCKET_BYTES as MAX_WEBSOCKET_BYTES
     from dextouch.serving.settings import ServiceSettings as ServiceSettings
     from dextouch.serving.settings import load_settings as load_settings

@@ -1,0 +1,81 @@
+// The page System: state of services, disks and queues; jobs and the audit log have files of their own.
+
+import { element, levelBadge, setText } from "../dom.js";
+import { age, count, plural } from "../format.js";
+import { LiveLink } from "../live.js";
+import { badge, why } from "../study_parts.js";
+import { startTheme } from "../theme.js";
+import { AuditTable } from "./audit_table.js";
+import { bytes, cpu, filling, latency } from "./figures.js";
+import { Jobs } from "./jobs.js";
+
+const find = (id) => document.getElementById(id);
+const LEVELS = { ready: "OK", waiting: "WARN", down: "ERROR" };
+
+function number(text) {
+  return element("td", { class: "number" }, text);
+}
+
+function versionCell(service, own) {
+  if (service.version === null) return element("td", {}, "–");
+  if (service.version === own) return element("td", {}, service.version);
+  return element("td", {}, element("span", { class: "differs" }, service.version), why(`dashboard ${own}`));
+}
+
+function serviceRow(service, own) {
+  const mark = service.shares_process ? " *" : "";
+  const reason = service.state === "waiting" ? `waiting for ${service.waiting_for.join(", ")}` : service.problem;
+  return element("tr", { "data-service": service.name, "data-level": service.state === "ready" ? null : LEVELS[service.state] },
+    element("td", {}, badge({ level: LEVELS[service.state], word: service.state })),
+    element("td", { class: "name" }, service.name, why(reason)),
+    versionCell(service, own),
+    number(age(service.uptime_s)), number(latency(service.latency_s)),
+    number(service.memory_bytes === null ? "–" : `${bytes(service.memory_bytes)}${mark}`),
+    number(service.cpu_ratio === null ? "–" : `${cpu(service.cpu_ratio)}${mark}`),
+    element("td", { class: "address" }, service.address));
+}
+
+function diskRow(disk) {
+  return element("tr", { "data-level": disk.level === "OK" ? null : disk.level },
+    element("td", {}, badge({ level: disk.level, word: disk.level === "OK" ? "OK" : "low" })),
+    element("td", { class: "name" }, disk.name), number(bytes(disk.free_bytes)),
+    element("td", { class: "number", title: disk.fill_bytes_per_s === null ? null : `over the last ${age(disk.span_s)}` }, filling(disk.fill_bytes_per_s)),
+    number(age(disk.left_s)));
+}
+
+function queueRow(queue) {
+  return element("tr", { "data-level": queue.level === "OK" ? null : queue.level },
+    element("td", {}, levelBadge(queue.level)),
+    element("td", { class: "name" }, queue.name), element("td", {}, queue.place), number(String(queue.count)), number(count(queue.limit)));
+}
+
+function fill(id, rows, columns, empty) {
+  find(id).replaceChildren(...(rows.length ? rows
+    : [element("tr", {}, element("td", { colspan: columns, class: "free" }, empty))]));
+}
+
+function show({ version, services, disks, queues }) {
+  const ready = services.filter((one) => one.state === "ready").length;
+  setText(find("summary"), `${ready} of ${plural(services.length, "service")} ready`);
+  setText(find("own_version"), `dashboard ${version}`);
+  fill("service_rows", services.map((one) => serviceRow(one, version)), 8, "This dashboard was started without the address of any service.");
+  find("shared_process").hidden = !services.some((one) => one.shares_process);
+  fill("disk_rows", disks.map(diskRow), 5, "No service measures its disk.");
+  fill("queue_rows", queues.map(queueRow), 5, "No service has a queue.");
+}
+
+const jobs = new Jobs(find("job_rows"), find("jobs_note"), find("no_jobs"));
+const link = new LiveLink({
+  onTopic: (topic, data) => {
+    if (topic === "system") show(data);
+    if (topic === "studies") jobs.showStudies(data.studies);
+  },
+  onBinary: () => {},
+  onState: (connected) => setText(find("link"), connected ? "live" : "dashboard not reachable: what you see is old"),
+});
+link.show("system", true);
+link.show("studies", true);
+document.addEventListener("visibilitychange", () => link.sendView());
+startTheme(find("theme"), () => {});
+jobs.start();
+new AuditTable(find).start();
