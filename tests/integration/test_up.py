@@ -56,7 +56,9 @@ async def test_all_services_in_one_process(solver, tmp_path, capsys):
             seen_whole(client, urls["dashboard"], expected - {"dashboard"}), START_LIMIT_S
         )
         worlds = (await client.get(urls["twin"] + "/v1/worlds")).json()["worlds"]
+        audit = (await client.get(urls["dashboard"] + "/v1/audit")).json()
     assert worlds[0]["kind"] == "twin"
+    assert audit["folder"] == str(tmp_path / "data" / "audit")
     stop.set()
     assert await running == 0
     assert urls["dashboard"] in capsys.readouterr().out
