@@ -150,6 +150,6 @@ def test_takes_of_an_operator(watched, station, tmp_path):
     assert row.locator("td").nth(5).text_content() == "1"
 
     page.get_by_role("button", name="Sign out").click()
-    expect(page.get_by_label("Key")).to_be_visible()
+    expect(page.get_by_label("Key", exact=True)).to_be_visible()
     page.goto(f"{station}/episodes")
-    expect(page.get_by_label("Key")).to_be_visible()
+    expect(page.get_by_label("Key", exact=True)).to_be_visible()

@@ -24,7 +24,7 @@ def address(serve, app):
 
 
 def sign_in(page, key):
-    page.get_by_label("Key").fill(key)
+    page.get_by_label("Key", exact=True).fill(key)
     page.get_by_role("button", name="Sign in").click()
 
 
@@ -60,9 +60,9 @@ def test_signing_out_ends_the_session(page, address):
     page.goto(address)
     sign_in(page, KEY)
     page.get_by_role("button", name="Sign out").click()
-    expect(page.get_by_label("Key")).to_be_visible()
+    expect(page.get_by_label("Key", exact=True)).to_be_visible()
     page.goto(address)
-    expect(page.get_by_label("Key")).to_be_visible()
+    expect(page.get_by_label("Key", exact=True)).to_be_visible()
 
 
 def test_other_pages_of_a_browser_that_signs_out_go_to_the_sign_in(page, address):
@@ -72,7 +72,7 @@ def test_other_pages_of_a_browser_that_signs_out_go_to_the_sign_in(page, address
     other = page.context.new_page()
     other.goto(address)
     other.get_by_role("button", name="Sign out").click()
-    expect(page.get_by_label("Key")).to_be_visible()
+    expect(page.get_by_label("Key", exact=True)).to_be_visible()
 
 
 def test_a_page_that_lost_session_and_link_goes_to_the_sign_in(page, address, app):
@@ -89,7 +89,7 @@ def test_a_page_that_lost_session_and_link_goes_to_the_sign_in(page, address, ap
     expect(page.locator("#link")).to_have_text("live")
     app.state.sessions._open.clear()
     links[-1].close(code=1001)
-    expect(page.get_by_label("Key")).to_be_visible()
+    expect(page.get_by_label("Key", exact=True)).to_be_visible()
 
 
 def test_a_button_of_a_session_that_ended_goes_to_the_sign_in(page, serve, serve_station, tmp_path):
@@ -105,7 +105,7 @@ def test_a_button_of_a_session_that_ended_goes_to_the_sign_in(page, serve, serve
     page.locator("#operator").fill("p7")
     app.state.sessions._open.clear()
     page.get_by_role("button", name="Arm").click()
-    expect(page.get_by_label("Key")).to_be_visible()
+    expect(page.get_by_label("Key", exact=True)).to_be_visible()
 
 
 def test_a_password_manager_finds_its_fields(page, address):
