@@ -124,6 +124,8 @@ def test_people_are_named_and_filtered(page, serve_dashboard):
             expect(page.locator("[name=key]")).to_be_visible()
         elif key.startswith("no"):
             expect(page.get_by_text("unknown key")).to_be_visible()
+        else:
+            expect(page.get_by_role("link", name="System")).to_be_visible()
     rows = page.locator("#audit_rows tr")
     expect(rows).to_have_count(4)
     for row, words in zip(
@@ -144,6 +146,7 @@ def test_the_navigation_has_one_line(open_page, serve_dashboard):
     page.goto(f"{address}/system")
     page.locator("[name=key]").fill(KEY)
     page.keyboard.press("Enter")
+    expect(page.get_by_role("link", name="System")).to_be_visible()
     for path in ("/system", "/", "/episodes", "/studies"):
         page.goto(f"{address}{path}")
         expect(page.get_by_role("link", name="System")).to_be_visible()
