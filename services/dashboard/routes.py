@@ -47,7 +47,8 @@ class Subscription(FrozenModel):
 def api_router(settings: DashboardSettings, fleet: Fleet, sessions: Sessions) -> APIRouter:
     """Router of the page's data and actions."""
     guards = [Depends(sessions.guard), Depends(SESSION)]
-    router = APIRouter(prefix="/v1", dependencies=guards, tags=["dashboard"])
+    # Every route takes the name of a station, which may be unknown.
+    router = APIRouter(prefix="/v1", dependencies=guards, tags=["dashboard"], responses={404: {}})
     Station = Annotated[Feeds, Depends(fleet.of)]
     layout = {**heatmap_layout(), "bones": skeleton_bones()}
 

@@ -68,7 +68,7 @@ def test_the_page_names_every_file_of_a_package():
 def test_a_take_is_recorded_and_the_dead_cell_is_found(lab):
     (shown,) = PAGE.outputs
     assert run(lab, *PAGE.command("python ")[1:]) == shown
-    (take,) = (lab / "takes").iterdir()
+    (take,) = (path for path in (lab / "takes").iterdir() if path.is_dir())
     spool = SpoolReader(take)
     descriptor = spool.streams["tactile_left"]
     assert (descriptor.shape, descriptor.nominal_rate_hz, descriptor.unit) == ((64,), 100, "counts")

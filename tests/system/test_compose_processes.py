@@ -124,7 +124,8 @@ def test_the_dashboard_shows_it(composed, recording_id):
         assert browser.post("/sign_in", data={"key": KEY}).status_code == 303
         overview = browser.get("/v1/overview").json()
     levels = {service["name"]: service["level"] for service in overview["services"]}
-    assert set(levels) == {"acquisition", "episode_store", "alignment", "twin", "world_model"}
+    services = {"acquisition", "episode_store", "alignment", "twin", "world_model", "studies"}
+    assert set(levels) == services
     assert {name for name, level in levels.items() if level != "OK"} == set(WITHOUT)
     assert len(overview["station"]["streams"]) >= 10
     assert recording_id in [take["name"] for take in overview["takes"]]

@@ -22,7 +22,7 @@ station calibrate latency, station calibrate profile, station calibrate robot-ba
 station calibrate show, station calibrate wrist, station serve,
 store delete, store list, store migrate, store purge, store repair, store restore, store serve,
 store show, store verify,
-study report, study run,
+study report, study run, study serve,
 train adapt, train data, train direct-judge, train distill, train imagined, train policy,
 train probe, train state, train tokenizer, train world-model,
 twin record, twin serve, up
@@ -30,7 +30,8 @@ twin record, twin serve, up
 NAMES = [" ".join(name.split()) for name in COMMANDS.split(",")]
 # Services run until they are stopped and answer over HTTP: they have no result to write.
 WITHOUT_JSON = {
-    "align serve", "dashboard", "rate serve", "serve", "station serve", "store serve", "twin serve",
+    "align serve", "dashboard", "rate serve", "serve", "station serve", "store serve",
+    "study serve", "twin serve",
     # These print a file.
     "completion", "config example",
 }  # fmt: skip
@@ -78,7 +79,9 @@ def commands_below(name: str) -> list[str]:
         parser = help_of(name).parser
         assert parser is not None, name
         inner = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
-        words = tuple(inner[0].choices) if inner else ()
+        # Commands with classes of settings are listed there, not by the parser.
+        own = dict.fromkeys([*inner[0].choices, *main.commands_of(name)]) if inner else {}
+        words = tuple(own)
     if not words:
         # A command may have others below it, such as `evaluate prediction`.
         return [name, *(f"{name} {word}" for word in main.commands_of(name))]
