@@ -1,6 +1,7 @@
 """Time to the first picture of the player and from a click on its timeline to all pictures.
 
-Prints medians and 95th percentiles of this machine: `pytest tests/browser/test_player_latency.py`.
+Prints medians and 95th percentiles of this machine:
+`pytest -s -m slow tests/browser/test_player_latency.py`.
 """
 
 import sys
@@ -17,6 +18,7 @@ from services.dashboard.settings import DashboardSettings
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
 
+pytestmark = pytest.mark.slow
 NUM_LOADS = 5
 NUM_CLICKS = 40
 DURATION_S = 30

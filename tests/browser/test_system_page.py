@@ -65,7 +65,7 @@ def services_are_shown(page, urls):
     store = page.locator("[data-service='episode store']")
     expect(store).to_contain_text("ready")
     expect(store).to_contain_text(urls["episode_store_url"])
-    expect(store).to_contain_text(re.compile(r"\d MB \*"))
+    expect(store).to_contain_text(re.compile(r"\d [MG]B \*"))
     expect(page.locator("#own_version")).to_have_text(f"dashboard {__version__}")
     expect(page.locator("[data-service=twin]")).to_contain_text("twin: no answer to GET /healthz")
     expect(page.locator("#shared_process")).to_be_visible()
