@@ -33,7 +33,7 @@ demo: $(VENV)/.runtime   ## record, align, predict and evaluate on this machine
 	$(BIN)/dextouch demo
 
 # Bytecode is cached, since tests start many processes that would otherwise each compile all modules.
-test: $(VENV)/.dev       ## the default test run (seven to eight minutes on two cores)
+test: $(VENV)/.dev       ## the default test run (about twelve minutes on two cores)
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n logical --dist loadfile
 
 slow: $(VENV)/.dev       ## the long tests

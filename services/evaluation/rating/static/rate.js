@@ -109,6 +109,8 @@ function refresh() {
 }
 
 function draw() {
+  // An image may arrive after its rollout was left.
+  if (!shown) return;
   const picture = pictures[step];
   at("step").value = step;
   at("time").textContent = `${(step / shown.rate_hz).toFixed(1)} s`;
