@@ -13,7 +13,7 @@ DOCS_VENV ?= .venv-docs
 SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
+.PHONY: demo test check slow browser kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -33,11 +33,14 @@ demo: $(VENV)/.runtime   ## record, align, predict and evaluate on this machine
 	$(BIN)/dextouch demo
 
 # Bytecode is cached, since tests start many processes that would otherwise each compile all modules.
-test: $(VENV)/.dev       ## the default test run (about twelve minutes on two cores)
+test: $(VENV)/.dev       ## the default test run (about eight minutes on two cores)
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n logical --dist loadfile
 
 slow: $(VENV)/.dev       ## the long tests
 	$(BIN)/python -m pytest -q -m slow
+
+browser: $(VENV)/.dev    ## all tests of the pages, in Chromium; apt-get install chromium
+	$(BIN)/python -m pytest -q -m "slow or not slow" tests/browser $(ARGS)
 
 wheel-test: $(VENV)/.dev   ## build the wheel, install it outside the checkout, run its demo and its services
 	$(BIN)/python -m pytest -q -m slow tests/system/test_wheel.py

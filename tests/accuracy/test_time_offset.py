@@ -65,6 +65,7 @@ def test_offset_of_a_few_seeds(num_axes, bound_ms, capsys):
     assert max(sigmas) <= 3
 
 
+@pytest.mark.slow
 def test_sigma_covers_the_spread_of_stamps_that_jitter(capsys):
     """Noise alone would allow half the sigma; stamps of real streams jitter by milliseconds."""
     ratios = {"noise": [], "jitter": []}

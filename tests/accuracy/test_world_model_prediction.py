@@ -95,6 +95,7 @@ def test_the_shipped_model_is_small_and_knows_its_history(shipped):
     assert not set(metadata.train_episode_ids) & set(metadata.heldout_episode_ids)
 
 
+@pytest.mark.slow
 def test_it_looks_before_it_feels(shipped, tmp_path):
     """With the objects elsewhere the same motions must not be felt: touch follows sight."""
     windows = [

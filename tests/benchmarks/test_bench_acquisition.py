@@ -41,6 +41,7 @@ def run(tmp_path_factory):
     return done.stdout, json.loads((folder / "figures.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_quick_run_measures_everything(run):
     text, figures = run
     found = {(j["family"], j["way"]): j for j in figures["judgements"]}

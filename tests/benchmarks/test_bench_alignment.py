@@ -40,6 +40,7 @@ def run(tmp_path_factory):
     return done.stdout, folder, json.loads((folder / "bench_alignment.json").read_text())
 
 
+@pytest.mark.slow
 def test_every_method_is_timed_by_step(run):
     text, folder, figures = run
     (take,) = figures["takes"]
@@ -56,6 +57,7 @@ def test_every_method_is_timed_by_step(run):
     assert not (folder / "written" / "store").exists()
 
 
+@pytest.mark.slow
 def test_ours_keeps_its_bounds_and_arrivals_come_late_by_the_path_delay(run):
     _, _, figures = run
     verdicts = {row["what"]: row["verdict"] for row in figures["requirements"]}

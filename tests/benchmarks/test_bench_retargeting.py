@@ -55,6 +55,7 @@ def run(tmp_path_factory):
     return folder, json.loads((folder / "bench_retargeting.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_quick_run_measures_ours_everywhere(run):
     _, figures = run
     assert {(one["method"], one["motion"]) for one in figures["speed"]} == {
@@ -67,6 +68,7 @@ def test_a_quick_run_measures_ours_everywhere(run):
     assert [one["text"][:9] for one in figures["faults"]] == ["continues"] * 3
 
 
+@pytest.mark.slow
 def test_promises_that_need_no_quiet_machine_are_kept(run):
     _, figures = run
     verdicts = {row["what"]: row["verdict"] for row in figures["requirements"]}
@@ -79,6 +81,7 @@ def test_promises_that_need_no_quiet_machine_are_kept(run):
             assert verdict == "pass", what
 
 
+@pytest.mark.slow
 def test_the_chart_has_our_point_in_both_panels(run):
     folder, _ = run
     chart = ET.parse(folder / "bench_retargeting.svg").getroot()  # noqa: S314 (ours)
@@ -193,6 +196,7 @@ rival_process._main()
 """
 
 
+@pytest.mark.slow
 def test_a_rival_that_refuses_hangs_or_dies_does_not_end_the_run(monkeypatch):
     begin = subprocess.Popen
 
@@ -218,6 +222,7 @@ def test_a_rival_that_refuses_hangs_or_dies_does_not_end_the_run(monkeypatch):
             process.run(faulty[3.0], 1.0)
 
 
+@pytest.mark.slow
 def test_a_rival_that_does_not_finish_is_a_row(monkeypatch):
     begin = subprocess.Popen
     # It takes its time at the first sample of all.

@@ -50,6 +50,7 @@ def run(tmp_path_factory):
     return folder, done.stdout, json.loads((folder / "figures.json").read_text())
 
 
+@pytest.mark.slow
 def test_every_design_is_measured(run):
     _, text, figures = run
     assert list(figures["designs"]) == DESIGNS
@@ -60,6 +61,7 @@ def test_every_design_is_measured(run):
             assert min(result[key]["values"]) > 0, (name, key)
 
 
+@pytest.mark.slow
 def test_every_requirement_has_a_figure(run):
     _, text, figures = run
     verdicts = [requirement["verdict"] for requirement in figures["requirements"]]
@@ -68,6 +70,7 @@ def test_every_requirement_has_a_figure(run):
     assert all(verdict in text for verdict in verdicts)
 
 
+@pytest.mark.slow
 def test_bytes_and_images_are_what_the_codecs_promise(run):
     """None of these depends on how busy the machine is."""
     designs = run[2]["designs"]
@@ -78,6 +81,7 @@ def test_bytes_and_images_are_what_the_codecs_promise(run):
     assert np.mean(psnr_db["zarr-jpeg"]) - np.mean(psnr_db["ours-h264"]) < 3
 
 
+@pytest.mark.slow
 def test_the_live_run_counts_every_row(run):
     (live,) = run[2]["live"]
     per_second = 3 * 30 + sum(NUMERIC_RATES_HZ.values())
@@ -85,6 +89,7 @@ def test_the_live_run_counts_every_row(run):
     assert 0 <= live["num_late"] <= per_second
 
 
+@pytest.mark.slow
 def test_the_chart_has_a_point_for_every_design(run):
     folder, _, _ = run
     chart = ET.parse(folder / "out" / "bench_store.svg").getroot()  # noqa: S314 (our own file)
@@ -102,6 +107,7 @@ def take():
     return make_take(0.6, seed=3)
 
 
+@pytest.mark.slow
 def test_a_seed_makes_one_take():
     take, again, other = (make_take(0.1, seed=seed) for seed in (3, 3, 4))
     for name, stream in {**take.images, **take.numbers}.items():

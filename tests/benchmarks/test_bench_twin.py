@@ -29,6 +29,7 @@ def run(tmp_path_factory):
     return folder, json.loads((folder / "bench_twin.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_quick_run_measures_everything(run):
     folder, figures = run
     assert list(figures["chunk_ms"]) == list(SELECTORS)

@@ -38,6 +38,7 @@ def run(tmp_path_factory):
     return folder, json.loads((folder / "bench_world-model.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_quick_run_measures_everything(run):
     folder, figures = run
     names = {one.name for one in benchmark.VARIANTS}
@@ -48,6 +49,7 @@ def test_a_quick_run_measures_everything(run):
     assert "Imagined touch" in (folder / "bench_world-model.svg").read_text()
 
 
+@pytest.mark.slow
 def test_the_model_is_nearer_to_the_twin_than_standing_still(run):
     errors = run[1]["errors"]
     ours, copied = errors[run[1]["options"]["served"]], errors[tables.COPY_FIRST]
@@ -55,6 +57,7 @@ def test_the_model_is_nearer_to_the_twin_than_standing_still(run):
     assert ours["touch_kpa"] < copied["touch_kpa"]
 
 
+@pytest.mark.slow
 def test_half_precision_is_near_full_precision_and_not_the_same(run):
     # Shape checks know float32 only, so half precision is tried without them.
     errors = run[1]["errors"]
@@ -65,6 +68,7 @@ def test_half_precision_is_near_full_precision_and_not_the_same(run):
         assert half == pytest.approx(full, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_kept_context_does_not_change_the_errors(run):
     errors = run[1]["errors"]
     for steps in (2, 4, 8):

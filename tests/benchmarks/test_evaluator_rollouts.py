@@ -87,6 +87,7 @@ def plan(tmp_path_factory):
     return StudyPlan(keep, trained, ("stand_bottle",), (39_077,), (0.0,), num_still_starts=0)
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_without_rolling_out_again(plan, monkeypatch):
     study, path = work.Study(plan), plan.keep / "rollouts.jsonl"
     missing = study.missing(KeptRows(path), "stand_bottle", 39_077)

@@ -162,6 +162,7 @@ def test_the_zero_of_a_glove_is_measured_from_the_page_by_keyboard(page, address
 
 
 @pytest.mark.usefixtures("few_poses")
+@pytest.mark.slow
 def test_a_run_is_ended_and_what_is_wrong_is_said(page, address, folder):
     page.goto(f"{address}/calibration")
     page.locator("tr[data-name=K_head] button").click()

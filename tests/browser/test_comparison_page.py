@@ -152,6 +152,7 @@ def test_both_worlds_side_by_side_with_their_errors(page, serve_dashboard, item,
     assert problems == []
 
 
+@pytest.mark.slow
 def test_a_world_that_ends_its_rollout_says_why(page, serve_dashboard, item):
     address, *_ = serve_dashboard(ends_at=48)
     page.goto(f"{address}/rollouts?replay={item.episode_id}")
@@ -165,6 +166,7 @@ def test_a_world_that_ends_its_rollout_says_why(page, serve_dashboard, item):
     ("episode_id", "says"),
     [("recorded-by-hand", "expected a robot episode with a seed"), ("nothing", "nothing")],
 )
+@pytest.mark.slow
 def test_episodes_that_cannot_be_replayed_are_refused(page, serve_dashboard, episode_id, says):
     address, *_ = serve_dashboard()
     page.goto(f"{address}/rollouts")

@@ -58,6 +58,7 @@ def open_list(page, address, query=""):
     expect(page.locator("#range")).not_to_be_empty()
 
 
+@pytest.mark.slow
 def test_a_take_is_one_row_and_opens_in_the_player(page, address, takes):
     open_list(page, address)
     expect(names(page)).to_have_text([f"take-{number}" for number in range(5)])
@@ -72,6 +73,7 @@ def test_a_take_is_one_row_and_opens_in_the_player(page, address, takes):
     page.wait_for_url("**/episodes/episode/take-1-aligned")
 
 
+@pytest.mark.slow
 def test_filters_are_in_the_address_and_survive_a_reload(page, address, takes):
     open_list(page, address)
     page.locator("[name=task]").select_option("stack_bowls")
@@ -97,6 +99,7 @@ def test_filters_are_in_the_address_and_survive_a_reload(page, address, takes):
     expect(page).to_have_url(f"{address}/episodes?view=recording&text=TAKE-4")
 
 
+@pytest.mark.slow
 def test_days_are_those_of_the_browser(open_page, address, store):
     # 23:30 of the third and 00:30 of the fourth in Helsinki.
     for name, at in (("late", "2026-05-03T20:30:00Z"), ("early", "2026-05-03T21:30:00Z")):
@@ -108,6 +111,7 @@ def test_days_are_those_of_the_browser(open_page, address, store):
     expect(names(page)).to_have_text(["late"])
 
 
+@pytest.mark.slow
 def test_pages_are_turned_by_keys(page, address, store):
     for number in range(53):
         write_episode(store, f"e-{number:02d}", num_steps=2)
@@ -120,6 +124,7 @@ def test_pages_are_turned_by_keys(page, address, store):
     expect(names(page)).to_have_text(["e-50", "e-51", "e-52"])
 
 
+@pytest.mark.slow
 def test_many_are_deleted_and_restored_by_keys(page, address, store, takes):
     open_list(page, address)
     expect(names(page)).to_have_count(5)
@@ -150,6 +155,7 @@ def test_many_are_deleted_and_restored_by_keys(page, address, store, takes):
     expect(names(page)).to_have_count(5)
 
 
+@pytest.mark.slow
 def test_a_deletion_is_taken_back(page, address, store, takes):
     open_list(page, address)
     expect(names(page)).to_have_count(5)

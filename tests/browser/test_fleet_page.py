@@ -65,6 +65,7 @@ def test_a_station_that_stops_is_stale_and_first(wall, stations):
     expect(tile).not_to_have_attribute("data-level", "STALE")
 
 
+@pytest.mark.slow
 def test_a_tile_opens_its_station(wall):
     wall.locator("[data-station=desk_2] a").click()
     expect(wall.locator("h1")).to_contain_text("desk_2")
@@ -76,6 +77,7 @@ def test_a_tile_opens_its_station(wall):
     expect(wall.locator("h1")).to_contain_text("desk_2")
 
 
+@pytest.mark.slow
 def test_an_action_reaches_the_station_of_the_page(wall, stations):
     wall.locator("[data-station=desk_2] a").click()
     expect(wall.locator("#recorder_state")).to_have_text("idle")

@@ -152,6 +152,7 @@ def plotted(page, name):
     return [np.array(column, dtype=np.float64) for column in columns]
 
 
+@pytest.mark.slow
 def test_plots_show_the_script_at_its_times(open_page, scripted):
     address, began_s = scripted
     page = open_page(viewport={"width": 1366, "height": 900}, timezone_id="UTC")
@@ -190,6 +191,7 @@ def strip_colour(page, row, t_s):
     )
 
 
+@pytest.mark.slow
 def test_takes_and_silences_are_marked_on_the_axis(open_page, scripted):
     address, began_s = scripted
     page = open_page(viewport={"width": 1366, "height": 900}, color_scheme="light")
@@ -211,6 +213,7 @@ def test_takes_and_silences_are_marked_on_the_axis(open_page, scripted):
     assert strip_colour(page, other, began_s + 5) == strip_colour(page, other, began_s + 12.5)
 
 
+@pytest.mark.slow
 def test_one_cursor_and_a_view_that_the_address_keeps(open_page, scripted):
     address, _ = scripted
     page = open_page(viewport={"width": 1366, "height": 900}, timezone_id="UTC")

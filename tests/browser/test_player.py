@@ -141,6 +141,7 @@ def test_ten_random_moments_are_those_that_were_written(watched, address, played
         assert check(opened(watched, link), streams) == t_ns
 
 
+@pytest.mark.slow
 def test_a_gap_shows_no_sample_and_is_marked(watched, address, played):
     _, streams, _ = played
     shown = opened(watched, f"{address}/episodes/episode/episode-1?at=5.25")
@@ -166,6 +167,7 @@ def test_a_gap_shows_no_sample_and_is_marked(watched, address, played):
     until(watched, f"document.querySelector('[data-camera]').dataset.stamp === '{stamps[first]}'")
 
 
+@pytest.mark.slow
 def test_recordings_beyond_the_whole_numbers_of_a_browser(watched, address, played):
     _, _, raw = played
     for share in (0.1, 0.77):
@@ -184,6 +186,7 @@ def test_recordings_beyond_the_whole_numbers_of_a_browser(watched, address, play
         assert int(re.search(r"largest (\d+) counts", text)[1]) == largest[:320].max()
 
 
+@pytest.mark.slow
 def test_scrubbing_never_shows_an_image_with_another_ones_time(watched, address, played):
     _, streams, _ = played
     opened(watched, f"{address}/episodes/episode/episode-1?at=9")
@@ -224,6 +227,7 @@ def test_scrubbing_never_shows_an_image_with_another_ones_time(watched, address,
     check(watched.evaluate(READ), streams)
 
 
+@pytest.mark.slow
 def test_playing_moves_all_panes_together(watched, address, played):
     _, streams, _ = played
     opened(watched, f"{address}/episodes/episode/episode-1?at=8")
@@ -244,6 +248,7 @@ def test_playing_moves_all_panes_together(watched, address, played):
     until_clock(watched, "> 0.9")
 
 
+@pytest.mark.slow
 def test_a_link_shows_the_same_elsewhere(watched, open_page, address, played):
     _, streams, _ = played
     page = watched
@@ -282,6 +287,7 @@ def test_a_link_shows_the_same_elsewhere(watched, open_page, address, played):
     assert ranges[0] == ranges[1] != ""
 
 
+@pytest.mark.slow
 def test_an_item_without_cameras(watched, address, played):
     shown = opened(watched, f"{address}/episodes/episode/no-cameras?at=3")
     assert not any(name.startswith("camera") for name in shown["panes"])
@@ -301,6 +307,7 @@ def test_one_hand_and_hostile_text(watched, address, played):
     assert watched.locator("main img").count() == 0
 
 
+@pytest.mark.slow
 def test_facts_and_exports(watched, address, played):
     opened(watched, f"{address}/episodes/episode/episode-1")
     facts = watched.locator("#facts")

@@ -64,6 +64,7 @@ def test_a_person_rates_all_rollouts(serve, page, settings):
     assert problems == []
 
 
+@pytest.mark.slow
 def test_a_wrong_key_is_said_and_the_right_one_opens_the_page(serve, page, settings):
     key = {"name": "ada", "key": "a-key-of-some-length", "scopes": ("rate",)}
     app = create_rating_app(RatingSettings(**settings.model_dump() | {"api_keys": (key,)}))

@@ -121,6 +121,7 @@ def test_a_session_by_keyboard_alone(page, open_dashboard, spool):
     assert (kept.operator, kept.consent, kept.success) == ("p7", True, False)
 
 
+@pytest.mark.slow
 def test_takes_are_counted_against_a_goal(page, open_dashboard, spool, tmp_path):
     tasks = tmp_path / "tasks.toml"
     tasks.write_text(
@@ -159,6 +160,7 @@ def test_takes_are_counted_against_a_goal(page, open_dashboard, spool, tmp_path)
     assert len(saved_takes(spool)) == 2
 
 
+@pytest.mark.slow
 def test_after_the_reset_the_next_take_is_armed(page, open_dashboard):
     open_dashboard(reset_s=2)
     page.get_by_label("Arm again after the reset").check()
@@ -169,6 +171,7 @@ def test_after_the_reset_the_next_take_is_armed(page, open_dashboard):
     expect(page.locator("#reset")).to_be_hidden()
 
 
+@pytest.mark.slow
 def test_a_reset_is_skipped_and_outlives_a_reload(page, open_dashboard):
     open_dashboard(reset_s=3600)
     take(page)
@@ -188,6 +191,7 @@ def test_a_reset_is_skipped_and_outlives_a_reload(page, open_dashboard):
     expect(state(page)).to_have_text("armed")
 
 
+@pytest.mark.slow
 def test_a_pedal_is_the_next_step(page, open_dashboard, spool):
     open_dashboard()
     button = page.locator("#pedal")
@@ -214,6 +218,7 @@ def test_a_pedal_is_the_next_step(page, open_dashboard, spool):
     assert [one.success for one in saved_takes(spool)] == [None]
 
 
+@pytest.mark.slow
 def test_a_pedal_that_sends_space_presses_no_button(page, open_dashboard):
     open_dashboard()
     page.locator("#pedal").click()
@@ -229,6 +234,7 @@ def test_a_pedal_that_sends_space_presses_no_button(page, open_dashboard):
     expect(state(page)).to_have_text("armed")
 
 
+@pytest.mark.slow
 def test_keys_work_in_a_list_and_after_typing(page, open_dashboard):
     open_dashboard()
     chosen = page.locator("#task_choice")
@@ -256,6 +262,7 @@ def test_keys_work_in_a_list_and_after_typing(page, open_dashboard):
     press(page, "s", "checking")
 
 
+@pytest.mark.slow
 def test_sounds_are_heard_once_they_are_allowed(page, open_dashboard):
     page.add_init_script(FAKE_AUDIO)
     open_dashboard()

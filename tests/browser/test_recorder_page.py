@@ -162,6 +162,7 @@ def test_keys_work_again_after_typing(page, address):
     press_until(page, "d", "discarded")
 
 
+@pytest.mark.slow
 def test_a_page_that_is_loaded_anew_shows_what_is_armed(page, address):
     open_recorder(page, address)
     fill(page, instruction="Stack the bowls", operator="p7")
@@ -175,6 +176,7 @@ def test_a_page_that_is_loaded_anew_shows_what_is_armed(page, address):
     expect(page.get_by_role("button", name="Record")).to_be_enabled()
 
 
+@pytest.mark.slow
 def test_a_refused_take_is_shown_and_sent_again(page, serve, serve_station, spool):
     """Three times when it was saved, and three times more when the operator asks for it."""
     problem = {"type": "urn:dextouch:error:InvalidInputError", "title": "InvalidInput"}
@@ -206,6 +208,7 @@ def test_a_refused_take_is_shown_and_sent_again(page, serve, serve_station, spoo
     expect(last).to_contain_text("unknown task, said 6 times")
 
 
+@pytest.mark.slow
 def test_no_store_is_said(page, address):
     page.goto(address)
     page.locator("#takes").scroll_into_view_if_needed()

@@ -81,6 +81,7 @@ def test_what_is_unusual_comes_first_and_leaves_with_a_verdict(page, address, st
     expect(page.get_by_label("Reviewer")).to_have_value("mika")
 
 
+@pytest.mark.slow
 def test_many_are_rejected_for_a_reason_of_ones_own_and_taken_back(page, address, store):
     page.goto(f"{address}/review")
     expect(names(page)).to_have_count(4)
@@ -98,6 +99,7 @@ def test_many_are_rejected_for_a_reason_of_ones_own_and_taken_back(page, address
     assert [store.review(f"{name}-aligned") for name in rejected] == [None] * 4
 
 
+@pytest.mark.slow
 def test_nothing_is_rejected_without_a_reason(page, address, store):
     page.goto(f"{address}/review")
     expect(names(page)).to_have_count(4)
@@ -111,6 +113,7 @@ def test_nothing_is_rejected_without_a_reason(page, address, store):
     assert store.review("long-aligned") is None
 
 
+@pytest.mark.slow
 def test_recordings_that_could_not_be_aligned(page, address, store, alignment):
     write_recording(store, "raw", success=True, started_at=NOON)
     problem = {"detail": "recording 'raw': streams ['head'] are missing"}

@@ -108,6 +108,7 @@ def test_a_policy_without_images_shows_touch_alone(opened, world_url):
         expect(opened.locator("#watched_note")).to_contain_text("asks for no images")
 
 
+@pytest.mark.slow
 def test_steps_are_sent_only_while_they_are_in_view(opened, world_url):
     with RolloutClient(world_url) as client, client.start(**START) as rollout:
         opened.get_by_role("button", name="Watch").click()
@@ -119,6 +120,7 @@ def test_steps_are_sent_only_while_they_are_in_view(opened, world_url):
         assert opened.locator("#watched").get_attribute("data-step") == "0"
 
 
+@pytest.mark.slow
 def test_a_service_that_does_not_answer_is_named(page, serve):
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))

@@ -65,6 +65,7 @@ def test_signing_out_ends_the_session(page, address):
     expect(page.get_by_label("Key", exact=True)).to_be_visible()
 
 
+@pytest.mark.slow
 def test_other_pages_of_a_browser_that_signs_out_go_to_the_sign_in(page, address):
     page.goto(address)
     sign_in(page, KEY)
@@ -75,6 +76,7 @@ def test_other_pages_of_a_browser_that_signs_out_go_to_the_sign_in(page, address
     expect(page.get_by_label("Key", exact=True)).to_be_visible()
 
 
+@pytest.mark.slow
 def test_a_page_that_lost_session_and_link_goes_to_the_sign_in(page, address, app):
     """As after a restart: the link breaks, and the new one is refused for a reason no page sees."""
     links = []
@@ -92,6 +94,7 @@ def test_a_page_that_lost_session_and_link_goes_to_the_sign_in(page, address, ap
     expect(page.get_by_label("Key", exact=True)).to_be_visible()
 
 
+@pytest.mark.slow
 def test_a_button_of_a_session_that_ended_goes_to_the_sign_in(page, serve, serve_station, tmp_path):
     station = serve_station(tmp_path / "spool")
     app = create_app(DashboardSettings(api_keys=(OPERATOR,), acquisition_url=station))

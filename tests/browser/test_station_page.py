@@ -77,6 +77,7 @@ def test_nothing_is_live_a_second_after_its_station_stopped(live, station):
     assert min(delays_s) < 1.0, delays_s
 
 
+@pytest.mark.slow
 def test_dragging_turns_and_a_double_click_resets(live, station):
     # Only the pointer changes the picture of a station that is stopped.
     station.stop()
@@ -100,6 +101,7 @@ def test_dragging_turns_and_a_double_click_resets(live, station):
     assert now == at_first
 
 
+@pytest.mark.slow
 def test_pictures_out_of_view_are_not_sent(page, serve, station):
     kinds = []
 

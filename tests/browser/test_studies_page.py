@@ -80,6 +80,7 @@ def test_a_study_that_runs_and_ends(opened, root):
                 assert float(shown) == pytest.approx(expected(task, world), abs=0.0051)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_trusted_is_said_beside_the_number(opened, root):
     finish(root)
     opened.get_by_role("link", name="touch and sight").click()
@@ -90,6 +91,7 @@ def test_what_cannot_be_trusted_is_said_beside_the_number(opened, root):
     expect(failed).to_contain_text("1 of 8 failed to run and are not counted")
 
 
+@pytest.mark.slow
 def test_rates_are_sorted_by_any_column(opened, root):
     finish(root)
     opened.get_by_role("link", name="touch and sight").click()
@@ -120,6 +122,7 @@ def test_disagreements_come_first_and_every_cell_leads_to_its_rollouts(opened, r
     expect(rows).to_have_count(100)
 
 
+@pytest.mark.slow
 def test_rollouts_in_the_dashboards_store_are_linked(page, address, root):
     finish(root)
     page.route("**/v1/episode_store/episodes/**", lambda route: route.fulfill(json={}))
@@ -128,11 +131,13 @@ def test_rollouts_in_the_dashboards_store_are_linked(page, address, root):
     expect(link).to_have_attribute("href", re.compile("^/episodes/episode/rollout-.*-real-"))
 
 
+@pytest.mark.slow
 def test_unknown_studies_are_named(page, address):
     page.goto(f"{address}/studies/none")
     expect(page.locator("#study_note")).to_contain_text("no results in")
 
 
+@pytest.mark.slow
 def test_the_rating_page_is_in_the_navigation_where_it_is_configured(page, serve):
     page.goto(serve(create_app(DashboardSettings(rating_url="http://127.0.0.1:8087"))))
     link = page.get_by_role("link", name="Rating")

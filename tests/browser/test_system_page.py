@@ -112,6 +112,7 @@ def test_services_jobs_and_audit(page, serve_dashboard, urls, folder, worker):
     assert problems == []
 
 
+@pytest.mark.slow
 def test_people_are_named_and_filtered(page, serve_dashboard):
     keys = [{"name": name, "key": name + KEY, "scopes": ("operate",)} for name in ("ada", "kim")]
     address = serve_dashboard(api_keys=keys, alignment_url=None, twin_url=None)
@@ -139,6 +140,7 @@ def test_people_are_named_and_filtered(page, serve_dashboard):
     expect(rows).to_have_count(2)
 
 
+@pytest.mark.slow
 def test_the_navigation_has_one_line(open_page, serve_dashboard):
     keys = [{"name": "ada", "key": KEY, "scopes": ("operate",)}]
     address = serve_dashboard(api_keys=keys)

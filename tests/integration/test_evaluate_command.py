@@ -152,6 +152,7 @@ def rows(folder):
     return [json.loads(line) for line in lines]
 
 
+@pytest.mark.slow
 def test_policies_of_ones_own_are_scored(folder, url):
     done = evaluate(
         *(folder, url),

@@ -149,6 +149,7 @@ def test_a_killed_worker_fails_its_job_alone(service, store):
     service.until(lambda: set(service.states()) == {"done"})
 
 
+@pytest.mark.slow
 def test_a_job_that_kills_the_service_is_not_tried_for_ever(store, tmp_path):
     service = Service(store, tmp_path, max_attempts=1)
     try:

@@ -128,6 +128,7 @@ class Soak:
                     assert (values == values[:, :1]).all()
 
 
+@pytest.mark.slow
 def test_two_stations_in_a_hurry(tmp_path):
     """A take of ten seconds from each of two stations, at four times their rate."""
     soak = Soak(tmp_path, stations=2, seconds=2, take_s=2.5, speed=4)

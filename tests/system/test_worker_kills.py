@@ -82,6 +82,7 @@ def report(load, kills_s, what):
 
 
 @pytest.mark.parametrize("num_kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_kills_of_workers_on_one_port(one_port, num_kills):
     rng, kills_s = random.Random(num_kills), []
     with Load(one_port.url) as load:
@@ -151,6 +152,7 @@ def test_a_drained_worker_finishes_and_begins_nothing(gateway):
     assert is_ready(second.url)
 
 
+@pytest.mark.slow
 def test_a_new_checkpoint_by_a_restart_of_one_worker_after_another(one_port):
     with Load(one_port.url) as load, RolloutClient(one_port.url) as client:
         assert client.worlds()[0].digest == "d1"

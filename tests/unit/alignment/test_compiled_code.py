@@ -183,6 +183,7 @@ def build(image, script):
         path.chmod(path.stat().st_mode | (0o055 if path.is_dir() else 0o044))
 
 
+@pytest.mark.slow
 def test_code_that_root_compiled_is_run_by_the_images_user(image):
     build(image, SMALL)
     base, told = start_container(image)
@@ -194,6 +195,7 @@ def test_code_that_root_compiled_is_run_by_the_images_user(image):
     assert "compiled_code" not in logged
 
 
+@pytest.mark.slow
 def test_an_image_without_code_starts_and_compiles(image):
     shutil.rmtree(image / "compiled", ignore_errors=True)
     base, told = start_container(image)
@@ -203,6 +205,7 @@ def test_an_image_without_code_starts_and_compiles(image):
     assert not found["is_loaded"]
 
 
+@pytest.mark.slow
 def test_without_any_folder_code_is_compiled_in_memory(image):
     found, logged = run_as(IMAGE_UID, SMALL, image, "/proc/nowhere")
     assert found == {"total": 3.5, "folder": None, "is_loaded": False}

@@ -142,6 +142,7 @@ def test_posterior_is_that_of_importance_sampling():
     assert drawn.std(axis=0) == pytest.approx(sigma, rel=0.1)
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_where_a_bootstrap_does_not():
     generator, held = rng(14), {"posterior": 0, "bootstrap": 0}
     for _ in range(30):

@@ -161,6 +161,7 @@ def test_a_study_gives_the_rows_of_an_evaluation(tmp_path, url, study, parts):
     )
 
 
+@pytest.mark.slow
 def test_an_interrupted_study_ends_as_if_nothing_had_happened(tmp_path, study, parts):
     whole = StudyResults.create_or_resume(tmp_path / "whole", header_of(study))
     expected = run_study(study, whole, parts).to_report()

@@ -96,6 +96,7 @@ def test_the_same_motion_carries_the_weight_that_only_the_instruction_tells():
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.slow
 def test_a_policy_that_ignores_the_instruction_fails_in_one_of_two_tasks(world, seed):
     """Equal starts and equal physics: equal actions end equally, on one of the two mats."""
     starts = {name: world.reset(RolloutStart(name, seed, "")).state for name in MOVES}

@@ -102,6 +102,7 @@ def _interpolated_one_by_one(self, target):
     return pose_from_transform(np.stack(Ts, axis=1)), joints
 
 
+@pytest.mark.slow
 def test_bodies_interpolated_together_give_the_bytes_of_each_by_itself(
     bottle_stage, bowls_stage, robot_take, human_take, monkeypatch
 ):

@@ -79,6 +79,7 @@ def test_a_push_passes_through_the_place_of_an_object_above_the_table(bowls_stag
     assert max(nearest_m) < 0.05
 
 
+@pytest.mark.slow
 def test_a_push_moves_the_object_and_a_slip_can_drop_it(bottle_stage):
     pushed = [
         record(bottle_stage, seed, TakeOptions(images=(), motion=Motion("push"))) for seed in (0, 3)

@@ -168,6 +168,7 @@ def test_boxes_of_shapes_are_those_computed_by_hand():
     np.testing.assert_allclose(boxes[1], [0, 0, 1, 0.1, half, half], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_task_of_free_objects_moves_as_mujoco_alone_moves_it(bowls_stage):
     """Fixed and jointed objects must not change a bit of scenes that have none."""
     episode = record(bowls_stage, 6, TakeOptions(0.01, images=()))

@@ -31,12 +31,14 @@ def test_demonstrators_succeed(stage, seed):
     assert list(attributes.event_times_s.values()) == sorted(attributes.event_times_s.values())
 
 
+@pytest.mark.slow
 def test_both_hands_squeeze_their_boot(stage):
     held_n = record(stage, 11, BLIND).pad_forces_n[round(2.2 * 60)]
     assert (held_n[:, 0] > 2.0).all()
     assert (held_n[:, 1:5].sum(axis=1) > 2.0).all()
 
 
+@pytest.mark.slow
 def test_demonstrators_four_centimetres_wrong_fail(stage):
     takes = [record(stage, seed, TakeOptions(noise_m=0.04, images=())) for seed in (11, 12, 13)]
     assert sum(take.attributes.success for take in takes) <= 1

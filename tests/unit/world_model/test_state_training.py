@@ -181,6 +181,7 @@ def test_all_takes_of_a_scene_are_labelled_or_none():
         _labelled(training, settings.model_copy(update={"labelled_share": 1e-6}))
 
 
+@pytest.mark.slow
 def test_cores_begin_anywhere_up_to_the_last_latent_step(config):
     table = scene_table([episode(seed, 81) for seed in range(2)], config)
     starts = start_steps(table)

@@ -147,6 +147,7 @@ def test_images_of_every_second_step_are_not_taken_for_those_of_all(tmp_path, to
             read(str(store.root))
 
 
+@pytest.mark.slow
 def test_streamed_training_gives_the_weights_of_training_in_memory(
     stored, in_memory, train_settings
 ):

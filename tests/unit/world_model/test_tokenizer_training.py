@@ -83,6 +83,7 @@ def test_a_short_training_brings_touch_back(name, settings):
     assert last.contact_iou > 0.6
 
 
+@pytest.mark.slow
 def test_a_run_repeats_and_keeps_scenes_apart(settings, tmp_path):
     points = []
     report = train_tokenizer(settings, lambda share, point: points.append((share, point)))

@@ -33,6 +33,7 @@ def test_the_loss_falls(toy_episodes, train_settings):
     assert log[-1].share == 1.0
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_weights(toy_episodes, train_settings):
     def weights():
         run = TrainingRun(toy_episodes, train_settings)

@@ -40,6 +40,7 @@ def assert_same_run(report, expected):
     assert not state_path(report.checkpoint).exists()
 
 
+@pytest.mark.slow
 def test_a_killed_run_of_both_domains_goes_on_as_if_nothing_had_happened(
     toy_store, human_store, settings, tmp_path
 ):
@@ -67,6 +68,7 @@ def test_a_killed_run_of_both_domains_goes_on_as_if_nothing_had_happened(
     assert_same_run(report, expected)
 
 
+@pytest.mark.slow
 def test_windows_that_were_read_ahead_are_read_again(toy_store, settings, tmp_path):
     expected = train(settings.model_copy(update={"streaming": True}))
 

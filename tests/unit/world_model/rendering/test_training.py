@@ -39,6 +39,7 @@ def test_a_short_training_draws_nearer_to_the_truth_than_the_warp(trained, clips
     assert drawn.psnr_objects_db > warp.psnr_objects_db + 0.4
 
 
+@pytest.mark.slow
 def test_the_same_generator_gives_the_same_weights(trained, clips, small, settings):
     again = train_renderer(clips, small, settings, rng=np.random.default_rng(0))
     for a, b in zip(again.network.parameters(), trained.network.parameters(), strict=True):
@@ -115,6 +116,7 @@ def test_sharpness_of_a_point_by_hand():
     assert sharpness(image).tolist() == pytest.approx([8 / 9])
 
 
+@pytest.mark.slow
 def test_poses_of_another_source_can_be_judged(trained, clips):
     def elsewhere(_number, clip):
         poses = clip.states.object_poses.copy()

@@ -66,6 +66,7 @@ def test_only_what_loses_little_is_converted(model):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.slow
 def test_training_and_prediction_follow_the_model_to_its_device(model, episode, dtype):
     # The meta device computes shapes only, and refuses tensors of any other device.
     away = model.to("meta").to(dtype)
