@@ -15,8 +15,10 @@ from pydantic_core import PydanticUndefined, to_jsonable_python
 from pydantic_settings import EnvSettingsSource, SettingsError
 
 from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.data_folder import DATA_VARIABLE, data_folder
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.serving import (
+    DATA,
     CommandSettings,
     configuration_path,
     explained,
@@ -76,8 +78,10 @@ def settings_class(section: str) -> type[CommandSettings]:
     return found
 
 
-def check_sections() -> None:
-    """Refuse a configuration file with a section that no command has.
+def apply_configuration() -> None:
+    """Use the data folder of the configuration file, and refuse sections that no command has.
+
+    The folder is relative to the file; the environment variable DEXTOUCH_DATA comes before it.
 
     Raises:
         InvalidInputError: an unknown section, or an unreadable file.
@@ -85,8 +89,10 @@ def check_sections() -> None:
     path = configuration_path()
     if path is None:
         return
-    for name in read_configuration(path):
-        if name not in SECTIONS:
+    for name, value in read_configuration(path).items():
+        if name == DATA:
+            os.environ.setdefault(DATA_VARIABLE, str(path.parent / Path(value).expanduser()))
+        elif name not in SECTIONS:
             raise InvalidInputError(
                 f"{path}:{line_of(path, (name,))}: unknown section [{name}], expected one of "
                 f"{', '.join(SECTIONS)}"
@@ -136,6 +142,9 @@ def example(sections: Sequence[str]) -> str:
     lines = [
         "# Settings of DexTouch. Every line is a default: remove the # to change it.",
         "# Flags and environment variables (DEXTOUCH_<SECTION>_<SETTING>) come before this file.",
+        "",
+        "# Data folder of all commands, relative to this file (environment: DEXTOUCH_DATA).",
+        '#data = "data"',
     ]
     for section in sections:
         kind = settings_class(section)
@@ -250,6 +259,7 @@ def show_main(argv: Sequence[str]) -> int:
     options = parser.parse_args(list(argv))
     path = configuration_path()
     print(f"# {path.resolve() if path else 'no dextouch.toml here, and no DEXTOUCH_CONFIG'}")
+    print(f"# data folder: {data_folder()}")
     result: dict[str, Any] = {}
     for section in [options.section] if options.section else SECTIONS:
         found = [
@@ -265,7 +275,10 @@ def show_main(argv: Sequence[str]) -> int:
         result[section] = {
             ".".join(one.keys): {"value": one.value, "origin": one.origin} for one in found
         }
-    write_result(options.json, {"file": str(path) if path else None, "sections": result})
+    write_result(
+        options.json,
+        {"file": str(path) if path else None, "data": str(data_folder()), "sections": result},
+    )
     return 0
 
 

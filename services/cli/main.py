@@ -138,7 +138,8 @@ and evaluate policies in it.
 
 Every command has --help; commands that terminate write their result with
 --json PATH, or --json - for standard output. Services (serve, station serve, …) also
-read their flags from environment variables and dextouch.toml (see config).
+read their flags from environment variables and dextouch.toml (see config), where
+`data = "FOLDER"` names the data folder of all commands.
 All commands: docs/command_line.md
 
 example:
@@ -206,9 +207,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_USAGE
     try:
         if os.environ.get("DEXTOUCH_CONFIG") or Path("dextouch.toml").is_file():
-            from services.cli.configuration import check_sections
+            from services.cli.configuration import apply_configuration
 
-            check_sections()
+            apply_configuration()
         with messages_aside(words):
             return run_command(words)
     except ModuleNotFoundError as error:

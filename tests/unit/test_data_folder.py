@@ -42,6 +42,43 @@ def test_what_is_in_the_data_folder_is_listed_exported_and_imported(monkeypatch,
     assert EpisodeStore("there/store").list() == ["one"]
 
 
+@pytest.fixture
+def without_variable(monkeypatch):
+    """A command may set the variable; it is removed again after the test."""
+    monkeypatch.setenv("DEXTOUCH_DATA", "")
+    monkeypatch.delenv("DEXTOUCH_DATA")
+
+
+@pytest.mark.usefixtures("without_variable")
+def test_the_configuration_file_names_the_folder_of_all_commands(monkeypatch, tmp_path, capsys):
+    write_episode(EpisodeStore(str(tmp_path / "lab/touch/store")), "one", num_steps=3)
+    (tmp_path / "lab/dextouch.toml").write_text('data = "touch"\n[up]\nwithout = ["twin"]\n')
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    monkeypatch.setenv("DEXTOUCH_CONFIG", "../lab/dextouch.toml")
+    assert main.main(["store", "list"]) == 0
+    assert capsys.readouterr().out.startswith("one ")
+    to = str(tmp_path / "one.mcap")
+    assert main.main(["export", "--format", "mcap", "one", "--to", to]) == 0
+    assert UpSettings().data.resolve() == tmp_path / "lab/touch"
+
+
+def test_the_environment_comes_before_the_configuration_file(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DEXTOUCH_DATA", "here")
+    (tmp_path / "dextouch.toml").write_text('data = "there"\n')
+    assert main.main(["config", "show"]) == 0
+    assert "# data folder: here" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("value", ["3", '""'])
+def test_a_data_folder_that_is_none_is_refused(monkeypatch, tmp_path, capsys, value):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dextouch.toml").write_text(f"# touch\ndata = {value}\n")
+    assert main.main(["store", "list"]) == main.EXIT_REFUSED
+    assert "dextouch.toml:2: data: got" in capsys.readouterr().err
+
+
 def test_a_bucket_is_no_data_folder(monkeypatch, capsys):
     monkeypatch.setenv("DEXTOUCH_DATA", "s3://bucket/touch")
     with pytest.raises(InvalidInputError, match="expected a local folder"):

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from dextouch.serving.child_process import Answer as Answer
     from dextouch.serving.child_process import ChildProcess as ChildProcess
     from dextouch.serving.child_process import serve_parent as serve_parent
+    from dextouch.serving.configuration_file import DATA as DATA
     from dextouch.serving.configuration_file import CommandSettings as CommandSettings
     from dextouch.serving.configuration_file import configuration_path as configuration_path
     from dextouch.serving.configuration_file import explained as explained

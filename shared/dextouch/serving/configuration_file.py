@@ -26,6 +26,8 @@ from dextouch.schemas import first_problems
 VARIABLE: Final = "DEXTOUCH_CONFIG"
 FILE_NAME: Final = "dextouch.toml"
 PREFIX: Final = "DEXTOUCH_"
+# The only setting outside of a section: the data folder of all commands.
+DATA: Final = "data"
 _HEADER = re.compile(r"\s*\[\[?\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?")
 _KEY = re.compile(r"\s*([\w.\"' -]+?)\s*=")
 
@@ -77,10 +79,11 @@ def configuration_path() -> Path | None:
 
 
 def read_configuration(path: Path) -> Mapping[str, Any]:
-    """Sections of a configuration file.
+    """Sections of a configuration file, and its data folder if it names one.
 
     Raises:
-        InvalidInputError: it cannot be read, is no TOML, or has a setting outside of a section.
+        InvalidInputError: it cannot be read, is no TOML, or has another setting outside of a
+            section.
     """
     try:
         return _read(path, path.stat().st_mtime_ns)
@@ -92,7 +95,13 @@ def read_configuration(path: Path) -> Mapping[str, Any]:
 def _read(path: Path, _: int) -> Mapping[str, Any]:
     sections = tomllib.loads(path.read_text(encoding="utf-8"))
     for name, values in sections.items():
-        if not isinstance(values, dict):
+        if name == DATA:
+            if not isinstance(values, str) or not values:
+                raise InvalidInputError(
+                    f"{path}:{line_of(path, (name,))}: data: got {values!r}, expected the path of "
+                    "the data folder"
+                )
+        elif not isinstance(values, dict):
             line = line_of(path, (name,))
             raise InvalidInputError(
                 f"{path}:{line}: {name} stands outside of a section; expected it below [dashboard] "
