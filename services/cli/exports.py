@@ -2,6 +2,7 @@
 
 import argparse
 import shutil
+import sys
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -9,8 +10,9 @@ from pathlib import Path
 
 from dextouch.command_line import CommandParser, add_json, progress, write_result
 from dextouch.data_folder import default_store
-from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
+from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader, is_rejected
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 
 Reader = EpisodeReader | RecordingReader
 Report = dict[str, object]
@@ -86,7 +88,7 @@ def _replaced(folder: Path, *, force: bool) -> Iterator[None]:
 
 
 def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
-    """The given ids, or those that match the filters."""
+    """The given ids, or those that match the filters and were not rejected in review."""
     given = ((key, getattr(options, key)) for key in ("task", "domain", "operator"))
     wanted = {key: value for key, value in given if value is not None}
     if options.ids and wanted:
@@ -95,17 +97,31 @@ def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
         raise InvalidInputError("got an id twice; expected every id once")
     if options.ids:
         return list(options.ids)
-    found = []
+    found, num_rejected = [], 0
     for item_id in store.list(kind=options.kind):
         attributes = _open(store, options.kind, item_id).attributes
-        if all(getattr(attributes, key) == value for key, value in wanted.items()):
+        if any(getattr(attributes, key) != value for key, value in wanted.items()):
+            continue
+        if not options.with_rejected and _is_rejected(store, attributes):
+            num_rejected += 1
+        else:
             found.append(item_id)
+    left_out = f"{num_rejected} rejected in review left out; --with-rejected exports them"
     if not found:
         raise NotFoundError(
-            f"{options.store}: no {options.kind} matches {wanted or 'anything'}; "
-            "`dextouch store list` shows its contents"
+            f"{options.store}: no {options.kind} matches {wanted or 'anything'}"
+            f"{f' ({left_out})' if num_rejected else ''}; `dextouch store list` shows its contents"
         )
+    if num_rejected:
+        print(left_out, file=sys.stderr)
     return found
+
+
+def _is_rejected(store: EpisodeStore, about: EpisodeAttributes | RecordingAttributes) -> bool:
+    if isinstance(about, EpisodeAttributes):
+        return is_rejected(store, about)
+    review = store.review(about.recording_id, kind="recording")
+    return review is not None and review.verdict == "rejected"
 
 
 def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
@@ -183,6 +199,8 @@ def export_main(argv: Sequence[str]) -> int:
     add("--task", metavar="TASK", help="only episodes of this task")
     add("--domain", choices=("human", "robot"), help="only episodes of this domain")
     add("--operator", metavar="P", help="only items of this operator")
+    rejected = "also items that were rejected in review; ids that are given always are"
+    add("--with-rejected", action="store_true", help=rejected)
     add("--force", action="store_true", help="replace existing files")
     quality = "mcap: encode rgb8 images as JPEG (default: lossless)"
     add("--jpeg-quality", type=int, metavar="1…100", help=quality)

@@ -2,11 +2,13 @@
 
 import json
 import sys
+from datetime import UTC, datetime
 
 import pytest
 import zarr
 
 from dextouch.episodes import EpisodeStore
+from dextouch.schemas import Review
 from services.cli import main
 from tests.unit.bridges.takes import differing_streams, write_episode, write_recording
 
@@ -59,6 +61,25 @@ def test_filters_choose_and_files_go_into_a_folder(store, dextouch, tmp_path):
     assert names(folder) == ["take-0001.mcap", "take-0002.mcap"]
     assert dextouch("import", "--format", "mcap", folder, store="other")[0] == 0
     assert EpisodeStore(tmp_path / "other").list(kind="recording") == ["take-0001", "take-0002"]
+
+
+def test_what_was_rejected_in_review_is_left_out_unless_it_is_asked_for(store, dextouch, tmp_path):
+    rejected = Review(verdict="rejected", reviewed_at=datetime(2026, 5, 4, tzinfo=UTC))
+    for name in ("take-0001", "take-0002"):
+        write_recording(store, name, count=5)
+    for name in ("one", "two"):
+        write_episode(store, name, num_steps=3)
+    store.set_review("take-0001", rejected, kind="recording")
+    store.set_review("two", rejected)
+    words = ("export", "--format", "mcap")
+    status, _, err = dextouch(*words, "--kind", "recording", "--to", tmp_path / "takes")
+    assert (status, names(tmp_path / "takes")) == (0, ["take-0002.mcap"])
+    assert "1 rejected in review left out" in err
+    assert dextouch(*words, "--to", tmp_path / "episodes")[0] == 0
+    assert names(tmp_path / "episodes") == ["one.mcap"]
+    assert dextouch(*words, "--with-rejected", "--to", tmp_path / "all")[0] == 0
+    assert names(tmp_path / "all") == ["one.mcap", "two.mcap"]
+    assert dextouch(*words, "two", "--to", tmp_path / "two.mcap")[0] == 0
 
 
 def test_filters_and_ids_exclude_each_other(store, dextouch, tmp_path):
