@@ -7,7 +7,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from dextouch.episodes import TrashKind
-from dextouch.episodes.care import DeletionRequest, delete_for_good, plan_deletion
+from dextouch.episodes.care import (
+    DeletionRequest,
+    delete_for_good,
+    plan_deletion,
+    reviews_by,
+)
 from dextouch.errors import InvalidInputError
 from services.episode_store.commands.context import EXIT_DAMAGED, Context, Outcome, readable_size
 
@@ -44,8 +49,13 @@ def _delete_all_of(context: Context) -> Outcome:
         operator=options.operator, recording=options.recording, derived=derived
     )
     asked = options.operator or options.recording
-    for victim in plan_deletion(root, request):
+    victims = plan_deletion(root, request)
+    for victim in victims:
         context.say(f"{victim.place}/{victim.folder}  {victim.reason}")
+    gone = {(victim.place, victim.folder) for victim in victims}
+    for facts in reviews_by(root, request):
+        if (facts.place, facts.folder.name) not in gone:
+            context.say(f"{facts.place}/{facts.folder.name}  review: loses its reviewer's name")
     if not options.yes and _answer(f"Type {asked} to delete all of this permanently: ") != asked:
         raise InvalidInputError("delete: not confirmed; nothing was removed")
     path = Path(options.receipt or f"deletion-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json")
@@ -56,7 +66,8 @@ def _delete_all_of(context: Context) -> Outcome:
     for place in receipt.unreadable:
         context.say(f"{place}  cannot be read; repair or delete it, then repeat")
     context.say(
-        f"{len(receipt.deleted)} removed, {len(receipt.remaining)} references left, "
+        f"{len(receipt.deleted)} removed, {len(receipt.unnamed_reviews)} reviews without a name, "
+        f"{len(receipt.remaining)} references left, "
         f"{len(receipt.unreadable)} unreadable of {receipt.num_files_searched} files searched; "
         f"receipt {path}"
     )

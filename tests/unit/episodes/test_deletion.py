@@ -2,6 +2,7 @@
 
 import json
 import struct
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from dextouch.episodes.care import (
     deletion,
     plan_deletion,
     repair_group,
+    reviews_by,
 )
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
-from dextouch.schemas import LineageEntry, RecordingAttributes
+from dextouch.schemas import LineageEntry, RecordingAttributes, Review
 from dextouch.streams import SampleBatch, StreamDescriptor
 
 MINE, OTHER = "op-1", "op-10"
@@ -127,6 +129,36 @@ def test_all_of_an_operator_goes_and_nothing_of_another(filled, tmp_path):
     assert OTHER not in receipt_path.read_text()
     with pytest.raises(NotFoundError, match="nothing in"):
         delete_for_good(filled.root, DeletionRequest(operator=MINE), receipt_path)
+
+
+def test_reviews_of_an_operator_lose_the_name_and_keep_the_verdict(filled, tmp_path):
+    at = datetime(2026, 5, 4, tzinfo=UTC)
+    for reviewer, item_id in ((MINE, "b-episode"), (OTHER, "b-imagined"), (MINE, "a-episode")):
+        filled.set_review(
+            item_id, Review(verdict="rejected", reason="r", reviewer=reviewer, reviewed_at=at)
+        )
+    request = DeletionRequest(operator=MINE)
+    assert [facts.item_id for facts in reviews_by(filled.root, request)] == [
+        "a-episode",
+        "b-episode",
+    ]
+    receipt = delete_for_good(filled.root, request, tmp_path / "r.json")
+    assert receipt.complete
+    assert receipt.unnamed_reviews == ("episodes/b-episode",)
+    assert filled.review("b-episode") == Review(verdict="rejected", reason="r", reviewed_at=at)
+    assert filled.review("b-imagined").reviewer == OTHER
+
+
+def test_an_operator_who_only_reviewed_is_forgotten_too(filled, tmp_path):
+    review = Review(
+        verdict="accepted", reviewer="kim", reviewed_at=datetime(2026, 5, 4, tzinfo=UTC)
+    )
+    filled.set_review("b-episode", review)
+    receipt = delete_for_good(filled.root, DeletionRequest(operator="kim"), tmp_path / "r.json")
+    assert receipt.complete
+    assert receipt.deleted == ()
+    assert receipt.unnamed_reviews == ("episodes/b-episode",)
+    assert filled.review("b-episode").verdict == "accepted"
 
 
 def test_a_recording_with_and_without_what_was_made_of_it(filled, tmp_path):

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from dextouch.episodes.care.deletion import DeletionRequest as DeletionRequest
     from dextouch.episodes.care.deletion import delete_for_good as delete_for_good
     from dextouch.episodes.care.deletion import plan_deletion as plan_deletion
+    from dextouch.episodes.care.deletion import reviews_by as reviews_by
     from dextouch.episodes.care.inspection import UPLOADS as UPLOADS
     from dextouch.episodes.care.inspection import Finding as Finding
     from dextouch.episodes.care.inspection import ItemReport as ItemReport

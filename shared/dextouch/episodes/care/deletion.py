@@ -18,6 +18,7 @@ from pydantic import BaseModel, ValidationError
 from dextouch.episodes.care.store_facts import PLACES, Facts, Wanted, all_facts, small_files
 from dextouch.episodes.files import disk_errors, replace_file, try_lock
 from dextouch.episodes.format import Kind, sha256_hex
+from dextouch.episodes.reviews import REVIEW_FILE
 from dextouch.episodes.trash import TRASH, put_into_trash, remove_for_good
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 
@@ -85,7 +86,10 @@ class Reference:
 
 @dataclass(frozen=True)
 class DeletionReceipt:
-    """Record of a deletion: deleted items, time, and files searched afterwards; saved as JSON."""
+    """Record of a deletion: deleted items, time, and files searched afterwards; saved as JSON.
+
+    `unnamed_reviews` are places of other people's items whose review lost its reviewer's name.
+    """
 
     request: DeletionRequest
     started_at: str
@@ -96,6 +100,7 @@ class DeletionReceipt:
     remaining: tuple[Reference, ...]
     unreadable: tuple[str, ...]
     num_files_searched: int
+    unnamed_reviews: tuple[str, ...] = ()
     receipt_version: int = RECEIPT_VERSION
     counts: dict[str, int] = field(default_factory=dict)
 
@@ -137,6 +142,21 @@ def plan_deletion(
                 names |= {(facts.kind, facts.item_id), *((k, i) for k, i, _ in versions)}
                 hashes |= {sha256, *(h for _, _, h in versions)} - {None}
     return found
+
+
+def reviews_by(root: Path, request: DeletionRequest) -> list[Facts]:
+    """Items whose review was written by the operator of a request."""
+    if request.operator is None:
+        return []
+    return [facts for facts in all_facts(root) if facts.reviewer == request.operator]
+
+
+def _remove_reviewer(facts: Facts) -> None:
+    """Remove the reviewer's name from a review; the verdict stays."""
+    path = facts.folder / REVIEW_FILE
+    with disk_errors(f"remove the reviewer of {facts.item_id}"):
+        fields = json.loads(path.read_bytes())
+        replace_file(path, json.dumps(fields | {"reviewer": None}).encode())
 
 
 def _reason(facts: Facts, request: DeletionRequest) -> str | None:
@@ -181,7 +201,8 @@ def delete_for_good(
     """Delete all that a request covers, search the remaining files, and write the receipt.
 
     Uploads and stages locked by a writer are kept and listed as remaining: stop the writer and
-    repeat. Checkpoints are only searched.
+    repeat. Reviews that the operator wrote of other people's items lose their name. Checkpoints are
+    only searched.
 
     Args:
         root: of the store.
@@ -190,7 +211,7 @@ def delete_for_good(
         checkpoints: folder with models that may have been trained on the deleted data.
 
     Raises:
-        NotFoundError: nothing in the store matches.
+        NotFoundError: nothing in the store matches, and the operator reviewed nothing.
         InvalidInputError: a receipt path inside the store, where the search would find it.
     """
     if receipt_path.resolve().is_relative_to(root.resolve()):
@@ -199,15 +220,18 @@ def delete_for_good(
         )
     path = _intent_path(root, request)
     intent = _read_intent(path, root, request)
-    known = intent.victims
+    known, reviewed = intent.victims, list[Facts]()
     for _ in range(_MAX_ROUNDS):
         known += [v for v in plan_deletion(root, request, known=known) if v not in known]
-        if not known:
+        if not known and not reviewed and not reviews_by(root, request):
             raise NotFoundError(f"deletion: nothing in {root} stems from {request.name!r}")
         with disk_errors("write down what is to be deleted"):
             path.parent.mkdir(parents=True, exist_ok=True)
             replace_file(path, json.dumps(intent.model_dump()).encode())
         went = [_remove(root, victim) for victim in known]
+        for facts in reviews_by(root, request):
+            _remove_reviewer(facts)
+            reviewed.append(facts)
         if not any(went):
             break
     words = {v.id for v in known} | {v.sha256 for v in known if v.sha256} | {request.name}
@@ -224,6 +248,7 @@ def delete_for_good(
         remaining=tuple(remaining),
         unreadable=tuple(unreadable),
         num_files_searched=num_files,
+        unnamed_reviews=tuple(f"{facts.place}/{facts.folder.name}" for facts in reviewed),
         counts={p: sum(v.place == p for v in deleted) for p in PLACES},
     )
     with disk_errors(f"write {receipt_path}"):

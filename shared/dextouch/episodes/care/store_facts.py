@@ -13,6 +13,7 @@ from typing import Any
 from dextouch.episodes.care.inspection import UPLOADS
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE
+from dextouch.episodes.reviews import REVIEW_FILE
 from dextouch.episodes.spool import RECORDING_FILE
 from dextouch.episodes.staged_group import STAGE_FILE, STAGING
 from dextouch.episodes.trash import TRASH
@@ -45,7 +46,8 @@ class Facts:
     """Identity of one folder of a store, even a damaged or unfinished one.
 
     `item_id` and `kind` are those of its (intended) group; `lineage` the kinds, ids and hashes of
-    its sources; `readable` is false where nothing could be parsed.
+    its sources, `reviewer` the pseudonym in its review; `readable` is false where nothing could be
+    parsed.
     """
 
     folder: Path
@@ -53,6 +55,7 @@ class Facts:
     kind: str
     item_id: str
     operator: str | None
+    reviewer: str | None
     lineage: tuple[tuple[str, str, str | None], ...]
     sha256: str | None
     readable: bool
@@ -80,9 +83,17 @@ def _facts(folder: Path, place: str) -> Facts:
         for entry in (entries if isinstance(entries, list) else [])
         if isinstance(entry, dict)
     )
-    operator, sha256 = attributes.get("operator"), _dict(folder / COMMIT_FILE).get("sha256")
-    readable = bool(attributes) or not any(small_files(folder))
-    return Facts(folder, place, kind, item_id, _text(operator), lineage, _text(sha256), readable)
+    return Facts(
+        folder=folder,
+        place=place,
+        kind=kind,
+        item_id=item_id,
+        operator=_text(attributes.get("operator")),
+        reviewer=_text(_dict(folder / REVIEW_FILE).get("reviewer")),
+        lineage=lineage,
+        sha256=_text(_dict(folder / COMMIT_FILE).get("sha256")),
+        readable=bool(attributes) or not any(small_files(folder)),
+    )
 
 
 def _named(name: str, place: str) -> tuple[str, str]:
