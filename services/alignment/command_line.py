@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import Progress as Bars
 from rich.progress import TaskID
 
-from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.command_line import CommandParser, ProgressLines, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, disk_errors
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.hands.hand_files import load_hand
@@ -155,7 +155,8 @@ def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
 
 @contextmanager
 def _bars(console: Console, num_recordings: int) -> Iterator[OnRecordingProgress]:
-    """A bar for each recording at work and one for all; nothing without a terminal."""
+    """A bar for each recording at work and one for all; without a terminal, lines."""
+    lines = ProgressLines("align", has_bar=console.is_terminal)
     shown: dict[str, TaskID] = {}
     shares: dict[str, float] = {}
     with Bars(console=console, disable=not console.is_terminal, transient=True) as bars:
@@ -168,6 +169,9 @@ def _bars(console: Console, num_recordings: int) -> Iterator[OnRecordingProgress
             shares[recording_id] = progress.share
             bars.update(shown[recording_id], completed=progress.share, description=where)
             bars.update(whole, completed=sum(shares.values()))
+            num_done = sum(share >= 1 for share in list(shares.values()))
+            share = f"{progress.share:.0%}"
+            lines.show(f"{num_done} of {num_recordings}  {where.strip()} {share}")
 
         yield on_progress
 

@@ -77,6 +77,7 @@ class ProgressLines:
 
     Args:
         title: of the job.
+        has_bar: whether a terminal shows a bar instead.
         period_s: shortest time between two lines.
         clock_s: tells the time.
     """
@@ -85,17 +86,18 @@ class ProgressLines:
         self,
         title: str,
         *,
+        has_bar: bool = True,
         period_s: float = LINE_PERIOD_S,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._title, self._period_s, self._clock_s = title, period_s, clock_s
-        self._is_terminal = sys.stderr.isatty()
+        self._is_shown = not (has_bar and sys.stderr.isatty())
         self._last_s = clock_s()
 
     def show(self, text: str, *, is_last: bool = False) -> None:
-        """Print how far the job is, unless a terminal is there or a line has just been printed."""
+        """Print how far the job is, unless a bar is shown or a line has just been printed."""
         now_s = self._clock_s()
-        if not self._is_terminal and (is_last or now_s - self._last_s >= self._period_s):
+        if self._is_shown and (is_last or now_s - self._last_s >= self._period_s):
             self._last_s = now_s
             sys.stderr.write(f"   {self._title} {text}".rstrip() + "\n")
             sys.stderr.flush()

@@ -84,6 +84,13 @@ def test_progress_prints_lines_where_no_terminal_is(capsys):
     assert capsys.readouterr().err.splitlines() == ["   export 2 of 9", "   export 9 of 9"]
 
 
+def test_progress_without_a_bar_prints_lines_on_a_terminal_too(capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    for has_bar in (True, False):
+        ProgressLines(f"bar {has_bar}", has_bar=has_bar).show("9 of 9", is_last=True)
+    assert capsys.readouterr().err == "   bar False 9 of 9\n"
+
+
 def test_progress_of_items_ends_with_a_line(capsys):
     assert list(progress(iter("abc"), "export mcap", 3)) == ["a", "b", "c"]
     out, err = capsys.readouterr()

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-import structlog
 import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from dextouch.command_line import ProgressLines
 from dextouch.errors import InvalidInputError
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.configuration import DynamicsConfig
@@ -33,6 +33,7 @@ from services.world_model.state_checkpoints import (
     StateMetadata,
     write_state_checkpoint,
 )
+from services.world_model.training.averaging import OnStep
 from services.world_model.training.core_training import (
     CoreData,
     start_steps,
@@ -55,10 +56,8 @@ from services.world_model.training.state_evaluation import evaluate_dynamics
 READER_VERSION, CORE_VERSION, RENDERER_VERSION = 3, 4, 3
 # Largest number of episodes the renderer is trained on; it samples few of their images anyway.
 MAX_CLIPS = 1500
-_LOG_EVERY = 500
 _SEED_STRIDE = 1000
 _CPU_S = "cpu_s"
-logger = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True)
@@ -249,18 +248,15 @@ def _train_renderer(work: _Work) -> None:
     ]
     chosen = rng.permutation(len(episodes))[:MAX_CLIPS]
     clips = scene_clips([episodes[index] for index in sorted(chosen)])
+    lines = ProgressLines("train renderer", has_bar=False)
+
+    def on_progress(now: RendererProgress) -> None:
+        lines.show(f"{now.share:.0%}  step {now.step}  loss {now.loss:.4f}")
+
     trained = train_renderer(
-        clips, settings.renderer, settings.drawing, rng=rng, on_progress=_say_drawing
+        clips, settings.renderer, settings.drawing, rng=rng, on_progress=on_progress
     )
     _keep(trained.network, work.renderer_file, trained.cpu_s)
-
-
-def _say_drawing(now: RendererProgress) -> None:
-    if now.step % _LOG_EVERY == 0:
-        logger.info(
-            "training_state", part="renderer", step=now.step, share=round(now.share, 2),
-            loss=round(now.loss, 4),
-        )  # fmt: skip
 
 
 def _keep(model: nn.Module, path: Path, cpu_s: float) -> None:
@@ -284,12 +280,10 @@ def _train_member(work: _Work, member: int) -> None:
     )
     table = SceneTable.from_tensors(flat)
     seed = work.settings.seed * _SEED_STRIDE + member
-    log = _Log(member)
     started_s = time.process_time()
     if not work.reader_file(member).exists():
-        trained = train_reader(
-            table, work.config, work.settings.reader, seed=seed, on_step=log.reader
-        )
+        on_step = _on_step(member, "reader")
+        trained = train_reader(table, work.config, work.settings.reader, seed=seed, on_step=on_step)
         _keep(trained, work.reader_file(member), time.process_time() - started_s)
     reader = StartReader(work.config)
     _load(reader, work.reader_file(member))
@@ -297,29 +291,19 @@ def _train_member(work: _Work, member: int) -> None:
     started_s = time.process_time()
     readings = {step: read_objects(reader, table, step) for step in start_steps(table)}
     data = CoreData(table, touch_latents(codec, table), readings)
-    core = train_core(data, work.config, work.settings.core, seed=seed, on_step=log.core)
+    on_step = _on_step(member, "core")
+    core = train_core(data, work.config, work.settings.core, seed=seed, on_step=on_step)
     _keep(core, work.core_file(member), time.process_time() - started_s)
 
 
-class _Log:
-    """Periodic progress log of a member's training."""
+def _on_step(member: int, part: str) -> OnStep:
+    """Shows how far a part of a member is."""
+    lines = ProgressLines(f"train member {member} {part}", has_bar=False)
 
-    def __init__(self, member: int) -> None:
-        self._member = member
+    def on_step(step: int, loss: float) -> None:
+        lines.show(f"step {step}  loss {loss:.4f}")
 
-    def reader(self, step: int, loss: float) -> None:
-        """Log one step of the reader."""
-        self._say("reader", step, loss)
-
-    def core(self, step: int, loss: float) -> None:
-        """Log one step of the core."""
-        self._say("core", step, loss)
-
-    def _say(self, part: str, step: int, loss: float) -> None:
-        if step % _LOG_EVERY == 0:
-            logger.info(
-                "training_state", member=self._member, part=part, step=step, loss=round(loss, 4)
-            )
+    return on_step
 
 
 def _assembled(work: _Work, codec: TouchCodec) -> tuple[DynamicsModel, RendererNetwork, float]:

@@ -1,10 +1,13 @@
 """`dextouch align` from the shell: recordings aligned and told, refused with a reason, reported."""
 
 import json
+import re
 import threading
+from functools import partial
 
 import pytest
 
+from dextouch.command_line import ProgressLines
 from dextouch.episodes import EpisodeStore
 from services.alignment import command_line
 from services.cli.main import main
@@ -38,6 +41,14 @@ def test_recordings_are_aligned_and_told(store, tmp_path, capsys):
     assert json.loads(path.read_text())[0]["created"] is True
     assert main(["align", *arguments]) == 0
     assert "take was aligned already" in capsys.readouterr().out
+
+
+def test_progress_is_told_where_no_terminal_is(store, capsys, monkeypatch):
+    monkeypatch.setattr(command_line, "ProgressLines", partial(ProgressLines, period_s=0.0))
+    assert main(["align", "run", "take", "--workers", "1", "--store", str(store.root)]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(r"   align 0 of 1  take \w+.* 25%", lines[0])
+    assert len(lines) > 1
 
 
 def test_a_failure_is_told_and_the_others_are_aligned(store, capsys):
