@@ -13,7 +13,8 @@ DOCS_VENV ?= .venv-docs
 SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow browser kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
+SCREENS ?= build/screens
+.PHONY: demo test check slow browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -35,6 +36,10 @@ demo: $(VENV)/.runtime   ## record, align, predict and evaluate on this machine
 # Bytecode is cached, since tests start many processes that would otherwise each compile all modules.
 test: $(VENV)/.dev       ## the default test run (about eight minutes on two cores)
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n logical --dist loadfile
+
+screens: $(VENV)/.dev    ## pictures of every screen of the dashboard in build/screens, at 1366 and 1920 px, light and dark
+	mkdir -p $(SCREENS)
+	DEXTOUCH_SCREENS=$(SCREENS) $(BIN)/python -m pytest -q -m "slow or not slow" tests/browser/test_screens.py
 
 slow: $(VENV)/.dev       ## the long tests
 	$(BIN)/python -m pytest -q -m slow

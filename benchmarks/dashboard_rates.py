@@ -47,9 +47,15 @@ def serve_child(kind: str, *arguments: str) -> None:
     asyncio.run(serve_all([(place, app)], stop=asyncio.Event(), on_ready=tell, grace_s=1))
 
 
-async def count_updates(url: str, topics: list[str], seconds: float) -> Counter[str]:
-    """Changed messages by what they are, and which hand, station or topic."""
+async def count_updates(
+    url: str, topics: list[str], seconds: float
+) -> tuple[Counter[str], Counter[str]]:
+    """Messages by what they are and which hand, station or topic: all, and those that differ.
+
+    A text that says the same again, as of a station at rest, is no change but an update.
+    """
     updates: Counter[str] = Counter()
+    changes: Counter[str] = Counter()
     newest: dict[str, str | bytes] = {}
     address = url.replace("http", "ws", 1) + "/v1/live"
     async with websockets.connect(address, origin=websockets.Origin(url)) as socket:
@@ -61,10 +67,10 @@ async def count_updates(url: str, topics: list[str], seconds: float) -> Counter[
                 name = json.loads(message)["topic"]
             else:
                 name = f"{NAMES[message[0]]} {message[1]}"
-            if newest.get(name) != message:
-                updates[name] += 1
-                newest[name] = message
-    return updates
+            updates[name] += 1
+            changes[name] += newest.get(name) != message
+            newest[name] = message
+    return updates, changes
 
 
 def main() -> None:
@@ -93,9 +99,12 @@ def main() -> None:
             dashboard = address(start("dashboard", json.dumps(urls)))
             httpx.get(f"{dashboard}/healthz").raise_for_status()
             time.sleep(WARM_UP_S)
-            updates = asyncio.run(count_updates(dashboard, topics, options.seconds))
+            updates, changes = asyncio.run(count_updates(dashboard, topics, options.seconds))
             for name, count in sorted(updates.items()):
-                print(f"{name:15} {count / options.seconds:5.1f} updates/s")
+                changed = changes[name] / options.seconds
+                print(
+                    f"{name:15} {count / options.seconds:5.1f} updates/s  {changed:5.1f} changes/s"
+                )
             print(f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors")
         finally:
             for process in processes:

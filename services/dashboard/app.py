@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
-from prometheus_client import Gauge
+from prometheus_client import CollectorRegistry, Gauge
 
 from dextouch.serving import AccessControl, create_service_app, serve
 from services.dashboard.audit import AuditLog
@@ -35,18 +35,8 @@ def create_app(
         settings: services to show, and access control.
         upstreams: clients of the services; created from the settings' URLs by default.
     """
-    if upstreams is None:
-        connect = partial(
-            Upstream.connect, key=settings.upstream_key, timeout_s=settings.upstream_timeout_s
-        )
-        upstreams = {name: connect(name, url) for name, url in settings.upstream_urls().items()}
-        stations = {
-            name: connect("acquisition", url) for name, url in settings.station_urls().items()
-        }
-    else:
-        stations = (
-            {settings.station: upstreams["acquisition"]} if "acquisition" in upstreams else {}
-        )
+    upstreams, stations = _clients(settings, upstreams)
+    clients = (*upstreams.values(), *stations.values())
     feeds = {
         name: Feeds({"acquisition": client, **upstreams}, settings)
         for name, client in stations.items()
@@ -66,8 +56,8 @@ def create_app(
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         yield
         await comparisons.stop()
-        for upstream in (*upstreams.values(), *stations.values()):
-            await upstream.close()
+        for client in clients:
+            await client.close()
 
     app = create_service_app(
         name="dashboard",
@@ -94,17 +84,38 @@ def create_app(
     app.add_middleware(
         AuditTrail, log=audit_log, sessions=sessions, station=next(iter(fleet.names))
     )
-    seconds = upstream_histogram()
-    for upstream in (*upstreams.values(), *stations.values()):
-        upstream.seconds = seconds
-    app.state.registry.register(seconds)
-    text = "Signed-in browsers."
-    num_sessions = Gauge("dextouch_dashboard_sessions", text, registry=app.state.registry)
-    num_sessions.set_function(lambda: sessions.num_open)
+    _add_metrics(app.state.registry, clients, sessions)
     app.state.sessions = sessions
     app.state.refusal_page = partial(refusal_page, settings.station)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     return app
+
+
+def _clients(
+    settings: DashboardSettings, upstreams: Mapping[str, Upstream] | None
+) -> tuple[Mapping[str, Upstream], dict[str, Upstream]]:
+    """Clients of the services, and of the stations by name."""
+    if upstreams is not None:
+        station = upstreams.get("acquisition")
+        return upstreams, {} if station is None else {settings.station: station}
+    connect = partial(
+        Upstream.connect, key=settings.upstream_key, timeout_s=settings.upstream_timeout_s
+    )
+    return (
+        {name: connect(name, url) for name, url in settings.upstream_urls().items()},
+        {name: connect("acquisition", url) for name, url in settings.station_urls().items()},
+    )
+
+
+def _add_metrics(
+    registry: CollectorRegistry, clients: Sequence[Upstream], sessions: Sessions
+) -> None:
+    seconds = upstream_histogram()
+    for client in clients:
+        client.seconds = seconds
+    registry.register(seconds)
+    num_sessions = Gauge("dextouch_dashboard_sessions", "Signed-in browsers.", registry=registry)
+    num_sessions.set_function(lambda: sessions.num_open)
 
 
 def main(argv: Sequence[str]) -> int:

@@ -36,6 +36,7 @@ from services.dashboard.station_view import (
     RecorderView,
     StationView,
     recorder_view,
+    silent_view,
     station_view,
 )
 from services.dashboard.take_state import TakeStateView, last_take
@@ -52,6 +53,8 @@ NEWEST = "sort=time&descending=true&limit=6"
 # Intervals of a study take seconds; its other routes wait meanwhile.
 STUDY_TIMEOUT_S = 60.0
 OUTCOMES = {True: "success", False: "failure", None: "not judged"}
+# In place of a picture.
+SILENT = "no answer from the station"
 # Of the station's recorder, which checks their bodies.
 ACTIONS = ("arm", "record", "stop", "save", "discard", "rerecord", "session")
 # A WebSocket message: text (JSON) or bytes.
@@ -186,14 +189,19 @@ class Feeds:
 
     async def station(self) -> StationView:
         """Streams and recorder of the station, or why it is unreachable."""
+        if not self.has("acquisition"):
+            return StationView(
+                note="This dashboard was started without a station "
+                "(DEXTOUCH_DASHBOARD_ACQUISITION_URL)."
+            )
+        acquisition = self.upstream("acquisition")
         try:
-            acquisition = self.upstream("acquisition")
             health, recorder = await asyncio.gather(
                 acquisition.read(StationHealth, "/v1/health", timeout_s=self._live_timeout_s),
                 acquisition.read(RecorderStatus, "/v1/recorder", timeout_s=self._live_timeout_s),
             )
         except DexTouchError as error:
-            return StationView(note=error.message)
+            return silent_view(error, acquisition.address)
         return station_view(health, recorder)
 
     async def _trends(self) -> dict[str, list[float | None]]:
@@ -275,7 +283,7 @@ class Feeds:
                 kind="recording",
                 name=item.recording_id,
                 size=f"{item.duration_s:.1f} s, {sum(item.num_samples.values())} samples, "
-                f"{len(item.num_samples)} streams",
+                f"{_plural(len(item.num_samples), 'stream')}",
                 consent=item.consent,
                 **_labels(item),
             )
@@ -323,16 +331,16 @@ class Feeds:
     async def _taxel_messages(self) -> list[Message]:
         try:
             _, arrays = await self._live("taxels")
-        except DexTouchError as error:
-            return [topic_message("taxels_lost", error.message)]
+        except DexTouchError:
+            return [topic_message("taxels_lost", SILENT)]  # why, the station topic reports
         return [taxel_message(side, arrays.get(f"tactile_{side}")) for side in SIDES]
 
     async def _pose_messages(self) -> list[Message]:
         try:
             fields, arrays = await self._live("poses")
             return [pose_message(fields["age_s"], arrays)]
-        except DexTouchError as error:
-            return [topic_message("poses_lost", error.message)]
+        except DexTouchError:
+            return [topic_message("poses_lost", SILENT)]  # why, the station topic reports
 
     async def _live(self, what: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """What the station shows now; it counts as unreachable if it takes too long."""
@@ -340,6 +348,10 @@ class Feeds:
             "GET", f"/v1/live/{what}", timeout_s=self._live_timeout_s
         )
         return unpack(answer.content, max_bytes=MAX_LIVE_BYTES)
+
+
+def _plural(count: int, name: str) -> str:
+    return f"{count} {name}" if count == 1 else f"{count} {name}s"
 
 
 def _labels(item: EpisodeSummary | RecordingSummary) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from fastapi import Query
 from pydantic import ValidationError
 
-from dextouch.errors import DexTouchError, NotFoundError
+from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
     CameraLive,
@@ -24,6 +24,7 @@ from dextouch.streams import unpack
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 from services.dashboard.feeds import MAX_LIVE_BYTES, Feeds, Message, Topic, topic_message
 from services.dashboard.settings import DashboardSettings
+from services.dashboard.station_view import trouble
 from services.dashboard.upstream import Upstream
 
 FLEET_TAXELS_MESSAGE = 3
@@ -35,7 +36,7 @@ GRACE_S = 0.1
 
 
 class Tile(FrozenModel):
-    """A station on the wall; of one that does not answer only name, level and cause are known.
+    """A station on the wall; of one that does not answer name, level, cause and advice are known.
 
     `hours_today` are those of the store's episodes of this station; None where unknown.
     """
@@ -43,6 +44,7 @@ class Tile(FrozenModel):
     name: str
     level: HealthLevel = "STALE"
     cause: str = "no answer yet"
+    advice: str = ""
     recorder: str = "unknown"
     task: str | None = None
     duration_s: float | None = None
@@ -64,7 +66,7 @@ class WatchedStation:
         self._overview: StationOverview | None = None
         self._pressures: dict[str, np.ndarray] = {}
         self._answered_s = float("-inf")
-        self._failure = "no answer yet"
+        self._failure = ("no answer yet", "")
         self._hours_today: float | None = None
         self._hours_due_s = float("-inf")
 
@@ -73,6 +75,11 @@ class WatchedStation:
         if self._asking is None or self._asking.done():
             self._asking = asyncio.create_task(self._ask())
         return self._asking
+
+    @property
+    def _address(self) -> str:
+        has = self._feeds.has("acquisition")
+        return self._feeds.upstream("acquisition").address if has else ""
 
     async def _ask(self) -> None:
         try:
@@ -85,9 +92,10 @@ class WatchedStation:
             self._answered_s = time.monotonic()
         except ValidationError as error:
             self._overview = None
-            self._failure = f"{self.name}: unexpected overview ({first_problems(error)})"
+            found = InvalidInputError(f"unexpected overview ({first_problems(error)})")
+            self._failure = trouble(found, self._address)
         except DexTouchError as error:
-            self._overview, self._failure = None, error.message
+            self._overview, self._failure = None, trouble(error, self._address)
 
     async def ask_hours(self, store: Upstream) -> None:
         """Hours of today's episodes, asked every 10 s; unknown where the store does not say."""
@@ -116,8 +124,8 @@ class WatchedStation:
         """The station now."""
         overview = self._overview
         if overview is None or not self.is_known():
-            cause = self._failure if overview is None else "does not answer"
-            return Tile(name=self.name, cause=cause, hours_today=self._hours_today)
+            cause, advice = ("no answer", "") if overview else self._failure
+            return Tile(name=self.name, cause=cause, advice=advice, hours_today=self._hours_today)
         fresh = [camera for camera in overview.cameras if camera.age_s <= self._timeout_s]
         return Tile(
             name=self.name,

@@ -3,6 +3,7 @@
 import json
 import secrets
 import time
+from asyncio import to_thread
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
@@ -16,8 +17,8 @@ from jinja2 import Environment, FileSystemLoader
 from starlette.requests import HTTPConnection
 
 from dextouch.errors import AccessDeniedError, DexTouchError, NotFoundError
-from dextouch.schemas import status_of
 from dextouch.serving import FORM, KIB, AccessControl, not_signed_in, takes
+from services.dashboard.documents import HELP, Documents, find_documents
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.tasks import TaskChoice, load_tasks
 
@@ -45,31 +46,38 @@ TEMPLATES = Environment(
 class Screen:
     """A page of the dashboard: where it is, its template, and its name in the navigation.
 
-    Screens that belong to another one, such as the player, have that one's name in `within`. Those
-    of one station keep `?station=` in the navigation; the wall is offered to those with several.
+    Screens that belong to another one, such as the player, have that one's name in `within`; the
+    wall is offered to dashboards of several stations. `help` is the section of docs/dashboard.md.
     """
 
     path: str
     template: str
     title: str
     within: str = ""
-    of_station: bool = False
+    help: str = ""
     of_several: bool = False
 
 
 SCREENS: Final = (
-    Screen("/", "station.html", "Station", of_station=True),
-    Screen("/fleet", "fleet.html", "Fleet", of_several=True),
-    Screen("/health", "health.html", "Health", of_station=True),
-    Screen("/episodes", "episodes.html", "Episodes"),
-    Screen("/episodes/{kind}/{item_id}", "player.html", "Player", within="Episodes"),
-    Screen("/review", "review.html", "Review"),
-    Screen("/hours", "hours.html", "Hours"),
-    Screen("/calibration", "calibration.html", "Calibration"),
-    Screen("/rollouts", "rollouts.html", "Rollouts"),
-    Screen("/studies", "studies.html", "Studies"),
-    Screen("/studies/{name}", "study.html", "Study", within="Studies"),
-    Screen("/system", "system.html", "System"),
+    Screen("/", "station.html", "Station", help="recording"),
+    Screen("/fleet", "fleet.html", "Fleet", help="several-stations", of_several=True),
+    Screen("/health", "health.html", "Health", help="health"),
+    Screen("/episodes", "episodes.html", "Episodes", help="recordings-and-episodes"),
+    Screen(
+        "/episodes/{kind}/{item_id}",
+        "player.html",
+        "Player",
+        within="Episodes",
+        help="playing-an-episode",
+    ),
+    Screen("/review", "review.html", "Review", help="review"),
+    Screen("/hours", "hours.html", "Hours", help="hours"),
+    Screen("/calibration", "calibration.html", "Calibration", help="calibration"),
+    Screen("/rollouts", "rollouts.html", "Rollouts", help="rollouts"),
+    Screen("/studies", "studies.html", "Studies", help="studies"),
+    Screen("/studies/{name}", "study.html", "Study", within="Studies", help="studies"),
+    Screen("/system", "system.html", "System", help="system"),
+    Screen(f"{HELP}{{name:path}}", "help.html", "Help", within="Help"),
 )
 
 
@@ -142,8 +150,9 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
     router = APIRouter(include_in_schema=False)
     page = partial(_page, settings.station)
     tasks = load_tasks(settings.task_file)
+    documents = Documents(find_documents())
     for screen in SCREENS:
-        show = _shown(screen, settings, sessions, tasks)
+        show = _shown(screen, settings, sessions, tasks, documents)
         router.add_api_route(screen.path, show, methods=["GET"])
 
     @router.post("/sign_in")
@@ -183,6 +192,7 @@ def _shown(
     settings: DashboardSettings,
     sessions: Sessions,
     tasks: tuple[TaskChoice, ...],
+    documents: Documents,
 ) -> Callable[[Request], Awaitable[Response]]:
     """Route of a screen; browsers that are not signed in get the sign-in in its place."""
 
@@ -193,6 +203,9 @@ def _shown(
         names, chosen = list(settings.station_urls()), request.query_params.get("station")
         if chosen is not None and chosen not in names:
             raise NotFoundError(f"station {chosen!r}: this dashboard shows {', '.join(names)}")
+        document = None
+        if screen.title == "Help":
+            document = await to_thread(documents.read, request.path_params["name"])
         return _page(
             chosen or (names[0] if names else settings.station),
             screen.template,
@@ -205,6 +218,7 @@ def _shown(
             settings=settings,
             goals=json.dumps(settings.goal_hours),
             signed_in=sessions.needs_key,
+            document=document,
         )
 
     return show
@@ -216,11 +230,11 @@ def _own_path(text: str) -> str:
     return text if is_own and not text.startswith(("//", "/\\")) else "/"
 
 
-def refusal_page(station: str, _: Request, error: DexTouchError) -> Response:
+def refusal_page(station: str, error: DexTouchError, status: int) -> Response:
     """HTML page of a refusal, in place of problem+json."""
-    return _page(station, "refused.html", status_of(error), reason=error.message)
+    return _page(station, "refused.html", status, status=status, reason=error.message)
 
 
-def _page(station: str, name: str, status: int = 200, **values: object) -> HTMLResponse:
+def _page(station: str, name: str, code: int = 200, **values: object) -> HTMLResponse:
     text = TEMPLATES.get_template(name).render(station=station, **values)
-    return HTMLResponse(text, status, headers=PAGE_HEADERS)
+    return HTMLResponse(text, code, headers=PAGE_HEADERS)

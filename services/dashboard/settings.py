@@ -73,7 +73,7 @@ class DashboardSettings(ServiceSettings):
         default=1 / 30, ge=0.02, le=10, description="seconds between updates of hands and poses"
     )
     fleet_period_s: float = Field(
-        default=0.15, ge=0.05, le=10, description="seconds between updates of the wall of stations"
+        default=0.1, ge=0.05, le=10, description="seconds between updates of the wall of stations"
     )
     list_period_s: float = Field(
         default=2.0, ge=0.2, le=60, description="seconds between listings of takes and episodes"

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+from dextouch.errors import AccessDeniedError, DexTouchError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
     DeviceHealth,
@@ -90,11 +91,11 @@ class GloveView(FrozenModel):
 
 
 class StationView(FrozenModel):
-    """Overview of the station; by default of one that does not respond, for the reason `note`."""
+    """Overview of the station; by default of one that is not configured, for the reason `note`."""
 
     reachable: bool = False
     level: HealthLevel = "STALE"
-    summary: str = "acquisition does not respond"
+    summary: str = ""
     note: str
     note_level: HealthLevel = "ERROR"
     host: HostView | None = None
@@ -102,6 +103,35 @@ class StationView(FrozenModel):
     streams: tuple[StreamView, ...] = ()
     recorder: RecorderView = RecorderView(state="unknown", level="ERROR")
     gloves: Mapping[str, GloveView] = {}
+
+
+def trouble(error: DexTouchError, address: str) -> tuple[str, str]:
+    """Why a station is not shown, in the words of an operator, and what to do."""
+    if error.details.get("no_answer"):
+        return (
+            "This station does not answer.",
+            "Check that its computer is on and on the network, and that the station's service runs "
+            f"there ({address}).",
+        )
+    if isinstance(error, AccessDeniedError):
+        advice = "Give the dashboard a key of this station: DEXTOUCH_DASHBOARD_UPSTREAM_KEY."
+        return f"This station refuses the dashboard: {error.message}.", advice
+    return error.message, ""
+
+
+def silent_view(error: DexTouchError, address: str) -> StationView:
+    """The view of a station that does not answer, or not as it should."""
+    message, advice = trouble(error, address)
+    cause = CauseView(
+        key="station",
+        level="STALE",
+        message=message,
+        advice=advice,
+        lasted_s=None,
+        num_streams=0,
+        findings=(error.message,) if error.message != message else (),
+    )
+    return StationView(summary="no answer", note="", causes=(cause,))
 
 
 def station_view(station: StationHealth, recorder: RecorderStatus) -> StationView:

@@ -151,6 +151,7 @@ class Upstream:
             f"{self.name}: no answer to {method} {path} ({type(error).__name__}); "
             "is the service running?",
             service=self.name,
+            no_answer=True,
         )
 
     async def ready(self) -> tuple[bool, str]:

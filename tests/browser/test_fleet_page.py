@@ -1,6 +1,7 @@
 """The wall of stations: one that stops is STALE within a second, and shows no picture."""
 
 import re
+import sys
 import time
 
 import pytest
@@ -57,6 +58,8 @@ def test_a_station_that_stops_is_stale_and_first(wall, stations):
         if delays_s[-1] < 1.0:
             break
         stations["desk_2"].go_on()
+    shown = ", ".join(f"{delay_s:.2f}" for delay_s in delays_s)
+    sys.stdout.write(f"STALE {shown} s after SIGSTOP\n")
     assert min(delays_s) < 1.0, delays_s
     # The other one may be in trouble of its own on a machine under load.
     if wall.locator("[data-station=desk_1]").get_attribute("data-level") != "ERROR":

@@ -1,6 +1,7 @@
 """Live pictures of a station: they move, they turn, and none of them outlives its station."""
 
 import re
+import sys
 import time
 
 import pytest
@@ -74,6 +75,8 @@ def test_nothing_is_live_a_second_after_its_station_stopped(live, station):
         expect_moving(live)
         if delays_s[-1] < 1.0:
             break
+    shown = ", ".join(f"{delay_s:.2f}" for delay_s in delays_s)
+    sys.stdout.write(f"STALE {shown} s after SIGSTOP\n")
     assert min(delays_s) < 1.0, delays_s
 
 

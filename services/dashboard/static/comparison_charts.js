@@ -1,5 +1,6 @@
 // Errors over the steps of a comparison: three plots with one cursor, shaded where imagination is doubted.
 
+import { css } from "./canvas.js";
 import uPlot from "./vendor/uplot/uPlot.esm.js";
 
 const HEIGHT = 150;
@@ -8,10 +9,6 @@ const PLOTS = [
   { key: "pressure_error_kpa", label: "Pressure error, kPa", range: (max) => [0, Math.max(max, 0.2)] },
   { key: "contact_f1", label: "Contact F1", range: () => [0, 1] },
 ];
-
-function css(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
 
 // Values of a plot; F1 says nothing where neither world has contact.
 export function series(view, key) {

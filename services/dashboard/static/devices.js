@@ -1,6 +1,6 @@
 // Devices panel: the computer, then one line a root cause, then one row a stream, grouped by device.
 
-import { element, levelBadge, setText } from "./dom.js";
+import { element, levelBadge, setText, showChildren } from "./dom.js";
 import { age, count, number } from "./format.js";
 import { sparkline } from "./sparkline.js";
 
@@ -44,7 +44,7 @@ export class DevicesPanel {
     this.note.dataset.level = station.note_level;
     setText(this.note, station.note);
     this.host.hidden = station.host === null;
-    if (station.host) this.host.replaceChildren(levelBadge(station.host.level), element("span", { class: "quiet" }, hostText(station.host)));
+    if (station.host) showChildren(this.host, [levelBadge(station.host.level), element("span", { class: "quiet" }, hostText(station.host))]);
     this.showCauses(station.causes);
     this.streams = station.streams;
     this.showRows();
@@ -62,7 +62,7 @@ export class DevicesPanel {
       const text = rest.length === 1 ? `1 more cause: ${rest[0].message}` : `${rest.length} more causes`;
       nodes.push(this.fold("", element("summary", { class: "quiet" }, text), rest.map((cause) => this.cause(cause))));
     }
-    this.causes.replaceChildren(...nodes);
+    showChildren(this.causes, nodes);
   }
 
   cause(cause) {
@@ -81,7 +81,7 @@ export class DevicesPanel {
   }
 
   fold(key, summary, children, attributes = {}) {
-    const details = element("details", attributes, summary, ...children);
+    const details = element("details", { ...attributes, "data-key": key }, summary, ...children);
     details.open = this.open.has(key);
     details.addEventListener("toggle", () => (details.open ? this.open.add(key) : this.open.delete(key)));
     return details;
@@ -90,9 +90,10 @@ export class DevicesPanel {
   showRows() {
     const clocks = this.streams.some((stream) => stream.skew_ppm !== null || stream.clock_error_ms !== null);
     this.body.closest("table").classList.toggle("no_clocks", !clocks);
+    this.body.closest("table").hidden = this.streams.length === 0;
     const perDevice = new Map();
     for (const stream of this.streams) perDevice.set(stream.device, [...(perDevice.get(stream.device) ?? []), stream]);
-    this.body.replaceChildren(...[...perDevice].flatMap(([device, streams]) => this.group(device, streams)));
+    showChildren(this.body, [...perDevice].flatMap(([device, streams]) => this.group(device, streams)));
   }
 
   // A device of one stream is named beside it; one of several has a row above them.

@@ -16,3 +16,29 @@ export function levelBadge(level) {
 export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
+
+function isSame(old, fresh) {
+  return old.nodeName === fresh.nodeName && old.dataset?.key === fresh.dataset?.key;
+}
+
+function patch(old, fresh) {
+  if (old.nodeType === Node.TEXT_NODE) {
+    if (old.data !== fresh.data) old.data = fresh.data;
+    return;
+  }
+  for (const { name } of [...old.attributes]) if (!fresh.hasAttribute(name) && name !== "open") old.removeAttribute(name);
+  for (const { name, value } of fresh.attributes) if (name !== "open" && old.getAttribute(name) !== value) old.setAttribute(name, value);
+  showChildren(old, [...fresh.childNodes]);
+}
+
+// Show these nodes, changing only what differs: a click, the focus and selected text survive updates. What has listeners of
+// its own needs a `data-key`, since nodes of the same key stay with their listeners.
+export function showChildren(parent, nodes) {
+  nodes.forEach((fresh, index) => {
+    const old = parent.childNodes[index];
+    if (!old) parent.append(fresh);
+    else if (isSame(old, fresh)) patch(old, fresh);
+    else old.replaceWith(fresh);
+  });
+  while (parent.childNodes.length > nodes.length) parent.lastChild.remove();
+}

@@ -2,7 +2,7 @@
 
 import { showImage } from "./cameras.js";
 import { element, levelBadge, setText } from "./dom.js";
-import { number, stopwatch } from "./format.js";
+import { number, plural, stopwatch } from "./format.js";
 import { Freshness } from "./freshness.js";
 import { HandCanvas } from "./hands.js";
 import { LiveLink } from "./live.js";
@@ -33,13 +33,14 @@ class StationTile {
     this.timer = element("span", { class: "timer" });
     this.task = element("span", { class: "task" });
     this.cause = element("p", { class: "cause" });
+    this.advice = element("p", { class: "to_do" });
     this.facts = { today: element("dd", {}), disk: element("dd", {}) };
     this.camera = element("div", { class: "picture" });
     this.image_ms = 0;
     this.node = element("li", { class: "tile", "data-station": name }, element("a", { href: `/?station=${encodeURIComponent(name)}` },
       element("div", { class: "tile_head" }, this.badge, element("strong", {}, name), this.timer),
       element("p", { class: "doing" }, this.task),
-      this.cause,
+      this.cause, this.advice,
       element("div", { class: "pictures" }, ...canvases, this.camera),
       element("dl", {}, element("div", {}, element("dt", {}, "today"), this.facts.today), element("div", {}, element("dt", {}, "disk"), this.facts.disk))));
     this.hands = Object.fromEntries(SIDES.map((side, index) => [side, new HandCanvas(canvases[index], {}, side, heatmap)]));
@@ -51,10 +52,11 @@ class StationTile {
     if (this.badge.firstChild?.textContent !== tile.level) this.badge.replaceChildren(levelBadge(tile.level));
     this.node.dataset.recorder = tile.recorder;
     const recording = tile.recorder === "recording";
-    setText(this.timer, recording ? `● ${stopwatch(tile.duration_s)}` : tile.recorder);
-    setText(this.task, tile.task ?? "no task");
+    setText(this.timer, recording ? `● ${stopwatch(tile.duration_s)}` : tile.recorder === "unknown" ? "" : tile.recorder);
+    setText(this.task, tile.task ?? (tile.recorder === "unknown" ? "" : "no task"));
     setText(this.cause, tile.cause);
-    this.cause.title = tile.cause;
+    setText(this.advice, tile.advice);
+    this.node.title = tile.cause;
     setText(this.facts.today, number(tile.hours_today, 2, "h"));
     setText(this.facts.disk, diskText(tile));
     this.showCamera(tile.camera);
@@ -77,7 +79,7 @@ class StationTile {
   }
 
   clear(cause) {
-    this.show({ name: this.tile.name, level: "STALE", cause, recorder: "unknown", task: null, duration_s: null, hours_today: null,
+    this.show({ name: this.tile.name, level: "STALE", cause, advice: "", recorder: "unknown", task: null, duration_s: null, hours_today: null,
       disk_left_s: null, disk_free_bytes: null, camera: null, gloves: [] });
   }
 }
@@ -94,7 +96,7 @@ function show(shown) {
   if (names.join("\n") !== order.join("\n")) find("tiles").replaceChildren(...names.map((name) => tiles.get(name).node));
   order = names;
   const counts = ["ERROR", "STALE", "WARN", "OK"].map((level) => [shown.filter((tile) => tile.level === level).length, level]);
-  setText(find("summary"), counts.filter(([count]) => count > 0).map(([count, level]) => `${count} ${level}`).join(" · "));
+  setText(find("counts"), `${plural(shown.length, "station")}: ${counts.filter(([count]) => count > 0).map(([count, level]) => `${count} ${level}`).join(" · ")}`);
 }
 
 const clearAll = (cause) => tiles.forEach((tile) => tile.clear(cause));

@@ -1,6 +1,7 @@
 // Pressures of one hand → a canvas in hand layout. Layout and colours come from the server, which
 // takes them from dextouch.tactile.heatmap, so that report and page show the same picture.
 
+import { beforeNextFrame, cleared, css } from "./canvas.js";
 import { setText } from "./dom.js";
 import { number } from "./format.js";
 import { drawMark } from "./taxel_marks.js";
@@ -9,10 +10,6 @@ import { PADS, padForces, STATES, statesOf, taxelName, trusted } from "./taxels.
 const GAP = 0.09;
 const TIP_TAXELS = 16;
 const NUM_TIPS = 5;
-
-export function css(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
 
 function box(cells, columns) {
   const rows = cells.map((cell) => Math.floor(cell / columns));
@@ -36,7 +33,7 @@ export class HandCanvas {
     this.pressures_kpa = null;
     this.states = new Map();
     this.hovered = null;
-    this.waiting = false;
+    this.request = beforeNextFrame(() => this.draw());
     for (const name of ["pointermove", "pointerdown"]) canvas.addEventListener(name, (event) => this.hover(event));
     canvas.addEventListener("pointerleave", () => this.hover(null));
     new ResizeObserver(() => this.request()).observe(canvas);
@@ -85,33 +82,37 @@ export class HandCanvas {
     return { cell_px, left_px: (width - cell_px * columns) / 2, top_px: (height - cell_px * rows) / 2 };
   }
 
-  request() {
-    if (this.waiting) return;
-    this.waiting = true;
-    requestAnimationFrame(() => {
-      this.waiting = false;
-      this.draw();
-    });
-  }
-
   draw() {
-    const scale = window.devicePixelRatio || 1;
-    const width = Math.round(this.canvas.clientWidth * scale);
-    const height = Math.round(this.canvas.clientHeight * scale);
-    if (width === 0 || height === 0) return;
-    if (this.canvas.width !== width || this.canvas.height !== height) {
-      this.canvas.width = width;
-      this.canvas.height = height;
-    }
+    const found = cleared(this.canvas);
+    if (!found) return;
+    const { context, width, height } = found;
     const { cell_px, left_px, top_px } = this.placement(width, height);
-    const context = this.canvas.getContext("2d");
-    context.setTransform(1, 0, 0, 1, 0, 0);
-    context.clearRect(0, 0, width, height);
+    context.drawImage(this.unloaded(width, height), 0, 0);
     context.setTransform(cell_px, 0, 0, cell_px, left_px, top_px);
-    this.drawSilhouette(context);
     this.drawTaxels(context);
     this.drawMarks(context, { cell_px, left_px, top_px });
     this.showTexts();
+  }
+
+  // The hand without pressures, drawn once for a size and theme: most of its taxels are unloaded most of the time.
+  unloaded(width, height) {
+    const key = [width, height, css("--hand"), css("--cell")].join();
+    if (this.unloadedKey === key) return this.unloadedPicture;
+    const { cell_px, left_px, top_px } = this.placement(width, height);
+    const picture = new OffscreenCanvas(width, height);
+    const context = picture.getContext("2d");
+    context.setTransform(cell_px, 0, 0, cell_px, left_px, top_px);
+    this.drawSilhouette(context);
+    context.fillStyle = css("--cell");
+    for (const cell of this.cells) this.fillCell(context, cell);
+    Object.assign(this, { unloadedKey: key, unloadedPicture: picture });
+    return picture;
+  }
+
+  fillCell(context, cell) {
+    context.beginPath();
+    context.roundRect((cell % this.heatmap.columns) + GAP, Math.floor(cell / this.heatmap.columns) + GAP, 1 - 2 * GAP, 1 - 2 * GAP, 0.24);
+    context.fill();
   }
 
   drawSilhouette(context) {
@@ -138,22 +139,14 @@ export class HandCanvas {
   }
 
   drawTaxels(context) {
-    const { ramp, columns, full_scale_kpa, contact_kpa } = this.heatmap;
-    const empty = css("--cell");
-    this.cells.forEach((cell, taxel) => {
-      const pressure_kpa = this.pressures_kpa ? this.pressures_kpa[taxel] : NaN;
-      if (Number.isFinite(pressure_kpa) && pressure_kpa >= contact_kpa / 2) {
-        const share = Math.min(pressure_kpa / full_scale_kpa, 1);
-        const [red, green, blue] = ramp[Math.round(share * (ramp.length - 1))];
-        context.fillStyle = `rgb(${red} ${green} ${blue})`;
-      } else {
-        context.fillStyle = empty;
-      }
-      const row = Math.floor(cell / columns);
-      const column = cell % columns;
-      context.beginPath();
-      context.roundRect(column + GAP, row + GAP, 1 - 2 * GAP, 1 - 2 * GAP, 0.24);
-      context.fill();
+    if (!this.pressures_kpa) return;
+    const { ramp, full_scale_kpa, contact_kpa } = this.heatmap;
+    this.pressures_kpa.forEach((pressure_kpa, taxel) => {
+      if (!Number.isFinite(pressure_kpa) || pressure_kpa < contact_kpa / 2) return;
+      const share = Math.min(pressure_kpa / full_scale_kpa, 1);
+      const [red, green, blue] = ramp[Math.round(share * (ramp.length - 1))];
+      context.fillStyle = `rgb(${red} ${green} ${blue})`;
+      this.fillCell(context, this.cells[taxel]);
     });
   }
 

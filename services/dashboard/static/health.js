@@ -4,7 +4,7 @@ import { element, levelBadge, setText } from "./dom.js";
 import { clockTime, firstKnown, History, queryOf, runs, scaled, viewOf } from "./history.js";
 import { unpack } from "./packed.js";
 import { LinePlot, StripPlot } from "./plots.js";
-import { ask } from "./session.js";
+import { ask, pagePath } from "./session.js";
 import { startTheme } from "./theme.js";
 
 const PERIOD_MS = 1000;
@@ -54,7 +54,7 @@ const overview = new StripPlot(find("overview"), { rows: () => strips, takes: ()
 
 function go(change) {
   view = { ...view, ...change };
-  window.history.replaceState(null, "", queryOf(view));
+  window.history.replaceState(null, "", pagePath(queryOf(view)));
   draw();
 }
 

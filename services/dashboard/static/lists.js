@@ -1,10 +1,10 @@
 // Services and newest takes → short lists.
 
-import { element, levelBadge } from "./dom.js";
-import { ask } from "./session.js";
+import { element, levelBadge, showChildren } from "./dom.js";
+import { ask, pagePath } from "./session.js";
 
 export function showServices(list, services) {
-  list.replaceChildren(...services.map((service) => element("li", { title: service.message },
+  showChildren(list, services.map((service) => element("li", { title: service.message },
     levelBadge(service.level), element("span", {}, service.name),
     service.level === "OK" ? null : element("span", { class: "quiet" }, service.message))));
 }
@@ -18,7 +18,7 @@ function why(text) {
 function takeRow(take) {
   return element("tr", {},
     element("td", { class: "quiet" }, take.kind, why(take.domain)),
-    element("td", { class: "name" }, element("a", { href: `/episodes/${take.kind}/${encodeURIComponent(take.name)}` }, take.name), why(take.size), why(take.clocks)),
+    element("td", { class: "name" }, element("a", { href: pagePath(`/episodes/${take.kind}/${encodeURIComponent(take.name)}`) }, take.name), why(take.size), why(take.clocks)),
     element("td", {}, take.task),
     element("td", {}, take.operator ?? "–", why(CONSENT.get(take.consent))),
     element("td", {}, take.outcome));
@@ -53,5 +53,5 @@ export function showRefused(list, refused) {
 
 export function showTakes(body, { takes, note }) {
   const empty = element("tr", {}, element("td", { colspan: 5, class: "free" }, note));
-  body.replaceChildren(...(takes.length ? takes.map(takeRow) : [empty]));
+  showChildren(body, takes.length ? takes.map(takeRow) : [empty]);
 }

@@ -1,11 +1,12 @@
 // The page: one live link feeds the panels; a panel that is out of sight is not sent.
 
 import { CameraPanel } from "./cameras.js";
+import { css } from "./canvas.js";
 import { DevicesPanel } from "./devices.js";
 import { element, setText } from "./dom.js";
 import { age } from "./format.js";
 import { Freshness } from "./freshness.js";
-import { css, drawScale, HandCanvas, readTaxels } from "./hands.js";
+import { drawScale, HandCanvas, readTaxels } from "./hands.js";
 import { showRefused, showServices, showTakes } from "./lists.js";
 import { LiveLink } from "./live.js";
 import { PoseView } from "./pose_view.js";
@@ -47,7 +48,7 @@ const fresh = {
 };
 
 function showNoStation(note) {
-  showStation({ level: "STALE", summary: "", note, note_level: "ERROR", reachable: false, host: null, causes: [], streams: [],
+  showStation({ level: "STALE", summary: "no updates", note, note_level: "ERROR", reachable: false, host: null, causes: [], streams: [],
     recorder: { state: "unknown", actions: [], elapsed_s: null, problems: [], level: "STALE" } });
 }
 

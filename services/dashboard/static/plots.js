@@ -1,5 +1,6 @@
 // Plots over time with one cursor: lines of a stream with its gaps, events and takes, and the strips of all streams.
 
+import { css } from "./canvas.js";
 import { clockTime } from "./history.js";
 import uPlot from "./vendor/uplot/uPlot.esm.js";
 
@@ -10,22 +11,18 @@ const MAX_EVENT_LINES = 12;
 export const ROW_HEIGHT = 19;
 let selection = null;
 
-export function colour(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
-
 export function levelColour(level) {
-  return colour(LEVELS[level] ?? "--quiet");
+  return css(LEVELS[level] ?? "--quiet");
 }
 
 function timeAxis() {
-  return { stroke: () => colour("--quiet"), grid: { stroke: () => colour("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui", size: 24, gap: 3,
+  return { stroke: () => css("--quiet"), grid: { stroke: () => css("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui", size: 24, gap: 3,
     values: (_, splits, __, ___, step_s) => splits.map((t_s) => clockTime(t_s, { seconds: step_s < 60 })) };
 }
 
 function valueAxis(label, scale, side) {
-  return { scale, side, label, labelSize: 16, labelFont: "11px system-ui", labelGap: 0, size: AXIS_WIDTH - 16, gap: 3, font: "11px system-ui", stroke: () => colour("--quiet"),
-    grid: { show: side === 3, stroke: () => colour("--line"), width: 1 }, ticks: { show: false } };
+  return { scale, side, label, labelSize: 16, labelFont: "11px system-ui", labelGap: 0, size: AXIS_WIDTH - 16, gap: 3, font: "11px system-ui", stroke: () => css("--quiet"),
+    grid: { show: side === 3, stroke: () => css("--line"), width: 1 }, ticks: { show: false } };
 }
 
 // A cursor that all plots share; dragging selects a span of time.
@@ -73,7 +70,7 @@ function paintMarks(plot, marks) {
       const found = span(plot, start_s, stop_s);
       if (!found) continue;
       ctx.globalAlpha = alpha;
-      ctx.fillStyle = colour(name);
+      ctx.fillStyle = css(name);
       ctx.fillRect(found[0], bbox.top, found[1], bbox.height);
     }
     const shown = marks.events.map((event) => [event, span(plot, event.t_s, event.t_s)]).filter(([, found]) => found);
@@ -97,13 +94,15 @@ export class LinePlot {
     this.about = about;
     const scales = [...new Set(about.series.map((series) => series.scale))];
     const lines = about.series.map((series) => ({
-      label: series.label, scale: series.scale, stroke: () => colour(series.colour), width: 1.4, spanGaps: false,
-      points: { show: false }, fill: series.fill ? () => `color-mix(in srgb, ${colour(series.colour)} 18%, transparent)` : undefined,
+      label: series.label, scale: series.scale, stroke: () => css(series.colour), width: 1.4, spanGaps: false,
+      points: { show: false }, fill: series.fill ? () => `color-mix(in srgb, ${css(series.colour)} 18%, transparent)` : undefined,
       value: (_, value) => (value === null || value === undefined ? "–" : `${value.toFixed(series.digits)} ${series.unit}`),
     }));
     const base = shared(onSelect, { drawAxes: [(plot) => paintMarks(plot, marks())], draw: [(plot) => this.paintNominal(plot)] });
     this.plot = new uPlot({
-      ...base, width: this.width(), height: about.height ?? 150, legend: { live: true },
+      ...base, width: this.width(), height: about.height ?? 150,
+      // Variables, so that the legend follows the theme as the lines do.
+      legend: { live: true, markers: { stroke: (_, index) => `var(${about.series[index - 1]?.colour})`, fill: () => "transparent" } },
       scales: { ...base.scales, ...Object.fromEntries(scales.map((scale) => [scale, { range: (_, low, high) => this.range(low, high, scale) }])) },
       axes: [timeAxis(), ...scales.map((scale, index) => valueAxis(scale, scale, index === 0 ? 3 : 1))],
       // All plots of a column begin and end at the same place.
@@ -129,7 +128,7 @@ export class LinePlot {
     if (!this.nominal) return;
     paint(plot, (ctx, bbox) => {
       const y = plot.valToPos(this.nominal, this.about.series[0].scale, true);
-      ctx.strokeStyle = colour("--quiet");
+      ctx.strokeStyle = css("--quiet");
       ctx.setLineDash([4 * devicePixelRatio, 4 * devicePixelRatio]);
       ctx.beginPath();
       ctx.moveTo(bbox.left, y);
@@ -162,7 +161,7 @@ export class StripPlot {
     this.plot = new uPlot({
       ...base, width: Math.max(root.clientWidth, 300), height: this.height(), legend: { show: false },
       scales: { ...base.scales, y: { dir: -1, range: () => [0, rows().length + 1] } },
-      axes: [timeAxis(), { scale: "y", side: 3, size: 150, gap: 6, font: "12px system-ui", stroke: () => colour("--ink"), grid: { show: false }, ticks: { show: false },
+      axes: [timeAxis(), { scale: "y", side: 3, size: 150, gap: 6, font: "12px system-ui", stroke: () => css("--ink"), grid: { show: false }, ticks: { show: false },
         splits: () => ["", ...rows()].map((_, index) => index + 0.5), values: () => ["takes", ...rows().map((row) => row.name)] }],
       padding: [2, 10, 0, 0],
       series: [{}, { scale: "y", show: true, stroke: "transparent", points: { show: false } }],
@@ -186,7 +185,7 @@ export class StripPlot {
         const top = plot.valToPos(row, "y", true);
         const height = plot.valToPos(row + 1, "y", true) - top;
         ctx.globalAlpha = alpha;
-        ctx.fillStyle = colour(name);
+        ctx.fillStyle = css(name);
         ctx.fillRect(found[0], top + height * (0.88 - 0.76 * share), found[1], 0.76 * height * share);
       };
       for (const take of takes) bar(0, take.start_s, take.stop_s, 1, "--accent", 0.75);

@@ -1,6 +1,7 @@
 // Hands and poses in space, drawn on a 2-D canvas; drag or arrow keys turn, wheel or + and - zoom, double click or 0 resets.
 
-import { element, levelBadge } from "./dom.js";
+import { beforeNextFrame, cleared, css } from "./canvas.js";
+import { element, levelBadge, showChildren } from "./dom.js";
 import { age } from "./format.js";
 import { apply, fitted, orbitCamera, project, turned, zoomed } from "./projection.js";
 import { scene } from "./poses.js";
@@ -13,10 +14,6 @@ const GRID_CELLS = 5;
 const KEYS = { ArrowLeft: [-12, 0], ArrowRight: [12, 0], ArrowUp: [0, 12], ArrowDown: [0, -12] };
 const ZOOMS = { "+": 0.9, "-": 1 / 0.9 };
 
-function css(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
-
 export class PoseView {
   constructor(canvas, list, bones) {
     this.canvas = canvas;
@@ -27,7 +24,7 @@ export class PoseView {
     this.orbit = HOME;
     this.fits = false;
     this.floor_m = 0;
-    this.waiting = false;
+    this.request = beforeNextFrame(() => this.draw());
     this.listed = { text: "", at_ms: 0 };
     this.listen();
     new ResizeObserver(() => this.request()).observe(canvas);
@@ -93,30 +90,18 @@ export class PoseView {
     const now_ms = performance.now();
     if (text === this.listed.text && now_ms - this.listed.at_ms < LIST_PERIOD_MS) return;
     this.listed = { text, at_ms: now_ms };
-    this.list.replaceChildren(...this.streams.map(({ name, age_s, values }) => element("li", { "data-stream": name },
+    showChildren(this.list, this.streams.map(({ name, age_s, values }) => element("li", { "data-stream": name },
       levelBadge(values.length > 0 ? "OK" : "STALE"),
       element("span", {}, name.replaceAll("_", " ")),
       element("span", { class: "quiet" }, age_s === null ? "no data" : age(age_s)))));
   }
 
-  request() {
-    if (this.waiting) return;
-    this.waiting = true;
-    requestAnimationFrame(() => {
-      this.waiting = false;
-      this.draw();
-    });
-  }
-
   draw() {
-    const scale = window.devicePixelRatio || 1;
+    const found = cleared(this.canvas);
+    if (!found) return;
+    const { context, scale } = found;
     const size = { width_px: this.canvas.clientWidth, height_px: this.canvas.clientHeight };
-    if (size.width_px === 0 || size.height_px === 0) return;
-    const [width, height] = [Math.round(scale * size.width_px), Math.round(scale * size.height_px)];
-    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
-    const context = this.canvas.getContext("2d");
     context.setTransform(scale, 0, 0, scale, 0, 0);
-    context.clearRect(0, 0, size.width_px, size.height_px);
     context.font = `12px ${getComputedStyle(document.body).fontFamily}`;
     context.lineCap = context.lineJoin = "round";
     const { bodies, hands } = scene(this.streams);

@@ -211,8 +211,8 @@ export class RecorderPanel {
     const state = this.recorder?.state;
     if (state === "checking" && this.outcome() === undefined) return "How did this take end? Success: Y, failure: N, not judged: U";
     if (this.reset.running) return "Reset the scene.";
-    const next = { idle: "Choose a task, then arm: A", armed: "Record: R", recording: "Stop: S", checking: "Save: V", saved: "Next take, arm: A", discarded: "Next take, arm: A" };
-    return next[state] ? next[state] + pedal : "";
+    const next = { unknown: "No connection to this station: see Devices, below.", idle: "Choose a task, then arm: A", armed: "Record: R", recording: "Stop: S", checking: "Save: V", saved: "Next take, arm: A", discarded: "Next take, arm: A" };
+    return next[state] ? next[state] + (state === "unknown" ? "" : pedal) : "";
   }
 
   show(recorder, level) {
@@ -222,7 +222,7 @@ export class RecorderPanel {
     this.level = level;
     this.received_ms = performance.now();
     for (const id of ["recorder_state", "stage"]) this.find(id).dataset.state = recorder.state;
-    setText(this.find("recorder_state"), recorder.state);
+    setText(this.find("recorder_state"), recorder.state === "unknown" ? "no station" : recorder.state);
     this.reset.keep(recorder);
     this.forgetOutcome(recorder);
     this.takePrompt(recorder);

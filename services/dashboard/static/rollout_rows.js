@@ -1,6 +1,6 @@
 // Open rollouts → rows of the table, and the words for their state and doubt.
 
-import { element } from "./dom.js";
+import { element, showChildren } from "./dom.js";
 import { age } from "./format.js";
 
 const IDLE_S = 30;
@@ -39,7 +39,7 @@ export function rolloutRow(rollout, isWatched, watch) {
   const doubt = doubtOf(rollout);
   const button = element("button", { type: "button", "aria-pressed": isWatched }, isWatched ? "Watching" : "Watch");
   button.addEventListener("click", () => watch(rollout));
-  return element("tr", { "data-level": state.level === "OK" ? null : state.level, "data-watch": rollout.watch_id },
+  return element("tr", { "data-level": state.level === "OK" ? null : state.level, "data-watch": rollout.watch_id, "data-key": rollout.watch_id },
     element("td", {}, badge(state), why(rollout.ended)),
     element("td", { class: "name" }, rollout.world, why(KINDS[rollout.kind] ?? rollout.service)),
     element("td", {}, rollout.client || "not named", why(rollout.key && rollout.key !== WITHOUT_KEYS ? `key ${rollout.key}` : "")),
@@ -56,7 +56,5 @@ export function showRollouts(body, rollouts, watched, watch) {
   const rows = rollouts.map((one) => rolloutRow(one, one.watch_id === watched, watch));
   const empty = element("tr", {}, element("td", { colspan: 10, class: "free" },
     "No open rollouts. A policy that is evaluated in one of the worlds appears here."));
-  const focused = document.activeElement?.closest?.("[data-watch]")?.dataset.watch;
-  body.replaceChildren(...(rows.length ? rows : [empty]));
-  if (focused) body.querySelector(`[data-watch="${focused}"] button`)?.focus();
+  showChildren(body, rows.length ? rows : [empty]);
 }

@@ -6,7 +6,7 @@ import { HandCanvas } from "./hands.js";
 import { LiveLink } from "./live.js";
 import { drawRgb } from "./rgb_canvas.js";
 import { badge, doubtOf, showRollouts, stateOf } from "./rollout_rows.js";
-import { ask } from "./session.js";
+import { ask, pagePath } from "./session.js";
 import { imageOf, readSteps, touchOf } from "./step_messages.js";
 import { StepPlayer } from "./step_player.js";
 import { startTheme } from "./theme.js";
@@ -37,7 +37,7 @@ function watch(rollout) {
   setText(find("step_text"), "");
   for (const hand of Object.values(hands)) hand.clear("no steps yet");
   note(watched ? "Waiting for the newest steps." : "");
-  history.replaceState(null, "", watched ? `#${watched.topic}` : location.pathname);
+  history.replaceState(null, "", pagePath(watched ? `#${watched.topic}` : location.pathname));
   if (watched) {
     about(rollout);
     link.show(watched.topic, true);

@@ -8,6 +8,14 @@ export function stationPath(path, station = new URLSearchParams(location.search)
   return `${path}${path.includes("?") ? "&" : "?"}station=${encodeURIComponent(station)}`;
 }
 
+// Address of a page of the dashboard that stays with this page's station.
+export function pagePath(path) {
+  const station = new URLSearchParams(location.search).get("station");
+  const url = new URL(path, location.href);
+  if (station !== null) url.searchParams.set("station", station);
+  return `${url.pathname}${url.search}${url.hash}`;
+}
+
 export async function ask(path, options) {
   const answer = await fetch(stationPath(path), options);
   if (answer.status === 401) location.reload();

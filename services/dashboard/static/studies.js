@@ -1,7 +1,8 @@
 // The list of studies, with the progress of those that run.
 
-import { element, setText } from "./dom.js";
+import { element, setText, showChildren } from "./dom.js";
 import { LiveLink } from "./live.js";
+import { pagePath } from "./session.js";
 import { badge, progress, stateOf, why } from "./study_parts.js";
 import { startTheme } from "./theme.js";
 
@@ -9,7 +10,7 @@ const find = (id) => document.getElementById(id);
 
 function row(study) {
   const title = study.problem ? element("strong", {}, study.name)
-    : element("a", { href: `/studies/${encodeURIComponent(study.name)}` }, study.title || study.name);
+    : element("a", { href: pagePath(`/studies/${encodeURIComponent(study.name)}`) }, study.title || study.name);
   return element("tr", { "data-level": study.problem ? "ERROR" : null },
     element("td", {}, badge(stateOf(study))),
     element("td", { class: "name" }, title, study.title && study.title !== study.name ? why(study.name) : null, why(study.problem)),
@@ -22,10 +23,10 @@ function row(study) {
 }
 
 function show({ studies, note }) {
-  setText(find("summary"), `${studies.length} studies, ${studies.filter((one) => one.is_running).length} running`);
+  setText(find("summary"), `${studies.length === 1 ? "1 study" : `${studies.length} studies`}, ${studies.filter((one) => one.is_running).length} running`);
   const empty = note ? [note] : ["No studies yet. Run one with ", element("code", {}, "dextouch study run study.toml --folder data/studies/NAME --store data/store"),
     "; ", element("code", {}, "dextouch study run --help"), " has an example of study.toml."];
-  find("study_rows").replaceChildren(...(studies.length ? studies.map(row)
+  showChildren(find("study_rows"), (studies.length ? studies.map(row)
     : [element("tr", {}, element("td", { colspan: 8, class: "free" }, ...empty))]));
 }
 

@@ -1,6 +1,7 @@
 // Tables of one study: rates by policy, task and world, agreement, and rollouts.
 
 import { element } from "./dom.js";
+import { pagePath } from "./session.js";
 import { badge, cautions, figure, interval, rateBar, why } from "./study_parts.js";
 
 // One row per task and policy, with its rates by world.
@@ -57,7 +58,7 @@ export function outcome(success) {
 // `playable` holds the ids of episodes that the dashboard's store has; others get no link.
 export function rolloutRow(rollout, playable) {
   const play = (id, label) => (id && playable.has(id)
-    ? element("a", { href: `/episodes/episode/${encodeURIComponent(id)}` }, label) : null);
+    ? element("a", { href: pagePath(`/episodes/episode/${encodeURIComponent(id)}`) }, label) : null);
   const links = [play(rollout.episode_id, rollout.world === "real" ? "Play" : `Play ${rollout.world}`),
     rollout.world === "real" ? null : play(rollout.real_episode_id, "Play real")].filter(Boolean);
   return element("tr", {},

@@ -7,7 +7,7 @@ export function startTheme(button, onChange) {
   const apply = () => {
     if (theme === "system") delete document.documentElement.dataset.theme;
     else document.documentElement.dataset.theme = theme;
-    button.textContent = `Theme: ${theme}`;
+    button.querySelector("#theme_name").textContent = theme;
     onChange();
   };
   button.addEventListener("click", () => {

@@ -30,6 +30,7 @@ from dextouch.schemas import (
     Problem,
     Readiness,
     problem_from_error,
+    status_of,
 )
 from dextouch.serving.connections import RequestMiddleware, ShortcutMiddleware
 from dextouch.serving.documentation import document_service
@@ -153,7 +154,7 @@ def _health_router(name: str, readiness: ReadinessCheck | None) -> APIRouter:
 def _add_error_handlers(app: FastAPI) -> None:
     @app.exception_handler(DexTouchError)
     async def ours(request: Request, error: DexTouchError) -> Response:
-        return _problem_response(request, error)
+        return _refusal(request, error)
 
     @app.exception_handler(RequestValidationError)
     async def validation(request: Request, error: RequestValidationError) -> Response:
@@ -187,16 +188,20 @@ def _add_error_handlers(app: FastAPI) -> None:
 
 def _refusal(request: Request, error: DexTouchError | HTTPException) -> Response:
     if isinstance(error, DexTouchError):
-        page = getattr(request.app.state, "refusal_page", None)
-        if page is not None and "text/html" in request.headers.get("accept", ""):
-            shown: Response = page(request, error)
-            return shown
-        return _problem_response(request, error)
+        return _page_or_problem(request, error, status_of(error))
     kind = CLASS_OF_STATUS.get(error.status_code, UnavailableError)
     ours = kind(f"{request.method} {request.url.path}: {error.detail}")
-    response = _problem_response(request, ours, error.status_code)
+    response = _page_or_problem(request, ours, error.status_code)
     response.headers.update(error.headers or {})
     return response
+
+
+def _page_or_problem(request: Request, error: DexTouchError, status: int) -> Response:
+    page = getattr(request.app.state, "refusal_page", None)
+    if page is not None and "text/html" in request.headers.get("accept", ""):
+        shown: Response = page(error, status)
+        return shown
+    return _problem_response(request, error, status)
 
 
 def _problem_response(

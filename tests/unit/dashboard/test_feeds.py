@@ -143,14 +143,19 @@ async def test_absent_station_shows_no_numbers():
         {"acquisition": broken_upstream("acquisition")}, DashboardSettings()
     ).station()
     assert (view.reachable, view.level, view.streams) == (False, "STALE", ())
-    assert "acquisition: no answer to GET" in view.note
+    (cause,) = view.causes
+    assert (view.note, cause.level) == ("", "STALE")
+    assert cause.message == "This station does not answer."
+    assert "(http://fake)" in cause.advice
+    assert "acquisition: no answer to GET" in cause.findings[0]
 
 
 async def test_answer_of_another_form_is_named(feeds, services):
     services.stream["level"] = "FINE"
     view = await feeds.station()
     assert not view.reachable
-    assert "unexpected response to GET /v1/health (streams.0.level: " in view.note
+    (cause,) = view.causes
+    assert "unexpected response to GET /v1/health (streams.0.level: " in cause.message
 
 
 async def test_services(upstreams):

@@ -2,10 +2,12 @@
 
 import { element, setText } from "../dom.js";
 import { plural } from "../format.js";
+import { pagePath } from "../session.js";
 import { startTheme } from "../theme.js";
 import { get, getIfServed, newestJobs, post } from "./api.js";
 import * as cells from "./cells.js";
-import { Grid, isFree } from "./grid.js";
+import { Grid } from "./grid.js";
+import { listen, say, showSelected } from "./grid_keys.js";
 import { showLineage } from "./lineage.js";
 import { FILTERS, PAGE_ROWS, isFiltered, pageWords, readQuery, storeQuery, writeQuery } from "./query.js";
 import { itemsOf, playerPath, rowsOf, stageOf, subjectOf } from "./stage.js";
@@ -23,11 +25,6 @@ let asked = 0;
 let deletion = null;
 let lastMoved = [];
 
-function say(text, level = "OK") {
-  find("message").dataset.level = level;
-  setText(find("message"), text);
-}
-
 // Rows
 
 function checkbox(name) {
@@ -35,7 +32,7 @@ function checkbox(name) {
 }
 
 function itemRow({ item, job }) {
-  return element("tr", {}, checkbox(item.id), cells.timeCell(item), cells.taskCell(item), cells.nameCell(item, playerPath(item)),
+  return element("tr", {}, checkbox(item.id), cells.timeCell(item), cells.taskCell(item), cells.nameCell(item, pagePath(playerPath(item))),
     cells.operatorCell(item), cells.stationCell(item), cells.outcomeCell(item), cells.lengthCell(item), cells.qualityCell(item),
     cells.stageCell(stageOf({ item, job })));
 }
@@ -78,7 +75,7 @@ async function listed() {
 function nothing() {
   if (query.view === "trash") return ["The trash is empty."];
   if (isFiltered(query)) return ["Nothing matches these filters."];
-  return ["Nothing is stored yet. Record a take on ", element("a", { href: "/" }, "Station"), ", or run ",
+  return ["Nothing is stored yet. Record a take on ", element("a", { href: pagePath("/") }, "Station"), ", or run ",
     element("code", {}, "dextouch demo"), " with the same data folder: its episodes appear here."];
 }
 
@@ -116,7 +113,7 @@ async function showChoices() {
 
 function go(changes, { isTyping = false } = {}) {
   query = { ...query, page: 1, ...changes };
-  const address = `${location.pathname}${writeQuery(query)}`;
+  const address = pagePath(`${location.pathname}${writeQuery(query)}`);
   if (isTyping) history.replaceState(null, "", address);
   else history.pushState(null, "", address);
   showQuery();
@@ -151,8 +148,7 @@ function chosen() {
 }
 
 function showSelection() {
-  const count = grid.selected.size;
-  setText(find("selected"), count ? `${count} selected` : "none selected: keys act on the focused row");
+  showSelected(grid);
   const aligned = alignable();
   find("align").disabled = !aligned.length;
   setText(find("align").firstElementChild, aligned.some((row) => row.job) ? "Align again" : "Align");
@@ -237,7 +233,7 @@ async function act(work) {
 
 function open(key) {
   const item = rows.get(key)?.item;
-  if (item && query.view !== "trash") location.assign(playerPath(item));
+  if (item && query.view !== "trash") location.assign(pagePath(playerPath(item)));
 }
 
 const KEYS = {
@@ -257,19 +253,6 @@ function lineageSubject() {
   return row.item.kind === "recording" ? { kind: "recording", id: row.item.id } : subjectOf(row.item);
 }
 
-document.addEventListener("keydown", (event) => {
-  if (event.key === "Escape" && form.contains(event.target)) {
-    event.target.blur();
-    grid.focus();
-  } else if (isFree(event) && !grid.onKey(event) && !event.ctrlKey && !event.metaKey && !event.repeat) {
-    const act = KEYS[event.key.toLowerCase()];
-    if (act) {
-      event.preventDefault();
-      act();
-    }
-  }
-});
-
 const grid = new Grid(find("rows"), { onChange: () => showSelection(), onOpen: open });
 let typed = null;
 form.addEventListener("input", (event) => {
@@ -285,10 +268,7 @@ for (const tab of document.querySelectorAll("[data-view-tab]")) tab.addEventList
 for (const head of document.querySelectorAll("[data-sort]")) {
   head.addEventListener("click", () => go({ sort: head.dataset.sort, descending: head.dataset.sort === query.sort ? !query.descending : ["time", "duration", "findings"].includes(head.dataset.sort) }));
 }
-for (const [id, key] of [["previous", "arrowleft"], ["next", "arrowright"], ["delete", "delete"], ["restore", "r"], ["align", "g"], ["lineage", "l"]]) {
-  find(id).addEventListener("click", () => KEYS[key]());
-}
-find("pick_all").addEventListener("change", (event) => grid.select(grid.keys, event.target.checked));
+listen(grid, { form, actions: KEYS, buttons: [["previous", "arrowleft"], ["next", "arrowright"], ["delete", "delete"], ["restore", "r"], ["align", "g"], ["lineage", "l"]] });
 window.addEventListener("popstate", () => { query = readQuery(location.search); showQuery(); refresh(); });
 document.addEventListener("visibilitychange", () => { if (!document.hidden) refresh(); });
 setInterval(() => { if (!document.hidden) refresh(); }, REFRESH_MS);

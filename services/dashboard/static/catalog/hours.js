@@ -2,6 +2,7 @@
 
 import { element, setText } from "../dom.js";
 import { number, plural } from "../format.js";
+import { pagePath } from "../session.js";
 import { startTheme } from "../theme.js";
 import { get } from "./api.js";
 import { bars, counted, withGoals } from "./hours_rows.js";
@@ -110,7 +111,7 @@ async function showChoices() {
 }
 
 form.addEventListener("input", () => {
-  history.replaceState(null, "", `${location.pathname}?${address()}`.replace(/\?$/, ""));
+  history.replaceState(null, "", pagePath(`${location.pathname}?${address()}`));
   refresh();
 });
 form.addEventListener("submit", (event) => event.preventDefault());

@@ -1,6 +1,7 @@
 // Dialog with what an item was made from, what was made from it, and its alignment jobs.
 
 import { element } from "../dom.js";
+import { pagePath } from "../session.js";
 import { get, getIfServed } from "./api.js";
 import { under } from "./cells.js";
 
@@ -9,7 +10,7 @@ const PLAYED = ["recording", "episode"];
 
 function nodeItem(node) {
   const name = node.is_stored && PLAYED.includes(node.kind)
-    ? element("a", { href: `/episodes/${node.kind}/${encodeURIComponent(node.id)}` }, node.id)
+    ? element("a", { href: pagePath(`/episodes/${node.kind}/${encodeURIComponent(node.id)}`) }, node.id)
     : element("strong", {}, node.id);
   const known = node.is_stored || !PLAYED.includes(node.kind) ? node.summary : "not in this store: deleted, or elsewhere";
   return element("li", {}, element("span", { class: "quiet" }, node.kind), name, under(known));

@@ -4,6 +4,9 @@ export const PAGE_ROWS = 50;
 export const VIEWS = ["take", "recording", "episode", "trash"];
 export const FILTERS = ["text", "task", "operator", "station", "domain", "outcome", "origin", "review", "from", "to"];
 const SORTS = ["time", "task", "id", "operator", "station", "duration", "findings"];
+// `station` in an address is the page's own, also on this page.
+const ADDRESS_NAMES = { station: "of_station" };
+const addressName = (name) => ADDRESS_NAMES[name] ?? name;
 const DAY = /^\d{4}-\d{2}-\d{2}$/;
 
 // Unknown values fall back to the defaults: an address may come from an older page, or from anybody.
@@ -13,7 +16,7 @@ export function readQuery(search) {
   const page = Number.parseInt(given.get("page") ?? "1", 10);
   const filters = {};
   for (const name of FILTERS) {
-    const value = given.get(name) ?? "";
+    const value = given.get(addressName(name)) ?? "";
     filters[name] = ["from", "to"].includes(name) && !DAY.test(value) ? "" : value.slice(0, 200);
   }
   return {
@@ -25,7 +28,7 @@ export function readQuery(search) {
 export function writeQuery({ view, sort, descending, page, filters }) {
   const written = new URLSearchParams();
   if (view !== VIEWS[0]) written.set("view", view);
-  for (const name of FILTERS) if (filters[name]) written.set(name, filters[name]);
+  for (const name of FILTERS) if (filters[name]) written.set(addressName(name), filters[name]);
   if (sort !== SORTS[0]) written.set("sort", sort);
   if (!descending) written.set("order", "up");
   if (page > 1) written.set("page", String(page));

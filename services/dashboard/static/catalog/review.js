@@ -1,10 +1,12 @@
 // The review queue: what needs a look first, accepted or rejected by keys; the store remembers it.
 
 import { element, setText } from "../dom.js";
+import { pagePath } from "../session.js";
 import { startTheme } from "../theme.js";
 import { get, getIfServed, post } from "./api.js";
 import * as cells from "./cells.js";
-import { Grid, isFree } from "./grid.js";
+import { Grid } from "./grid.js";
+import { listen, say, showSelected } from "./grid_keys.js";
 import { showLineage } from "./lineage.js";
 import { failedRecordings, fewWords, queueOf, reviewedItems } from "./queue.js";
 import { playerPath, reasonOf, subjectOf } from "./stage.js";
@@ -21,17 +23,12 @@ let asked = 0;
 let last = [];
 let rejected = [];
 
-function say(text, level = "OK") {
-  find("message").dataset.level = level;
-  setText(find("message"), text);
-}
-
 function row({ item, job }) {
   const findings = item.findings.map((finding) => element("li", { "data-code": finding.code }, finding.message));
   if (job) findings.unshift(element("li", { "data-code": "alignment_failed", title: job.problem?.detail }, `alignment failed: ${reasonOf(job)}`));
   const pick = element("td", { class: "pick" }, element("input", { type: "checkbox", tabindex: -1, "aria-label": `select ${item.id}` }));
   return element("tr", {}, pick, element("td", {}, element("ul", { class: "findings" }, ...findings)), cells.timeCell(item), cells.taskCell(item),
-    cells.nameCell(item, playerPath(item)), cells.operatorCell(item), cells.outcomeCell(item), cells.lengthCell(item));
+    cells.nameCell(item, pagePath(playerPath(item))), cells.operatorCell(item), cells.outcomeCell(item), cells.lengthCell(item));
 }
 
 // Requests
@@ -133,24 +130,12 @@ const KEYS = {
 
 const grid = new Grid(find("rows"), {
   onChange: () => {
-    setText(find("selected"), grid.selected.size ? `${grid.selected.size} selected` : "none selected: keys act on the focused row");
+    showSelected(grid);
     for (const id of ["accept", "reject", "lineage"]) find(id).disabled = !grid.meant().length;
   },
-  onOpen: (key) => location.assign(playerPath(rows.get(key).item)),
+  onOpen: (key) => location.assign(pagePath(playerPath(rows.get(key).item))),
 });
 
-document.addEventListener("keydown", (event) => {
-  if (event.key === "Escape" && form.contains(event.target)) {
-    event.target.blur();
-    grid.focus();
-  } else if (isFree(event) && !grid.onKey(event) && !event.ctrlKey && !event.metaKey && !event.repeat) {
-    const act = KEYS[event.key.toLowerCase()];
-    if (act) {
-      event.preventDefault();
-      act();
-    }
-  }
-});
 dialog.addEventListener("keydown", (event) => {
   const choice = event.target === reasons.other ? undefined : reasons.reason[Number(event.key) - 1];
   if (!choice) return;
@@ -165,8 +150,7 @@ dialog.addEventListener("close", () => {
   if (dialog.returnValue === "reject" && reason) review(rejected, "rejected", reason);
   grid.focus();
 });
-for (const [id, key] of [["accept", "a"], ["reject", "r"], ["undo", "z"], ["lineage", "l"]]) find(id).addEventListener("click", () => KEYS[key]());
-find("pick_all").addEventListener("change", (event) => grid.select(grid.keys, event.target.checked));
+listen(grid, { form, actions: KEYS, buttons: [["accept", "a"], ["reject", "r"], ["undo", "z"], ["lineage", "l"]] });
 
 form.addEventListener("submit", (event) => event.preventDefault());
 form.addEventListener("input", (event) => {
@@ -176,7 +160,7 @@ form.addEventListener("input", (event) => {
   }
   const { task, origin } = form.elements;
   const query = new URLSearchParams({ ...(task.value && { task: task.value }), ...(origin.value !== "recorded" && { origin: origin.value || "any" }) });
-  history.replaceState(null, "", `${location.pathname}?${query}`.replace(/\?$/, ""));
+  history.replaceState(null, "", pagePath(`${location.pathname}?${query}`));
   refresh();
 });
 

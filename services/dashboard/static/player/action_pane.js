@@ -1,5 +1,6 @@
 // The 67-D action at the playhead as bars in its five blocks; commanded values are ticks beside them.
 
+import { cleared, css } from "../canvas.js";
 import { element, setText } from "../dom.js";
 import { secondsText, stampOf } from "./times.js";
 
@@ -20,10 +21,6 @@ export function describe(index) {
   const block = BLOCKS.find(({ first, count }) => index >= first && index < first + count);
   const place = index - block.first;
   return block.count === 9 ? { text: `${block.name} ${POSE[place]}`, unit: POSE_UNITS[place] } : { text: `${block.name} ${place}`, unit: "rad" };
-}
-
-function css(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
 export class ActionPane {
@@ -83,12 +80,9 @@ export class ActionPane {
   }
 
   draw() {
-    const scale = window.devicePixelRatio || 1;
-    const width = Math.round(this.canvas.clientWidth * scale);
-    const height = Math.round(this.canvas.clientHeight * scale);
-    if (!width || !height) return;
-    Object.assign(this.canvas, { width, height });
-    const context = this.canvas.getContext("2d");
+    const found = cleared(this.canvas);
+    if (!found) return;
+    const { context, width, height, scale } = found;
     const bar = width / ACTION_SIZE;
     const label_px = 14 * scale;
     const middle = (height - label_px) / 2;

@@ -2,6 +2,7 @@
 
 import { element, levelBadge } from "../dom.js";
 import { number } from "../format.js";
+import { pagePath } from "../session.js";
 import { fetchFacts } from "./item.js";
 
 const OUTCOMES = { true: ["OK", "success"], false: ["ERROR", "failure"], null: ["STALE", "not judged"] };
@@ -75,7 +76,7 @@ function lineage(nodes) {
   const others = nodes.filter((node) => node.relation !== "self");
   if (!others.length) return null;
   const link = ({ kind, id, is_stored }) => (is_stored && ["recording", "episode"].includes(kind)
-    ? element("a", { href: `/episodes/${kind}/${encodeURIComponent(id)}` }, id) : element("span", {}, `${id}${is_stored ? "" : " (not in this store)"}`));
+    ? element("a", { href: pagePath(`/episodes/${kind}/${encodeURIComponent(id)}`) }, id) : element("span", {}, `${id}${is_stored ? "" : " (not in this store)"}`));
   return block("Lineage", element("ul", { class: "lineage" },
     ...others.map((node) => element("li", {}, `${RELATIONS[node.relation]} ${node.kind} `, link(node), node.summary ? element("span", { class: "quiet" }, ` ${node.summary}`) : null))));
 }

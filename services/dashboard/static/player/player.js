@@ -1,6 +1,7 @@
 // Panes, timeline, plots and keys around one playhead.
 
 import { element, setText } from "../dom.js";
+import { pagePath } from "../session.js";
 import { ActionPane, ACTION_SIZE } from "./action_pane.js";
 import { CameraPane } from "./camera_pane.js";
 import { isSignal, signalParts } from "./curves.js";
@@ -340,7 +341,7 @@ export class Player {
     if (this.url_timer) return;
     this.url_timer = setTimeout(() => {
       this.url_timer = null;
-      history.replaceState(null, "", `?${this.query()}`);
+      history.replaceState(null, "", pagePath(`?${this.query()}`));
     }, URL_MS);
   }
 

@@ -1,6 +1,7 @@
 // Plots of signals over the visible part of the timeline; a recording's raw signal lies over the
 // aligned one. Values are the lowest and highest of each bin, so that no peak is lost.
 
+import { css } from "../canvas.js";
 import { element, setText } from "../dom.js";
 import uPlot from "../vendor/uplot/uPlot.esm.js";
 import { binCentres, signalParts, withGaps } from "./curves.js";
@@ -9,10 +10,6 @@ const HEIGHT_PX = 110;
 const MAX_POINTS = 2000;
 const MAX_PER_REQUEST = 16;
 const DELAY_MS = 120;
-
-function css(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
 
 function sizeOf(root, name) {
   return parseFloat(getComputedStyle(root).getPropertyValue(name));

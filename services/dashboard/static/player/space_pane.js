@@ -1,5 +1,6 @@
 // Hands, wrists and head at the playhead in the world: measured skeletons beside the robot's hands.
 
+import { cleared, css } from "../canvas.js";
 import { element, setText } from "../dom.js";
 import { BONES, frameOfMatrix, frameOfPose, Orbit, TIPS, toWorld } from "./geometry.js";
 import { secondsText, stampOf } from "./times.js";
@@ -12,10 +13,6 @@ const FINGERS = ["thumb", "index", "middle", "ring", "little"];
 const NUM_FINGERS = 5;
 const CHAIN_POINTS = 4;
 const SIDES = ["left", "right"];
-
-function css(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
 
 function distanceText(ours, theirs) {
   const parts = ours.map((point, k) => `${FINGERS[k]} ${(1000 * Math.hypot(...point.map((value, axis) => value - theirs[k][axis]))).toFixed(0)}`);
@@ -176,13 +173,9 @@ export class SpacePane {
   }
 
   draw() {
-    const scale = window.devicePixelRatio || 1;
-    const width = Math.round(this.canvas.clientWidth * scale);
-    const height = Math.round(this.canvas.clientHeight * scale);
-    if (!width || !height) return;
-    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
-    const context = this.canvas.getContext("2d");
-    context.clearRect(0, 0, width, height);
+    const found = cleared(this.canvas);
+    if (!found) return;
+    const { context, width, height, scale } = found;
     const project = this.orbit.projector(width, height);
     const line = (from, to, colour, width_px, isDashed = false) => {
       const [a, b] = [project(from), project(to)];

@@ -3,6 +3,7 @@
 import { get, getIfServed, post } from "../catalog/api.js";
 import { element, setText } from "../dom.js";
 import { age } from "../format.js";
+import { pagePath } from "../session.js";
 import { badge, progress, why } from "../study_parts.js";
 
 const PERIOD_MS = 2000;
@@ -108,7 +109,7 @@ export class Jobs {
   alignmentRow(job) {
     const row = this.row(`alignment ${job.alignment_id}`, () => [
       element("td"),
-      element("td", { class: "name" }, element("a", { href: `/episodes/recording/${encodeURIComponent(job.recording_id)}` }, job.recording_id)),
+      element("td", { class: "name" }, element("a", { href: pagePath(`/episodes/recording/${encodeURIComponent(job.recording_id)}`) }, job.recording_id)),
       element("td", {}, "alignment"), element("td"), element("td", { class: "free" }), element("td", { class: "number" }),
       element("td", { class: "act" }, twoStep("Cancel", () => this.cancel(job)))]);
     const running = job.state === "running";
@@ -122,7 +123,7 @@ export class Jobs {
   studyRow(study) {
     const row = this.row(`study ${study.name}`, () => [
       element("td", {}, badge({ level: "OK", word: "running" })),
-      element("td", { class: "name" }, element("a", { href: `/studies/${encodeURIComponent(study.name)}` }, study.title || study.name),
+      element("td", { class: "name" }, element("a", { href: pagePath(`/studies/${encodeURIComponent(study.name)}`) }, study.title || study.name),
         study.title && study.title !== study.name ? why(study.name) : null),
       element("td", {}, "study"), element("td"), element("td", { class: "free" }), element("td", { class: "number" }, "–"), element("td")]);
     row.cells[3].replaceChildren(progress(study));

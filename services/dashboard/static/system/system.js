@@ -1,6 +1,6 @@
 // The page System: state of services, disks and queues; jobs and the audit log have files of their own.
 
-import { element, levelBadge, setText } from "../dom.js";
+import { element, levelBadge, setText, showChildren } from "../dom.js";
 import { age, count, plural } from "../format.js";
 import { LiveLink } from "../live.js";
 import { badge, why } from "../study_parts.js";
@@ -50,7 +50,7 @@ function queueRow(queue) {
 }
 
 function fill(id, rows, columns, empty) {
-  find(id).replaceChildren(...(rows.length ? rows
+  showChildren(find(id), (rows.length ? rows
     : [element("tr", {}, element("td", { colspan: columns, class: "free" }, empty))]));
 }
 
