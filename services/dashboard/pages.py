@@ -16,7 +16,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment, FileSystemLoader
 from starlette.requests import HTTPConnection
 
-from dextouch.errors import AccessDeniedError, DexTouchError, NotFoundError
+from dextouch.errors import AccessDeniedError, NotFoundError
 from dextouch.serving import FORM, KIB, AccessControl, not_signed_in, takes
 from services.dashboard.documents import HELP, Documents, find_documents
 from services.dashboard.settings import DashboardSettings
@@ -230,9 +230,9 @@ def _own_path(text: str) -> str:
     return text if is_own and not text.startswith(("//", "/\\")) else "/"
 
 
-def refusal_page(station: str, error: DexTouchError, status: int) -> Response:
+def refusal_page(station: str, reason: str, status: int) -> Response:
     """HTML page of a refusal, in place of problem+json."""
-    return _page(station, "refused.html", status, status=status, reason=error.message)
+    return _page(station, "refused.html", status, status=status, reason=reason)
 
 
 def _page(station: str, name: str, code: int = 200, **values: object) -> HTMLResponse:

@@ -5,7 +5,7 @@ import { ask, pagePath } from "./session.js";
 
 export function showServices(list, services) {
   showChildren(list, services.map((service) => element("li", { title: service.message },
-    levelBadge(service.level), element("span", {}, service.name),
+    levelBadge(service.level), element("span", {}, service.name.replaceAll("_", " ")),
     service.level === "OK" ? null : element("span", { class: "quiet" }, service.message))));
 }
 

@@ -69,8 +69,8 @@ def create_service_app(
 
     Returns:
         The application; `app.state.registry` accepts further metrics, `app.state.refusal_page`
-        renders a refusal as an HTML page, and `app.state.shortcut` answers some requests in place
-        of their route (see `Shortcut`).
+        renders a refusal or an error as an HTML page for browsers, and `app.state.shortcut` answers
+        some requests in place of their route (see `Shortcut`).
     """
     hide_secrets(settings)
     app = FastAPI(
@@ -199,7 +199,7 @@ def _refusal(request: Request, error: DexTouchError | HTTPException) -> Response
 def _page_or_problem(request: Request, error: DexTouchError, status: int) -> Response:
     page = getattr(request.app.state, "refusal_page", None)
     if page is not None and "text/html" in request.headers.get("accept", ""):
-        shown: Response = page(error, status)
+        shown: Response = page(masked(error.message), status)
         return shown
     return _problem_response(request, error, status)
 
