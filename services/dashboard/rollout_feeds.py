@@ -119,6 +119,8 @@ class RolloutFeeds:
         except DexTouchError as error:
             # Failures of the connection name the service themselves.
             reason = error.message.removeprefix(f"{service}: ")
+            if error.details.get("no_answer"):
+                reason = f"no answer from {upstream.address}; is the service running?"
             return RolloutsView(problems=(f"{service}: {reason}",))
         worlds = {world.name: world for world in described.worlds}
         shown = ("name", "kind", "tasks", "model_rate_hz", "predicts_touch")

@@ -75,8 +75,9 @@ class Screens:
                 if PICTURES:
                     path = Path(PICTURES) / f"{name}_{width_px}_{scheme}.png"
                     self.page.wait_for_timeout(200)
-                    # A dialog, and the deck of the player, belong to the window.
-                    of_window = self.page.locator("dialog[open], .deck:not([hidden])").count() > 0
+                    # A dialog and the deck of the player belong to the window; documents are long.
+                    windows = "dialog[open], .deck:not([hidden]), .document"
+                    of_window = self.page.locator(windows).count() > 0
                     self.page.screenshot(path=path, full_page=not of_window)
 
 

@@ -16,7 +16,7 @@ export function levelColour(level) {
 }
 
 function timeAxis() {
-  return { stroke: () => css("--quiet"), grid: { stroke: () => css("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui", size: 24, gap: 3,
+  return { stroke: () => css("--quiet"), grid: { stroke: () => css("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui", size: 24, gap: 3, space: 80,
     values: (_, splits, __, ___, step_s) => splits.map((t_s) => clockTime(t_s, { seconds: step_s < 60 })) };
 }
 
