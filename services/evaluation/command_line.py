@@ -20,6 +20,7 @@ from services.evaluation.endings import EndingEpisode, read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.cloning_episodes import read_cloning_episodes
 from services.evaluation.policies.cloning_training import train_cloned_policy
+from services.evaluation.policies.colour_servo import ColourServo
 from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import ReplayPolicy
@@ -158,6 +159,8 @@ def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str,
         cloned = BehaviourCloningPolicy.load(settings.cloned_policy)
         policies["behaviour-cloning"] = cloned
         trained_on["the cloned policy"] = cloned.metadata.training_starts
+    if "colour-servo" in settings.builtin:
+        policies["colour-servo"] = ColourServo()
     if "hold" in settings.builtin:
         policies["hold"] = HoldPolicy()
     return policies, trained_on
@@ -181,11 +184,13 @@ def _address(world: ServedWorld, connections: ExitStack) -> WorldAddress:
 
 
 def print_scores(report: Mapping[str, Any]) -> None:
-    """Print success rates and agreement of a report."""
+    """Print success rates, of how many rollouts, and agreement of a report."""
     worlds = ["real"] if report["imagined_world"] is None else ["real", "imagined"]
-    print(f"{'task':<16}{'policy':<22}" + "".join(f"{world:>10}" for world in worlds))
+    print(f"{'task':<16}{'policy':<22}" + "".join(f"{world:>16}" for world in worlds))
     for row in report["policies"]:
-        rates = "".join(f"{figure(row[world]):>10}" for world in worlds)
+        rates = "".join(
+            f"{figure(row[world])} of {row[world + '_rollouts']}".rjust(16) for world in worlds
+        )
         print(f"{row['task']:<16}{row['policy']:<22}{rates}")
     for task, rows in report["real_differences"].items() if not report["agreement"] else ():
         print(f"\n{task}: differences of success rates")

@@ -136,9 +136,10 @@ class RunSettings(CommandSettings):
     scripts: dict[str, str] = Field(
         default={}, description="stores of episodes to replay, by policy name"
     )
-    builtin: tuple[Literal["behaviour-cloning", "hold"], ...] = Field(
+    builtin: tuple[Literal["behaviour-cloning", "colour-servo", "hold"], ...] = Field(
         default=("behaviour-cloning", "hold"),
-        description="bundled policies; [] for none",
+        description="bundled policies; [] for none; colour-servo knows only stand_bottle and "
+        "open_drawer",
     )
     cloned_policy: Path = Field(
         default=DEFAULT_POLICY, description="checkpoint of `dextouch train policy`"

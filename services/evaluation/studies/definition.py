@@ -56,7 +56,7 @@ class PolicyChoice(FrozenModel):
 
     factory: str | None = None
     arguments: dict[str, Any] = Field(default={})
-    builtin: Literal["behaviour-cloning", "hold"] | None = None
+    builtin: Literal["behaviour-cloning", "colour-servo", "hold"] | None = None
     checkpoint: Path | None = None
     replay: str | None = None
     script: str | None = None

@@ -8,6 +8,7 @@ from pathlib import Path
 from dextouch.clients import Policy
 from dextouch.episodes import EpisodeStore
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
+from services.evaluation.policies.colour_servo import ColourServo
 from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import ReplayPolicy
@@ -85,4 +86,6 @@ class PolicyFactory:
             return copy(self._replays[name])
         if choice.builtin == "hold":
             return HoldPolicy()
+        if choice.builtin == "colour-servo":
+            return ColourServo()
         return BehaviourCloningPolicy.load(choice.checkpoint or DEFAULT_POLICY)

@@ -1,6 +1,7 @@
 """The command `run`: what it writes and prints, also when rollouts fail, and paths it refuses."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,8 @@ def test_a_study_without_a_single_imagined_ending_is_reported(
     shown = capsys.readouterr()
     assert status == 1
     assert "2 of 4 rollouts failed" in shown.err
+    (row,) = (line for line in shown.out.splitlines() if line.startswith("reach  "))
+    assert re.fullmatch(r"reach +hold +[01]\.[05]+ of 2 +undefined of 0", row)
     assert "hold in dream, 2 x: stuck: this world imagines nothing" in shown.err
     comment = "No start was completed in both worlds (real and dream) by every policy"
     assert "Pearson undefined, MMRV undefined" in shown.out

@@ -13,6 +13,7 @@ from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.checkpoints import save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.endings import read_ending_episode
+from services.evaluation.policies.colour_servo import ColourServo
 from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.rating.rated_rollouts import rated_rollouts, state_scores
 from services.evaluation.rating.rubrics import Rubric
@@ -273,6 +274,13 @@ def test_errors_that_are_no_text_can_be_read_again(tmp_path, study, parts):
     report = run_study(study, results, odd)
     assert "caf?.pt" in report.failures[0].message
     assert StudyResults.read(tmp_path).outcomes == results.outcomes
+
+
+def test_a_study_has_bundled_policies(tmp_path):
+    text = STUDY.replace('factory = "toys:script"', 'builtin = "colour-servo"')
+    factory = PolicyFactory(definition_of(text, tmp_path), lambda _: pytest.fail("a script"))
+    assert [type(one) for one in factory.load().values()] == [HoldPolicy, ColourServo]
+    assert factory.training_starts() == factory.digests() == {}
 
 
 def test_changed_policies_are_another_study(tmp_path, policy_checkpoint):
