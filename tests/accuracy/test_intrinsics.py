@@ -73,6 +73,22 @@ def test_rendered_camera_is_found_within_its_sigmas(capsys):
     assert found.rms_px <= 0.3
 
 
+def test_a_corner_on_the_rim_of_the_print_is_no_corner_of_the_board(monkeypatch):
+    """OpenCV took one for the outermost corner of a noisy image: 12 px off, with no other sign."""
+    photo, whole = render(np.random.default_rng(2), tilt_rad=0.4), cv2.findChessboardCorners
+    assert find_boards([photo], BOARD).photos == (0,)
+
+    def wrong(*given):
+        found, corners = whole(*given)
+        corners = corners.copy()
+        corners[0] += 0.6 * (corners[0] - corners[1])
+        return found, corners
+
+    monkeypatch.setattr(cv2, "findChessboardCorners", wrong)
+    monkeypatch.setattr(cv2, "cornerSubPix", lambda _photo, corners, *_: corners)
+    assert find_boards([photo], BOARD).photos == ()
+
+
 def test_flat_views_and_missing_boards_are_refused():
     rng = np.random.default_rng(3)
     flat = [render(rng, tilt_rad=0.02) for _ in range(6)]

@@ -103,7 +103,8 @@ def score_a_policy(page, folder, twin_url):
         [*DEXTOUCH, *words[1:]], cwd=folder, env=environment(), stderr=subprocess.DEVNULL
     )
     try:
-        expect(page.locator("#rollout_rows")).to_contain_text("mine")
+        # The command starts in half a minute where others compute.
+        expect(page.locator("#rollout_rows")).to_contain_text("mine", timeout=120_000)
         expect(page.locator("#rollout_rows")).to_contain_text("stand_bottle")
         assert scoring.wait(300) == 0
     finally:

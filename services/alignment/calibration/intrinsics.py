@@ -6,7 +6,7 @@ squares do show it, those across the motion more than those along it.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -25,6 +25,13 @@ MIN_VIEWS = 5
 # Views from one direction alone cannot tell focal length from distance.
 MIN_TILT_SPREAD_RAD = np.deg2rad(15.0)
 MAX_FOCAL_SIGMA = 0.05
+# Corners that turn between neighbours by more than this share of a square are not of the board: the
+# detector took the rim of the print for one. Boards turned by 60 degrees at 0.3 m reach 0.2.
+MAX_CORNER_SHIFT = 0.4
+# Views with residuals above this multiple of the median (and this many pixels) have such corners,
+# which move the focal length by more than its reported sigma: 0.5 % by one corner of 25 views.
+MAX_RESIDUAL_RATIO, MIN_WRONG_PX = 3.0, 0.2
+MAX_SHARE_LEFT_OUT = 0.2
 # Wider edges are blurred. Measured on rendered ChArUco boards: sharp 2.0 to 2.2 px, out of focus by
 # 1.5 px (one sigma) 3.1 to 3.7, moved by 3 px 2.4 to 3.3, moved by 6 px 4.1 to 5.1; on photos of a
 # real camera of 640 by 480 px 2.0 to 3.1.
@@ -85,7 +92,7 @@ class CameraCalibration:
         rms_by_photo_px: the same by photo; a much larger one means that the photo is blurred or the
             board was bent.
         coverage: share of a 4 × 4 grid over the image in which corners were seen.
-        used_images: indices of the photos on which the board was found.
+        used_images: indices of the photos on which the board was found and fits the others.
     """
 
     K: Float64[np.ndarray, "3 3"]
@@ -96,6 +103,11 @@ class CameraCalibration:
     rms_by_photo_px: Float64[np.ndarray, " n"]
     coverage: float
     used_images: tuple[int, ...]
+
+    @property
+    def focal_sigma(self) -> float:
+        """Standard deviation of the focal length as a share of it, the larger of both axes."""
+        return float((self.sigma_fxfycxcy_px[:2] / np.diag(self.K)[:2]).max())
 
 
 View = tuple[Float32[np.ndarray, "_ 3"], Float32[np.ndarray, "_ 2"]]
@@ -158,29 +170,28 @@ def calibrate_camera(
 def calibrate_found(found: FoundBoards) -> CameraCalibration:
     """`calibrate_camera` for corners that were detected before.
 
+    Views that do not fit the others are left out, at most a fifth of all.
+
     Raises:
         InvalidInputError: the board is found in too few photos.
         DegenerateMotionError: the views do not show the focal length; tilt the board.
     """
-    import cv2
-
     if len(found.photos) < MIN_VIEWS:
         raise InvalidInputError(
             f"photos: the board is found in {len(found.photos)} of {found.num_photos}, expected at "
             f"least {MIN_VIEWS}; check the board's size and kind, light and sharpness"
         )
-    rms_px, K, distortion, turns, _, sigma, _, by_photo = cv2.calibrateCameraExtended(
-        list(found.points_board),
-        list(found.pixels_px),
-        found.image_size_px,
-        np.eye(3),
-        np.zeros(5),
-    )
-    sigma, K = np.asarray(sigma, dtype=np.float64).ravel(), np.asarray(K, dtype=np.float64)
-    relative = float(max(sigma[0] / K[0, 0], sigma[1] / K[1, 1]))
-    normals = rotation_from_vector(np.array(turns, dtype=np.float64).reshape(-1, 3))[:, :, 2]
-    # Largest angle between two directions of the board.
-    spread_rad = float(np.arccos(np.clip(normals @ normals.T, -1, 1)).max())
+    result, spread_rad = _solved(found)
+    max_left_out = int(MAX_SHARE_LEFT_OUT * len(found.photos))
+    while len(result.used_images) > max(len(found.photos) - max_left_out, MIN_VIEWS):
+        by_photo_px = result.rms_by_photo_px
+        worst = int(np.argmax(by_photo_px))
+        limit_px = max(MAX_RESIDUAL_RATIO * float(np.median(by_photo_px)), MIN_WRONG_PX)
+        if by_photo_px[worst] <= limit_px:
+            break
+        used = [at for at, photo in enumerate(found.photos) if photo in result.used_images]
+        result, spread_rad = _solved(_selected(found, used[:worst] + used[worst + 1 :]))
+    relative = result.focal_sigma
     if spread_rad < MIN_TILT_SPREAD_RAD or not relative <= MAX_FOCAL_SIGMA:
         raise DegenerateMotionError(
             f"intrinsics: the board's directions differ by {np.rad2deg(spread_rad):.0f} degrees "
@@ -190,8 +201,33 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
             spread_deg=float(np.rad2deg(spread_rad)),
             relative_sigma=relative,
         )
+    return result
+
+
+def _selected(found: FoundBoards, places: Sequence[int]) -> FoundBoards:
+    """Some of the photos, by their places in `found`."""
+    points = tuple(found.points_board[at] for at in places)
+    pixels = tuple(found.pixels_px[at] for at in places)
+    photos = tuple(found.photos[at] for at in places)
+    return replace(found, points_board=points, pixels_px=pixels, photos=photos)
+
+
+def _solved(found: FoundBoards) -> tuple[CameraCalibration, float]:
+    """Least squares, and the largest angle between two directions of the board (rad)."""
+    import cv2
+
+    rms_px, K, distortion, turns, _, sigma, _, by_photo = cv2.calibrateCameraExtended(
+        list(found.points_board),
+        list(found.pixels_px),
+        found.image_size_px,
+        np.eye(3),
+        np.zeros(5),
+    )
+    sigma, K = np.asarray(sigma, dtype=np.float64).ravel(), np.asarray(K, dtype=np.float64)
+    normals = rotation_from_vector(np.array(turns, dtype=np.float64).reshape(-1, 3))[:, :, 2]
+    spread_rad = float(np.arccos(np.clip(normals @ normals.T, -1, 1)).max())
     cells = np.concatenate(found.pixels_px) / np.array(found.image_size_px) * 4
-    return CameraCalibration(
+    result = CameraCalibration(
         K=K,
         distortion=np.asarray(distortion, dtype=np.float64).ravel()[:5],
         sigma_fxfycxcy_px=sigma[:4],
@@ -201,6 +237,7 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
         coverage=len(np.unique(cells.astype(int).clip(0, 3), axis=0)) / 16,
         used_images=found.photos,
     )
+    return result, spread_rad
 
 
 def max_edge_width_px(photo: np.ndarray) -> float:
@@ -263,9 +300,21 @@ def _chessboard(board: Chessboard) -> Detector:
         half_px = int(np.clip(0.35 * gap_px, 2, 11))
         stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
         corners = cv2.cornerSubPix(photo, corners, (half_px, half_px), (-1, -1), stop)
-        return points, np.asarray(corners, dtype=np.float32).reshape(-1, 2)
+        pixels = np.asarray(corners, dtype=np.float32).reshape(-1, 2)
+        return (points, pixels) if _is_regular(pixels.reshape(*rows.shape, 2)) else None
 
     return detect
+
+
+def _is_regular(grid: Float32[np.ndarray, "rows columns 2"]) -> bool:
+    """Whether all corners lie about midway between their neighbours, or go on as these do."""
+    for lines in (grid, grid.swapaxes(0, 1)):
+        steps = np.diff(lines, axis=0)
+        lengths = np.linalg.norm(steps, axis=-1)
+        turns = np.linalg.norm(np.diff(steps, axis=0), axis=-1)
+        if (turns > MAX_CORNER_SHIFT * np.minimum(lengths[1:], lengths[:-1])).any():
+            return False
+    return True
 
 
 def _charuco(board: CharucoBoard) -> dict[str, Detector]:

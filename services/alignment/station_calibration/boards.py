@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from services.alignment.calibration.intrinsics import (
     CharucoBoard,
     Chessboard,
     FoundBoards,
+    calibrate_found,
     edge_width_px,
     find_boards,
     max_edge_width_px,
@@ -87,14 +88,7 @@ class Photos:
 
     def corners(self) -> FoundBoards:
         """The views as the solver takes them."""
-        return FoundBoards(
-            tuple(view.points_board for view in self.views),
-            tuple(view.pixels for view in self.views),
-            self.size_px,
-            tuple(range(len(self.views))),
-            len(self),
-            self.pattern,
-        )
+        return replace(found_boards(self.views, self.size_px), num_photos=len(self))
 
     def tell_left_out(self, say: Callable[[str], None] = print) -> None:
         """List the excluded photos with the reasons."""
@@ -243,6 +237,8 @@ def _dark_first(photo: np.ndarray, pixels: np.ndarray, board: Chessboard) -> np.
 
 # With fewer views than this the focal length scatters by more than 0.3 % (docs/calibration.md).
 ENOUGH_VIEWS = 25
+# Three of these sigmas are 0.3 % of the focal length.
+MAX_FOCAL_SIGMA = 0.001
 VIEWS_PER_REGION = 2
 VIEWS_PER_TILT = 2
 # Distortion is largest at the rim: corners must come within this part of every edge.
@@ -271,11 +267,14 @@ class Coverage:
     Attributes:
         views_by_region: number of views with corners in each ninth of the image.
         tilts_rad: [n, 2] angle of the board's normal to the viewing ray: right, down.
+        focal_sigma: standard deviation of the focal length that these views give, as a share of
+            it; infinity where they give none.
         todo: advice, most important first; empty if the coverage is sufficient.
     """
 
     views_by_region: Int64[np.ndarray, "3 3"]
     tilts_rad: Float64[np.ndarray, "n 2"]
+    focal_sigma: float
     todo: tuple[str, ...]
 
 
@@ -297,7 +296,7 @@ class TurnCoverage:
 def camera_coverage(
     views: Sequence[BoardView], size_px: tuple[int, int], lens: Lens | None = None
 ) -> Coverage:
-    """Coverage of the image by positions, tilts and sizes of the board.
+    """Coverage of the image by positions, tilts and sizes of the board, and what it gives.
 
     Args:
         views: views with a detected board.
@@ -317,7 +316,36 @@ def camera_coverage(
     todo = [*_places(by_region, by_edge), *_poses(tilts_rad, sizes)]
     if not todo and len(views) < ENOUGH_VIEWS:
         todo = [f"take {ENOUGH_VIEWS - len(views)} more photos, each from another direction"]
-    return Coverage(by_region, tilts_rad, tuple(todo))
+    focal_sigma = _focal_sigma(views, size_px)
+    if not todo and focal_sigma > MAX_FOCAL_SIGMA:
+        todo = [_surer(focal_sigma, tilts_rad)]
+    return Coverage(by_region, tilts_rad, focal_sigma, tuple(todo))
+
+
+def _focal_sigma(views: Sequence[BoardView], size_px: tuple[int, int]) -> float:
+    try:
+        return calibrate_found(found_boards(views, size_px)).focal_sigma
+    except InvalidInputError:
+        return float("inf")
+
+
+def _surer(focal_sigma: float, tilts_rad: np.ndarray) -> str:
+    """Advice for the focal length: the tilt of which there are fewest views, near the camera."""
+    counts = [(tilts_rad @ np.array(one) >= MIN_TILT_RAD).sum() for one in TILTS.values()]
+    words = list(TILTS)[int(np.argmin(counts))]
+    known = f"to {focal_sigma:.2%}" if np.isfinite(focal_sigma) else "too badly"
+    return (
+        f"tilt the board by 30 to 45 degrees with {words} to the camera, near enough to fill half "
+        f"of the image: the focal length is known {known}, expected {MAX_FOCAL_SIGMA:.1%}"
+    )
+
+
+def found_boards(views: Sequence[BoardView], size_px: tuple[int, int]) -> FoundBoards:
+    """Views as the solver takes them."""
+    points = tuple(view.points_board for view in views)
+    pixels = tuple(view.pixels for view in views)
+    pattern = views[0].pattern if views else ""
+    return FoundBoards(points, pixels, size_px, tuple(range(len(views))), len(views), pattern)
 
 
 def _tilt_rad(view: BoardView, lens: Lens) -> Float64[np.ndarray, "2"]:

@@ -41,7 +41,7 @@ WATCH_PERIOD_S = 1.0
 MAX_MOTION_PX = 1.5
 # Views nearer to a kept one than this share of the image diagonal are redundant.
 MIN_NEWS = 0.04
-MAX_VIEWS = 60
+MAX_VIEWS = 80
 # Number of live images without a new view (4 s and more) after which a hint is printed.
 TELL_AFTER_IMAGES = 20
 
@@ -74,6 +74,8 @@ def calibrate_photos(options: argparse.Namespace, *, say: Say = print) -> dict[s
     if options.check:
         return report
     result = calibrate_found(photos.corners())
+    for index in sorted(set(range(len(photos.views))) - set(result.used_images)):
+        say(f"  corners of {photos.views[index].name} do not fit the others: left out")
     lens = Lens(result.K, result.distortion)
     coverage, _ = write_coverage(photos.views, photos.size_px, options.to, options.camera, lens)
     residuals = [reprojection(view, lens) for view in photos.views]

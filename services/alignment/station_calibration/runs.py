@@ -17,7 +17,12 @@ from dextouch.clients import HttpLink
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
 from dextouch.schemas import StationHealth
 from services.alignment.station_calibration import glove
-from services.alignment.station_calibration.boards import ENOUGH_VIEWS, BoardView, parse_board
+from services.alignment.station_calibration.boards import (
+    ENOUGH_VIEWS,
+    MAX_FOCAL_SIGMA,
+    BoardView,
+    parse_board,
+)
 from services.alignment.station_calibration.camera_views import (
     Session,
     calibrate_photos,
@@ -205,6 +210,11 @@ class GuidedRun:
                 self._set(camera=_camera_view(index, session))
                 if session.is_enough or self._is_finished.is_set():
                     break
+        if session.todo and not self._is_finished.is_set():
+            raise InvalidInputError(
+                f"lens: {len(session.views)} views are not enough ({session.todo[0]}); check that "
+                f"the board is flat and its image sharp, and begin again; photos: {photos}"
+            )
         self._say(f"{len(session.views)} views: solving")
         return calibrate_photos(options, say=self._say)
 
@@ -221,6 +231,8 @@ def _camera_view(index: int, session: Session) -> CameraRunView:
         views_by_region=tuple(map(tuple, coverage.views_by_region.tolist())) if coverage else (),
         num_views=len(session.views),
         num_wanted=ENOUGH_VIEWS,
+        focal_sigma=coverage.focal_sigma if coverage and coverage.focal_sigma < 1 else None,
+        focal_sigma_wanted=MAX_FOCAL_SIGMA,
         todo=session.todo,
         hint=session.hint,
     )

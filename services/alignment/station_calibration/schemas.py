@@ -61,6 +61,8 @@ class CameraRunView(FrozenModel):
     """Live view of a camera run: the newest image and what was seen in it, in its pixels.
 
     `corners_px` are those of the newest image, `outlines_px` those of the boards that were kept.
+    `focal_sigma` is the standard deviation of the focal length that the views give, as a share of
+    it, None where they give none; the run goes on until it is `focal_sigma_wanted`.
     """
 
     image_index: int
@@ -71,6 +73,8 @@ class CameraRunView(FrozenModel):
     views_by_region: tuple[tuple[int, ...], ...] = ()
     num_views: int = 0
     num_wanted: int
+    focal_sigma: float | None = None
+    focal_sigma_wanted: float
     todo: tuple[str, ...] = ()
     hint: str = ""
 

@@ -1,6 +1,6 @@
 // The calibration page: what is due, and guided runs with live coverage of the board.
 
-import { ageWords, capital, LEVELS, nextWords, polygon, runLevel, runTitle } from "./calibration_words.js";
+import { ageWords, capital, countWords, LEVELS, nextWords, polygon, progressOf, runLevel, runTitle } from "./calibration_words.js";
 import { element, levelBadge, setText } from "./dom.js";
 import { ask } from "./session.js";
 import { startTheme } from "./theme.js";
@@ -138,8 +138,8 @@ function showRun(run) {
   setText(find("run_hint"), hintOf(run, isEnded));
   find("run_count").hidden = !camera;
   if (camera) {
-    find("run_progress").value = Math.min(1, camera.num_views / camera.num_wanted);
-    setText(find("run_count_text"), `${camera.num_views} of ${camera.num_wanted} views`);
+    find("run_progress").value = progressOf(camera);
+    setText(find("run_count_text"), countWords(camera));
   }
   const todo = camera && !isEnded ? camera.todo.slice(1) : [];
   find("run_todo").replaceChildren(...todo.map((words) => element("li", {}, words)));

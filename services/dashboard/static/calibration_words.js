@@ -31,6 +31,17 @@ export function nextWords(run) {
   return run.busy_s > 0 ? `Recording: ${run.busy_s.toFixed(1)} s` : "Working.";
 }
 
+// How many views there are, and how well they know the focal length.
+export function countWords({ num_views: views, num_wanted: wanted, focal_sigma: sigma, focal_sigma_wanted: limit }) {
+  const known = sigma === null ? "not known yet" : `± ${(100 * sigma).toFixed(2)} %`;
+  return `${views} of ${wanted} views · focal length ${known}, wanted ± ${(100 * limit).toFixed(2)} %`;
+}
+
+// Share of the way: views count first, then the focal length.
+export function progressOf({ num_views: views, num_wanted: wanted, focal_sigma: sigma, focal_sigma_wanted: limit }) {
+  return Math.min(1, views / wanted, sigma === null ? 0.5 : Math.max(0.5, limit / sigma));
+}
+
 function doneWords({ request, facts }) {
   if (request.kind !== "camera") return "Done. Restart the station to use the new calibration.";
   const [fx, fy, cx, cy] = facts.fx_fy_cx_cy_px;
