@@ -150,17 +150,20 @@ def _on_socket(place: MockPlace, source: PacketSource, decoder: Decoder) -> Mock
     return MockPair(MockDevice(place, source, port), driver)
 
 
-def _known_of(pairs: Sequence[MockPair], seed: int) -> dict[str, Matrix]:
+def _known_of(
+    pairs: Sequence[MockPair], seed: int, *, error_ms: float = LATENCY_SIGMA_MS
+) -> dict[str, Matrix]:
     """What a calibrated station knows of these devices.
 
-    The path delay of each stream is wrong by about its sigma, as a measured one would be.
+    The path delay of each stream is wrong by about its sigma, as a measured one would be; with an
+    `error_ms` of 0 it is the true one.
     """
     known: dict[str, Matrix] = {}
     for pair in pairs:
         known |= pair.calibration
         rng, faults = device_rng(seed, f"latency_{pair.device.name}"), pair.device.faults
-        error_ms = LATENCY_SIGMA_MS * rng.standard_normal() if faults.path_delay_ms else 0.0
-        measured_ns = round(max(0.0, faults.path_delay_ms + error_ms) * 1e6)
+        wrong_ms = error_ms * rng.standard_normal() if faults.path_delay_ms else 0.0
+        measured_ns = round(max(0.0, faults.path_delay_ms + wrong_ms) * 1e6)
         for descriptor in pair.driver.descriptors:
             known[f"{descriptor.name}_latency_ns"] = ((float(measured_ns),),)
             known[f"{descriptor.name}_latency_sigma_ns"] = ((LATENCY_SIGMA_MS * 1e6,),)
@@ -169,12 +172,16 @@ def _known_of(pairs: Sequence[MockPair], seed: int) -> dict[str, Matrix]:
 
 @dataclass(frozen=True)
 class MockTake:
-    """A recorded take: where it lies, what was done to it, what the check found."""
+    """A recorded take: where it lies, what was done to it, what the check found.
+
+    `true_calibration` is that of the mock devices: tare and gain of gloves, and all path delays.
+    """
 
     recording_id: str
     spool_path: Path
     ledger: Ledger
     check: TakeCheck
+    true_calibration: Mapping[str, Matrix]
 
 
 class MockStation:
@@ -289,7 +296,8 @@ class MockStation:
         ledger = Ledger(self._seed, start_ns, devices)
         path = recorder.spool_root / status.recording_id
         ledger.save(path / LEDGER_FILE)
-        return MockTake(status.recording_id, path, ledger, check)
+        truth = _known_of(self.pairs, self._seed, error_ms=0.0)
+        return MockTake(status.recording_id, path, ledger, check, truth)
 
     def play_forever(self) -> None:
         """Let the devices go round and round, for a station that an operator uses.

@@ -140,6 +140,13 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
         "success_probe": models.probe.metadata.metrics,
         "stages": stages.rows(),
         "errors": worst_errors({name: take.errors for name, take in takes.items()}),
+        "errors_by_calibration": {
+            name: {
+                which: {error: errors[error] for error in COMMON_ERRORS}
+                for which, errors in (("measured", take.errors), ("true", take.errors_true))
+            }
+            for name, take in takes.items()
+        },
         "takes": {
             name: {
                 **take.errors,
@@ -194,7 +201,11 @@ def _take(
         recording.upload(spool, urls["episode_store"])
     with stages.stage(f"align_{domain}", f"aligning the {domain} take"):
         job = recording.align(urls["alignment"], recorded.recording_id)
-        return recording.measure(store, truth, recorded, job.alignment_id, devices=devices)
+        episode = store.open(job.alignment_id)
+    with stages.stage(f"true_{domain}", "aligning it again, with the true calibration"):
+        scratch = EpisodeStore(spool.parent / "true")
+        exact = recording.align_truly(recorded, scratch, job.options)
+        return recording.measure(episode, exact, truth, recorded, devices=devices)
 
 
 def worst_errors(takes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

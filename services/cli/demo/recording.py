@@ -24,11 +24,14 @@ from services.acquisition.mock_station import MockTake
 from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.replay import replay_calibration, replay_streams
 from services.acquisition.uploader import Uploader
+from services.alignment.jobs import align_recording
+from services.alignment.options import AlignmentOptions
 from services.alignment.recording_error import compare_with_truth, match_streams
 from services.alignment.schemas import AlignmentJob
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan
 from services.cli.mock_takes import TakePlan, measure_gloves, origin_in_truth_ns, play_take
 from services.cli.training_data import Order, in_processes, make_episode
+from services.episode_store.committing import commit_spool
 from services.evaluation.progress import Progress
 from services.twin.cameras import CAMERAS
 from services.twin.hands import Domain
@@ -45,10 +48,14 @@ ALIGNMENT_TIMEOUT_S = 1800.0
 
 @dataclass(frozen=True)
 class Take:
-    """A recorded and aligned take with its end-to-end errors."""
+    """A recorded and aligned take with its end-to-end errors.
+
+    `errors_true` are those of the same take aligned with the true calibration of its devices.
+    """
 
     episode: EpisodeReader
     errors: dict[str, Any]
+    errors_true: dict[str, Any]
     devices: list[dict[str, Any]]
     clock_residuals_ms: dict[str, np.ndarray]
 
@@ -180,25 +187,45 @@ def align(alignment_url: str, recording_id: str) -> AlignmentJob:
     return AlignmentJob.model_validate_json(answer.body)
 
 
+def align_truly(take: MockTake, store: EpisodeStore, options: AlignmentOptions) -> EpisodeReader:
+    """Align a take as if its gloves and path delays had been calibrated without error.
+
+    Args:
+        take: still in its spool.
+        store: for the recording with its true calibration, and the episode.
+        options: of the other alignment.
+    """
+    attributes = SpoolReader(take.spool_path).attributes
+    calibration = {**attributes.calibration, **take.true_calibration}
+    commit_spool(store, take.spool_path, attributes.model_copy(update={"calibration": calibration}))
+    return store.open(align_recording(store, take.recording_id, options).episode_id)
+
+
 def measure(
-    store: EpisodeStore,
+    episode: EpisodeReader,
+    episode_true: EpisodeReader,
     truth: EpisodeReader,
     take: MockTake,
-    episode_id: str,
     *,
     devices: list[dict[str, Any]],
 ) -> Take:
-    """Errors of the aligned episode against its truth."""
-    episode = store.open(episode_id)
-    started_ns = store.recording(take.recording_id).attributes.started_t_host_ns
-    if started_ns is None:
-        raise InvalidInputError(f"recording {take.recording_id}: no start time; record it again")
-    origin_ns = origin_in_truth_ns(
-        take, started_t_host_ns=started_ns, quality=episode.attributes.quality
-    )
+    """Errors of the aligned episodes, by the measured and the true calibration, against truth."""
+    origin_ns = _origin_ns(episode, take)
     errors = compare_with_truth(episode, truth, origin_in_truth_ns=origin_ns)
+    errors_true = compare_with_truth(
+        episode_true, truth, origin_in_truth_ns=_origin_ns(episode_true, take)
+    )
     residuals = {}
     for name, match in match_streams(episode, truth, origin_ns).items():
         t_s = episode.read(name).t_ref_ns[match.index] * 1e-9
         residuals[name] = np.stack([t_s, (match.offset_ns - match.mean_offset_ns) * 1e-6])
-    return Take(episode, errors, devices, residuals)
+    return Take(episode, errors, errors_true, devices, residuals)
+
+
+def _origin_ns(episode: EpisodeReader, take: MockTake) -> int:
+    started_ns = SpoolReader(take.spool_path).attributes.started_t_host_ns
+    if started_ns is None:
+        raise InvalidInputError(f"recording {take.recording_id}: no start time; record it again")
+    return origin_in_truth_ns(
+        take, started_t_host_ns=started_ns, quality=episode.attributes.quality
+    )

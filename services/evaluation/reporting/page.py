@@ -20,6 +20,7 @@ from services.evaluation.reporting.drawings import (
 )
 from services.evaluation.reporting.pictures import ReportPictures
 from services.evaluation.reporting.sections import (
+    calibration_rows,
     clock_rows,
     comparison_bars,
     error_rows,
@@ -60,6 +61,7 @@ def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
         tiles=tiles(report),
         stages=stage_bars(report.get("stages", [])),
         errors=error_rows(report.get("errors", {})),
+        calibrations=calibration_rows(report),
         clocks=clock_rows(report.get("errors", {})),
         clock_chart=clock_chart(pictures),
         action_charts=action_charts(pictures.actions),

@@ -104,6 +104,16 @@ class ErrorRow:
 
 
 @dataclass(frozen=True)
+class CalibrationRow:
+    """One error of a take with the measured and with the true calibration of its devices."""
+
+    name: str
+    measured: Any
+    true: Any
+    unit: str
+
+
+@dataclass(frozen=True)
 class AgreementFigure:
     """One agreement figure, with its 95 % interval if it has one."""
 
@@ -193,6 +203,18 @@ def error_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
             holds = value >= bound[1] if bound[0] == "≥" else value <= bound[1]
         rows.append(ErrorRow(name, value, unit, f"{bound[0]} {bound[1]:g}" if bound else "", holds))
     return rows
+
+
+def calibration_rows(report: Mapping[str, Any]) -> list[CalibrationRow]:
+    """Errors of each take with the measured calibration, and those with the true one."""
+    return [
+        CalibrationRow(
+            f"{take.capitalize()}: {name.lower()}", found["measured"][key], found["true"][key], unit
+        )
+        for take, found in report.get("errors_by_calibration", {}).items()
+        for key, name, unit, _ in ERRORS
+        if key in found["measured"]
+    ]
 
 
 def clock_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:

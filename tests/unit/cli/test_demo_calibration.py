@@ -5,10 +5,12 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolReader
+from dextouch.schemas import TakePrompt, matrix_rows
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration
 from services.acquisition.mock_station import LATENCY_SIGMA_MS
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
+from services.alignment.options import AlignmentOptions
 from services.cli import mock_takes
 from services.cli.demo import recording
 from tests.unit.bridges.takes import write_episode
@@ -45,6 +47,32 @@ def test_path_delays_are_measured_and_not_what_the_script_states(measured, side)
     # A real clock: the mock's threads wake late, which belongs to the path, by what the host does.
     assert 0 < abs(latency_ns - stated_ns) < 5e6
     assert 0 < sigma_ns < 5e6
+
+
+def test_a_take_is_aligned_again_with_the_calibration_that_its_devices_have(measured, tmp_path):
+    streams = pattern_streams(3.0)
+    plan = mock_takes.TakePlan(
+        streams,
+        TakePrompt(task="wave", instruction="wave", domain="human"),
+        success=True,
+        calibration={"K_head": matrix_rows(np.eye(3)), **measured},
+        recording_id="demo-human",
+        seed=SEED,
+        unit_seed=SEED,
+    )
+    take, _ = mock_takes.play_take(plan, tmp_path / "spool", station="demo")
+    options = AlignmentOptions(max_gap_ms=200.0)
+    episode = recording.align_truly(take, EpisodeStore(tmp_path / "true"), options)
+    delays_ms = {clock.stream: clock.latency_ms for clock in episode.attributes.clocks}
+    script = FaultScript.first_light()
+    assert delays_ms["tactile_left"] == script.of("glove_left").path_delay_ms
+    assert delays_ms["head"] == script.of("pose_tracker_head").path_delay_ms
+    (played_kpa,) = (s.values for s in streams if s.descriptor.name == "tactile_left")
+    gain = GloveCalibration.seeded("left", SEED).gain_counts_per_kpa.min()
+    read_kpa = episode.read("tactile_left").values[::20].astype(float)
+    errors_kpa = [np.abs(played_kpa - one).max(axis=1).min() for one in read_kpa]
+    # The glove rounds to whole counts; nothing else is wrong.
+    assert max(errors_kpa) <= 0.501 / gain
 
 
 def test_without_gloves_nothing_is_measured(tmp_path):

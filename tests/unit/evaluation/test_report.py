@@ -33,6 +33,10 @@ REPORT = {
         "clock_rms_ms": {"tactile_left": 0.31, "camera_head": 1.7},
         "taxel_iou": 0.991, "taxel_mae_kpa": 0.02, "wrist_error_mm": float("nan"),
     },
+    "errors_by_calibration": {"human": {
+        "measured": {"wrist_error_mm": 0.678, "wrist_error_deg": float("nan")},
+        "true": {"wrist_error_mm": 0.512, "wrist_error_deg": 0.03},
+    }},
     "world_model": {
         "psnr": 25.5, "psnr_copy": 24.0, "psnr_codec": 31.0, "psnr_other_take": 22.0,
         "psnr_hands_still": 24.6,
@@ -180,6 +184,15 @@ def test_bounds_are_judged():
     assert clocks == {"Clock of tactile left, RMS": True, "Clock of camera head, RMS": False}
     assert rows["Contact agreement (IoU)"] is True
     assert rows["Wrist position error"] is None
+
+
+def test_errors_stand_beside_those_with_the_true_calibration(tmp_path):
+    write_report(REPORT, PICTURES, tmp_path / "report.html")
+    text = re.sub(r"<[^>]+>|\s+", " ", (tmp_path / "report.html").read_text())
+    text = re.sub(" +", " ", text)
+    assert "mean error measured calibration true calibration" in text
+    assert "Human: wrist position error 0.678 mm 0.512 mm" in text
+    assert "Human: wrist rotation error undefined ° 0.0300 °" in text
 
 
 def test_headlines():
