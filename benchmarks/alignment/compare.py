@@ -36,7 +36,7 @@ from services.alignment.synchronization.recorded_streams import (
 )
 from services.alignment.synchronization.resampling import grid_times_ns
 from services.alignment.synchronization.stream_clock import TimedStream, time_stream
-from services.cli.demo.recording import measure
+from services.cli.demo.recording import errors_of
 from services.episode_store.committing import commit_spool
 
 OURS, LINEAR, NEAREST = "ours", "arrivals, interpolated", "arrivals, nearest sample"
@@ -220,7 +220,7 @@ def _on_grid(streams: dict[str, DatedStream], *, nearest: bool) -> tuple[int, Gr
 
 
 def _errors(store: EpisodeStore, recorded: RecordedTake, episode_id: str) -> dict[str, float]:
-    found = measure(store, recorded.truth, recorded.take, episode_id, devices=[]).errors
+    _, found = errors_of(store, episode_id, recorded.truth, recorded.take)
     rms, left = found["clock_rms_ms"], found["latency_error_ms"]
     times = [float(np.hypot(rms[name], left[name])) for name in rms]
     return {

@@ -202,10 +202,13 @@ def _take(
     with stages.stage(f"align_{domain}", f"aligning the {domain} take"):
         job = recording.align(urls["alignment"], recorded.recording_id)
         episode = store.open(job.alignment_id)
+        origin_ns, errors = recording.errors_of(store, job.alignment_id, truth, recorded)
+        residuals_ms = recording.clock_residuals_ms(episode, truth, origin_ns)
     with stages.stage(f"true_{domain}", "aligning it again, with the true calibration"):
         scratch = EpisodeStore(spool.parent / "true")
-        exact = recording.align_truly(recorded, scratch, job.options)
-        return recording.measure(episode, exact, truth, recorded, devices=devices)
+        exact_id = recording.align_truly(recorded, scratch, job.options).attributes.episode_id
+        _, errors_true = recording.errors_of(scratch, exact_id, truth, recorded)
+    return recording.Take(episode, errors, errors_true, devices, residuals_ms)
 
 
 def worst_errors(takes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

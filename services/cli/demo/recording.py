@@ -201,31 +201,26 @@ def align_truly(take: MockTake, store: EpisodeStore, options: AlignmentOptions) 
     return store.open(align_recording(store, take.recording_id, options).episode_id)
 
 
-def measure(
-    episode: EpisodeReader,
-    episode_true: EpisodeReader,
-    truth: EpisodeReader,
-    take: MockTake,
-    *,
-    devices: list[dict[str, Any]],
-) -> Take:
-    """Errors of the aligned episodes, by the measured and the true calibration, against truth."""
-    origin_ns = _origin_ns(episode, take)
-    errors = compare_with_truth(episode, truth, origin_in_truth_ns=origin_ns)
-    errors_true = compare_with_truth(
-        episode_true, truth, origin_in_truth_ns=_origin_ns(episode_true, take)
+def errors_of(
+    store: EpisodeStore, episode_id: str, truth: EpisodeReader, take: MockTake
+) -> tuple[int, dict[str, Any]]:
+    """Time 0 of an aligned episode on the truth's time axis, and its errors against the truth."""
+    episode = store.open(episode_id)
+    started_ns = store.recording(take.recording_id).attributes.started_t_host_ns
+    if started_ns is None:
+        raise InvalidInputError(f"recording {take.recording_id}: no start time; record it again")
+    origin_ns = origin_in_truth_ns(
+        take, started_t_host_ns=started_ns, quality=episode.attributes.quality
     )
+    return origin_ns, compare_with_truth(episode, truth, origin_in_truth_ns=origin_ns)
+
+
+def clock_residuals_ms(
+    episode: EpisodeReader, truth: EpisodeReader, origin_ns: int
+) -> dict[str, np.ndarray]:
+    """Times (s) of every stream's samples and their errors without the mean."""
     residuals = {}
     for name, match in match_streams(episode, truth, origin_ns).items():
         t_s = episode.read(name).t_ref_ns[match.index] * 1e-9
         residuals[name] = np.stack([t_s, (match.offset_ns - match.mean_offset_ns) * 1e-6])
-    return Take(episode, errors, errors_true, devices, residuals)
-
-
-def _origin_ns(episode: EpisodeReader, take: MockTake) -> int:
-    started_ns = SpoolReader(take.spool_path).attributes.started_t_host_ns
-    if started_ns is None:
-        raise InvalidInputError(f"recording {take.recording_id}: no start time; record it again")
-    return origin_in_truth_ns(
-        take, started_t_host_ns=started_ns, quality=episode.attributes.quality
-    )
+    return residuals

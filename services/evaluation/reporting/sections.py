@@ -16,6 +16,8 @@ ERRORS: tuple[tuple[str, str, str, tuple[str, float] | None], ...] = (
     ("fingertip_error_mm", "Fingertip error", "mm", None),
 )
 CLOCK_BOUND_MS = 1.0
+# Smaller errors with measured and true calibration are not told apart.
+LEAST_SHOWN = 0.001
 AGREEMENT: tuple[tuple[str, str], ...] = (
     ("pearson", "Pearson"),
     ("mmrv", "MMRV, ties counted"),
@@ -108,8 +110,8 @@ class CalibrationRow:
     """One error of a take with the measured and with the true calibration of its devices."""
 
     name: str
-    measured: Any
-    true: Any
+    measured: str
+    true: str
     unit: str
 
 
@@ -207,14 +209,19 @@ def error_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
 
 def calibration_rows(report: Mapping[str, Any]) -> list[CalibrationRow]:
     """Errors of each take with the measured calibration, and those with the true one."""
-    return [
-        CalibrationRow(
-            f"{take.capitalize()}: {name.lower()}", found["measured"][key], found["true"][key], unit
-        )
-        for take, found in report.get("errors_by_calibration", {}).items()
-        for key, name, unit, _ in ERRORS
-        if key in found["measured"]
-    ]
+    rows = []
+    for take, found in report.get("errors_by_calibration", {}).items():
+        for key, name, unit, _ in ERRORS:
+            if key in found["measured"]:
+                shown = f"{take.capitalize()}: {name.lower().removesuffix(' error')}"
+                both = (_at_least(found[which][key]) for which in ("measured", "true"))
+                rows.append(CalibrationRow(shown, *both, unit))
+    return rows
+
+
+def _at_least(value: object) -> str:
+    is_small = is_number(value) and abs(float(str(value))) < LEAST_SHOWN
+    return f"< {LEAST_SHOWN}" if is_small else figure(value)
 
 
 def clock_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:

@@ -152,7 +152,10 @@ def test_the_table_shows_undefined_agreement(capsys):
                 ),
                 1.0,
             ),
-            "policies": [{"policy": "hold", "task": "t", "real": 0.0, "imagined": 0.5}],
+            "policies": [
+                {"policy": "hold", "task": "t", "real": 0.0, "imagined": 0.5}
+                | {"real_rollouts": 7, "imagined_rollouts": 6}
+            ],
             "agreement": {
                 "t": {
                     "pearson": "undefined",
@@ -168,7 +171,7 @@ def test_the_table_shows_undefined_agreement(capsys):
         }
     )
     shown = capsys.readouterr().out
-    for words in ("undefined", "another scene", "≥ 0.98", "0.100", "It flatters."):
+    for words in ("undefined", "another scene", "≥ 0.98", "0.100", "It flatters.", "0.0 of 7"):
         assert words in shown
 
 
