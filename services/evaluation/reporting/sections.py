@@ -214,8 +214,8 @@ def calibration_rows(report: Mapping[str, Any]) -> list[CalibrationRow]:
         for key, name, unit, _ in ERRORS:
             if key in found["measured"]:
                 shown = f"{take.capitalize()}: {name.lower().removesuffix(' error')}"
-                both = (_at_least(found[which][key]) for which in ("measured", "true"))
-                rows.append(CalibrationRow(shown, *both, unit))
+                measured, true = _at_least(found["measured"][key]), _at_least(found["true"][key])
+                rows.append(CalibrationRow(shown, measured, true, unit))
     return rows
 
 
