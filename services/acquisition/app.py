@@ -11,6 +11,7 @@ from dextouch.episodes import disk_errors
 from dextouch.serving import create_service_app, serve
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
+from services.acquisition.enrolment import with_enrolment
 from services.acquisition.health import HealthCollector
 from services.acquisition.memory import keep_for_life
 from services.acquisition.metrics import RecorderCollector
@@ -100,6 +101,7 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
         InvalidInputError: neither devices nor mocks, or an unknown episode to play.
         StorageError: the folder of the takes cannot be made.
     """
+    settings = with_enrolment(settings)
     with disk_errors(f"make the spool {settings.spool}"):
         settings.spool.mkdir(parents=True, exist_ok=True)
     recover_spool(settings.spool)

@@ -5,7 +5,7 @@ from typing import Literal
 
 from pydantic import Field, SecretStr, model_validator
 
-from dextouch.data_folder import default_spool
+from dextouch.data_folder import default_enrolment, default_spool
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import ServiceSettings, service_config
 from services.acquisition.devices.kinds import ChosenDevice
@@ -75,6 +75,11 @@ class AcquisitionSettings(ServiceSettings, SpoolSafety):
     episode_store_url: str | None = Field(default=None, description="store to upload takes to")
     episode_store_key: SecretStr | None = Field(
         default=None, description="bearer key of the episode store"
+    )
+    enrolment: Path = Field(
+        default_factory=default_enrolment,
+        description="file of dextouch station enrol, which gives the store, its key and the "
+        "station's name where they are not set",
     )
     upload_period_s: float = Field(
         default=2.0, gt=0, le=3600, description="seconds between checks for takes to upload"

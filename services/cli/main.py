@@ -30,12 +30,24 @@ COMMANDS = {
     "twin serve": Command("serve rollouts in the twin", "twin.serving:serve"),
     "station": Command("record and calibrate a station's devices"),
     "station serve": Command("record gloves, trackers and cameras", "acquisition.app:main"),
+    "station enrol": Command(
+        "exchange a one-time token for the station's key of the store",
+        "cli.enrolment:station_enrol_main",
+    ),
     "station calibrate": Command("calibrate gloves, cameras and latencies", "cli.calibrate:main"),
     "store": Command(
-        "list, show, verify, repair, migrate, delete, restore, purge, serve",
+        "list, show, verify, repair, migrate, delete, restore, purge, enrol, serve",
         "episode_store.command_line:main",
     ),
     "store serve": Command("serve the store over HTTP", "episode_store.app:main"),
+    "store enrol": Command(
+        "get a one-time token with which a station gets its key",
+        "cli.enrolment:store_enrol_main",
+    ),
+    "store stations": Command("list enrolled stations", "cli.enrolment:store_stations_main"),
+    "store revoke": Command(
+        "revoke the key of an enrolled station", "cli.enrolment:store_revoke_main"
+    ),
     "export": Command(
         "write LeRobot, MCAP, Rerun or UMI files from a store", "cli.exports:export_main"
     ),

@@ -67,7 +67,7 @@ def create_app(
             api_router(settings, fleet, sessions),
             forwarding_router(fleet, sessions),
             comparison_router(comparisons, sessions),
-            system_router(system, audit_log, sessions),
+            system_router(system, audit_log, sessions, upstreams.get("episode_store")),
             live_router(
                 fleet,
                 [

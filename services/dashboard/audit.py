@@ -8,7 +8,7 @@ import heapq
 import os
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -52,6 +52,7 @@ class AuditPage(FrozenModel):
         folder: where the log is kept; None if only in memory, until the dashboard ends.
         num_damaged: unreadable lines among those that were read.
         num_lost: entries that could not be written since the dashboard started.
+        no_used_tokens: why the entries of enrolled stations are missing; empty if they are not.
     """
 
     entries: tuple[AuditEntry, ...]
@@ -61,6 +62,7 @@ class AuditPage(FrozenModel):
     folder: str | None
     num_damaged: int
     num_lost: int
+    no_used_tokens: str = ""
 
 
 class RotatedLines:
@@ -154,9 +156,17 @@ class AuditLog:
                 logger.exception("audit_not_written", entry=entry.model_dump(mode="json"))
 
     def newest(
-        self, limit: int, *, action: str | None = None, person: str | None = None
+        self,
+        limit: int,
+        *,
+        action: str | None = None,
+        person: str | None = None,
+        others: Iterable[AuditEntry] = (),
     ) -> AuditPage:
-        """The newest entries, those of an action and of a person only if these are given."""
+        """The newest entries, those of an action and of a person only if these are given.
+
+        `others` are entries that are kept elsewhere.
+        """
         damaged = 0
 
         def readable(lines: RotatedLines | None) -> Iterator[AuditEntry]:
@@ -169,7 +179,9 @@ class AuditLog:
 
         with self._lock:
             remembered = list(reversed(self._in_memory))
-        sources = (readable(self._of_people), readable(self._of_others), iter(remembered))
+        elsewhere = sorted(others, key=lambda one: one.at, reverse=True)
+        logged = (readable(self._of_people), readable(self._of_others))
+        sources = (*logged, iter(remembered), iter(elsewhere))
         found: list[AuditEntry] = []
         people: dict[str, None] = {}
         for entry in heapq.merge(*sources, key=lambda one: one.at, reverse=True):

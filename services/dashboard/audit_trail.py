@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from dextouch.serving import masked
 from services.dashboard.audit import NOT_SIGNED_IN, AuditEntry, AuditLog
+from services.dashboard.enrolments import ACTION as USE_TOKEN
 from services.dashboard.feeds import ACTIONS as RECORDER_ACTIONS
 from services.dashboard.pages import Sessions
 
@@ -35,6 +36,8 @@ ACTIONS: Final[Mapping[str, str]] = {
     "/v1/episode_store/catalog/reviews": "review",
     "/v1/episode_store/trash": "delete",
     "/v1/episode_store/trash/restore": "restore",
+    "/v1/episode_store/enrolments": "enrol station",
+    "/v1/episode_store/enrolments/{station}/revoke": "revoke station",
     "/v1/alignment/alignments": "align",
     "/v1/alignment/alignments/{alignment_id}/cancel": "cancel alignment",
     "/v1/alignment/calibration/runs": "start calibration",
@@ -44,11 +47,12 @@ ACTIONS: Final[Mapping[str, str]] = {
 }
 OF_STATION: Final = ("/v1/recorder/", "/v1/uploads/")
 # Fields of bodies that name what is changed, or how; all others may be private.
-NAMED: Final = ("verdict", "kind", "subject", "task", "recording_id", "episode_id")
+NAMED: Final = ("station", "verdict", "kind", "subject", "task", "recording_id", "episode_id")
 ALL_ACTIONS: Final = tuple(
     sorted(
         [
             *set(ACTIONS.values()) - {"recorder"},
+            USE_TOKEN,
             *(f"recorder: {action}" for action in RECORDER_ACTIONS),
         ]
     )

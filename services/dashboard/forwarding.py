@@ -10,22 +10,28 @@ from starlette.datastructures import QueryParams
 
 from dextouch.serving import JSON, KIB, takes
 from services.dashboard.fleet import Fleet
-from services.dashboard.pages import Sessions
+from services.dashboard.pages import SCOPE, Sessions
 
 # Headers of a response that a browser needs to show and to cache it.
 PASSED_HEADERS: Final = ("content-type", "etag", "cache-control", "location")
 # What a user asked for may take longer to compute than the state that pages fetch again and again.
 TIMEOUT_S: Final = 60.0
+# Of administrators, who have it beside that of operators.
+ENROL: Final = "enrol"
 
 
 @dataclass(frozen=True)
 class Forwarded:
-    """A route of a service, `path` below its /v1, offered as /v1/SERVICE/PATH."""
+    """A route of a service, `path` below its /v1, offered as /v1/SERVICE/PATH.
+
+    The key that signed in needs `scope`.
+    """
 
     service: str
     path: str
     method: Literal["GET", "POST", "DELETE"] = "GET"
     max_body_bytes: int = 64 * KIB
+    scope: str = SCOPE
 
 
 FORWARDED: Final = (
@@ -53,6 +59,9 @@ FORWARDED: Final = (
     Forwarded("episode_store", "/trash", "POST", max_body_bytes=256 * KIB),
     Forwarded("episode_store", "/trash/restore", "POST", max_body_bytes=256 * KIB),
     Forwarded("episode_store", "/uploads"),
+    Forwarded("episode_store", "/enrolments"),
+    Forwarded("episode_store", "/enrolments", "POST", scope=ENROL),
+    Forwarded("episode_store", "/enrolments/{station}/revoke", "POST", scope=ENROL),
     Forwarded("acquisition", "/uploads"),
     Forwarded("alignment", "/alignments"),
     Forwarded("alignment", "/alignments", "POST"),
@@ -79,15 +88,18 @@ def forwarding_router(fleet: Fleet, sessions: Sessions) -> APIRouter:
     for route in FORWARDED:
         router.add_api_route(
             f"/{route.service}{route.path}",
-            _forwarder(fleet, route),
+            _forwarder(fleet, route, sessions),
             methods=[route.method],
             response_class=Response,
         )
     return router
 
 
-def _forwarder(fleet: Fleet, route: Forwarded) -> Callable[[Request], Awaitable[Response]]:
+def _forwarder(
+    fleet: Fleet, route: Forwarded, sessions: Sessions
+) -> Callable[[Request], Awaitable[Response]]:
     async def forward(request: Request) -> Response:
+        sessions.require(request, route.scope)
         names = {name: quote(value, safe="") for name, value in request.path_params.items()}
         path = f"/v1{route.path}".format(**names)
         query, feeds = request.query_params, fleet.of()

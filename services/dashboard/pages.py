@@ -17,7 +17,7 @@ from jinja2 import Environment, FileSystemLoader
 from starlette.requests import HTTPConnection
 
 from dextouch.errors import AccessDeniedError, NotFoundError
-from dextouch.serving import FORM, KIB, AccessControl, not_signed_in, takes
+from dextouch.serving import FORM, KIB, AccessControl, Grant, not_signed_in, takes
 from services.dashboard.documents import HELP, Documents, find_documents
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.tasks import TaskChoice, load_tasks
@@ -96,8 +96,8 @@ class Sessions:
         self.lifetime_s = lifetime_s
         self._access = access
         self._clock_s = clock_s
-        # Name of the key and end of the session, by its token.
-        self._open: dict[str, tuple[str, float]] = {}
+        # What its key allows and the end of the session, by its token.
+        self._open: dict[str, tuple[Grant, float]] = {}
 
     @property
     def num_open(self) -> int:
@@ -111,13 +111,13 @@ class Sessions:
         Raises:
             AccessDeniedError: an unknown key or one without the scope.
         """
-        person = self._access.check(f"Bearer {key}", SCOPE)
+        grant = self._access.granted(f"Bearer {key}", SCOPE)
         now_s = self._clock_s()
         self._open = {token: one for token, one in self._open.items() if one[1] > now_s}
         while len(self._open) >= MAX_SESSIONS:
             self._open.pop(next(iter(self._open)))
         token = secrets.token_urlsafe(32)
-        self._open[token] = person, now_s + self.lifetime_s
+        self._open[token] = grant, now_s + self.lifetime_s
         return token
 
     def sign_out(self, connection: HTTPConnection) -> None:
@@ -136,13 +136,24 @@ class Sessions:
 
     def person_of(self, token: str) -> str | None:
         """Name of the key that opened a session; None if it is not open."""
-        person, end_s = self._open.get(token, (None, 0.0))
-        return person if end_s > self._clock_s() else None
+        grant = self._grant(token)
+        return None if grant is None else grant.name
+
+    def _grant(self, token: str) -> Grant | None:
+        grant, end_s = self._open.get(token, (None, 0.0))
+        return grant if end_s > self._clock_s() else None
 
     def guard(self, connection: HTTPConnection) -> None:
         """Refuse browsers that are not signed in."""
         if not self.allows(connection):
             raise not_signed_in()
+
+    def require(self, connection: HTTPConnection, scope: str) -> None:
+        """Refuse browsers that signed in with a key without this scope."""
+        self.guard(connection)
+        grant = self._grant(connection.cookies.get(COOKIE, ""))
+        if grant is not None:
+            grant.require(scope)
 
 
 def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Annotated, Any
 from urllib.parse import quote
 
@@ -11,6 +12,7 @@ from fastapi.responses import JSONResponse
 from fastapi.security import APIKeyCookie
 from pydantic import Field, ValidationError
 from pydantic_core import to_jsonable_python
+from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocketState
 
 from dextouch.errors import AccessDeniedError, NotFoundError
@@ -19,6 +21,7 @@ from dextouch.serving import JSON, KIB, OCTETS, takes
 from services.dashboard.audit import AuditLog, AuditPage
 from services.dashboard.audit_trail import ALL_ACTIONS
 from services.dashboard.comparison import Comparisons, ComparisonView, StartComparison
+from services.dashboard.enrolments import used_tokens
 from services.dashboard.feeds import Feeds, Topic
 from services.dashboard.fleet import Fleet
 from services.dashboard.live_messages import heatmap_layout, skeleton_bones
@@ -26,6 +29,7 @@ from services.dashboard.pages import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView
 from services.dashboard.system import System, SystemView
+from services.dashboard.upstream import Upstream
 
 WEBSOCKET_REFUSED = 1008
 # Interval at which a WebSocket checks that its session is still valid.
@@ -124,7 +128,9 @@ def comparison_router(comparisons: Comparisons, sessions: Sessions) -> APIRouter
     return router
 
 
-def system_router(system: System, log: AuditLog, sessions: Sessions) -> APIRouter:
+def system_router(
+    system: System, log: AuditLog, sessions: Sessions, store: Upstream | None
+) -> APIRouter:
     """Router of the state of all services, and of the audit log."""
     guards = [Depends(sessions.guard), Depends(SESSION)]
     router = APIRouter(prefix="/v1", dependencies=guards, tags=["system"])
@@ -135,14 +141,16 @@ def system_router(system: System, log: AuditLog, sessions: Sessions) -> APIRoute
         return await system.read()
 
     @router.get("/audit")
-    def audit(
+    async def audit(
         limit: Annotated[int, Query(ge=1, le=1000)] = 100,
         action: Annotated[str | None, Query(max_length=200)] = None,
         person: Annotated[str | None, Query(max_length=64)] = None,
     ) -> AuditPage:
         """Requests that changed something, or were refused, newest first."""
-        found = log.newest(limit, action=action, person=person)
-        return found.model_copy(update={"actions": ALL_ACTIONS})
+        used, problem = await used_tokens(store)
+        newest = partial(log.newest, limit, action=action, person=person, others=used)
+        found = await run_in_threadpool(newest)
+        return found.model_copy(update={"actions": ALL_ACTIONS, "no_used_tokens": problem})
 
     return router
 

@@ -11,6 +11,8 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import StorageError
 from dextouch.serving import create_service_app, serve
 from services.episode_store.catalog import Catalog
+from services.episode_store.enrolment import Enrolments
+from services.episode_store.enrolment_routes import enrolment_router
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
 from services.episode_store.playback import playback_router
@@ -20,6 +22,8 @@ from services.episode_store.settings import EpisodeStoreSettings
 from services.episode_store.trash import trash_router
 
 logger = structlog.get_logger(__name__)
+
+ENROLMENTS_FILE = "enrolments.json"
 
 
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
@@ -32,6 +36,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         max_requests=settings.max_batches_in_flight, max_bytes=settings.max_bytes_in_flight
     )
     metrics = UploadMetrics()
+    enrolments = Enrolments(settings.enrolments or store.root / ENROLMENTS_FILE)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -53,9 +58,11 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
             content_router(store, settings),
             playback_router(store, settings),
             trash_router(store, max_page=settings.max_page),
+            enrolment_router(enrolments),
         ],
         lifespan=lifespan,
     )
+    enrolments.connect(app.state.access)
     metrics.register(app.state.registry, limits, catalog.num_items())
     return app
 

@@ -1,5 +1,7 @@
 """Settings of the episode store, from flags and DEXTOUCH_EPISODE_STORE_… variables."""
 
+from pathlib import Path
+
 from pydantic import Field
 
 from dextouch.data_folder import default_store
@@ -20,6 +22,11 @@ class EpisodeStoreSettings(ServiceSettings):
 
     store_url: str = Field(
         default_factory=default_store, min_length=1, description="folder, file:///… or s3://…"
+    )
+    enrolments: Path | None = Field(
+        default=None,
+        description="file of the enrolled stations, with hashes of their keys (default: "
+        "enrolments.json in the store's folder)",
     )
     sync_uploads: bool = Field(
         default=True, description="wait for the disk before a batch is confirmed"

@@ -28,6 +28,11 @@ def default_store() -> str:
     return str(data_folder() / "store")
 
 
+def default_enrolment() -> Path:
+    """Where an enrolled station keeps its key of the store."""
+    return data_folder() / "enrolment.json"
+
+
 def default_spool() -> Path:
     """Where a station keeps its takes until they are uploaded."""
     return data_folder() / "spool"

@@ -24,9 +24,12 @@ SCOPES = (
     "study_read",
     "rate",
     "operate",
+    "enrol",
 )
 # Needs no key on any service: probes, and the description of the routes.
 PUBLIC = {"GET /healthz", "GET /readyz", "GET /metrics", "GET /openapi.json"}
+# Needs a one-time token in place of a key.
+BY_TOKEN = {"episode_store": {"POST /v1/enrolments/exchange"}}
 # Scope by route. The dashboard is not here: all its routes below /v1 need a session.
 TABLE = {
     "acquisition": {
@@ -91,6 +94,9 @@ TABLE = {
         "GET /v1/trash": "store_read",
         "POST /v1/trash": "store_delete",
         "POST /v1/trash/restore": "store_delete",
+        "GET /v1/enrolments": "enrol",
+        "POST /v1/enrolments": "enrol",
+        "POST /v1/enrolments/{station}/revoke": "enrol",
     },
     "worlds": {
         "GET /v1/worlds": "rollout",
@@ -210,7 +216,7 @@ def test_every_route_has_a_scope_or_is_public(keyed):
     """Add a row for a new route: which scope should it need?"""
     service, app = keyed
     pages = RATING_PAGE if service == "rating" else set()
-    assert operations(app) == set(TABLE[service]) | PUBLIC | pages
+    assert operations(app) == set(TABLE[service]) | PUBLIC | pages | BY_TOKEN.get(service, set())
 
 
 def test_the_document_says_which_scope(keyed):
@@ -253,6 +259,17 @@ async def test_probes_and_pages_say_nothing_secret(keyed):
             answer = await client.get(operation.split()[1])
             assert answer.status_code in {200, 503}, operation
             assert not any(key_of(scope) in answer.text for scope in SCOPES)
+
+
+@pytest.mark.parametrize("presented", NO_KEYS)
+async def test_no_key_replaces_an_enrolment_token(tmp_path, presented):
+    """Not even one with every scope, nor one that is presented in place of the token."""
+    every = ApiKey(name="every", key=key_of("every"), scopes=SCOPES)
+    async with client_of(APPS["episode_store"](tmp_path, api_keys=(every,))) as client:
+        for key in (key_of("every"), WRONG_KEY):
+            given = {"json": {"token": key}} | NO_KEYS[presented](key)
+            found = await ask(client, "POST /v1/enrolments/exchange", **given)
+            assert found == (403, "unknown_token")
 
 
 class Upstreams:
@@ -326,15 +343,30 @@ async def test_the_dashboard_and_what_it_forwards_need_a_session(page, upstreams
     assert not upstreams.asked
 
 
-async def test_operators_reach_every_route_until_they_sign_out(page, upstreams):
+# Of keys with the scope enrol beside operate.
+OF_ADMINISTRATORS = {
+    "POST /v1/episode_store/enrolments",
+    "POST /v1/episode_store/enrolments/{station}/revoke",
+}
+
+
+@pytest.mark.parametrize("scopes", [("operate",), ("operate", "enrol")])
+async def test_operators_reach_their_routes_until_they_sign_out(tmp_path, upstreams, scopes):
+    key = ApiKey(name="someone", key=key_of("operate"), scopes=scopes)
+    page = APPS["dashboard"](tmp_path, upstreams=upstreams.clients(), api_keys=(key,))
     routes, _ = kinds_of(page)
+    assert routes >= OF_ADMINISTRATORS
     async with client_of(page) as client:
         cookie = (await sign_in(client, key_of("operate"))).headers["set-cookie"].partition(";")[0]
         given = {"headers": {"cookie": cookie}}
         for operation in sorted(routes):
-            status, _ = await ask(client, operation, **given)
-            assert status not in {401, 403}, operation
+            status, reason = await ask(client, operation, **given)
+            if operation in OF_ADMINISTRATORS and "enrol" not in scopes:
+                assert (status, reason) == (403, "missing_scope"), operation
+            else:
+                assert status not in {401, 403}, operation
         reached = set(upstreams.asked)
+        assert (("POST", "/v1/enrolments") in reached) is ("enrol" in scopes)
         assert (("POST", "/v1/trash")) in reached
         signed_out = await client.post("/sign_out", **given)
         assert signed_out.status_code == 303

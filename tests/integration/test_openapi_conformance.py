@@ -42,6 +42,7 @@ SCOPES = (
     "rollout",
     "rate",
     "operate",
+    "enrol",
 )
 OTHER_KEY = "another-key-of-length"
 KEYED = {

@@ -94,9 +94,9 @@ def is_folder_at(descriptor: int, path: Path) -> bool:
     return there.st_ino == os.fstat(descriptor).st_ino
 
 
-def write_file(path: Path, data: bytes, *, sync: bool = True) -> None:
+def write_file(path: Path, data: bytes, *, sync: bool = True, mode: int = 0o644) -> None:
     """Write a new file; it is durable on return unless `sync` is false."""
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     try:
         write_all(descriptor, data)
         if sync:
@@ -128,11 +128,11 @@ def partial_name(name: str) -> str:
     return name + ".partial"
 
 
-def replace_file(path: Path, data: bytes) -> None:
-    """Replace the contents of a file atomically."""
+def replace_file(path: Path, data: bytes, *, mode: int = 0o644) -> None:
+    """Replace the contents of a file atomically; `mode` are its permissions."""
     partial = path.with_name(partial_name(path.name))
     partial.unlink(missing_ok=True)
-    write_file(partial, data)
+    write_file(partial, data, mode=mode)
     partial.replace(path)
     sync_folder(path.parent)
 

@@ -26,6 +26,13 @@ if TYPE_CHECKING:
     from dextouch.schemas.catalog import TrashContents as TrashContents
     from dextouch.schemas.catalog import TrashedItem as TrashedItem
     from dextouch.schemas.catalog import Verdict as Verdict
+    from dextouch.schemas.enrolment import KEY_NAME_PATTERN as KEY_NAME_PATTERN
+    from dextouch.schemas.enrolment import EnrolmentToken as EnrolmentToken
+    from dextouch.schemas.enrolment import EnrolStation as EnrolStation
+    from dextouch.schemas.enrolment import StationEnrolment as StationEnrolment
+    from dextouch.schemas.enrolment import StationEnrolments as StationEnrolments
+    from dextouch.schemas.enrolment import StationKey as StationKey
+    from dextouch.schemas.enrolment import UseToken as UseToken
     from dextouch.schemas.episodes import ID_PATTERN as ID_PATTERN
     from dextouch.schemas.episodes import CatalogHours as CatalogHours
     from dextouch.schemas.episodes import ClockMethod as ClockMethod

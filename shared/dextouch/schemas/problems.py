@@ -40,7 +40,14 @@ STATUS_OF_CLASS: tuple[tuple[type[DexTouchError], int], ...] = (
     (StorageFullError, 507),
     (StorageError, 500),
 )
-STATUS_OF_REASON = {"missing_scope": 403, "foreign_origin": 403, "foreign_host": 421}
+STATUS_OF_REASON = {
+    "missing_scope": 403,
+    "foreign_origin": 403,
+    "unknown_token": 403,
+    "used_token": 403,
+    "expired_token": 403,
+    "foreign_host": 421,
+}
 CLASS_OF_STATUS: dict[int, type[DexTouchError]] = {
     **dict.fromkeys((400, 405, 406, 415, 422), InvalidInputError),
     **dict.fromkeys((401, 403, 421), AccessDeniedError),
@@ -91,8 +98,8 @@ def status_of(error: DexTouchError) -> int:
     """The HTTP status of an error.
 
     Two classes depend on their details: a temporary limit (`retry_after_s`) is 429, any other 413;
-    a refusal depends on its `reason`: a missing or unknown key is 401, a missing scope or a foreign
-    origin 403, a foreign host name 421.
+    a refusal depends on its `reason`: a missing or unknown key is 401, a missing scope, a foreign
+    origin or an invalid enrolment token 403, a foreign host name 421.
     """
     if isinstance(error, LimitExceededError) and "retry_after_s" in error.details:
         return 429

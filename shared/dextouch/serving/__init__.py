@@ -25,9 +25,11 @@ if TYPE_CHECKING:
     from dextouch.serving.guard import MSGPACK as MSGPACK
     from dextouch.serving.guard import OCTETS as OCTETS
     from dextouch.serving.guard import AccessControl as AccessControl
+    from dextouch.serving.guard import Grant as Grant
     from dextouch.serving.guard import RequireScope as RequireScope
     from dextouch.serving.guard import media_type as media_type
     from dextouch.serving.guard import not_signed_in as not_signed_in
+    from dextouch.serving.guard import secret_digest as secret_digest
     from dextouch.serving.guard import takes as takes
     from dextouch.serving.json_bodies import JsonBody as JsonBody
     from dextouch.serving.logs import configure_logging as configure_logging

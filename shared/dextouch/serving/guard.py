@@ -28,6 +28,7 @@ from starlette.types import Message as AsgiMessage
 
 from dextouch.errors import AccessDeniedError, DexTouchError
 from dextouch.frozen_model import FrozenModel
+from dextouch.schemas import KEY_NAME_PATTERN
 from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
 
 logger = structlog.get_logger(__name__)
@@ -128,12 +129,26 @@ def _foreign_origin(got: str, own: str) -> AccessDeniedError:
     )
 
 
-class ApiKey(FrozenModel):
-    """A key and its scopes; `name` appears in logs, the key never."""
+class Grant(FrozenModel):
+    """What a key allows; `name` appears in logs."""
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")
-    key: SecretStr = Field(min_length=16)
+    name: str = Field(pattern=KEY_NAME_PATTERN)
     scopes: tuple[str, ...] = Field(min_length=1)
+
+    def require(self, scope: str) -> None:
+        """Raise AccessDeniedError if the key lacks a scope."""
+        if scope not in self.scopes:
+            raise AccessDeniedError(
+                f"key {self.name!r} lacks the scope {scope!r}; it has: {', '.join(self.scopes)}",
+                reason="missing_scope",
+                scope=scope,
+            )
+
+
+class ApiKey(Grant):
+    """A key of the settings."""
+
+    key: SecretStr = Field(min_length=16)
 
 
 def not_signed_in() -> AccessDeniedError:
@@ -153,38 +168,51 @@ class AccessControl:
     """The keys of one service; without keys (loopback only, see settings) access is open."""
 
     def __init__(self, api_keys: Sequence[ApiKey]) -> None:
-        self._keys = [(_digest(key.key.get_secret_value()), key) for key in api_keys]
+        self._keys = tuple((secret_digest(key.key.get_secret_value()), key) for key in api_keys)
+        self._enrolled: tuple[tuple[bytes, Grant], ...] = ()
 
     @property
     def has_keys(self) -> bool:
         """Whether the service requires a key."""
         return bool(self._keys)
 
-    def find(self, authorization: str | None) -> ApiKey | None:
-        """The key in the header, if it is a valid one."""
-        presented = _digest(_token(authorization) or "")
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of all keys."""
+        return frozenset(grant.name for _, grant in (*self._keys, *self._enrolled))
+
+    def set_enrolled(self, enrolled: Sequence[tuple[bytes, Grant]]) -> None:
+        """Accept these keys, given as digests, beside those of the settings, and no earlier ones.
+
+        A service without keys of its settings stays open.
+        """
+        self._enrolled = tuple(enrolled)
+
+    def find(self, authorization: str | None) -> Grant | None:
+        """What the key in the header allows, if it is a valid one."""
+        presented = secret_digest(_token(authorization) or "")
         # Every key is compared, to avoid a timing side channel.
-        matches = [key for digest, key in self._keys if hmac.compare_digest(digest, presented)]
+        known = (*self._keys, *self._enrolled)
+        matches = [grant for digest, grant in known if hmac.compare_digest(digest, presented)]
         return matches[0] if matches else None
 
-    def check(self, authorization: str | None, scope: str) -> str:
-        """Check a key and its scope, and return the key's name.
+    def granted(self, authorization: str | None, scope: str) -> Grant:
+        """Check a key and its scope, and return what the key allows.
 
         Raises:
             AccessDeniedError: no key, an unknown one (see `reason`), or one without the scope.
         """
         if not self._keys:
-            return "loopback"
-        key = self.find(authorization)
-        if key is None:
+            return Grant(name="loopback", scopes=(scope,))
+        grant = self.find(authorization)
+        if grant is None:
             raise _no_key(authorization)
-        if scope not in key.scopes:
-            raise AccessDeniedError(
-                f"key {key.name!r} lacks the scope {scope!r}; it has: {', '.join(key.scopes)}",
-                reason="missing_scope",
-                scope=scope,
-            )
-        return key.name
+        grant.require(scope)
+        return grant
+
+    def check(self, authorization: str | None, scope: str) -> str:
+        """Check a key and its scope as `granted`, and return the key's name."""
+        return self.granted(authorization, scope).name if self._keys else "loopback"
 
 
 @dataclass(frozen=True)
@@ -199,7 +227,8 @@ class RequireScope:
         return access.check(request.headers.get("authorization"), self.scope)
 
 
-def _digest(text: str) -> bytes:
+def secret_digest(text: str) -> bytes:
+    """By which keys and tokens are compared and kept."""
     return hashlib.sha256(text.encode()).digest()
 
 

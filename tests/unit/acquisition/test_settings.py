@@ -27,6 +27,7 @@ OPTIONS = {
     "calibration",
     "episode_store_url",
     "episode_store_key",
+    "enrolment",
     "upload_period_s",
     "keep_uploaded",
 }

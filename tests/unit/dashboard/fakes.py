@@ -76,6 +76,8 @@ class FakeServices:
         self.app.get("/v1/episodes/{episode_id}")(lambda: DETAIL)
         self.recordings = []
         self.app.get("/v1/recordings")(self._list_recordings)
+        self.enrolments = []
+        self.app.get("/v1/enrolments")(self._list_enrolments)
 
     async def _note(self, request, call_next):
         self.asked.append(request.url.path)
@@ -90,6 +92,9 @@ class FakeServices:
 
     def _list_recordings(self):
         return {"recordings": self.recordings, "num_matching": len(self.recordings)}
+
+    def _list_enrolments(self):
+        return {"enrolments": self.enrolments, "needs_key": True}
 
     def _taxels(self):
         arrays = {f"tactile_{side}": values for side, values in self.pressures.items()}

@@ -188,6 +188,35 @@ async def test_a_route_that_fails_is_kept(upstreams, folder, monkeypatch):
     assert json.loads(line)["status"] == 500
 
 
+async def test_tokens_that_stations_used_are_entries(make_app, services, folder):
+    """Only the store sees them; the dashboard adds them when the log is read."""
+    asked_at = "2026-05-01T12:00:00Z"
+    one = {"station": "desk_9", "state": "enrolled", "requested_at": asked_at}
+    one |= {"requested_by": "internal", "expires_at": "2026-05-01T12:15:00Z"}
+    used = one | {"enrolled_at": "2026-05-01T12:07:00Z", "enrolled_from": "10.0.0.9"}
+    waiting = one | {"station": "desk_8", "state": "waiting"}
+    services.enrolments = [waiting, used]
+    transport = httpx.ASGITransport(make_app(audit_folder=folder), raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+        await client.post("/v1/episode_store/enrolments", json={"station": "desk_9"})
+        await client.post("/v1/episode_store/enrolments/desk_9/revoke", json={})
+        page = await newest(client)
+        only = await newest(client, action="use enrolment token")
+        services.enrolments = ["damaged"]
+        without = await newest(client)
+    rows = [(e["action"], e["target"], e["person"]) for e in page["entries"]]
+    assert rows == [
+        ("revoke station", "desk_9", "open access"),
+        ("enrol station", "desk_9", "open access"),
+        ("use enrolment token", "desk_9", "station desk_9"),
+    ]
+    (entry_of_use,) = only["entries"]
+    assert (entry_of_use["at"], entry_of_use["client"]) == ("2026-05-01T12:07:00Z", "10.0.0.9")
+    assert page["no_used_tokens"] == ""
+    assert "/v1/enrolments" in without["no_used_tokens"]
+    assert len(without["entries"]) == 2
+
+
 def is_unsafe(route):
     return bool(route.methods - {"GET", "HEAD", "OPTIONS"})
 

@@ -20,12 +20,13 @@ function row(entry) {
     element("td", { class: "quiet" }, entry.client || "–"));
 }
 
-function notes({ folder, num_damaged, num_lost }) {
+function notes({ folder, num_damaged, num_lost, no_used_tokens }) {
   const found = [folder === null
     ? "Kept in memory only, and lost when the dashboard ends: set DEXTOUCH_DASHBOARD_AUDIT_FOLDER to keep it."
     : `Kept in ${folder}.`];
   if (num_damaged) found.push(`${plural(num_damaged, "damaged line")} skipped.`);
   if (num_lost) found.push(`${plural(num_lost, "entry").replace("entrys", "entries")} could not be written since the dashboard started; see its log.`);
+  if (no_used_tokens) found.push(`Without tokens that stations used: ${no_used_tokens}.`);
   return found.join(" ");
 }
 

@@ -38,3 +38,18 @@ export function result(status) {
   if (status < 400) return "done";
   return `${status < 500 ? "refused" : "failed"} (${status})`;
 }
+
+// The newest enrolment of each station, by name.
+export function newestOf(enrolments) {
+  const newest = new Map();
+  for (const one of enrolments) {
+    const known = newest.get(one.station);
+    if (!known || Date.parse(one.requested_at) > Date.parse(known.requested_at)) newest.set(one.station, one);
+  }
+  return [...newest.values()].sort((a, b) => (a.station < b.station ? -1 : 1));
+}
+
+// Since when an enrolment is in its state.
+export function since({ revoked_at, enrolled_at, requested_at }) {
+  return revoked_at ?? enrolled_at ?? requested_at;
+}

@@ -5,9 +5,9 @@ import { element, setText } from "../dom.js";
 import { age } from "../format.js";
 import { pagePath } from "../session.js";
 import { badge, progress, why } from "../study_parts.js";
+import { twoStep } from "./two_step.js";
 
 const PERIOD_MS = 2000;
-const CONFIRM_MS = 5000;
 const MAX_RUNNING = 20;
 const MAX_WAITING = 10;
 const NONE = { alignments: [], num_matching: 0 };
@@ -15,34 +15,6 @@ const NONE = { alignments: [], num_matching: 0 };
 function share(value) {
   const bar = element("progress", { max: 1, value, "aria-label": "progress" });
   return element("span", { class: "progress" }, bar, `${Math.round(100 * value)} %`);
-}
-
-// A button that acts on its second click within five seconds.
-function twoStep(text, act) {
-  const button = element("button", { type: "button", class: "danger" }, text);
-  let timer = null;
-  const end = () => {
-    clearTimeout(timer);
-    timer = null;
-    setText(button, text);
-    button.classList.remove("asked");
-  };
-  button.addEventListener("click", async () => {
-    if (timer === null) {
-      setText(button, `${text} now`);
-      button.classList.add("asked");
-      timer = setTimeout(end, CONFIRM_MS);
-      return;
-    }
-    end();
-    button.disabled = true;
-    try {
-      await act();
-    } finally {
-      button.disabled = false;
-    }
-  });
-  return button;
 }
 
 export class Jobs {

@@ -8,6 +8,7 @@ import { startTheme } from "../theme.js";
 import { AuditTable } from "./audit_table.js";
 import { bytes, cpu, filling, latency } from "./figures.js";
 import { Jobs } from "./jobs.js";
+import { StationKeys } from "./stations.js";
 
 const find = (id) => document.getElementById(id);
 const LEVELS = { ready: "OK", waiting: "WARN", down: "ERROR" };
@@ -60,10 +61,13 @@ function show({ version, services, disks, queues }) {
   setText(find("own_version"), `dashboard ${version}`);
   fill("service_rows", services.map((one) => serviceRow(one, version)), 8, "This dashboard was started without the address of any service.");
   find("shared_process").hidden = !services.some((one) => one.shares_process);
+  const store = services.find((one) => one.name === "episode store");
+  if (store) stations.suggest(store.address);
   fill("disk_rows", disks.map(diskRow), 5, "No service measures its disk.");
   fill("queue_rows", queues.map(queueRow), 5, "No service has a queue.");
 }
 
+const stations = new StationKeys(find);
 const jobs = new Jobs(find("job_rows"), find("jobs_note"), find("no_jobs"));
 const link = new LiveLink({
   onTopic: (topic, data) => {
@@ -78,4 +82,5 @@ link.show("studies", true);
 document.addEventListener("visibilitychange", () => link.sendView());
 startTheme(find("theme"), () => {});
 jobs.start();
+stations.start();
 new AuditTable(find).start();

@@ -1,0 +1,146 @@
+"""Commands that enrol stations at an episode store, list them, and revoke their keys."""
+
+import argparse
+import json
+import os
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Final, TypeVar
+from urllib.parse import quote
+
+from pydantic import BaseModel, SecretStr, ValidationError
+
+from dextouch.clients import HttpLink
+from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.data_folder import default_enrolment
+from dextouch.errors import UnavailableError
+from dextouch.schemas import (
+    EnrolmentToken,
+    StationEnrolments,
+    StationKey,
+    first_problems,
+)
+from services.acquisition.enrolment import Enrolment, check_writable, write_enrolment
+
+FormT = TypeVar("FormT", bound=BaseModel)
+KEY_VARIABLE: Final = "DEXTOUCH_KEY"
+PATH: Final = "/v1/enrolments"
+
+
+def station_enrol_main(argv: Sequence[str]) -> int:
+    """Exchange a token for the station's key, and write it to a file."""
+    parser = CommandParser(
+        prog="dextouch station enrol",
+        description="Exchange a one-time token for this station's key of the episode store, and "
+        "write it to a file that only its owner can read. dextouch station serve uploads with it "
+        "from its next start. Tokens come from the page System of the dashboard, or from "
+        "dextouch store enrol.",
+        epilog="example:\n  dextouch station enrol http://store.lab:8081 TOKEN",
+    )
+    parser.add_argument("url", metavar="URL", help="address of the episode store")
+    parser.add_argument("token", metavar="TOKEN", help="one-time token, valid for 15 minutes")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        metavar="PATH",
+        help="file of the key (default: enrolment.json in the data folder)",
+    )
+    add_json(parser)
+    options = parser.parse_args(list(argv))
+    path, url = options.output or default_enrolment(), options.url.rstrip("/")
+    link = HttpLink(url)
+    check_writable(path)
+    got = _ask(link, StationKey, "POST", f"{PATH}/exchange", {"token": options.token})
+    write_enrolment(
+        path,
+        Enrolment(station=got.station, episode_store_url=url, episode_store_key=SecretStr(got.key)),
+    )
+    print(f"enrolled as {got.station}; the key is in {path}")
+    used = "" if options.output is None else f" with --enrolment {path}"
+    print(f"(re)start the station to upload with it: dextouch station serve{used}")
+    write_result(
+        options.json, {"station": got.station, "episode_store_url": url, "path": str(path)}
+    )
+    return 0
+
+
+def store_enrol_main(argv: Sequence[str]) -> int:
+    """Get a one-time token for a station."""
+    parser = _administration(
+        "enrol", "Get a one-time token with which a station gets a key of its own.", "desk_3"
+    )
+    options = parser.parse_args(list(argv))
+    got = _ask(_link(options), EnrolmentToken, "POST", PATH, {"station": options.station})
+    command = f"dextouch station enrol {options.url} {got.token}"
+    print(f"run this on {got.station}, once, before {_shown(got.expires_at)}:\n\n  {command}\n")
+    write_result(options.json, got.model_dump(mode="json") | {"command": command})
+    return 0
+
+
+def store_stations_main(argv: Sequence[str]) -> int:
+    """List the enrolments of a store."""
+    parser = _administration("stations", "List enrolled, waiting and revoked stations.")
+    options = parser.parse_args(list(argv))
+    listed = _ask(_link(options), StationEnrolments, "GET", PATH)
+    for one in listed.enrolments:
+        ended = one.revoked_at or one.enrolled_at or one.requested_at
+        print(f"{one.station:<32}  {one.state:<8}  since {_shown(ended)}  {one.enrolled_from}")
+    if not listed.needs_key:
+        print("the store has no api_keys: stations upload without a key")
+    write_result(options.json, listed.model_dump(mode="json"))
+    return 0
+
+
+def store_revoke_main(argv: Sequence[str]) -> int:
+    """Revoke the key of a station."""
+    parser = _administration(
+        "revoke", "Refuse the key of an enrolled station, or its unused token, at once.", "desk_3"
+    )
+    options = parser.parse_args(list(argv))
+    path = f"{PATH}/{quote(options.station, safe='')}/revoke"
+    listed = _ask(_link(options), StationEnrolments, "POST", path)
+    print(f"revoked: {options.station}")
+    write_result(options.json, listed.model_dump(mode="json"))
+    return 0
+
+
+def _administration(name: str, does: str, usual: str = "") -> CommandParser:
+    """Parser of a command for administrators; `usual` is the station of its example."""
+    parser = CommandParser(
+        prog=f"dextouch store {name}",
+        description=does,
+        epilog=f"example:\n  dextouch store {name} {usual}".rstrip()
+        + " --url http://store.lab:8081",
+    )
+    if usual:
+        parser.add_argument("station", metavar="STATION", help="name of the station")
+    parser.add_argument("--url", required=True, metavar="URL", help="address of the store")
+    parser.add_argument(
+        "--key",
+        metavar="KEY",
+        help=f"API key with the scope enrol (default: the variable {KEY_VARIABLE})",
+    )
+    add_json(parser)
+    return parser
+
+
+def _link(options: argparse.Namespace) -> HttpLink:
+    return HttpLink(options.url, api_key=options.key or os.environ.get(KEY_VARIABLE))
+
+
+def _ask(
+    link: HttpLink, form: type[FormT], method: str, path: str, body: dict[str, str] | None = None
+) -> FormT:
+    reply = link.request(method, path, body=None if body is None else json.dumps(body).encode())
+    try:
+        return form.model_validate_json(reply.body)
+    except ValidationError as error:
+        raise UnavailableError(
+            f"unexpected response to {method} {path} ({first_problems(error)}); is this the "
+            "address of an episode store?"
+        ) from error
+
+
+def _shown(at: datetime) -> str:
+    return f"{at.astimezone():%Y-%m-%d %H:%M}"

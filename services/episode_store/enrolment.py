@@ -1,0 +1,255 @@
+"""Enrolment of stations: one-time tokens, exchanged for keys of the scope `store_write`.
+
+Only hashes of tokens and keys are kept: of tokens in memory, so that a restart invalidates them, of
+keys in a file.
+"""
+
+import hmac
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final, Literal
+
+import structlog
+from pydantic import ValidationError
+
+from dextouch.episodes import disk_errors, replace_file
+from dextouch.errors import (
+    AccessDeniedError,
+    ConflictError,
+    NotFoundError,
+    StorageError,
+)
+from dextouch.frozen_model import FrozenModel
+from dextouch.schemas import (
+    EnrolmentToken,
+    StationEnrolment,
+    StationEnrolments,
+    StationKey,
+    first_problems,
+)
+from dextouch.serving import AccessControl, Grant, secret_digest
+
+logger = structlog.get_logger(__name__)
+
+STATION_SCOPES: Final = ("store_write",)
+TOKEN_LIFETIME_S: Final = 15 * 60
+NUM_SECRET_BYTES: Final = 32
+# Used and expired tokens are remembered, so that a refusal can give the reason.
+MAX_TOKENS: Final = 256
+ASK_AGAIN: Final = "ask an administrator for a new one"
+
+
+class KeptEnrolment(StationEnrolment):
+    """An enrolment that led to a key, of which the file holds the SHA-256 in hexadecimal."""
+
+    state: Literal["enrolled", "revoked"]
+    key_sha256: str
+
+
+class KeptEnrolments(FrozenModel):
+    """Contents of the file, oldest first."""
+
+    format_version: Literal[1] = 1
+    enrolments: tuple[KeptEnrolment, ...] = ()
+
+
+@dataclass
+class Token:
+    """An issued token, by its digest."""
+
+    digest: bytes
+    enrolment: StationEnrolment
+    end_s: float
+    is_used: bool = False
+
+
+class Enrolments:
+    """Issues tokens and keys of stations; thread-safe, for one process.
+
+    Args:
+        path: file of the keys.
+        clock_s: tells the time.
+
+    Raises:
+        StorageError: the file cannot be read.
+    """
+
+    def __init__(self, path: Path, *, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._path, self._clock_s = path, clock_s
+        self._access = AccessControl(())
+        self._lock = threading.Lock()
+        self._tokens: list[Token] = []
+        self._kept = _read(path)
+        self._is_saved = True
+
+    def connect(self, access: AccessControl) -> None:
+        """Add the keys of stations to those that a service accepts, now and at every change."""
+        self._access = access
+        self._accept(self._kept)
+
+    def listing(self) -> StationEnrolments:
+        """All enrolments, newest first."""
+        with self._lock:
+            shown = [
+                StationEnrolment.model_validate(one.model_dump(exclude={"key_sha256"}))
+                for one in self._kept
+            ]
+            for token in self._tokens:
+                if not token.is_used:
+                    state = "waiting" if token.end_s > self._clock_s() else "expired"
+                    shown.append(token.enrolment.model_copy(update={"state": state}))
+        shown.sort(key=lambda one: one.requested_at, reverse=True)
+        return StationEnrolments(enrolments=tuple(shown), needs_key=self._access.has_keys)
+
+    def issue(self, station: str, *, by: str) -> EnrolmentToken:
+        """Issue a token for a station, in place of an earlier unused one.
+
+        Raises:
+            ConflictError: the store needs no keys, or has a key of this name.
+        """
+        if not self._access.has_keys:
+            raise ConflictError(
+                "the store has no api_keys, so that stations need no key either; set api_keys "
+                "before enrolling stations (docs/access.md)"
+            )
+        with self._lock:
+            if station in self._access.names:
+                raise ConflictError(
+                    f"station {station!r}: the store has a key of this name; revoke it, or choose "
+                    "another name",
+                    station=station,
+                )
+            token, now = secrets.token_urlsafe(NUM_SECRET_BYTES), datetime.now(UTC)
+            enrolment = StationEnrolment(
+                station=station,
+                state="waiting",
+                requested_at=now,
+                requested_by=by,
+                expires_at=now + timedelta(seconds=TOKEN_LIFETIME_S),
+            )
+            end_s = self._clock_s() + TOKEN_LIFETIME_S
+            self._forget_unused(station)
+            self._tokens.append(Token(secret_digest(token), enrolment, end_s))
+            self._tokens = self._tokens[-MAX_TOKENS:]
+        logger.info("issue_enrolment_token", station=station, by=by)
+        return EnrolmentToken(station=station, token=token, expires_at=enrolment.expires_at)
+
+    def exchange(self, text: str, *, client: str) -> StationKey:
+        """Exchange a token for a key, once.
+
+        Args:
+            text: the token.
+            client: address of the station.
+
+        Raises:
+            AccessDeniedError: an unknown, used or expired token.
+            StorageError: the key cannot be stored; the token stays valid.
+        """
+        with self._lock:
+            token = self._valid(secret_digest(text))
+            key = secrets.token_urlsafe(NUM_SECRET_BYTES)
+            changed = {
+                "state": "enrolled",
+                "enrolled_at": datetime.now(UTC),
+                "enrolled_from": client,
+                "key_sha256": secret_digest(key).hex(),
+            }
+            kept = KeptEnrolment.model_validate(token.enrolment.model_dump() | changed)
+            self._save((*self._kept, kept))
+            self._accept((*self._kept, kept))
+            token.is_used = True
+        logger.info("enrol_station", station=kept.station, client=client)
+        return StationKey(station=kept.station, key=key)
+
+    def revoke(self, station: str, *, by: str) -> None:
+        """Refuse the key of a station from now on, or its unused token.
+
+        Raises:
+            NotFoundError: the station has neither.
+            StorageError: the key is refused, but would be accepted again after a restart of the
+                service; a repetition tries to save this again.
+        """
+        with self._lock:
+            num_unused = self._forget_unused(station)
+            revoked = tuple(
+                one.model_copy(
+                    update={"state": "revoked", "revoked_at": datetime.now(UTC), "revoked_by": by}
+                )
+                if one.station == station and one.state == "enrolled"
+                else one
+                for one in self._kept
+            )
+            if revoked == self._kept and not num_unused and self._is_saved:
+                raise NotFoundError(
+                    f"station {station!r}: it has no enrolled key; keys of the setting api_keys "
+                    "are removed there",
+                    station=station,
+                )
+            # Before the file, so that a full disk does not leave the key valid.
+            self._is_saved = self._is_saved and revoked == self._kept
+            self._accept(revoked)
+            if not self._is_saved:
+                self._save(revoked)
+        logger.info("revoke_station", station=station, by=by)
+
+    def _valid(self, digest: bytes) -> Token:
+        # Every token is compared, to avoid a timing side channel.
+        found = [one for one in self._tokens if hmac.compare_digest(one.digest, digest)]
+        if not found:
+            raise AccessDeniedError(f"unknown token; {ASK_AGAIN}", reason="unknown_token")
+        if found[0].is_used:
+            raise AccessDeniedError(
+                f"the token was used before; {ASK_AGAIN}, and revoke the key if the station did "
+                "not get it",
+                reason="used_token",
+            )
+        if found[0].end_s <= self._clock_s():
+            raise AccessDeniedError(
+                f"the token has expired: tokens are valid for {TOKEN_LIFETIME_S // 60} minutes; "
+                f"{ASK_AGAIN}",
+                reason="expired_token",
+            )
+        return found[0]
+
+    def _forget_unused(self, station: str) -> int:
+        """Drop the unused tokens of a station, and return how many there were."""
+        left = [t for t in self._tokens if t.is_used or t.enrolment.station != station]
+        num_dropped = len(self._tokens) - len(left)
+        self._tokens = left
+        return num_dropped
+
+    def _save(self, enrolments: tuple[KeptEnrolment, ...]) -> None:
+        with disk_errors(f"write {self._path}"):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            text = KeptEnrolments(enrolments=enrolments).model_dump_json(indent=1)
+            replace_file(self._path, text.encode(), mode=0o600)
+        self._is_saved = True
+
+    def _accept(self, enrolments: tuple[KeptEnrolment, ...]) -> None:
+        self._kept = enrolments
+        self._access.set_enrolled(
+            [
+                (bytes.fromhex(one.key_sha256), Grant(name=one.station, scopes=STATION_SCOPES))
+                for one in enrolments
+                if one.state == "enrolled"
+            ]
+        )
+
+
+def _read(path: Path) -> tuple[KeptEnrolment, ...]:
+    with disk_errors(f"read {path}"):
+        if not path.exists():
+            return ()
+        text = path.read_bytes()
+    try:
+        return KeptEnrolments.model_validate_json(text).enrolments
+    except ValidationError as error:
+        raise StorageError(
+            f"{path}: no valid list of enrolled stations ({first_problems(error)}); restore it "
+            "from a backup, or remove it and enrol the stations again"
+        ) from error
