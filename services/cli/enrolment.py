@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 from collections.abc import Sequence
+from contextlib import closing
 from datetime import datetime
 from pathlib import Path
 from typing import Final, TypeVar
@@ -49,9 +50,9 @@ def station_enrol_main(argv: Sequence[str]) -> int:
     add_json(parser)
     options = parser.parse_args(list(argv))
     path, url = options.output or default_enrolment(), options.url.rstrip("/")
-    link = HttpLink(url)
     check_writable(path)
-    got = _ask(link, StationKey, "POST", f"{PATH}/exchange", {"token": options.token})
+    with closing(HttpLink(url)) as link:
+        got = _ask(link, StationKey, "POST", f"{PATH}/exchange", {"token": options.token})
     write_enrolment(
         path,
         Enrolment(station=got.station, episode_store_url=url, episode_store_key=SecretStr(got.key)),
@@ -71,7 +72,8 @@ def store_enrol_main(argv: Sequence[str]) -> int:
         "enrol", "Get a one-time token with which a station gets a key of its own.", "desk_3"
     )
     options = parser.parse_args(list(argv))
-    got = _ask(_link(options), EnrolmentToken, "POST", PATH, {"station": options.station})
+    with _link(options) as link:
+        got = _ask(link, EnrolmentToken, "POST", PATH, {"station": options.station})
     command = f"dextouch station enrol {options.url} {got.token}"
     print(f"run this on {got.station}, once, before {_shown(got.expires_at)}:\n\n  {command}\n")
     write_result(options.json, got.model_dump(mode="json") | {"command": command})
@@ -82,7 +84,8 @@ def store_stations_main(argv: Sequence[str]) -> int:
     """List the enrolments of a store."""
     parser = _administration("stations", "List enrolled, waiting and revoked stations.")
     options = parser.parse_args(list(argv))
-    listed = _ask(_link(options), StationEnrolments, "GET", PATH)
+    with _link(options) as link:
+        listed = _ask(link, StationEnrolments, "GET", PATH)
     for one in listed.enrolments:
         ended = one.revoked_at or one.enrolled_at or one.requested_at
         print(f"{one.station:<32}  {one.state:<8}  since {_shown(ended)}  {one.enrolled_from}")
@@ -99,7 +102,8 @@ def store_revoke_main(argv: Sequence[str]) -> int:
     )
     options = parser.parse_args(list(argv))
     path = f"{PATH}/{quote(options.station, safe='')}/revoke"
-    listed = _ask(_link(options), StationEnrolments, "POST", path)
+    with _link(options) as link:
+        listed = _ask(link, StationEnrolments, "POST", path)
     print(f"revoked: {options.station}")
     write_result(options.json, listed.model_dump(mode="json"))
     return 0
@@ -125,8 +129,8 @@ def _administration(name: str, does: str, usual: str = "") -> CommandParser:
     return parser
 
 
-def _link(options: argparse.Namespace) -> HttpLink:
-    return HttpLink(options.url, api_key=options.key or os.environ.get(KEY_VARIABLE))
+def _link(options: argparse.Namespace) -> closing[HttpLink]:
+    return closing(HttpLink(options.url, api_key=options.key or os.environ.get(KEY_VARIABLE)))
 
 
 def _ask(
