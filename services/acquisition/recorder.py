@@ -25,6 +25,7 @@ from dextouch.schemas import (
     TakeCheck,
     TakePrompt,
 )
+from dextouch.tracing import current_trace_id
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health import HealthMonitor
@@ -275,6 +276,7 @@ class Recorder:
             "success": how.success,
             "ledger": take.watch.ledger(),
             "quality": take.watch.quality(),
+            "trace_id": current_trace_id(),
         }
         spool.set_attributes(spool.attributes.model_copy(update=changed))
         spool.close()

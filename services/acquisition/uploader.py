@@ -23,7 +23,7 @@ from dextouch.errors import (
 )
 from dextouch.schemas import ID_TAKEN, RecordingAttributes, RecordingStatus, UploadStatus
 from dextouch.streams import StreamDescriptor, frame_body
-from dextouch.tracing import in_trace
+from dextouch.tracing import in_trace, new_trace
 from services.acquisition.memory import give_back_free_memory
 
 logger = structlog.get_logger(__name__)
@@ -166,8 +166,7 @@ class Uploader:
             if self._stopping.is_set():
                 break
             try:
-                with in_trace() as trace, bound_contextvars(trace_id=trace.trace_id):
-                    is_done = self._upload(path)
+                is_done = self._upload_traced(path)
                 if is_done:
                     done.append(path.name)
                     self._failures.pop(path.name, None)
@@ -221,11 +220,19 @@ class Uploader:
             self.upload_all()
             self._stopping.wait(max(self._period_s, self._retry_after_s))
 
-    def _upload(self, path: Path) -> bool:
+    def _upload_traced(self, path: Path) -> bool:
+        """Upload in the trace of the request that saved the take."""
         spool = SpoolReader(path)
         if not spool.closed or self._store is None:
             return False
-        status = _begin(self._store, spool.attributes)
+        with (
+            in_trace(new_trace(spool.attributes.trace_id)) as trace,
+            bound_contextvars(trace_id=trace.trace_id),
+        ):
+            return self._upload(path, spool, self._store)
+
+    def _upload(self, path: Path, spool: SpoolReader, store: EpisodeStoreClient) -> bool:
+        status = _begin(store, spool.attributes)
         recording_id = status.recording_id
         num_batches = {}
         for name, descriptor in spool.streams.items():
@@ -239,11 +246,9 @@ class Uploader:
                 start, stop = number * size, min((number + 1) * size, total)
                 body = spool.body(name, start, stop)
                 data = frame_body(name, body, stop - start, number=number)
-                self._store.send_batch(recording_id, descriptor, data, number=number)
+                store.send_batch(recording_id, descriptor, data, number=number)
         known = spool.attributes
-        status = self._store.finish(
-            recording_id, num_batches, success=known.success, ledger=known.ledger
-        )
+        status = store.finish(recording_id, num_batches, success=known.success, ledger=known.ledger)
         logger.info("upload_take", recording_id=path.name, stored_as=recording_id)
         # Where this fails the take is sent again: the store then answers that it has everything.
         with disk_errors(f"note the upload of {path.name!r}"):

@@ -25,7 +25,9 @@ S = TypeVar("S", EpisodeSummary, RecordingSummary)
 Outcome = Literal["success", "failure", "not_judged"]
 SortKey = Literal["id", "time", "duration", "task", "operator", "station", "findings"]
 ItemsKind = Literal["take", "recording", "episode"]
-_COMPARED = ("task", "operator", "station", "domain", "success", "recovered", "origin")
+_COMPARED = (
+    "task", "operator", "station", "domain", "success", "recovered", "origin", "trace_id",
+)  # fmt: skip
 # Order of items by their findings, where those without a score are among the outliers.
 _WEIGHTS = {"doubtful_clock": 10.0, "recovered": 5.0, "not_judged": 1.0}
 _SUCCESS: dict[Outcome, bool | None] = {"success": True, "failure": False, "not_judged": None}
@@ -71,7 +73,7 @@ class CatalogFilter(FrozenModel):
 
     `min_quality` are bounds `NAME:NUMBER` that must all hold; an item without the figure does not
     match. Times are created_after ≤ t < created_before; an item without a time does not match.
-    `text` is looked for in id, task, instruction, operator and station, in upper or lower case.
+    `text` is looked for in id, task, instruction, operator, station and trace, in any case.
     """
 
     task: str | None = None
@@ -81,6 +83,7 @@ class CatalogFilter(FrozenModel):
     success: bool | None = None
     outcome: Outcome | None = Field(default=None, description="as success, or not judged")
     recovered: bool | None = None
+    trace_id: str | None = Field(default=None, max_length=32)
     text: str | None = Field(default=None, max_length=200)
     min_quality: tuple[
         Annotated[str, AfterValidator(lambda text: quality_bound(text) and text)], ...

@@ -24,6 +24,7 @@ from dextouch.schemas import (
     RecordingStatus,
 )
 from dextouch.streams import read_batch
+from dextouch.tracing import current_trace_id
 from services.episode_store.committing import Commit, CommitProcess, commit_spool
 from services.episode_store.settings import EpisodeStoreSettings
 
@@ -107,6 +108,8 @@ class Ingest:
                 spool = self._upload(recording_id)
                 _check_same(attributes, spool.attributes)
                 return _status(spool)
+            if attributes.trace_id is None:
+                attributes = attributes.model_copy(update={"trace_id": current_trace_id()})
             spool = SpoolWriter(path, attributes, sync=self._sync)
             self._keep(recording_id, spool)
             logger.info("recording_created", recording_id=recording_id)
@@ -246,7 +249,9 @@ def idle_seconds(path: Path) -> float:
 
 def _check_same(got: RecordingAttributes, ours: RecordingAttributes) -> None:
     # Attributes known only at the end may differ from those at the beginning.
-    late = {"success": ours.success, "ledger": ours.ledger}
+    late: dict[str, object] = {"success": ours.success, "ledger": ours.ledger}
+    if got.trace_id is None:
+        late["trace_id"] = ours.trace_id
     if got.model_copy(update=late) != ours:
         raise ConflictError(
             f"recording {ours.recording_id!r} exists with other attributes; choose another id",

@@ -27,7 +27,9 @@ from services.episode_store.outliers import MIN_ITEMS, find_outliers
 AnyEntry = Entry[Any]
 Entries = Mapping[str, AnyEntry]
 Group = tuple[str, str, str, str]
-_SHARED: Final = ("task", "instruction", "domain", "station", "operator", "success", "recovered")
+_SHARED: Final = (
+    "task", "instruction", "domain", "station", "operator", "success", "recovered", "trace_id",
+)  # fmt: skip
 
 
 def item_of(

@@ -9,6 +9,7 @@ from jaxtyping import Float64
 from dextouch.clients import Policy, Rollout
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError
 from dextouch.schemas import MAX_SEED, Observation, ReturnSelector
+from dextouch.tracing import current_trace_id, in_trace
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.matched_starts import (
@@ -31,12 +32,14 @@ class PlayedRollout:
     """What happened in a finished rollout.
 
     `observations` are those of step 0 and of every chunk; `commanded` [T, 67] are the actions, row
-    0 the poses of step 0; `success` is the world's own report, None if it has none.
+    0 the poses of step 0; `success` is the world's own report, None if it has none. `trace_id` is
+    that of its requests.
     """
 
     observations: Sequence[Observation]
     commanded: Float64[np.ndarray, "steps 67"]
     success: bool | None
+    trace_id: str | None = None
 
     @property
     def ending(self) -> Observation:
@@ -90,7 +93,8 @@ class RolloutRunner:
         if isinstance(start, FailedStart):
             return rollout_failure(start.error, start, policy, world, repeat), None
         try:
-            played = self._play(start, actor, policy, world, repeat)
+            with in_trace():
+                played = self._play(start, actor, policy, world, repeat)
             ending = Ending.of(played.ending, start.task, imagined=world != REAL)
         except DexTouchError as error:
             return rollout_failure(error, start, policy, world, repeat), None
@@ -155,7 +159,7 @@ class RolloutRunner:
                 f"{where}: the last chunk has {len(seen[-1])} steps, expected at least "
                 f"{NUM_SEEN_STEPS}; send longer chunks"
             )
-        return PlayedRollout(seen, np.concatenate(commanded), success)
+        return PlayedRollout(seen, np.concatenate(commanded), success, current_trace_id())
 
     def _step(
         self, rollout: Rollout, chunk: np.ndarray, left: int, *, looks: bool | str, multiple: int

@@ -38,9 +38,9 @@ class TraceContext:
         return replace(self, span_id=secrets.token_hex(8))
 
 
-def new_trace() -> TraceContext:
-    """The first span of a new trace."""
-    return TraceContext(secrets.token_hex(16), secrets.token_hex(8))
+def new_trace(trace_id: str | None = None) -> TraceContext:
+    """The first span of a new trace, or a new one of the trace of this id."""
+    return TraceContext(trace_id or secrets.token_hex(16), secrets.token_hex(8))
 
 
 def parse_traceparent(text: str) -> TraceContext | None:
@@ -76,6 +76,12 @@ def in_trace(context: TraceContext | None = None) -> Iterator[TraceContext]:
         yield context
     finally:
         _current.reset(token)
+
+
+def current_trace_id() -> str | None:
+    """Id of the trace of the current work; None without."""
+    context = current_trace()
+    return None if context is None else context.trace_id
 
 
 def trace_headers() -> dict[str, str]:

@@ -313,6 +313,8 @@ def test_facts_and_exports(watched, address, played):
     facts = watched.locator("#facts")
     expect(facts).to_contain_text("p17")
     expect(facts).to_contain_text("3.50")
+    trace = facts.get_by_role("link", name=items.TRACE_ID)
+    expect(trace).to_have_attribute("href", f"/episodes?text={items.TRACE_ID}")
     expect(facts.get_by_role("link", name="take-1")).to_have_attribute(
         "href", "/episodes/recording/take-1"
     )

@@ -10,8 +10,11 @@ import pytest
 from dextouch.episodes.spool import SpoolReader
 from dextouch.streams import unpack
 from services.acquisition.app import create_app
+from services.acquisition.mocks import pattern
 from services.acquisition.settings import AcquisitionSettings
 
+# Of the specification (https://www.w3.org/TR/trace-context/).
+TRACE_ID = "4bf92f3577b34da6a3ce929d0e0e4736"
 PROMPT = {"task": "stack_bowls", "instruction": "stack the bowls"}
 
 
@@ -115,6 +118,23 @@ async def test_refusals_are_problems(tmp_path):
         assert "instruction" in answer.json()["detail"]
         answer = await client.get("/v1/live/cameras/nowhere")
         assert answer.status_code == 404
+
+
+async def test_a_take_keeps_the_trace_in_which_it_was_saved(tmp_path, monkeypatch):
+    streams = [s for s in pattern.pattern_streams() if s.descriptor.name == "head"]
+    monkeypatch.setattr(pattern, "pattern_streams", lambda: streams)
+    async with station(tmp_path) as client:
+        await client.post("/v1/recorder/arm", json=PROMPT)
+        recording_id = (await client.post("/v1/recorder/record")).json()["recording_id"]
+        await until_samples(client, 3)
+        await client.post("/v1/recorder/stop")
+        saved = await client.post(
+            "/v1/recorder/save",
+            json={"accept_incomplete": True},
+            headers={"traceparent": f"00-{TRACE_ID}-00f067aa0ba902b7-01"},
+        )
+        assert saved.is_success, saved.text
+    assert SpoolReader(tmp_path / recording_id).attributes.trace_id == TRACE_ID
 
 
 async def test_keys_are_asked_for(tmp_path):

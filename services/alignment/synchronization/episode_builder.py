@@ -193,6 +193,7 @@ def _episode_attributes(
         # What the station measured, too; of two figures with one name the aligned one counts.
         quality=source.quality | quality,
         created_at=source.started_at,
+        trace_id=source.trace_id,
     )
 
 

@@ -1,5 +1,6 @@
 """Schemas of the store's catalog: items of both kinds, lineage, the trash, reviews, hours."""
 
+from operator import not_
 from typing import Literal
 
 from pydantic import AwareDatetime, Field
@@ -148,6 +149,7 @@ class CatalogItem(FrozenModel):
     recovered: bool = False
     duration_s: float = Field(ge=0)
     at: AwareDatetime | None = None
+    trace_id: str | None = Field(default=None, exclude_if=not_)
     figures: dict[str, float] = Field(default={})
     time_doubts: tuple[str, ...] = ()
     recordings: tuple[str, ...] = ()

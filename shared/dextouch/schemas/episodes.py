@@ -29,6 +29,8 @@ ClockMethod = Literal["device", "sequence", "counting", "arrival"]
 # distinguished from an increase of the path delay.
 ClockWarning = Literal["skew", "residual", "stop"]
 StoreId = Annotated[str, Field(pattern=ID_PATTERN)]
+# Of a W3C trace (docs/operations.md#traces).
+TraceId = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 Domain = Literal["human", "robot"]
 Origin = Literal["recorded", "twin", "imagined"]
 RIGID_TOLERANCE: Final = 1e-6
@@ -114,8 +116,8 @@ class EpisodeAttributes(FrozenModel):
     `recovered` marks an episode recovered after its writer crashed. `object_boxes_m` has one box
     per object, centre and half sizes in the object's own frame. `event_times_s` is the time at
     which each milestone of the task was first reached, in seconds from step 0; milestones never
-    reached are absent. If empty, these two are not written, so that older releases can read the
-    episode.
+    reached are absent. `trace_id` is that of the recording, or of the client that ran the rollout.
+    If empty, these three are not written, so that older releases can read the episode.
     """
 
     format_version: Literal[1] = FORMAT_VERSION
@@ -141,6 +143,7 @@ class EpisodeAttributes(FrozenModel):
     clocks: tuple[ClockReport, ...] = ()
     quality: dict[str, FiniteFloat] = Field(default={})
     created_at: AwareDatetime | None = None
+    trace_id: TraceId | None = Field(default=None, exclude_if=not_)
     streams: tuple[StreamDescriptor, ...] = ()
 
     @field_validator("K_head")

@@ -1,5 +1,6 @@
 """Schemas of recordings: attributes, and the bodies of uploads to the store."""
 
+from operator import not_
 from typing import Annotated, Literal
 
 from pydantic import AwareDatetime, Field, FiniteFloat
@@ -11,6 +12,7 @@ from dextouch.schemas.episodes import (
     LineageEntry,
     Matrix,
     StoreId,
+    TraceId,
 )
 from dextouch.streams import StreamDescriptor
 
@@ -33,6 +35,8 @@ class RecordingAttributes(FrozenModel):
     `started_t_host_ns` is the station's monotonic clock at `started_at`; `calibration` holds named
     matrices (`K_head`, `T_tracker_left_wrist_left`, …); `ledger` the counted faults; `quality`
     named figures; `recovered` marks a take that the station did not finish.
+    `trace_id` is that of the request that saved the take, or else began its upload; if empty, it is
+    not written.
     """
 
     format_version: Literal[1] = FORMAT_VERSION
@@ -51,6 +55,7 @@ class RecordingAttributes(FrozenModel):
     lineage: Annotated[tuple[LineageEntry, ...], Field(fail_fast=True)] = ()
     ledger: Annotated[tuple[LedgerEntry, ...], Field(fail_fast=True)] = ()
     quality: dict[str, FiniteFloat] = Field(default={})
+    trace_id: TraceId | None = Field(default=None, exclude_if=not_)
     streams: Annotated[tuple[StreamDescriptor, ...], Field(fail_fast=True)] = ()
 
     def as_interrupted(self) -> "RecordingAttributes":

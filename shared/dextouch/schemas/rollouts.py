@@ -114,6 +114,7 @@ class WatchedRollout(FrozenModel):
         idle_s: since its newest chunk, or its start.
         doubt: of the newest chunk; None where the world reports none.
         success: at the newest step; None where unknown.
+        trace_id: of the request that began it; None if another version of DexTouch began it.
     """
 
     watch_id: str
@@ -132,6 +133,7 @@ class WatchedRollout(FrozenModel):
     idle_s: float
     doubt: Doubt | None = None
     success: bool | None = None
+    trace_id: str | None = None
 
 
 class WatchedRollouts(FrozenModel):

@@ -48,19 +48,23 @@ class WatchNote:
     begun_host_ns: int = 0
     doubt: Doubt | None = None
     success: bool | None = None
+    trace_id: str | None = None
 
     def to_bytes(self, info: Mapping[str, Any]) -> bytes:
         """Serialize the note with the progress of its rollout and the time of this write."""
         doubt = None if self.doubt is None else self.doubt.model_dump()
-        known = (self.client, self.key, self.begun_host_ns, doubt, self.success)
+        known = (self.client, self.key, self.begun_host_ns, doubt, self.success, self.trace_id)
         return msgpack.packb((info, time.time_ns(), known))
 
     @staticmethod
     def from_bytes(note: bytes) -> "tuple[dict[str, Any], int, WatchNote]":
         """Progress, time of the write on the host clock (ns), and the note."""
-        info, written_host_ns, (client, key, begun_host_ns, doubt, success) = msgpack.unpackb(note)
+        info, written_host_ns, known = msgpack.unpackb(note)
+        # A process of an earlier version writes no trace.
+        client, key, begun_host_ns, doubt, success, *trace_id = known
         doubted = None if doubt is None else Doubt.model_validate(doubt)
-        return info, written_host_ns, WatchNote(client, key, begun_host_ns, doubted, success)
+        shown = WatchNote(client, key, begun_host_ns, doubted, success, *trace_id)
+        return info, written_host_ns, shown
 
 
 @dataclass(frozen=True)

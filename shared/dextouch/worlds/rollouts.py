@@ -38,6 +38,7 @@ from dextouch.schemas import (
 )
 from dextouch.serving import StateStore
 from dextouch.streams import pack
+from dextouch.tracing import current_trace_id
 from dextouch.worlds.batcher import StepJob, WorldWorker, batch_histogram
 from dextouch.worlds.records import (
     Answer,
@@ -191,7 +192,9 @@ class RolloutService:
             origin = RolloutOrigin(started.anchor, started.K_head)
             shown = started.observation.selected(selector)
             parts = await parts_of(info, shown, selector, origin=origin)
-            note = WatchNote(client, owner, time.time_ns(), shown.doubt, shown.success)
+            note = WatchNote(
+                client, owner, time.time_ns(), shown.doubt, shown.success, current_trace_id()
+            )
             # No chunk has this response; it is kept for those who watch.
             record = RolloutRecord(info, snapshot, None, pack(*parts), placed, note)
             version = await self._records.write(record)
@@ -263,7 +266,8 @@ class RolloutService:
             changed["seed"] = seed
         info = parent.info.model_copy(update=changed)
         async with self._place(info.id) as placed:
-            note = replace(parent.note, key=owner, begun_host_ns=time.time_ns())
+            begun_host_ns, trace_id = time.time_ns(), current_trace_id()
+            note = replace(parent.note, key=owner, begun_host_ns=begun_host_ns, trace_id=trace_id)
             record = RolloutRecord(info, parent.snapshot, None, parent.payload, placed, note)
             await self._records.write(record)
         logger.info("rollout_forked", rollout_id=info.id, parent_id=rollout_id)

@@ -84,6 +84,7 @@ def _watched(info: dict[str, Any], written_host_ns: int, note: WatchNote) -> Wat
         idle_s=max(0.0, _NS * (now_ns - written_host_ns)),
         doubt=note.doubt,
         success=note.success,
+        trace_id=note.trace_id,
         **{name: info[name] for name in WatchedRollout.model_fields.keys() & info.keys()},
     )
 

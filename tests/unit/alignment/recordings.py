@@ -20,6 +20,7 @@ def write_recording(
     calibration=None,
     edit=lambda name, values: values,
     task="stand-bottle",
+    trace_id=None,
 ):
     """A robot that stands still; `lost` are (stream, first, last) samples that never arrived.
 
@@ -32,6 +33,7 @@ def write_recording(
         domain="robot",
         station="test",
         started_t_host_ns=START_NS,
+        trace_id=trace_id,
         calibration={"K_head": K_HEAD, **(calibration or {})},
     )
     t_ns = np.arange(round(seconds * 100), dtype=np.int64) * 10_000_000

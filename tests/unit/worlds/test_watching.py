@@ -13,7 +13,7 @@ from dextouch.schemas import decode_answer
 from dextouch.serving.guard import ApiKey
 from dextouch.streams import unpack
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from dextouch.worlds.records import RecordStore
+from dextouch.worlds.records import RecordStore, WatchNote
 from dextouch.worlds.rollouts import RolloutLimits, RolloutService
 from dextouch.worlds.watching import RolloutWatch
 from tests.unit.worlds.begun import ALL, START, begin, decoded
@@ -57,6 +57,30 @@ async def step(client, rollout_id, chunk, value=0.0, query=""):
 
 async def listed(client):
     return (await client.get("/v1/watch", headers=bearer("desk"))).json()
+
+
+async def test_a_rollout_keeps_the_trace_that_began_it(client):
+    # Of the specification (https://www.w3.org/TR/trace-context/).
+    trace_id, other = "4bf92f3577b34da6a3ce929d0e0e4736", "0af7651916cd43dd8448eb211c80319c"
+    begun = await start(client, traceparent=f"00-{trace_id}-00f067aa0ba902b7-01")
+    await step(client, begun.rollout.id, 0)
+    (one,) = (await listed(client))["rollouts"]
+    assert (one["trace_id"], one["next_chunk"]) == (trace_id, 1)
+    fork = await client.post(
+        f"/v1/rollouts/{begun.rollout.id}/fork",
+        json={"seed": 4},
+        headers=bearer("policy") | {"traceparent": f"00-{other}-b7ad6b7169203331-00"},
+    )
+    assert fork.status_code == 201, fork.text
+    assert {one["trace_id"] for one in (await listed(client))["rollouts"]} == {trace_id, other}
+
+
+def test_notes_of_earlier_versions_name_no_trace():
+    note = msgpack.packb(({"id": "r"}, 7, ("policy", "key", 5, None, True)))
+    info, written_host_ns, read = WatchNote.from_bytes(note)
+    assert (info, written_host_ns) == ({"id": "r"}, 7)
+    assert read == WatchNote("policy", "key", 5, None, success=True)
+    assert read.trace_id is None
 
 
 async def test_the_listing_says_who_does_what_since_when(client):

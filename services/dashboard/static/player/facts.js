@@ -35,7 +35,7 @@ function wideBlock(title, ...children) {
   return found;
 }
 
-function about(item) {
+function about(item, trace_id) {
   const { about: facts } = item;
   return block("About", rows([
     ["Task", facts.task],
@@ -47,6 +47,7 @@ function about(item) {
     ["Time", facts.at ? new Date(facts.at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" }) : null],
     ["Length", `${((item.stop_ns - item.start_ns) / 1e9).toFixed(3)} s`],
     ["Model steps", facts.num_steps ? `${facts.num_steps} at ${facts.model_rate_hz} Hz` : null],
+    ["Trace", trace_id ? element("a", { class: "trace", href: `/episodes?text=${trace_id}` }, trace_id) : null],
     ["Incomplete", facts.recovered ? "yes: its writer did not finish it" : null],
   ]));
 }
@@ -114,6 +115,6 @@ export async function showFacts(root, item) {
     fetchFacts(`/catalog/lineage/${item.path}`).catch(() => ({ nodes: [] })),
   ]);
   const attributes = detail.attributes ?? detail;
-  const blocks = [about(item), lineage(found.nodes), clocks(attributes.clocks ?? []), quality(attributes.quality), ledger(attributes.ledger), exports(item.about)];
+  const blocks = [about(item, attributes.trace_id), lineage(found.nodes), clocks(attributes.clocks ?? []), quality(attributes.quality), ledger(attributes.ledger), exports(item.about)];
   root.replaceChildren(...blocks.filter((one) => one));
 }
