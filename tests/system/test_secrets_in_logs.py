@@ -25,7 +25,7 @@ from tests.unit.evaluation.toy_store import write
 pytestmark = pytest.mark.system
 START_LIMIT_S = 300
 SCOPES = {
-    "episode_store": ("store_read", "store_write", "store_delete"),
+    "episode_store": ("store_read", "store_write", "store_delete", "enrol"),
     "alignment": ("align",),
     "acquisition": ("station",),
     "twin": ("rollout",),
@@ -131,6 +131,15 @@ def operations_of(client):
     ]
 
 
+def enrolled(client):
+    """Token and key of a station that is enrolled."""
+    as_admin = {"authorization": f"Bearer {KEYS['episode_store']}"}
+    asked = client.post("/v1/enrolments", json={"station": "desk_7"}, headers=as_admin)
+    token = asked.json()["token"]
+    got = client.post("/v1/enrolments/exchange", json={"token": token})
+    return token, got.json()["key"]
+
+
 def open_websockets(url, key):
     places = product(("/v1/live", "/v1/openpi"), ("", f"?key={key}"), ("Bearer", "Api-Key"))
     for path, query, kind in places:
@@ -161,7 +170,7 @@ def outputs(tmp_path_factory):
         up += [f"--{name}-port", "0"]
     rating = ["rate", "serve", "--store-url", str(folder / "rated")]
     rating += ["--marks", str(folder / "marks.sqlite"), "--rubrics", str(folder / "rubrics.toml")]
-    seen, metrics = [], {}
+    seen, metrics, enrolment = [], {}, ()
     with running(rating, rating_log, folder) as rater, running(up, log, folder) as services:
 
         def announced():
@@ -179,12 +188,17 @@ def outputs(tmp_path_factory):
                 for key in (KEYS[name], WRONG_KEY):
                     ask_everywhere(client, seen, key, operations_of(client))
                     open_websockets(url, key)
+                if name == "episode_store":
+                    enrolment = enrolled(client)
+                    for secret in enrolment:
+                        ask_everywhere(client, [], secret, operations_of(client))
                 if name == "dashboard":
                     sign_in(client, seen, (WRONG_KEY, KEYS["twin"], KEYS["dashboard"]))
                     for path in ("/v1/overview", "/v1/episode_store/episodes"):
                         exchange(client, seen, "GET", path)
                 metrics[name] = client.get("/metrics").text
-    return {"logs": log.read_text() + rating_log.read_text(), "seen": seen, "metrics": metrics}
+    logs = log.read_text() + rating_log.read_text()
+    return {"logs": logs, "seen": seen, "metrics": metrics, "enrolment": enrolment}
 
 
 def written(secret):
@@ -205,7 +219,7 @@ def test_the_requests_were_answered_in_many_ways(outputs):
 def test_no_key_is_in_the_logs(outputs):
     lines = outputs["logs"].splitlines()
     assert any("websocket_refused" in line for line in lines)
-    for secret in ALL_SECRETS | {WRONG_KEY}:
+    for secret in ALL_SECRETS | {WRONG_KEY, *outputs["enrolment"]}:
         for text in written(secret):
             assert not [line for line in lines if text in line], text
 
@@ -220,7 +234,7 @@ def test_no_key_of_a_service_is_in_a_reply(outputs):
 def test_no_key_is_in_the_metrics(outputs):
     for name, shown in outputs["metrics"].items():
         assert "dextouch_http_requests_total" in shown, name
-        for secret in ALL_SECRETS | {WRONG_KEY}:
+        for secret in ALL_SECRETS | {WRONG_KEY, *outputs["enrolment"]}:
             for text in written(secret):
                 assert text not in shown, name
 
