@@ -66,6 +66,7 @@ export class StationKeys {
       setText(this.find("enrol_text"), `Run this on ${station} before ${new Date(expires_at).toLocaleTimeString("en-GB", { timeStyle: "short" })}. `
         + "It works once, and is not shown again.");
       setText(this.find("enrol_command"), `dextouch station enrol ${url} ${token}`);
+      setText(this.find("enrol_copy"), "Copy");
       this.find("enrol_shown").hidden = false;
       this.open(false);
       this.form.elements.station.value = "";
