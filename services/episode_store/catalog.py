@@ -309,8 +309,15 @@ class Catalog:
         about, item_id = reader.attributes, reader.item_id
         kind: Kind = "episode" if isinstance(about, EpisodeAttributes) else "recording"
         item = item_of(reader, summary, self._store.review(item_id, kind=kind))
-        searched = (about.task, about.instruction, about.operator, about.station, about.trace_id)
-        text = "\n".join([item_id, *(part or "" for part in searched)]).casefold()
+        parts = (
+            item_id,
+            about.task,
+            about.instruction,
+            about.operator or "",
+            about.station or "",
+            about.trace_id or "",
+        )
+        text = "\n".join(parts).casefold()
         return Entry(summary, item, dict(about.quality), at, about.lineage, text)
 
 
