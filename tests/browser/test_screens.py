@@ -160,6 +160,7 @@ def test_entrance_and_stations(screens, serve, stations, tmp_path):
     expect(page).to_have_url(f"{address}/?station=desk_2")
 
 
+@pytest.mark.slow
 def test_stored_items(screens, serve, tmp_path):
     page = screens.page
     address = serve_dashboard(serve, tmp_path, serve_store(serve, tmp_path))
@@ -190,6 +191,7 @@ def test_stored_items(screens, serve, tmp_path):
     screens.look("hours")
 
 
+@pytest.mark.slow
 def test_services_and_worlds(screens, serve, station_process, tmp_path):
     page = screens.page
     station = station_process("desk_2", *STREAMS["desk_2"]).url
