@@ -281,7 +281,7 @@ def test_an_operator_is_deleted_after_typing_the_name(store, word, tmp_path, mon
     status, out, err = word(*words)
     assert status == 0
     assert "Type op-1" in err
-    assert "2 removed, 0 references left" in out
+    assert "2 removed, 0 reviews without a name, 0 references left" in out
     assert store.list() == ["e-1"]
     assert store.list(kind="recording") == ["r-2"]
     assert json.loads((tmp_path / "r.json").read_text())["counts"]["recordings"] == 1
