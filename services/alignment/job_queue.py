@@ -142,6 +142,10 @@ class JobQueue:
         """The job that has waited longest."""
         return next((job for job in self._jobs.values() if job.state == "waiting"), None)
 
+    def out_of_space(self, *, for_s: float) -> list[AlignmentJob]:
+        """Jobs that failed at least `for_s` ago because no space was left."""
+        return [job for job in self._jobs.values() if job.is_out_of_space(for_s=for_s)]
+
     def is_current(self, job: AlignmentJob) -> bool:
         """Whether this attempt still runs: the job was neither cancelled nor started again."""
         known = self._jobs.get(job.alignment_id)

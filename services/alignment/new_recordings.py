@@ -25,7 +25,8 @@ logger = structlog.get_logger(__name__)
 CALIBRATION_TASKS = "calibrate-"
 # As `episode_id_of` makes them.
 EPISODE_ID = re.compile(r"(.+)-[0-9a-f]{12}")
-# What cannot be read may be repaired, brought over to this format, or on a disk that comes back.
+# What cannot be read may be repaired, brought over to this format, or on a disk that comes back;
+# a full disk may have space again.
 RETRY_S = 60.0
 
 
@@ -34,8 +35,8 @@ class NewRecordings:
 
     A recording is skipped when it has a job, in whatever state; when an episode
     made from it is in the store or its trash, under any options; or when it is a calibration take.
-    One that cannot be aligned becomes a failed job with the reason. One that cannot be read is
-    logged and tried again after RETRY_S. One that comes back under the id of another that was
+    One that cannot be aligned becomes a failed job with the reason; if the disk was full, it is
+    submitted again after RETRY_S. One that cannot be read is logged and tried again after RETRY_S. One that comes back under the id of another that was
     deleted while this was watching counts as new unless an episode was made from its content.
     """
 
@@ -70,6 +71,10 @@ class NewRecordings:
         Raises:
             StorageError: the store cannot be listed, or jobs cannot be kept.
         """
+        for job in self._jobs.queue.out_of_space(for_s=RETRY_S):
+            again = AlignmentRequest(recording_id=job.recording_id, options=job.options)
+            with suppress(InvalidInputError, LimitExceededError, NotFoundError):
+                await self._jobs.submit(again)
         new = self._new(await asyncio.to_thread(self._store.list, kind="recording"))
         if not new:
             return

@@ -1,6 +1,7 @@
 """Request and response bodies of the alignment service, and the states of an alignment job."""
 
 from datetime import UTC, datetime
+from http import HTTPStatus
 from typing import Annotated, Literal
 
 from pydantic import AwareDatetime, Field, FiniteFloat, model_validator
@@ -124,6 +125,13 @@ class AlignmentJob(FrozenModel):
             attempts=self.attempts,
         )
         return self.ended("failed", error=error)
+
+    def is_out_of_space(self, *, for_s: float) -> bool:
+        """Whether it failed at least `for_s` ago because no space was left."""
+        if self.state != "failed" or self.problem is None or self.ended_at is None:
+            return False
+        is_old = (_now() - self.ended_at).total_seconds() >= for_s
+        return is_old and self.problem.status == HTTPStatus.INSUFFICIENT_STORAGE
 
     def with_eta(self) -> "AlignmentJob":
         """Estimates the remaining time from the time that the progress took so far."""

@@ -1,13 +1,14 @@
 """Services of compose files as containers of podman, which read every key that the files use."""
 
 import os
+import signal
 import time
 from dataclasses import dataclass, field
 
 import yaml
 
 from tests.containers.engine import ROOT, Engine
-from tests.system.compose_processes import free_port, interpolate, start_order
+from tests.system.compose_processes import free_port, interpolate, start_order, wait_for
 
 HEALTH_TIMEOUT_S = 180.0
 NETWORK = "dextouch"
@@ -119,9 +120,12 @@ class Composed:
 
     def up_all(self):
         """Start all lasting services, each after those that it depends on."""
-        lasting = {name: s for name, s in self.services.items() if not s.get("profiles")}
-        for name in start_order(lasting):
+        for name in self.lasting():
             self.up(name)
+
+    def lasting(self):
+        """Services of no profile, each after those that it depends on."""
+        return start_order({n: s for n, s in self.services.items() if not s.get("profiles")})
 
     def wait_healthy(self, name):
         """Run the health check of a container until it passes."""
@@ -137,8 +141,18 @@ class Composed:
         return self.engine.inspect(name, ".State.Pid")
 
     def signal(self, name, number):
-        """Send a signal to the first process of a container."""
-        os.kill(self.pid(name), number)
+        """Send a signal to the first process of a container; its id."""
+        pid = self.pid(name)
+        os.kill(pid, number)
+        return pid
+
+    def kill(self, name):
+        """End a container as the kernel does, and start it as `restart: unless-stopped` does."""
+        old_pid = self.signal(name, signal.SIGKILL)
+        wait_for(f"end of {name}", 30, lambda: self.pid(name) != old_pid, self.logs)
+        # Podman without systemd may leave this to whoever runs it.
+        if not self.engine.inspect(name, ".State.Running"):
+            self.engine.podman("start", name)
 
     def stop(self, name):
         """Stop a container as compose does; seconds and exit status."""
@@ -162,4 +176,6 @@ class Composed:
 
 def _full(image):
     """The name under which podman holds an image of the compose file."""
-    return f"localhost/{image}" if image.startswith("dextouch:") else f"docker.io/library/{image}"
+    if image.startswith("dextouch:"):
+        return f"localhost/{image}"
+    return f"docker.io/{image}" if "/" in image else f"docker.io/library/{image}"

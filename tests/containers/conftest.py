@@ -7,6 +7,7 @@ end). Without it, everything is made in a temporary folder.
 import os
 import secrets
 import signal
+import time
 
 import httpx
 import pytest
@@ -14,8 +15,11 @@ import pytest
 from tests.browser.conftest import chromium, open_page, open_pages  # noqa: F401 - fixtures
 from tests.containers import images
 from tests.containers.composed import Composed
+from tests.containers.disks import Disk
 from tests.containers.engine import engine_in, missing
+from tests.system.compose_processes import wait_for
 
+ARRIVAL_TIMEOUT_S = 120.0
 _FIGURES = []
 
 
@@ -75,14 +79,73 @@ def composed(engine, built, key, note):
 
 
 @pytest.fixture(scope="session")
-def ask(composed, key):
-    """Ask a service with the key; all logs are part of a failure's message."""
+def disks(composed, engine):
+    """Small disks below the spool and the store, by the name of the volume."""
+    sizes = {"spool": 2 << 30, "store": 4 << 30}
+    disks = {name: Disk(engine, name, size) for name, size in sizes.items()}
+    volumes = {f"/data/{name}": disk.mounted for name, disk in disks.items()}
+    users = ("episode_store", "acquisition", "alignment")
+    try:
+        composed.down(*users)
+        for name in users:
+            composed.up(name, volumes=volumes)
+        yield disks
+    finally:
+        composed.down(*users)
+        for disk in disks.values():
+            disk.close()
+
+
+@pytest.fixture(scope="session")
+def client(key):
+    """HTTP with the key."""
     headers = {"authorization": f"Bearer {key}"}
     with httpx.Client(headers=headers, timeout=60, trust_env=False) as client:
+        yield client
 
-        def ask(method, service, path, **more):
-            answer = client.request(method, composed.url(service) + path, **more)
-            assert answer.is_success, f"{answer.status_code} {answer.text}\n{composed.logs()}"
-            return answer.json()
 
-        yield ask
+@pytest.fixture(scope="session")
+def ask(composed, client):
+    """Ask a service with the key; all logs are part of a failure's message."""
+
+    def ask(method, service, path, **more):
+        answer = client.request(method, composed.url(service) + path, **more)
+        assert answer.is_success, f"{answer.status_code} {answer.text}\n{composed.logs()}"
+        return answer.json()
+
+    return ask
+
+
+@pytest.fixture
+def arrived(composed, ask):
+    """Wait until the store has exactly the samples of a take that the station counted."""
+
+    def arrived(recording_id, num_samples, *, limit_s=ARRIVAL_TIMEOUT_S):
+        def stored():
+            try:
+                found = ask("GET", "episode_store", "/v1/recordings")["recordings"]
+            except httpx.TransportError:
+                return False
+            return [item for item in found if item["recording_id"] == recording_id]
+
+        wait_for("upload", limit_s, stored, composed.logs)
+        (found,) = stored()
+        assert found["num_samples"] == num_samples
+
+    return arrived
+
+
+@pytest.fixture
+def uploading(composed, ask):
+    """Wait until a part of a take is in the store."""
+
+    def uploading(recording_id):
+        def begun():
+            open_ones = ask("GET", "episode_store", "/v1/uploads")["uploads"]
+            return [item for item in open_ones if item["recording_id"] == recording_id]
+
+        deadline_s = time.monotonic() + ARRIVAL_TIMEOUT_S
+        while not begun():
+            assert time.monotonic() < deadline_s, composed.logs()
+
+    return uploading

@@ -8,6 +8,7 @@ from tests.containers.engine import ROOT, answers
 PYTHON = "docker.io/library/python:3.11-slim"
 REDIS = "docker.io/library/redis:7-alpine"
 HAPROXY = "docker.io/library/haproxy:3.2-alpine"
+PROMETHEUS = "docker.io/prom/prometheus:v3.5.0"
 REGISTRY = "https://registry-1.docker.io/v2/"
 TORCH_INDEX = "https://download.pytorch.org/whl/cpu/"
 DEBIAN = ROOT / "build/containers/bookworm.tar"
@@ -25,6 +26,12 @@ FROM debian AS haproxy
 USER 99:99
 STOPSIGNAL SIGUSR1
 CMD ["haproxy", "-W", "-db", "-f", "/usr/local/etc/haproxy/haproxy.cfg"]
+FROM debian AS prometheus
+RUN apt-get install -y --no-install-recommends prometheus \
+ && install --directory --owner=65534 --group=65534 /prometheus
+WORKDIR /prometheus
+ENTRYPOINT ["/usr/bin/prometheus"]
+USER 65534:65534
 """
 
 
@@ -34,15 +41,17 @@ def has(engine, image):
 
 
 def make_bases(engine):
-    """Pull python, redis and haproxy where a registry answers, or make them of Debian packages."""
-    wanted = [image for image in (PYTHON, REDIS, HAPROXY) if not has(engine, image)]
+    """Pull the images of others where a registry answers, or make them of Debian packages."""
+    images = (PYTHON, REDIS, HAPROXY, PROMETHEUS)
+    wanted = [image for image in images if not has(engine, image)]
     if wanted and answers(REGISTRY):
         for image in wanted:
             engine.podman("pull", "--quiet", image, timeout_s=600)
         return "pulled"
     if PYTHON in wanted:
         engine.podman("import", _debian(engine), PYTHON, timeout_s=300)
-    for image, stage in ((REDIS, "redis"), (HAPROXY, "haproxy")):
+    stages = ((REDIS, "redis"), (HAPROXY, "haproxy"), (PROMETHEUS, "prometheus"))
+    for image, stage in stages:
         if image in wanted:
             path = engine.folder / "stand_ins"
             path.write_text(STAND_INS.format(python=PYTHON))

@@ -1,6 +1,7 @@
 """Services of the compose file from their images: a take becomes an episode, then a rollout."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from playwright.sync_api import expect
 
 from dextouch.clients import EpisodeStoreClient, RolloutClient
 from dextouch.schemas import Observation
+from services.dashboard.pages import SCREENS
 from tests.system.compose_processes import record_take, wait_for
 
 pytestmark = pytest.mark.containers
@@ -59,10 +61,12 @@ def episode_id(composed, ask, take):
 
 def test_nothing_but_volumes_and_tmp_can_be_written(composed, engine):
     code = "import os, sys; print([p for p in sys.argv[1:] if os.access(p, os.W_OK)])"
-    places = ("/", "/data", "/opt/code", TMP, "/data/store", "/data/spool")
+    places = ("/", "/data", "/opt/code", TMP, "/data/store", "/data/spool", "/data/studies")
     for name, writable in (
         ("episode_store", [TMP, "/data/store"]),
+        ("alignment", [TMP, "/data/store"]),
         ("acquisition", [TMP, "/data/spool"]),
+        ("studies", [TMP]),
         ("twin", [TMP]),
         ("world_model", [TMP]),
         ("dashboard", [TMP]),
@@ -75,6 +79,15 @@ def test_nothing_but_volumes_and_tmp_can_be_written(composed, engine):
             assert re.search(rf"^Cap{kind}:\t0{{16}}$", status, re.M), name
         assert re.search(r"^NoNewPrivs:\t1$", status, re.M), name
         assert not engine.podman("diff", name).stdout.strip().replace("C /etc", ""), name
+
+
+def test_services_of_others_have_no_privileges(composed, engine):
+    for name in ("redis", "gateway"):
+        status = Path(f"/proc/{composed.pid(name)}/status").read_text()
+        assert not re.search(r"^Uid:\t0\t", status, re.M), name
+        for kind in ("Inh", "Prm", "Eff", "Bnd", "Amb"):
+            assert re.search(rf"^Cap{kind}:\t0{{16}}$", status, re.M), name
+        assert re.search(r"^NoNewPrivs:\t1$", status, re.M), name
 
 
 def test_a_take_becomes_an_episode(ask, episode_id, take):
@@ -125,6 +138,25 @@ def test_an_operator_signs_in(composed, key, take, open_page):
     page.get_by_role("button", name="Sign in").click()
     expect(page.get_by_role("heading", name="Recorder")).to_be_visible()
     expect(page.locator("#link")).to_have_text("live")
+    failures = []
+    page.on("pageerror", failures.append)
+    page.on("response", lambda answer: failures.append(answer) if answer.status >= 400 else None)
+    for screen in [screen for screen in SCREENS if not screen.within]:
+        page.goto(composed.url("dashboard") + screen.path)
+        expect(page.get_by_role("heading", level=1)).to_be_visible()
+        page.wait_for_load_state("networkidle")
+        assert not failures, f"{screen.path}: {failures}"
+
+
+def test_a_job_writes_into_the_store(composed, ask):
+    def num_episodes():
+        return len(ask("GET", "episode_store", "/v1/episodes")["episodes"])
+
+    before = num_episodes()
+    words = ("dextouch", "twin", "record", "--task", "stand_bottle", "--seeds", "0:1")
+    done = composed.run_once("twin_episodes", *words, "--store", "/data/store")
+    assert done.returncode == 0, done.stdout + done.stderr
+    wait_for("episode", 60, lambda: num_episodes() == before + 1, composed.logs)
 
 
 def test_keys_are_required(composed, engine):

@@ -95,6 +95,39 @@ async def looked_again(jobs):
         await asyncio.sleep(LOOK_PERIOD_S)
 
 
+async def test_what_found_the_disk_full_is_tried_again(store, worker, monkeypatch):
+    monkeypatch.setattr(new_recordings, "RETRY_S", 0.5)
+    run, is_full = worker.run, True
+
+    def without_space(self, name, *more):
+        if is_full:
+            worker.started.append(name)
+            raise StorageFullError("write episode: no space left")
+        return run(self, name, *more)
+
+    worker.run = without_space
+    write_recording(store, "take")
+    async with served(store) as jobs:
+
+        async def failed_twice():
+            return worker.started.count("take") > 1 and "take" in await jobs(state="failed")
+
+        await until(failed_twice)
+        (failed,) = (await jobs(state="failed")).values()
+        assert (failed["problem"]["status"], failed["options"]) == (
+            507,
+            AlignmentOptions().model_dump(mode="json"),
+        )
+        is_full = False
+
+        async def done():
+            return "take" in await jobs(state="done")
+
+        await until(done)
+        assert len(await jobs()) == 1
+    assert len(store.list()) == 1
+
+
 async def test_what_cannot_be_aligned_is_listed_with_its_reason_and_not_tried_again(store, worker):
     write_recording(store, "headless", streams=("wrist_left", "wrist_right"))
     async with served(store) as jobs:

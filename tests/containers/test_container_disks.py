@@ -1,0 +1,130 @@
+"""Full disks below the spool and the store: errors name the cause, nothing acknowledged is lost."""
+
+import pytest
+
+from tests.system.compose_processes import record_take, wait_for
+
+pytestmark = pytest.mark.containers
+TAKE_S = 3.0
+# The uploader comes back 30 s after the store said that it is full; alignment after a minute.
+FREED_TIMEOUT_S = 300.0
+MIB = 1 << 20
+PROMPT = {"task": "stand_bottle", "instruction": "stand the bottle up", "consent": True}
+
+
+@pytest.fixture
+def fill(disks):
+    """Fill a disk; it is freed at the end in any case."""
+
+    def fill(name, leave_bytes=0):
+        disks[name].fill(leave_bytes=leave_bytes)
+        assert disks[name].free_bytes() <= leave_bytes
+
+    yield fill
+    for disk in disks.values():
+        disk.free()
+
+
+@pytest.fixture
+def refused(composed, client):
+    """Ask a station for what its full disk must refuse; the reason."""
+
+    def refused(action, body=None):
+        answer = client.post(f"{composed.url('acquisition')}/v1/recorder/{action}", json=body)
+        assert answer.status_code == 507, answer.text
+        return answer.json()["detail"]
+
+    return refused
+
+
+def test_a_spool_that_fills_up_ends_the_take_and_keeps_it(
+    composed, disks, ask, fill, refused, arrived
+):
+    ask("POST", "acquisition", "/v1/recorder/arm", json=PROMPT)
+    recording_id = ask("POST", "acquisition", "/v1/recorder/record")["recording_id"]
+
+    def status():
+        return ask("GET", "acquisition", "/v1/recorder")
+
+    wait_for("samples", 30, lambda: status()["duration_s"] > TAKE_S, composed.logs)
+    before = status()["num_samples"]
+    fill("spool")
+    wait_for("end of the take", 30, lambda: status()["state"] == "checking", composed.logs)
+    ended = status()
+    assert "no space left" in ended["check"]["cause"]["message"]
+    assert any("no space left" in problem for problem in ended["problems"])
+    counted = {take["stream"]: take["num_samples"] for take in ended["check"]["streams"]}
+    assert all(counted[name] >= count for name, count in before.items())
+    save = {"success": True, "accept_incomplete": True}
+    assert "space" in refused("save", save)
+    composed.wait_healthy("acquisition")
+    disks["spool"].free()
+    assert ask("POST", "acquisition", "/v1/recorder/save", json=save)["state"] == "saved"
+    arrived(recording_id, counted)
+    arrived(*record_take(ask, TAKE_S, composed.logs))
+
+
+def test_a_nearly_full_spool_begins_no_take(composed, disks, ask, fill, refused, arrived):
+    fill("spool", leave_bytes=32 * MIB)
+    ask("POST", "acquisition", "/v1/recorder/arm", json=PROMPT)
+    reason = refused("record")
+    assert "32 MiB free, 64 MiB are reserved" in reason
+    assert "free space" in reason
+    disks["spool"].free()
+    arrived(*record_take(ask, TAKE_S, composed.logs))
+
+
+@pytest.mark.parametrize("begun", [False, True], ids=["before", "during"])
+def test_a_full_store_delays_the_upload_and_names_the_cause(
+    composed, disks, ask, fill, uploading, arrived, begun
+):
+    if not begun:
+        fill("store")
+    recording_id, num_samples = record_take(ask, TAKE_S, composed.logs)
+    if begun:
+        uploading(recording_id)
+        fill("store")
+
+    def error():
+        found = {item["recording_id"]: item for item in ask("GET", "acquisition", "/v1/uploads")}
+        assert not found[recording_id]["uploaded"]
+        assert not found[recording_id]["refused"]
+        return found[recording_id]["error"] or ""
+
+    wait_for("a reason", 120, error, composed.logs)
+    assert "free space on the store's disk" in error()
+    composed.wait_healthy("episode_store")
+    disks["store"].free()
+    arrived(recording_id, num_samples, limit_s=FREED_TIMEOUT_S)
+
+
+def test_a_full_store_delays_the_alignment(composed, disks, ask, fill, arrived):
+    recording_id, num_samples = record_take(ask, TAKE_S, composed.logs)
+    arrived(recording_id, num_samples)
+    fill("store")
+
+    def job():
+        params = {"recording_id": recording_id}
+        found = ask("GET", "alignment", "/v1/alignments", params=params)["alignments"]
+        return found[0] if found else None
+
+    wait_for(
+        "the end of an attempt",
+        FREED_TIMEOUT_S,
+        lambda: job() is None or job()["state"] in {"failed", "done"},
+        composed.logs,
+    )
+    ended = job()
+    if ended is not None:
+        # Not done: it was either submitted before there was no space, or never.
+        assert ended["state"] == "failed", ended
+        assert "space" in ended["problem"]["detail"]
+    composed.wait_healthy("alignment")
+    disks["store"].free()
+
+    def tried_again():
+        return job() is not None and job() != ended and job()["state"] in {"done", "failed"}
+
+    wait_for("another attempt", FREED_TIMEOUT_S, tried_again, composed.logs)
+    # Mocks play in real time, so that a busy machine leaves gaps.
+    assert job()["state"] == "done" or "gap" in job()["problem"]["detail"], job()
