@@ -36,8 +36,9 @@ class NewRecordings:
     A recording is skipped when it has a job, in whatever state; when an episode
     made from it is in the store or its trash, under any options; or when it is a calibration take.
     One that cannot be aligned becomes a failed job with the reason; if the disk was full, it is
-    submitted again after RETRY_S. One that cannot be read is logged and tried again after RETRY_S. One that comes back under the id of another that was
-    deleted while this was watching counts as new unless an episode was made from its content.
+    submitted again after RETRY_S. One that cannot be read is logged and tried again after RETRY_S.
+    One that comes back under the id of another that was deleted while this was watching counts as
+    new unless an episode was made from its content.
     """
 
     def __init__(self, store: EpisodeStore, jobs: JobRunner) -> None:

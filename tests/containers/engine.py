@@ -99,7 +99,8 @@ class Engine:
     def build(self, tag, containerfile, *, context, flags=()):
         """Build an image, in the way of a machine whose pip may have a configuration of its own."""
         self.run(
-            *("nice", "-n", "10", "buildah", "bud", "--layers", "--format", "docker"),
+            *("nice", "-n", max(0, 10 - os.nice(0)), "buildah", "bud"),
+            *("--layers", "--format", "docker"),
             *("--isolation", "chroot", "--pull-never", *_package_sources(self.folder), *flags),
             *("-t", tag, "-f", containerfile, context),
             timeout_s=BUILD_TIMEOUT_S,

@@ -1,5 +1,6 @@
 """Factory of service applications: middleware, problem+json errors, health and metrics."""
 
+import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import (
     AbstractAsyncContextManager,
@@ -37,6 +38,7 @@ from dextouch.serving.documentation import document_service
 from dextouch.serving.guard import AccessControl, Admits, BodyRules, GuardMiddleware, SitePolicy
 from dextouch.serving.masking import hide_secrets, masked
 from dextouch.serving.settings import ServiceSettings
+from dextouch.serving.spans import SPANS
 
 logger = structlog.get_logger(__name__)
 
@@ -121,6 +123,7 @@ def _started(lifespan: Lifespan | None) -> Lifespan:
             app.state.running = True
             yield
             app.state.running = False
+        await asyncio.to_thread(SPANS.close)
 
     return around
 

@@ -5,6 +5,7 @@ extra `tracing`. Without either, this module imports nothing.
 """
 
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -16,17 +17,21 @@ from starlette.types import Scope
 from dextouch.tracing import TraceContext, in_trace, new_trace, parse_traceparent
 
 if TYPE_CHECKING:
+    from opentelemetry.sdk.trace import TracerProvider
     from opentelemetry.trace import Tracer
 
 logger = structlog.get_logger(__name__)
 
 ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
+# How long a service that ends waits for its collector.
+FLUSH_S = 2.0
 
 
 class Spans:
     """Where spans of requests go; `tracer` is None while they go nowhere."""
 
     tracer: "Tracer | None" = None
+    provider: "TracerProvider | None" = None
 
     def configure(self, service: str) -> None:
         """Export spans if an endpoint is set and the SDK is installed."""
@@ -42,9 +47,17 @@ class Spans:
             logger.warning("spans_not_exported", reason="pip install 'dextouch-wm[tracing]'")
             return
         resource = resources.Resource.create({"service.name": service})
-        provider = sdk.TracerProvider(resource=resource)
+        # Its own handler at exit would wait half a minute, and does not run after a signal.
+        provider = sdk.TracerProvider(resource=resource, shutdown_on_exit=False)
         provider.add_span_processor(export.BatchSpanProcessor(otlp.OTLPSpanExporter()))
-        self.tracer = provider.get_tracer("dextouch")
+        self.provider, self.tracer = provider, provider.get_tracer("dextouch")
+
+    def close(self) -> None:
+        """Export the spans that wait; gives up after FLUSH_S, since the collector may be gone."""
+        if self.provider is not None:
+            closing = threading.Thread(target=self.provider.shutdown, name="spans", daemon=True)
+            closing.start()
+            closing.join(FLUSH_S)
 
     @contextmanager
     def of_request(self, scope: Scope, caller: TraceContext | None) -> Iterator[TraceContext]:

@@ -1,6 +1,8 @@
 """One trace from a client's call across two services: ids, logs, problems and exported spans."""
 
+import asyncio
 import re
+import threading
 
 import httpx
 import pytest
@@ -162,6 +164,52 @@ async def test_spans_of_one_call_are_one_trace(monkeypatch):
     assert store.parent.span_id == forwarded.context.span_id
     assert store.attributes["http.response.status_code"] == 200
     assert store.attributes["http.route"] == "/v1/episodes"
+
+
+async def test_a_service_that_ends_exports_the_spans_that_wait(monkeypatch):
+    sdk = pytest.importorskip("opentelemetry.sdk.trace", reason="extra tracing")
+    export = pytest.importorskip("opentelemetry.sdk.trace.export")
+    exporter, provider = HeldExporter(), sdk.TracerProvider(shutdown_on_exit=False)
+    # So that nothing is exported before the end.
+    provider.add_span_processor(export.BatchSpanProcessor(exporter, schedule_delay_millis=60_000))
+    monkeypatch.setattr(SPANS, "tracer", provider.get_tracer("test"))
+    monkeypatch.setattr(SPANS, "provider", provider)
+    app = service()
+    exporter.answers.set()
+    async with app.router.lifespan_context(app), client_of(app) as client:
+        await client.get("/healthz")
+        assert exporter.names == []
+    assert exporter.names == ["GET /healthz"]
+
+
+async def test_a_service_does_not_wait_long_for_a_collector_that_is_gone(monkeypatch):
+    sdk = pytest.importorskip("opentelemetry.sdk.trace", reason="extra tracing")
+    export = pytest.importorskip("opentelemetry.sdk.trace.export")
+    exporter, provider = HeldExporter(), sdk.TracerProvider(shutdown_on_exit=False)
+    provider.add_span_processor(export.BatchSpanProcessor(exporter))
+    monkeypatch.setattr(SPANS, "tracer", provider.get_tracer("test"))
+    monkeypatch.setattr(SPANS, "provider", provider)
+    monkeypatch.setattr("dextouch.serving.spans.FLUSH_S", 0.1)
+    app = service()
+    async with asyncio.timeout(20):
+        async with app.router.lifespan_context(app), client_of(app) as client:
+            await client.get("/healthz")
+    assert exporter.names == []
+    exporter.answers.set()
+
+
+class HeldExporter:
+    """Exports nothing until its collector answers."""
+
+    def __init__(self):
+        self.answers, self.names = threading.Event(), []
+
+    def export(self, spans):
+        self.answers.wait(60)
+        self.names += [span.name for span in spans]
+
+    def shutdown(self):
+        pass
 
 
 def test_nothing_is_exported_unless_it_is_configured(monkeypatch):
