@@ -14,7 +14,7 @@ DATA_PATH = ("acquisition", "episode_store", "alignment")
 KINDS = ("kill", "pause", "cut", "full disk")
 PROMPT = {"task": "stand_bottle", "instruction": "stand the bottle up", "consent": True}
 TAKE_S = 3.0
-ACTION_TIMEOUT_S = 60.0
+ACTION_TIMEOUT_S = 180.0
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Operator(threading.Thread):
         super().__init__(name="operator")
         headers = {"authorization": f"Bearer {key}"}
         self._client = httpx.Client(
-            base_url=f"{url}/v1/recorder", headers=headers, timeout=5, trust_env=False
+            base_url=f"{url}/v1/recorder", headers=headers, timeout=10, trust_env=False
         )
         self._stopping = threading.Event()
         self.counted, self.ended, self.refusals, self.failure = {}, set(), set(), None

@@ -10,7 +10,7 @@ import yaml
 from tests.containers.engine import ROOT, Engine
 from tests.system.compose_processes import free_port, interpolate, start_order, wait_for
 
-HEALTH_TIMEOUT_S = 180.0
+HEALTH_TIMEOUT_S = 600.0
 NETWORK = "dextouch"
 READ = {
     *("image", "build", "command", "environment", "healthcheck", "depends_on", "ports", "profiles"),
@@ -149,7 +149,7 @@ class Composed:
     def kill(self, name):
         """End a container as the kernel does, and start it as `restart: unless-stopped` does."""
         old_pid = self.signal(name, signal.SIGKILL)
-        wait_for(f"end of {name}", 30, lambda: self.pid(name) != old_pid, self.logs)
+        wait_for(f"end of {name}", 120, lambda: self.pid(name) != old_pid, self.logs)
         # Podman without systemd may leave this to whoever runs it.
         if not self.engine.inspect(name, ".State.Running"):
             self.engine.podman("start", name)

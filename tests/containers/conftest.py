@@ -19,7 +19,7 @@ from tests.containers.disks import Disk
 from tests.containers.engine import engine_in, missing
 from tests.system.compose_processes import wait_for
 
-ARRIVAL_TIMEOUT_S = 120.0
+ARRIVAL_TIMEOUT_S = 300.0
 _FIGURES = []
 
 
@@ -100,7 +100,7 @@ def disks(composed, engine):
 def client(key):
     """HTTP with the key."""
     headers = {"authorization": f"Bearer {key}"}
-    with httpx.Client(headers=headers, timeout=60, trust_env=False) as client:
+    with httpx.Client(headers=headers, timeout=120, trust_env=False) as client:
         yield client
 
 

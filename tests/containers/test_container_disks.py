@@ -7,7 +7,7 @@ from tests.system.compose_processes import record_take, wait_for
 pytestmark = pytest.mark.containers
 TAKE_S = 3.0
 # The uploader comes back 30 s after the store said that it is full; alignment after a minute.
-FREED_TIMEOUT_S = 300.0
+FREED_TIMEOUT_S = 600.0
 MIB = 1 << 20
 PROMPT = {"task": "stand_bottle", "instruction": "stand the bottle up", "consent": True}
 
@@ -49,7 +49,7 @@ def test_a_spool_that_fills_up_ends_the_take_and_keeps_it(
     wait_for("samples", 30, lambda: status()["duration_s"] > TAKE_S, composed.logs)
     before = status()["num_samples"]
     fill("spool")
-    wait_for("end of the take", 30, lambda: status()["state"] == "checking", composed.logs)
+    wait_for("end of the take", 60, lambda: status()["state"] == "checking", composed.logs)
     ended = status()
     assert "no space left" in ended["check"]["cause"]["message"]
     assert any("no space left" in problem for problem in ended["problems"])
@@ -91,7 +91,7 @@ def test_a_full_store_delays_the_upload_and_names_the_cause(
         assert not found[recording_id]["refused"]
         return found[recording_id]["error"] or ""
 
-    wait_for("a reason", 120, error, composed.logs)
+    wait_for("a reason", 300, error, composed.logs)
     assert "free space on the store's disk" in error()
     composed.wait_healthy("episode_store")
     disks["store"].free()

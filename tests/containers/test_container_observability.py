@@ -14,9 +14,9 @@ OURS = (
     *("acquisition", "episode_store", "alignment", "studies", "dashboard"),
     *("twin", "world_model"),
 )
-SCRAPED_TIMEOUT_S = 120.0
+SCRAPED_TIMEOUT_S = 300.0
 # A scrape, 30 s of the alert, an evaluation, and a busy machine.
-FIRING_TIMEOUT_S = 180.0
+FIRING_TIMEOUT_S = 300.0
 # Receives spans as collectors do, decoded by the classes that OpenTelemetry publishes.
 COLLECTOR = """
 import gzip, json
