@@ -107,9 +107,8 @@ class Operator(threading.Thread):
     def __init__(self, url, key):
         super().__init__(name="operator")
         headers = {"authorization": f"Bearer {key}"}
-        self._client = httpx.Client(
-            base_url=f"{url}/v1/recorder", headers=headers, timeout=10, trust_env=False
-        )
+        self._url = f"{url}/v1/recorder"
+        self._client = httpx.Client(headers=headers, timeout=10, trust_env=False)
         self._stopping = threading.Event()
         self.counted, self.ended, self.refusals, self.failure = {}, set(), set(), None
 
@@ -153,7 +152,7 @@ class Operator(threading.Thread):
         deadline_s = time.monotonic() + ACTION_TIMEOUT_S
         while True:
             with suppress(httpx.TransportError):
-                answer = self._client.request(method, path, json=body)
+                answer = self._client.request(method, self._url + path, json=body)
                 if answer.is_success:
                     return answer.json()
                 self.refusals.add(f"{answer.status_code} {answer.json()['detail']}")

@@ -104,8 +104,9 @@ class Composed:
         """Run a service, or another command as it, beside the others until it ends."""
         words = self.words(name, environment=environment)
         for flag in ("--name", "--network", "--publish", "--restart"):
-            at = words.index(flag)
-            del words[at : at + 2]
+            while flag in words:
+                at = words.index(flag)
+                del words[at : at + 2]
         own = self.services[name]["command"]
         words = [*words[1 : -len(own)], *(command or own)]
         return self.engine.podman("run", "--rm", "--network", network, *words, check=False)
