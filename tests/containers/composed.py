@@ -142,8 +142,11 @@ class Composed:
         return self.engine.inspect(name, ".State.Pid")
 
     def signal(self, name, number):
-        """Send a signal to the first process of a container; its id."""
+        """Send a signal to the first process of a container, once it runs; its id."""
+        # 0 while it is started again, which would be this process and its group.
+        wait_for(f"{name} to run", 120, lambda: self.pid(name) > 0, self.logs)
         pid = self.pid(name)
+        assert pid > 0, f"{name} does not keep running\n{self.log(name)}"
         os.kill(pid, number)
         return pid
 

@@ -92,9 +92,8 @@ def test_services_of_others_have_no_privileges(composed, engine):
 
 def test_a_take_becomes_an_episode(ask, episode_id, take):
     detail = ask("GET", "episode_store", f"/v1/episodes/{episode_id}")
-    # 15 steps a second of what was recorded, less the edges that not every stream covers (they are
-    # long where the machine is busy).
-    assert detail["num_steps"] >= 15 * TAKE_S / 2
+    # 15 steps a second of the longest part without gaps, which are many where the machine is busy.
+    assert 1 < detail["num_steps"] <= 15 * (TAKE_S + 1.0)
     lineage = [(entry["kind"], entry["id"]) for entry in detail["attributes"]["lineage"]]
     assert ("recording", take) in lineage
 
