@@ -162,9 +162,10 @@ def test_every_service_exports_its_requests(composed, spans):
 
 def test_a_trace_goes_through_the_dashboard_to_the_store(composed, key, spans):
     trace_id, parent_id = secrets.token_hex(16), secrets.token_hex(8)
-    headers = {"authorization": f"Bearer {key}", "traceparent": f"00-{trace_id}-{parent_id}-01"}
-    url = composed.url("dashboard") + "/v1/episode_store/recordings"
-    assert httpx.get(url, headers=headers, trust_env=False, timeout=60).is_success
+    with httpx.Client(base_url=composed.url("dashboard"), trust_env=False, timeout=60) as browser:
+        assert browser.post("/sign_in", data={"key": key}).status_code < 400
+        headers = {"traceparent": f"00-{trace_id}-{parent_id}-01"}
+        assert browser.get("/v1/episode_store/recordings", headers=headers).is_success
 
     def ours():
         return {
