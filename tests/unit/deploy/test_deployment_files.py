@@ -127,6 +127,17 @@ def test_image_runs_without_root_and_with_health():
         assert service["image"] == f"dextouch:{service['build']['target']}"
 
 
+def test_what_the_image_copies_is_let_into_its_build():
+    text = (ROOT / "deploy/Dockerfile").read_text()
+    let_in = set((ROOT / "deploy/Dockerfile.dockerignore").read_text().split())
+    copied = {
+        name for line in re.findall(r"^COPY (?!--)(.+) \S+$", text, re.M) for name in line.split()
+    }
+    assert {"docs", "services", "pyproject.toml"} <= copied
+    for name in copied:
+        assert f"!{name}" in let_in or f"!{name}/dextouch" in let_in, name
+
+
 def test_udev_rules_parse_and_name_devices_once():
     lines = (ROOT / "deploy/udev/60-dextouch.rules").read_text().splitlines()
     rules = [line for line in lines if line and not line.startswith("#")]
