@@ -205,6 +205,7 @@ def test_online_clock_costs_microseconds(capsys):
 @pytest.mark.parametrize(
     ("kind", "min_wraps"), [("u16 sequence", 1), ("u32 us", 20), ("48 MHz u32", 900)]
 )
+@pytest.mark.slow
 def test_a_day_of_wrapping_counters(kind, min_wraps, capsys):
     found = json.loads(probe(DAY_PROBE, kind))
     tell(

@@ -61,12 +61,14 @@ def figures(shipped, episodes):
 
 
 @pytest.mark.parametrize("kind", ["commanded", "measured"])
+@pytest.mark.slow
 def test_sight_beats_copying(figures, kind):
     assert figures[kind]["psnr"] > figures[kind]["psnr_copy"] + 2.8
     assert figures[kind]["psnr"] < figures[kind]["psnr_codec"]
 
 
 @pytest.mark.parametrize("kind", ["commanded", "measured"])
+@pytest.mark.slow
 def test_touch_beats_copying_and_nothing(figures, kind):
     rivals = figures[kind]["tactile_mse_copy"], figures[kind]["tactile_mse_zero"]
     # Reached: 0.143 with commanded actions, 0.119 with measured ones.
@@ -75,6 +77,7 @@ def test_touch_beats_copying_and_nothing(figures, kind):
 
 
 @pytest.mark.parametrize("kind", ["commanded", "measured"])
+@pytest.mark.slow
 def test_false_actions_for_the_same_moment_are_seen_and_felt(figures, kind):
     given = figures[kind]
     # Most of what images gain over standing still is the head's own motion.

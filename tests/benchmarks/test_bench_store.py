@@ -163,6 +163,7 @@ def block_take():
 
 
 @pytest.mark.parametrize("design", benchmark.DESIGNS, ids=lambda design: design.name)
+@pytest.mark.slow
 def test_every_design_gives_back_what_it_was_given(design, block_take, tmp_path):
     """Numbers exactly, images as well as the codec can."""
     assert design.missing() is None

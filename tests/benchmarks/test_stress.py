@@ -40,6 +40,7 @@ def test_cell(cell):
 
 
 @pytest.mark.parametrize(("stage", "hazard"), sorted(UNCHECKED))
+@pytest.mark.slow
 def test_cell_without_shape_checks(stage, hazard):
     words = [sys.executable, "-m", "benchmarks", "stress", stage, "--hazard", hazard]
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=300)

@@ -139,6 +139,7 @@ def test_a_lens_is_calibrated_from_the_page_by_keyboard(page, address, folder, c
 
 
 @pytest.mark.usefixtures("few_poses")
+@pytest.mark.slow
 def test_the_zero_of_a_glove_is_measured_from_the_page_by_keyboard(page, address, folder, capsys):
     page.goto(f"{address}/calibration")
     expect(page.locator("tr[data-name=tactile_left_tare_counts]")).to_contain_text("missing")

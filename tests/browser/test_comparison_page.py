@@ -115,6 +115,7 @@ def loops(images, other_images, touch, other_touch):
     return pixels, pressures, f1
 
 
+@pytest.mark.slow
 def test_both_worlds_side_by_side_with_their_errors(page, serve_dashboard, item, expected):
     address, twin, model = serve_dashboard()
     problems = []

@@ -88,6 +88,7 @@ def loaded(serve):
     return serve(create_dashboard(DashboardSettings(acquisition_url=serve(station))))
 
 
+@pytest.mark.slow
 def test_a_loaded_computer_is_one_line_above_ten_rows(open_page, loaded):
     page = open_page(viewport={"width": 1366, "height": 768}, color_scheme="light")
     page.goto(loaded)

@@ -2,6 +2,7 @@
 
 from datetime import UTC, datetime
 
+import pytest
 from playwright.sync_api import expect
 
 from dextouch.episodes import EpisodeStore
@@ -16,6 +17,7 @@ NOON = datetime(2026, 5, 4, 12, tzinfo=UTC)
 HOSTILE = '<img src=x onerror="document.title=1">'
 
 
+@pytest.mark.slow
 def test_hours_and_goals(page, serve, tmp_path):
     store = EpisodeStore(tmp_path / "store")
     # 90 steps are 6 s, which are 0.1 min.

@@ -131,6 +131,7 @@ def reject(page, take):
     expect(page.locator("#empty")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_takes_of_an_operator(watched, station, tmp_path):
     page = watched
     sign_in(page, station)

@@ -297,6 +297,7 @@ def test_an_item_without_cameras(watched, address, played):
     until_clock(watched, "> 3")
 
 
+@pytest.mark.slow
 def test_one_hand_and_hostile_text(watched, address, played):
     shown = opened(watched, f"{address}/episodes/episode/one-hand?at=3")
     assert "tactile_right" not in shown["panes"]

@@ -27,6 +27,7 @@ def settings(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_a_person_rates_all_rollouts(serve, page, settings):
     problems = []
     page.on("pageerror", lambda error: problems.append(str(error)))

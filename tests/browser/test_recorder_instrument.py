@@ -304,6 +304,7 @@ def test_a_hostile_prompt_stays_text(page, open_dashboard, station, tmp_path):
     assert "owned" not in page.title()
 
 
+@pytest.mark.slow
 def test_the_verdict_has_three_lines_and_the_rest_is_folded(page, serve):
     found = [
         {"stream": f"s{i}", "code": "gap", "level": "ERROR", "message": f"s{i}: {i} s missing"}

@@ -141,6 +141,7 @@ def ask_to_discard(page):
     raise AssertionError("the question was not seen")
 
 
+@pytest.mark.slow
 def test_keys_work_again_after_typing(page, address):
     live = open_recorder(page, address)
     fill(page, instruction="Stack the bowls")

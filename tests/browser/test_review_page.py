@@ -50,6 +50,7 @@ def names(page):
     return page.locator("#rows .item_name")
 
 
+@pytest.mark.slow
 def test_what_is_unusual_comes_first_and_leaves_with_a_verdict(page, address, store):
     page.goto(f"{address}/review")
     expect(names(page)).to_have_text(["long", "open", "odd-1", "odd-0"])

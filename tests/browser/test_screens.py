@@ -129,6 +129,7 @@ def look_at_silent_station(screens, address):
     screens.look("station_unreachable", is_tall=True)
 
 
+@pytest.mark.slow
 def test_entrance_and_stations(screens, serve, stations, tmp_path):
     page, address = screens.page, serve_dashboard(serve, tmp_path, stations)
     screens.may_ask(address)

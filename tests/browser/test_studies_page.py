@@ -104,6 +104,7 @@ def test_rates_are_sorted_by_any_column(opened, root):
         opened.get_by_role("button", name="model (imagined)").click()
 
 
+@pytest.mark.slow
 def test_disagreements_come_first_and_every_cell_leads_to_its_rollouts(opened, root):
     finish(root)
     opened.get_by_role("link", name="touch and sight").click()

@@ -172,6 +172,7 @@ def test_policies_of_ones_own_are_scored(folder, url):
     assert kept == [(name, world, 90000) for name in names for world in ("real", "copy-first")]
 
 
+@pytest.mark.slow
 def test_what_a_policy_does_wrong_is_named_and_the_others_are_scored(folder, url):
     wrong = ("nan", "six", "none", "ragged", "gone", "long", "narrow")
     policies = [("--policy", f"{what}=mypolicy:Returning") for what in wrong]

@@ -202,6 +202,7 @@ def observed(chaos, spool_root):
 
 
 @pytest.mark.parametrize("name", CHAOS)
+@pytest.mark.slow
 def test_each_has_exactly_its_causes_on_top(name, tmp_path):
     chaos = CHAOS[name]
     causes = observed(chaos, tmp_path).causes

@@ -129,6 +129,7 @@ def test_an_episode_that_cannot_be_made_is_told_and_the_others_go_on(tmp_path, c
     assert "0 made, 0 kept, 0 succeeded, 2 refused" in told
 
 
+@pytest.mark.slow
 def test_human_hands_pass_the_devices_unless_written_directly(tmp_path, capsys):
     summary = tmp_path / "counts.json"
     argv = ["--tasks", "stack_bowls", "--domains", "human", "--exact", "--images", "20"]

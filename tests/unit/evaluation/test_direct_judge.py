@@ -96,6 +96,7 @@ def test_fingertips_are_those_of_the_hand():
     assert bool(((distances > 0.05) & (distances < 0.3)).all())
 
 
+@pytest.mark.slow
 def test_a_trained_judge_tells_near_from_far(tmp_path):
     settings = DirectSettings(
         num_finder_steps=120, num_judge_steps=200, learning_rate=4e-3, max_cpu_s=60, batch_size=32

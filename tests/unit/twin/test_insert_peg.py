@@ -58,6 +58,7 @@ def test_a_demonstration_inserts_and_its_milestones_agree(peg_stage, seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.slow
 def test_a_miss_inserts_nothing(peg_stage, seed):
     assert not reached_at_every_step(peg_stage, seed, miss=True)[:, 1:].any()
 

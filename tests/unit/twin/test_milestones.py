@@ -38,12 +38,14 @@ def test_a_success_reaches_all_milestones_in_order(stage, tmp_path):
     assert len(stored.object_boxes_m) == len(stored.object_names)
 
 
+@pytest.mark.slow
 def test_a_miss_neither_touches_nor_succeeds(stage):
     episode = record(stage, SEED, TakeOptions(miss=True, images=()))
     assert episode.attributes.success is False
     assert stage.task.milestones[-1] not in episode.attributes.event_times_s
 
 
+@pytest.mark.slow
 def test_a_take_that_holds_still_reaches_nothing(stage):
     frozen = record(stage, SEED, TakeOptions(images=(), frozen_from_step=0))
     assert frozen.attributes.event_times_s == {}

@@ -70,6 +70,7 @@ def test_a_demonstration_places_the_phone_and_its_milestones_agree(phone_stage, 
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.slow
 def test_a_miss_places_nothing(phone_stage, seed):
     assert not reached_at_every_step(phone_stage, seed, miss=True)[:, 1:].any()
 

@@ -91,6 +91,7 @@ def test_an_indexed_episode_says_what_it_is(stored, in_memory):
 
 
 @pytest.mark.parametrize(("num_workers", "start_method"), [(0, None), (2, "fork"), (1, "spawn")])
+@pytest.mark.slow
 def test_batches_are_the_same_in_any_process(stored, in_memory, num_workers, start_method):
     def sampler(episodes):
         return WindowSampler(episodes, np.random.default_rng(3), max_steps=17)

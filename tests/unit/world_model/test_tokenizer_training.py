@@ -111,6 +111,7 @@ def test_principal_axes_take_no_steps(settings):
 
 
 @pytest.mark.parametrize("tokens", ["hand", "pad"])
+@pytest.mark.slow
 def test_the_world_model_keeps_the_tokenizer_frozen(settings, train_settings, toy_episodes, tokens):
     trained = train_tokenizer(settings)
     learned = set(trained.metadata.train_scenes)
