@@ -307,7 +307,7 @@ class Experiments:
                 name = f"generation/{column}/seed-{seed}/policy"
                 seeded = (*words, "--training.seed", str(seed))
                 yield self._policy(name, seeded, needs.get(column, ()))
-                policies[f"{column} {seed}"] = name
+                policies[policy_of(column, seed)] = name
         files = {policy: f"{name}/policy.safetensors" for policy, name in policies.items()}
         yield self._study_step("generation", files, {}, tuple(policies.values()))
 
@@ -321,6 +321,11 @@ class Experiments:
             *("--json", f"{name}/result.json"),
         )
         return Step(name, words, ("store", "result.json"), ("data/downstream", model))
+
+
+def policy_of(column: str, seed: int) -> str:
+    """Name of the policy of a column in the study of generated data; names begin with a letter."""
+    return f"{column.removeprefix('+')} {seed}"
 
 
 def folder_of(column: str) -> str:

@@ -20,6 +20,7 @@ from services.cli.reproduce.experiments import (
     Experiments,
     Table,
     folder_of,
+    policy_of,
 )
 from services.cli.reproduce.pages import Measured, Page, Row
 from services.cli.reproduce.steps import read_json
@@ -220,7 +221,7 @@ def _generation_pages(folder: Path, experiments: Experiments) -> list[Page]:
             task,
             {
                 column: Measured(
-                    tuple(rate[task, f"{column} {seed}"] for seed in experiments.seeds)
+                    tuple(rate[task, policy_of(column, seed)] for seed in experiments.seeds)
                 )
                 for column in GENERATED
             },

@@ -22,6 +22,7 @@ from services.cli.reproduce.provenance import data_of
 from services.cli.reproduce.sizes import QUICK, Sizes
 from services.cli.reproduce.steps import Runner, Step
 from services.cli.reproduce.tables import METRICS, make_pages
+from services.evaluation.studies.definition import read_definition
 
 # A command that appends its last word to a file and writes the result that its first word names.
 PROGRAM = (
@@ -142,6 +143,17 @@ def test_a_table_takes_only_the_steps_it_needs():
     assert "design/V-only/seed-0/prediction" in names
     assert "data/robot" in names
     assert not any(name.startswith(("scaling", "evaluator", "data/human")) for name in names)
+
+
+def test_studies_are_read_by_the_command_that_runs_them(tmp_path):
+    studies = [step for step in Experiments(Sizes(), (0, 1)).steps(TABLES) if step.inputs]
+    assert [step.name for step in studies] == ["evaluator/study", "generation/study"]
+    for step in studies:
+        ((_, text),) = step.inputs
+        path = tmp_path / "study.toml"
+        path.write_text(text)
+        assert read_definition(path).num_starts == Sizes().num_starts
+    assert len(read_definition(path).policies) == 8
 
 
 def test_the_table_of_scaling_takes_the_models_without_human_data():
