@@ -44,7 +44,9 @@ class Measured:
         sign = "+" if signed else ""
         if not math.isfinite(self.half_width):
             return f"{self.mean:{sign}.4g}"
-        digits = max(0, 1 - math.floor(math.log10(self.half_width))) if self.half_width else 4
+        # Seeds that agree leave the rounding of their mean.
+        is_zero = self.half_width <= 1e-9 * max(map(abs, self.values))
+        digits = 4 if is_zero else max(0, 1 - math.floor(math.log10(self.half_width)))
         return f"{self.mean:{sign}.{digits}f} ± {self.half_width:.{digits}f}"
 
 

@@ -178,6 +178,8 @@ def test_the_interval_is_students():
     assert measured.half_width == pytest.approx(4.3027 * spread / math.sqrt(3), rel=1e-4)
     assert Measured((3.0,)).text() == "3"
     assert Measured((math.nan, math.nan)).text() == "n/a"
+    assert Measured((0.1, 0.1, 0.1)).text() == "0.1000 ± 0.0000"
+    assert Measured((0.0, 0.0)).text() == "0.0000 ± 0.0000"
 
 
 def test_differences_are_taken_seed_by_seed():
