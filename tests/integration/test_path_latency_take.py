@@ -16,7 +16,7 @@ from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import MockPlace, ReplayStream
 from services.acquisition.station import Station
 
-SECONDS = 20
+SECONDS = 40
 PATH_DELAY_MS = 12.0
 PROMPT = TakePrompt(task="stand_bottle", instruction="stand the bottle up")
 
