@@ -13,7 +13,9 @@ from tests.system.wheel_environment import ROOT, build, own_packages
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 
-SERVICES = {"episode_store", "alignment", "acquisition", "twin", "world_model", "dashboard"}
+SERVICES = {
+    *("episode_store", "alignment", "acquisition", "twin", "world_model", "studies", "dashboard")
+}
 # Of a machine that is busy with other things; the solver may be compiled first.
 READY_LIMIT_S = 900
 IMPORT_ALL = """
@@ -51,6 +53,7 @@ def test_the_wheel_holds_every_file_of_both_packages(installed):
         files_below(ROOT / "services", Path("dextouch_services"))
         | files_below(ROOT / "shared/dextouch", Path("dextouch"))
         | files_below(ROOT / "deploy", share / "dextouch/deploy")
+        | files_below(ROOT / "docs", share / "dextouch/docs")
         | {str(share / "dextouch/docker-compose.yml")}
     )
     for path in own_packages(installed).values():
@@ -91,6 +94,7 @@ def test_all_services_answer_and_stop(installed):
                 wait_until_ready(client, name, url)
             page = client.get(urls["dashboard"])
             style = client.get(f"{urls['dashboard']}/static/style.css")
+            guide = client.get(f"{urls['dashboard']}/help/dashboard")
     finally:
         running.send_signal(signal.SIGINT)
         _, errors = running.communicate(timeout=120)
@@ -98,6 +102,8 @@ def test_all_services_answer_and_stop(installed):
     assert set(urls) == SERVICES
     assert page.is_success
     assert style.is_success
+    assert guide.is_success
+    assert "Recordings and episodes" in guide.text
 
 
 def test_the_demo_ends_well(installed):
