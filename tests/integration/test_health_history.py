@@ -67,16 +67,19 @@ def test_there_is_a_row_a_second(recorded):
 
 
 @pytest.mark.parametrize(
-    ("stream", "span_s"), [("tactile_left", STALL_S), ("head", UNPLUGGED_S)], ids=["stall", "plug"]
+    ("stream", "span_s", "late_s"),
+    [("tactile_left", STALL_S, 0.05), ("head", UNPLUGGED_S, 0.3)],
+    ids=["stall", "plug"],
 )
-def test_silences_are_where_the_script_has_them(recorded, stream, span_s):
+def test_silences_are_where_the_script_has_them(recorded, stream, span_s, late_s):
     t_s, values, _, _ = recorded
     inside_s = overlap_s(t_s, span_s)
     seconds = np.diff(t_s, prepend=t_s[0] - 1.0)
     gaps_s = values[stream]["gap_ratio"] * seconds
-    # A gap begins with the last sample before, and ends with the first after opening it again.
-    np.testing.assert_allclose(gaps_s, inside_s, atol=0.05)
-    assert gaps_s.sum() == pytest.approx(span_s[1] - span_s[0], abs=0.05)
+    # A gap begins with the last sample before, and ends with the first after opening it again,
+    # which a busy machine may only do at the next try.
+    np.testing.assert_allclose(gaps_s, inside_s, atol=late_s)
+    assert gaps_s.sum() == pytest.approx(span_s[1] - span_s[0], abs=late_s)
     rate_hz, is_all = values[stream]["rate_hz"], inside_s > seconds - 1e-6
     assert is_all.sum() >= 1
     nominal_hz = {"tactile_left": 60, "head": 100}[stream]
@@ -84,7 +87,7 @@ def test_silences_are_where_the_script_has_them(recorded, stream, span_s):
     quiet = overlap_s(t_s, (span_s[0] - ROW_S, span_s[1] + 2 * ROW_S)) == 0
     np.testing.assert_allclose(rate_hz[quiet], nominal_hz, rtol=0.02)
     assert values[stream]["level"][is_all].max() == 3  # STALE
-    assert values[stream]["age_s"].max() <= span_s[1] - span_s[0] + 0.1
+    assert values[stream]["age_s"].max() <= span_s[1] - span_s[0] + 0.05 + late_s
 
 
 def test_losses_are_those_of_the_ledger(recorded):
