@@ -7,7 +7,7 @@ The table is the intention: it does not come from the routes' own declarations. 
 import httpx
 import pytest
 
-from dextouch.serving.guard import ApiKey
+from dextouch.serving.keys import ApiKey
 from services.cli.up import BUILDERS
 from services.dashboard.upstream import Upstream
 from tests.contracts.service_apps import APPS, all_routes, client_of, open_websocket

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dextouch.serving.guard import ApiKey
+from dextouch.serving.keys import ApiKey
 from services.cli.up import BUILDERS
 from tests.contracts.service_apps import APPS, UP, client_of, dashboard
 

@@ -17,7 +17,7 @@ from schemathesis.specs.openapi import checks
 
 from dextouch.episodes import EpisodeStore
 from dextouch.serving import JSON
-from dextouch.serving.guard import ApiKey
+from dextouch.serving.keys import ApiKey
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.acquisition.settings import AcquisitionSettings
 from services.alignment.settings import AlignmentSettings

@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from dextouch.serving.guard import KIB as KIB
     from dextouch.serving.guard import MSGPACK as MSGPACK
     from dextouch.serving.guard import OCTETS as OCTETS
-    from dextouch.serving.guard import AccessControl as AccessControl
-    from dextouch.serving.guard import Grant as Grant
-    from dextouch.serving.guard import RequireScope as RequireScope
     from dextouch.serving.guard import media_type as media_type
-    from dextouch.serving.guard import not_signed_in as not_signed_in
-    from dextouch.serving.guard import secret_digest as secret_digest
     from dextouch.serving.guard import takes as takes
     from dextouch.serving.json_bodies import JsonBody as JsonBody
+    from dextouch.serving.keys import AccessControl as AccessControl
+    from dextouch.serving.keys import Grant as Grant
+    from dextouch.serving.keys import RequireScope as RequireScope
+    from dextouch.serving.keys import not_signed_in as not_signed_in
+    from dextouch.serving.keys import secret_digest as secret_digest
     from dextouch.serving.logs import configure_logging as configure_logging
     from dextouch.serving.masking import masked as masked
     from dextouch.serving.settings import MAX_WEBSOCKET_BYTES as MAX_WEBSOCKET_BYTES

@@ -35,7 +35,8 @@ from dextouch.schemas import (
 )
 from dextouch.serving.connections import RequestMiddleware, ShortcutMiddleware
 from dextouch.serving.documentation import document_service
-from dextouch.serving.guard import AccessControl, Admits, BodyRules, GuardMiddleware, SitePolicy
+from dextouch.serving.guard import Admits, BodyRules, GuardMiddleware, SitePolicy
+from dextouch.serving.keys import AccessControl
 from dextouch.serving.masking import hide_secrets, masked
 from dextouch.serving.settings import ServiceSettings
 from dextouch.serving.spans import SPANS

@@ -1,12 +1,10 @@
-"""What a service lets in: host name and origin, key and scope, media type and size of the body.
+"""What a service lets in: host name and origin, a key, media type and size of the body.
 
 Browsers let any page send requests to any address (CSRF), and with DNS rebinding a page can even
 read the responses. So a request without a key must come from a page of this service, or not from a
 page at all.
 """
 
-import hashlib
-import hmac
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -18,7 +16,6 @@ from typing import TypeVar
 import structlog
 from fastapi import APIRouter
 from fastapi.routing import APIRoute
-from pydantic import Field, SecretStr
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection, Request
@@ -27,9 +24,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.types import Message as AsgiMessage
 
 from dextouch.errors import AccessDeniedError, DexTouchError
-from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import KEY_NAME_PATTERN
 from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
+from dextouch.serving.keys import AccessControl, no_key, not_signed_in
 
 logger = structlog.get_logger(__name__)
 
@@ -127,115 +123,6 @@ def _foreign_origin(got: str, own: str) -> AccessDeniedError:
         f"got a request of {got}, expected one of {own} or of the setting allowed_origins",
         reason="foreign_origin",
     )
-
-
-class Grant(FrozenModel):
-    """What a key allows; `name` appears in logs."""
-
-    name: str = Field(pattern=KEY_NAME_PATTERN)
-    scopes: tuple[str, ...] = Field(min_length=1)
-
-    def require(self, scope: str) -> None:
-        """Raise AccessDeniedError if the key lacks a scope."""
-        if scope not in self.scopes:
-            raise AccessDeniedError(
-                f"key {self.name!r} lacks the scope {scope!r}; it has: {', '.join(self.scopes)}",
-                reason="missing_scope",
-                scope=scope,
-            )
-
-
-class ApiKey(Grant):
-    """A key of the settings."""
-
-    key: SecretStr = Field(min_length=16)
-
-
-def not_signed_in() -> AccessDeniedError:
-    """Error for a browser without a session."""
-    return AccessDeniedError("not signed in: open / and sign in", reason="missing_key")
-
-
-def _no_key(authorization: str | None) -> AccessDeniedError:
-    if _token(authorization) is not None:
-        return AccessDeniedError("unknown key", reason="unknown_key")
-    return AccessDeniedError(
-        "no key: expected the header 'Authorization: Bearer KEY'", reason="missing_key"
-    )
-
-
-class AccessControl:
-    """The keys of one service; without keys (loopback only, see settings) access is open."""
-
-    def __init__(self, api_keys: Sequence[ApiKey]) -> None:
-        self._keys = tuple((secret_digest(key.key.get_secret_value()), key) for key in api_keys)
-        self._enrolled: tuple[tuple[bytes, Grant], ...] = ()
-
-    @property
-    def has_keys(self) -> bool:
-        """Whether the service requires a key."""
-        return bool(self._keys)
-
-    @property
-    def names(self) -> frozenset[str]:
-        """Names of all keys."""
-        return frozenset(grant.name for _, grant in (*self._keys, *self._enrolled))
-
-    def set_enrolled(self, enrolled: Sequence[tuple[bytes, Grant]]) -> None:
-        """Accept these keys, given as digests, beside those of the settings, and no earlier ones.
-
-        A service without keys of its settings stays open.
-        """
-        self._enrolled = tuple(enrolled)
-
-    def find(self, authorization: str | None) -> Grant | None:
-        """What the key in the header allows, if it is a valid one."""
-        presented = secret_digest(_token(authorization) or "")
-        # Every key is compared, to avoid a timing side channel.
-        known = (*self._keys, *self._enrolled)
-        matches = [grant for digest, grant in known if hmac.compare_digest(digest, presented)]
-        return matches[0] if matches else None
-
-    def granted(self, authorization: str | None, scope: str) -> Grant:
-        """Check a key and its scope, and return what the key allows.
-
-        Raises:
-            AccessDeniedError: no key, an unknown one (see `reason`), or one without the scope.
-        """
-        if not self._keys:
-            return Grant(name="loopback", scopes=(scope,))
-        grant = self.find(authorization)
-        if grant is None:
-            raise _no_key(authorization)
-        grant.require(scope)
-        return grant
-
-    def check(self, authorization: str | None, scope: str) -> str:
-        """Check a key and its scope as `granted`, and return the key's name."""
-        return self.granted(authorization, scope).name if self._keys else "loopback"
-
-
-@dataclass(frozen=True)
-class RequireScope:
-    """Route dependency that requires a scope: `dependencies=[Depends(RequireScope("rollout"))]`."""
-
-    scope: str
-
-    async def __call__(self, request: Request) -> str:
-        """The name of the caller's key; raises AccessDeniedError."""
-        access: AccessControl = request.app.state.access
-        return access.check(request.headers.get("authorization"), self.scope)
-
-
-def secret_digest(text: str) -> bytes:
-    """By which keys and tokens are compared and kept."""
-    return hashlib.sha256(text.encode()).digest()
-
-
-def _token(authorization: str | None) -> str | None:
-    kind, _, token = (authorization or "").partition(" ")
-    # Api-Key is what clients of openpi send.
-    return token.strip() or None if kind.lower() in {"bearer", "api-key"} else None
 
 
 @dataclass(frozen=True)
@@ -401,7 +288,7 @@ class GuardMiddleware:
                 return
             signed_in = self.admits is not None and self.admits(connection)
             if is_unsafe and needs_key and not signed_in:
-                raise _no_key(authorization) if self.admits is None else not_signed_in()
+                raise no_key(authorization) if self.admits is None else not_signed_in()
             if self.admits is None:
                 return
         self.site.check(connection, is_unsafe=is_unsafe)

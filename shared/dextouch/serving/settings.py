@@ -22,8 +22,8 @@ from pydantic_settings import (
 from dextouch.command_line import CommandParser
 from dextouch.errors import InvalidInputError
 from dextouch.serving.configuration_file import CommandSettings, explained, section_of
-from dextouch.serving.guard import ApiKey
 from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
+from dextouch.serving.keys import ApiKey
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.spans import configure_spans
 

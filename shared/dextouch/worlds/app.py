@@ -18,10 +18,11 @@ from dextouch.serving import (
     run_workers,
     server_options,
 )
+from dextouch.worlds.limits import RolloutLimits
 from dextouch.worlds.metrics import WorldMetrics
 from dextouch.worlds.openpi import openpi_router
 from dextouch.worlds.records import RecordStore
-from dextouch.worlds.rollouts import Reopen, RolloutLimits, RolloutService
+from dextouch.worlds.rollouts import Reopen, RolloutService
 from dextouch.worlds.routes import ChunkShortcut, rollout_router, watch_router
 from dextouch.worlds.watching import RolloutWatch
 from dextouch.worlds.world import World

@@ -17,7 +17,6 @@ from weakref import WeakValueDictionary
 import numpy as np
 import structlog
 from jaxtyping import Float64
-from pydantic import Field
 
 from dextouch.errors import (
     ConflictError,
@@ -27,7 +26,6 @@ from dextouch.errors import (
     UnavailableError,
     UnknownNameError,
 )
-from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
     MAX_SEED,
     ReturnSelector,
@@ -40,6 +38,7 @@ from dextouch.serving import StateStore
 from dextouch.streams import pack
 from dextouch.tracing import current_trace_id
 from dextouch.worlds.batcher import StepJob, WorldWorker, batch_histogram
+from dextouch.worlds.limits import RolloutLimits
 from dextouch.worlds.records import (
     Answer,
     RecordStore,
@@ -61,21 +60,6 @@ from dextouch.worlds.world import (
 )
 
 logger = structlog.get_logger(__name__)
-
-
-class RolloutLimits(FrozenModel):
-    """Limits of this installation; every chunk renews `ttl_s`."""
-
-    max_rollouts: int = Field(default=64, ge=1, description="rollouts open at the same time")
-    max_rollouts_per_key: int | None = Field(
-        default=None, ge=1, description="open rollouts of one API key (default: no limit)"
-    )
-    max_chunks: int = Field(default=1000, ge=1, description="chunks of one rollout")
-    ttl_s: float = Field(
-        default=600.0,
-        gt=0,
-        description="seconds until an unused rollout expires; every chunk restarts them",
-    )
 
 
 # Opens the world of this name and digest, or returns None where it is not to be had.

@@ -9,7 +9,7 @@ from PIL import Image
 
 from dextouch.episodes import EpisodeStore
 from dextouch.schemas import LineageEntry
-from dextouch.serving.guard import ApiKey
+from dextouch.serving.keys import ApiKey
 from dextouch.streams import StreamDescriptor, unpack
 from services.episode_store.app import create_app
 from tests.unit.episode_store.episodes import write_episode

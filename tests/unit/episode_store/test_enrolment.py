@@ -13,7 +13,7 @@ from structlog.testing import capture_logs
 
 from dextouch.errors import AccessDeniedError, ConflictError, NotFoundError, StorageError
 from dextouch.serving import AccessControl
-from dextouch.serving.guard import ApiKey
+from dextouch.serving.keys import ApiKey
 from services.episode_store.app import create_app
 from services.episode_store.enrolment import Enrolments
 

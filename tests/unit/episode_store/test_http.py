@@ -19,7 +19,7 @@ from dextouch.errors import (
     UnknownNameError,
 )
 from dextouch.geometry import transform
-from dextouch.serving.guard import ApiKey
+from dextouch.serving.keys import ApiKey
 from services.cli.main import main
 from services.episode_store import command_line
 from services.episode_store.app import create_app

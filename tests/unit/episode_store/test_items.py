@@ -7,7 +7,7 @@ from httpx import ASGITransport, AsyncClient
 
 from dextouch.episodes import EpisodeStore
 from dextouch.schemas import Review
-from dextouch.serving.guard import ApiKey
+from dextouch.serving.keys import ApiKey
 from services.episode_store.app import create_app
 from tests.unit.episode_store.episodes import write_episode, write_recording, write_take
 

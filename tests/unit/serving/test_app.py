@@ -24,7 +24,7 @@ from dextouch.serving import (
     takes,
     timed,
 )
-from dextouch.serving.guard import ApiKey
+from dextouch.serving.keys import ApiKey
 
 CASES = [
     (errors.PacketError("bad"), 400),

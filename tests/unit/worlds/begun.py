@@ -2,7 +2,8 @@
 
 from dextouch.schemas import ReturnSelector, RolloutStart, decode_answer
 from dextouch.serving.state import MemoryState
-from dextouch.worlds.rollouts import RolloutLimits, RolloutService
+from dextouch.worlds.limits import RolloutLimits
+from dextouch.worlds.rollouts import RolloutService
 from tests.unit.worlds.fakes import (
     SumWorld,
 )

@@ -7,7 +7,7 @@ import pytest
 from httpx import ASGITransport, AsyncClient
 from pydantic import SecretStr
 
-from dextouch.serving.guard import ApiKey
+from dextouch.serving.keys import ApiKey
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.routes import ChunkShortcut
 from tests.unit.worlds.fakes import SumWorld, actions

@@ -21,7 +21,7 @@ from dextouch.schemas import (
     decode_answer,
     encode_start,
 )
-from dextouch.serving.guard import ApiKey
+from dextouch.serving.keys import ApiKey
 from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app, routes
 from tests.unit.worlds.fakes import CAMERAS, K_HEAD, SumWorld, actions, anchor, observation
 

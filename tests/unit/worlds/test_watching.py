@@ -10,11 +10,12 @@ from pydantic import SecretStr
 
 from dextouch.clients import RolloutClient
 from dextouch.schemas import decode_answer
-from dextouch.serving.guard import ApiKey
+from dextouch.serving.keys import ApiKey
 from dextouch.streams import unpack
 from dextouch.worlds import WorldServiceSettings, create_world_app
+from dextouch.worlds.limits import RolloutLimits
 from dextouch.worlds.records import RecordStore, WatchNote
-from dextouch.worlds.rollouts import RolloutLimits, RolloutService
+from dextouch.worlds.rollouts import RolloutService
 from dextouch.worlds.watching import RolloutWatch
 from tests.unit.worlds.begun import ALL, START, begin, decoded
 from tests.unit.worlds.fakes import SumWorld, actions
