@@ -1,6 +1,7 @@
 """Fixtures of the worlds' tests: a state store, in memory and behind a real Redis server."""
 
 import pytest
+from redis import Redis
 
 from dextouch.serving import open_state
 from tests.contracts.redis_server import running_redis
@@ -14,7 +15,11 @@ def redis_url(tmp_path_factory):
 
 @pytest.fixture(params=["memory", "redis"])
 async def state(request):
-    url = "memory://" if request.param == "memory" else request.getfixturevalue("redis_url")
+    url = "memory://"
+    if request.param == "redis":
+        url = request.getfixturevalue("redis_url")
+        with Redis.from_url(url) as server:
+            server.flushall()
     store = open_state(url)
     yield store
     await store.close()
