@@ -54,7 +54,7 @@ class Uploader:
 
     Args:
         spool_root: folder of the takes.
-        store: where they go; None keeps them in the spool.
+        store: where they go, closed by `stop`; None keeps them in the spool.
         period_s: pause between two looks into the spool, and after a failure.
         keep_uploaded: whether a take stays in the spool when the store has it.
     """
@@ -88,6 +88,8 @@ class Uploader:
         self._stopping.set()
         if self._thread.ident is not None:
             self._thread.join()
+        if self._store is not None:
+            self._store.close()
 
     @property
     def refused(self) -> Mapping[str, str]:

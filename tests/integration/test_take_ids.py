@@ -118,6 +118,9 @@ class RefusingStore(EpisodeStoreClient):
         self.num_asked = 0
         self.error = InvalidInputError("attributes: task: not in this store's list")
 
+    def close(self):
+        pass
+
     def create(self, attributes):
         self.num_asked += 1
         raise self.error

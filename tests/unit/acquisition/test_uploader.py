@@ -1,6 +1,7 @@
 import errno
 import os
 import shutil
+import socket
 
 import numpy as np
 import pytest
@@ -50,6 +51,10 @@ class FakeStore(EpisodeStoreClient):
         self.batches = {}
         self.finished = {}
         self.replies_until_failure = None
+        self.is_closed = False
+
+    def close(self):
+        self.is_closed = True
 
     def _reply(self):
         if self.replies_until_failure is not None:
@@ -286,8 +291,26 @@ def test_thread_uploads_and_stops(tmp_path):
     uploader.start()
     while not (tmp_path / "take" / UPLOADED_FILE).exists():
         uploader._stopping.wait(0.005)
+    assert not store.is_closed
     uploader.stop()
     assert "take" in store.finished
+    assert store.is_closed
+
+
+def test_no_connection_outlives_the_uploads(tmp_path):
+    spool(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"http://127.0.0.1:{server.getsockname()[1]}"
+        uploader = Uploader(tmp_path, EpisodeStoreClient(url), period_s=60.0)
+        uploader.start()
+        connection, _ = server.accept()
+        with connection:
+            connection.settimeout(10)
+            while b'"take"' not in connection.recv(2**16):
+                pass
+            connection.sendall(b"HTTP/1.1 503 Busy\r\ncontent-length: 0\r\n\r\n")
+            uploader.stop()
+            assert connection.recv(1) == b""
 
 
 def test_recovery_closes_what_was_left_open(tmp_path):
