@@ -46,6 +46,7 @@ def ask_for_a_token(page, station):
     page.get_by_role("button", name="Get a token").click()
 
 
+@pytest.mark.slow
 def test_a_station_is_enrolled_and_revoked(page, sign_in, store_url, tmp_path):
     problems = []
     page.on("pageerror", lambda error: problems.append(str(error)))
