@@ -75,6 +75,8 @@ def tab_to(page, selector):
 
 def sign_in(page, address):
     page.goto(address)
+    # Chromium moves the focus there a moment after the page is loaded.
+    expect(page.get_by_label("Key")).to_be_focused()
     page.keyboard.type(KEY)
     page.keyboard.press("Enter")
     expect(state(page)).to_have_text("idle")
