@@ -5,6 +5,7 @@ import os
 import resource
 import shutil
 import subprocess
+import sys
 import tempfile
 import urllib.error
 import urllib.request
@@ -12,10 +13,19 @@ from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PROGRAMS = ("buildah", "podman", "runc")
-HELPERS = Path("/usr/lib/podman")
+# Programs and their Debian packages. netavark runs iptables, on which its package does not depend.
+PACKAGES = {
+    **{name: name for name in ("buildah", "podman", "runc", "iptables")},
+    **{f"/usr/lib/podman/{name}": name for name in ("netavark", "aardvark-dns")},
+    "mkfs.ext4": "e2fsprogs",
+    "mount": "mount",
+    "nsenter": "util-linux",
+    # Makes the base images where no registry answers.
+    "mmdebstrap": "mmdebstrap",
+}
 CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
 BUILD_TIMEOUT_S = 1800
+REGISTRY = "https://registry-1.docker.io/v2/"
 # What this machine lacks by itself: cgroups of systemd, a journal, limits that only
 # CAP_SYS_RESOURCE may raise. Locks in a file, since those in shared memory are everybody's.
 CONTAINERS_CONF = """
@@ -43,10 +53,12 @@ def missing():
     """Why containers cannot be run here; empty if they can."""
     if os.getuid() != 0:
         return "only root can run containers without a daemon and a set-up of user namespaces"
-    lacking = [name for name in PROGRAMS if shutil.which(name) is None]
-    lacking += [name for name in ("netavark", "aardvark-dns") if not (HELPERS / name).is_file()]
+    lacking = [program for program in PACKAGES if not shutil.which(program)]
+    if "mmdebstrap" in lacking and answers(REGISTRY):
+        lacking.remove("mmdebstrap")
     if lacking:
-        return f"apt-get install {' '.join(lacking)}"
+        packages = " ".join(PACKAGES[program] for program in lacking)
+        return f"no {', '.join(lacking)}: apt-get install {packages}"
     return ""
 
 
@@ -148,7 +160,11 @@ def _package_sources(folder):
     flags = ["--volume", f"{CERTIFICATES}:{CERTIFICATES}:ro"] if CERTIFICATES.is_file() else []
     config = folder / "pip.conf"
     found = subprocess.run(
-        ["pip", "config", "list"], capture_output=True, text=True, check=False, cwd="/"
+        [sys.executable, "-m", "pip", "config", "list"],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd="/",
     ).stdout
     lines, folders = ["[global]"], set()
     for line in found.splitlines():

@@ -3,13 +3,12 @@
 import shutil
 import time
 
-from tests.containers.engine import ROOT, answers
+from tests.containers.engine import REGISTRY, ROOT, answers
 
 PYTHON = "docker.io/library/python:3.11-slim"
 REDIS = "docker.io/library/redis:7-alpine"
 HAPROXY = "docker.io/library/haproxy:3.2-alpine"
 PROMETHEUS = "docker.io/prom/prometheus:v3.5.0"
-REGISTRY = "https://registry-1.docker.io/v2/"
 TORCH_INDEX = "https://download.pytorch.org/whl/cpu/"
 DEBIAN = ROOT / "build/containers/bookworm.tar"
 PACKAGES = "python3,python3-venv,python3-pip,python-is-python3,ca-certificates"

@@ -98,26 +98,37 @@ def test_a_take_becomes_an_episode(ask, episode_id, take):
     assert ("recording", take) in lineage
 
 
-def test_the_world_model_goes_on_from_the_start_of_the_episode(composed, key, episode_id):
-    with EpisodeStoreClient(composed.url("episode_store"), api_key=key) as store:
-        window = store.window(episode_id, 0, 1, cameras=(CAMERA,))
-    first = Observation(
-        first_step=0,
-        images={CAMERA: window.images[CAMERA]},
-        tactile_kpa=window.tactile_kpa,
-        action_reached=window.actions,
-        reached_is_measured=True,
-    )
-    asked = {"task": "stand_bottle", "instruction": "stand the bottle up", "seed": 1}
-    # Through the gateway, which finds the container by its name.
-    with RolloutClient(composed.url("gateway", 8085), api_key=key) as client:
-        world = client.worlds()[0].name
-        start = (first, window.anchor, window.K_head)
-        with client.start(world=world, init=start, **asked) as rollout:
-            seen = rollout.step(np.repeat(window.actions, 8, axis=0))
-    assert len(seen) == 8
-    assert np.isfinite(seen.tactile_kpa).all()
-    assert seen.images[CAMERA].shape[0] == 8
+@pytest.fixture
+def roll_out(composed, key, episode_id):
+    """Continue the start of the episode in the served world model for 8 steps; its description."""
+
+    def roll_out():
+        with EpisodeStoreClient(composed.url("episode_store"), api_key=key) as store:
+            window = store.window(episode_id, 0, 1, cameras=(CAMERA,))
+        first = Observation(
+            first_step=0,
+            images={CAMERA: window.images[CAMERA]},
+            tactile_kpa=window.tactile_kpa,
+            action_reached=window.actions,
+            reached_is_measured=True,
+        )
+        asked = {"task": "stand_bottle", "instruction": "stand the bottle up", "seed": 1}
+        # Through the gateway, which finds the container by its name.
+        with RolloutClient(composed.url("gateway", 8085), api_key=key) as client:
+            (world,) = client.worlds()
+            start = (first, window.anchor, window.K_head)
+            with client.start(world=world.name, init=start, **asked) as rollout:
+                seen = rollout.step(np.repeat(window.actions, 8, axis=0))
+        assert len(seen) == 8
+        assert np.isfinite(seen.tactile_kpa).all()
+        assert seen.images[CAMERA].shape[0] == 8
+        return world
+
+    return roll_out
+
+
+def test_the_world_model_goes_on_from_the_start_of_the_episode(roll_out):
+    roll_out()
 
 
 def test_a_rollout_in_the_twin_goes_on(composed, key):
@@ -158,6 +169,25 @@ def test_a_job_writes_into_the_store(composed, ask):
     done = composed.run_once("twin_episodes", *words, "--store", "/data/store")
     assert done.returncode == 0, done.stdout + done.stderr
     wait_for("episode", 60, lambda: num_episodes() == before + 1, composed.logs)
+
+
+def test_what_the_training_job_writes_is_served(composed, engine, roll_out):
+    words = ("dextouch", "twin", "record", "--task", "stand_bottle", "--seeds", "0:4")
+    done = composed.run_once("twin_episodes", *words, "--store", "/data/store")
+    assert done.returncode == 0, done.stdout + done.stderr
+    words = composed.services["training"]["command"]
+    path = words[words.index("--output") + 1]
+    # The command of the job, but short: the way of the file is tested, not what was learned.
+    done = composed.run_once("training", *words, "--max-steps", "2")
+    assert done.returncode == 0, done.stdout + done.stderr
+    composed.down("world_model")
+    composed.up("world_model", environment={"DEXTOUCH_WORLD_MODEL_CHECKPOINT": path})
+    try:
+        digest = engine.podman("exec", "world_model", "sha256sum", path).stdout.split()[0]
+        assert roll_out().digest == digest
+    finally:
+        composed.down("world_model")
+        composed.up("world_model")
 
 
 def test_keys_are_required(composed, engine):

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from pydantic_settings import (
     BaseSettings,
     PydanticBaseSettingsSource,
+    SettingsConfigDict,
     TomlConfigSettingsSource,
 )
 
@@ -33,7 +34,12 @@ _KEY = re.compile(r"\s*([\w.\"' -]+?)\s*=")
 
 
 class CommandSettings(BaseSettings):
-    """Base of all settings: flags, then the environment, then `dextouch.toml`, then defaults."""
+    """Base of all settings: flags, then the environment, then `dextouch.toml`, then defaults.
+
+    An empty variable counts as not set, which is how compose passes one that is left out of `.env`.
+    """
+
+    model_config = SettingsConfigDict(env_ignore_empty=True)
 
     @classmethod
     def settings_customise_sources(

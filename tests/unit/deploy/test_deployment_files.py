@@ -12,6 +12,8 @@ import yaml
 
 from services.acquisition.take import STALL_NS
 from services.cli.main import COMMANDS, find_command
+from tests.containers import engine
+from tests.containers.engine import PACKAGES
 
 ROOT = Path(__file__).parents[3]
 COMPOSE = ROOT / "docker-compose.yml"
@@ -104,6 +106,34 @@ def test_the_gateway_knows_the_services_that_may_have_many_workers():
         # The gateway asks twice a second, and looks elsewhere after two refusals.
         assert float(environment[prefix + "DRAIN_S"]) > 2 * 0.5
     assert "check inter 500ms fall 2 " in text
+
+
+def test_the_documented_packages_are_those_of_the_programs_that_container_tests_run():
+    (listed,) = re.findall(r"`apt-get install ([^`]+)`", (ROOT / "docs/images.md").read_text())
+    assert set(listed.split()) == {*PACKAGES.values(), "chromium"}
+
+
+def test_a_missing_program_is_named(monkeypatch, tmp_path):
+    for program in set(PACKAGES) - {"iptables"}:
+        if not program.startswith("/"):
+            (tmp_path / program).touch(mode=0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(engine.os, "getuid", lambda: 0)
+    assert "no iptables" in engine.missing()
+    assert "apt-get install iptables" in engine.missing()
+
+
+def test_what_training_writes_can_be_served():
+    def mounted(name):
+        volumes = [volume.split(":") for volume in SERVICES[name]["volumes"]]
+        return {inside: source for source, inside, *_ in volumes}
+
+    words = SERVICES["training"]["command"]
+    output = Path(words[words.index("--output") + 1])
+    folder = str(output.parent)
+    assert mounted("world_model")[folder] == mounted("training")[folder]
+    passed = SERVICES["world_model"]["environment"]["DEXTOUCH_WORLD_MODEL_CHECKPOINT"]
+    assert passed == "${DEXTOUCH_WORLD_MODEL_CHECKPOINT:-}"
 
 
 def test_rollouts_outlast_a_restart_of_redis():

@@ -16,6 +16,7 @@ from dextouch.serving import (
     service_config,
 )
 from dextouch.serving.host_names import is_loopback
+from services.cli.up import UpSettings
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - that keys are demanded there is what is tested
 
@@ -33,6 +34,13 @@ def test_flags_stand_above_the_environment(monkeypatch):
     monkeypatch.setenv("DEXTOUCH_PROBE_RATE_HZ", "30")
     settings = load_settings(ProbeSettings, ["--rate-hz", "60"])
     assert (settings.port, settings.rate_hz) == (8101, 60.0)
+
+
+def test_an_empty_variable_counts_as_not_set(monkeypatch):
+    monkeypatch.setenv("DEXTOUCH_PROBE_RATE_HZ", "")
+    monkeypatch.setenv("DEXTOUCH_UP_STATION", "")
+    assert load_settings(ProbeSettings, []).rate_hz == 15.0
+    assert load_settings(UpSettings, []).station == "mock station"
 
 
 def test_unknown_flags_are_refused(capsys):
