@@ -10,7 +10,7 @@ REDIS = "docker.io/library/redis:7-alpine"
 HAPROXY = "docker.io/library/haproxy:3.2-alpine"
 PROMETHEUS = "docker.io/prom/prometheus:v3.5.0"
 TORCH_INDEX = "https://download.pytorch.org/whl/cpu/"
-DEBIAN = ROOT / "build/containers/bookworm.tar"
+DEBIAN = ROOT / ".containers/bookworm.tar"
 PACKAGES = "python3,python3-venv,python3-pip,python-is-python3,ca-certificates"
 # As the official images do it: users, folders, signals and commands.
 STAND_INS = """
