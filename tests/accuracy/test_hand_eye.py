@@ -14,10 +14,17 @@ from benchmarks.simulated.board_scenes import Motion, mount_difference
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.geometry import invert, transform
 from services.alignment.calibration.hand_eye import (
+    BoardViews,
     HandEyeNoise,
     solve_hand_eye,
 )
-from services.alignment.calibration.motion import DegenerateMotionError, move, park, twist
+from services.alignment.calibration.motion import (
+    DegenerateMotionError,
+    move,
+    park,
+    scaled_park,
+    twist,
+)
 
 RECORDED_POSES = Path(__file__).parents[3] / "shared/data/hand_eye/pose_samples.json"
 NUM_SEEDS = 20
@@ -44,7 +51,7 @@ def test_mount_is_as_near_as_promised_and_its_sigma_honest(with_corners, capsys)
         tracker, board = scene.Ts_world_tracker, scene.Ts_camera_board
         result = solve_hand_eye(tracker, board, views=scene.views if with_corners else None)
         ours.append(errors_deg_mm(result.T_tracker_camera, scene))
-        theirs.append(errors_deg_mm(park(tracker, board), scene))
+        theirs.append(errors_deg_mm(scaled_park(tracker, board)[0], scene))
         normalised.append(nees(result, scene))
         angle_rad, distance_m = mount_difference(result.T_tracker_camera, scene.T_tracker_camera)
         published.append(
@@ -196,6 +203,48 @@ def test_an_inverted_side_is_named():
             with pytest.raises(InvalidInputError, match="is probably inverted") as refusal:
                 solve_hand_eye(*wrong)
             assert refusal.value.details["inverted"] == name
+
+
+@pytest.mark.parametrize("scale", [0.95, 0.985, 1.015, 1.02, 1.05, 25.0 / 28.0, 1e-3, 1e3])
+@pytest.mark.parametrize("with_corners", [True, False])
+def test_a_board_of_another_size_than_was_entered_is_named(scale, with_corners):
+    """The board is `scale` as large as entered: a scaled page, a wrong number, millimetres."""
+    for seed in range(10):
+        scene = make_scene(seed)
+        board = scene.Ts_camera_board.copy()
+        board[:, :3, 3] /= scale
+        seen = scene.views
+        views = BoardViews(
+            [points / scale for points in seen.points_board],
+            seen.pixels_px,
+            seen.K,
+            seen.distortion,
+        )
+        with pytest.raises(InvalidInputError, match="expected 1") as refusal:
+            solve_hand_eye(scene.Ts_world_tracker, board, views=views if with_corners else None)
+        assert refusal.value.details["scale"] == pytest.approx(scale, rel=8e-3)
+
+
+def test_the_uncertain_size_of_a_board_is_part_of_sigma():
+    """A print within the ruler's error: the mount is as far off as its sigma says."""
+    ratios = []
+    for seed in range(NUM_SEEDS):
+        scene = make_scene(seed)
+        scale = 1.0 + 2e-3 * np.random.default_rng(seed).normal()
+        board = scene.Ts_camera_board.copy()
+        board[:, :3, 3] /= scale
+        result = solve_hand_eye(scene.Ts_world_tracker, board)
+        distance_m = mount_difference(result.T_tracker_camera, scene.T_tracker_camera)[1]
+        ratios.append(
+            [
+                distance_m / result.sigma_translation_m,
+                (result.board_scale - scale) / result.sigma_board_scale,
+            ]
+        )
+    rms = np.sqrt(np.square(ratios).mean(axis=0))
+    # 20 scenes: the mean square of the scale's errors has 20 degrees of freedom (0.5 … 1.7).
+    assert 0.7 < rms[0] < 1.3
+    assert 0.65 < rms[1] < 1.35
 
 
 def test_bad_views_are_named():

@@ -5,8 +5,12 @@ measured pose B of the target in the mounted frame, and a small correction D of 
 pose, whose size the tracker's noise limits. First the size of each source of noise is estimated
 from the residuals. Then all poses are found together by Gauss–Newton with analytic Jacobians; the
 corrections, six numbers a view, are eliminated by the Schur complement, so that the system to
-solve has 12 unknowns however many views there are. Hand-eye and robot-base calibration are this
+solve has 13 unknowns however many views there are. Hand-eye and robot-base calibration are this
 estimate with another sensor in the second series.
+
+The last unknown is the scale of the second series. A board that is s times as large as was entered
+is measured at 1/s of its distance, which would otherwise move the mount without a trace in its
+covariance.
 """
 
 from collections.abc import Callable
@@ -17,7 +21,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry import invert
+from dextouch.geometry import invert, transform
 from services.alignment.calibration.motion import Agreement, adjoint, move, twist, twist_jacobian
 
 # Of the Gauss–Newton steps; below the smallest (rad, m) nothing changes that could be measured.
@@ -106,15 +110,17 @@ class Component:
 
 @dataclass(frozen=True)
 class Bundle:
-    """The mount X, the target's pose Z in the world, and how well they are known.
+    """The mount X, the target's pose Z in the world, the scale, and how well they are known.
 
-    The covariance is of the twists of X, then of Z (rad, m, in their own frames); rows and columns
-    of a mount that was given are zero.
+    `scale` is true over measured lengths of the second series. The covariance is of the twists of
+    X, then of Z (rad, m, in their own frames), then of the logarithm of the scale; rows and columns
+    of what was given are zero.
     """
 
     X: Float64[np.ndarray, "4 4"]
     Z: Float64[np.ndarray, "4 4"]
-    covariance: Float64[np.ndarray, "12 12"]
+    scale: float
+    covariance: Float64[np.ndarray, "13 13"]
 
 
 def weighted_bundle(
@@ -122,20 +128,22 @@ def weighted_bundle(
     tracker: TrackerNoise,
     own: dict[str, Component],
     *,
+    scale_sigma: float = 0.0,
     corners: Callable[[float], Measurement] | None = None,
 ) -> tuple[Bundle, dict[str, float]]:
     """The bundle weighted with the noise estimated from the views, and that noise.
 
-    The second series has the sources of noise `own`. With `corners`, the measurement of a board's
-    corners by the noise of their pixels, those are weighted instead of its poses.
+    The second series has the sources of noise `own`, and a scale of one within `scale_sigma` (one
+    sigma; exactly one if 0). With `corners`, the measurement of a board's corners by the noise of
+    their pixels, those are weighted instead of its poses.
     """
     series, Ts = agreed.series, agreed.predicted
-    J, C = predicted_jacobians(Ts, agreed.X @ Ts)
+    J, C = predicted_jacobians(Ts, agreed.X @ Ts, 1.0)
     tracker_sigma = tracker.tracker_rotation_rad, tracker.tracker_translation_m
     components = sensor_components("tracker", C, tracker_sigma) | own
     left_over = twist(invert(series.Ts_mounted_target) @ Ts)
-    unknowns = J[:, :, 6:] if agreed.is_mount_known else J
-    found = estimate_sigmas(left_over, unknowns, list(components.values()))
+    free = free_unknowns(is_mount_known=agreed.is_mount_known, is_scale_known=scale_sigma == 0)
+    found = estimate_sigmas(left_over, J[:, :, free], list(components.values()))
     sigmas = dict(zip(components, found.tolist(), strict=True))
     if corners is None:
         shares = [sigmas[name] ** 2 * own[name].shapes for name in own]
@@ -149,6 +157,7 @@ def weighted_bundle(
         (sigmas["tracker_rotation_rad"], sigmas["tracker_translation_m"]),
         (agreed.X, agreed.Z),
         is_mount_known=agreed.is_mount_known,
+        scale_sigma=scale_sigma,
     )
     return bundle, sigmas
 
@@ -231,8 +240,9 @@ def solve_bundle(
     start: tuple[np.ndarray, np.ndarray],
     *,
     is_mount_known: bool = False,
+    scale_sigma: float = 0.0,
 ) -> Bundle:
-    """Estimate mount and target pose from all views together.
+    """Estimate mount, target pose and scale from all views together.
 
     Args:
         Ts_world_tracker: [n, 4, 4].
@@ -240,19 +250,24 @@ def solve_bundle(
         tracker_sigma: the tracker's noise, rad and m an axis; above zero.
         start: X and Z within a few degrees and centimetres.
         is_mount_known: leave X as it is.
+        scale_sigma: expected deviation of the scale from one (one sigma); 0 leaves it at one.
 
     Raises:
         InvalidInputError: the steps do not become small.
     """
     X, Z = start
-    free = slice(6, 12) if is_mount_known else slice(0, 12)
+    free = free_unknowns(is_mount_known=is_mount_known, is_scale_known=scale_sigma == 0)
+    expected = np.zeros((13, 13))
+    expected[12, 12] = 1 / scale_sigma**2 if scale_sigma else 0.0
+    log_scale = 0.0
     tightness = np.repeat(np.square(1 / np.array(tracker_sigma)), 3)
     D = np.broadcast_to(np.eye(4), Ts_world_tracker.shape)
     for _ in range(MAX_ROUNDS):
         X_B = invert(Ts_world_tracker @ D) @ Z
         Ts = invert(X) @ X_B
-        seen = measurement(Ts)
-        J, C = predicted_jacobians(Ts, X_B)
+        scale = float(np.exp(log_scale))
+        seen = measurement(transform(Ts[:, :3, :3], Ts[:, :3, 3] / scale))
+        J, C = predicted_jacobians(Ts, X_B, scale)
         J_T, C_T = np.swapaxes(J, 1, 2), np.swapaxes(C, 1, 2)
         H_C = seen.information @ C
         J_D = twist_jacobian(D)
@@ -261,30 +276,42 @@ def solve_bundle(
         own_gradient = C_T @ seen.gradient[..., None] + pull @ twist(D)[..., None]
         # What is left for X and Z to explain once each view's correction has done its best.
         left = seen.information - H_C @ own @ np.swapaxes(H_C, 1, 2)
-        gradient = J_T @ (seen.gradient[..., None] - H_C @ own @ own_gradient)
-        normal = (J_T @ left @ J).sum(axis=0)[free, free]
-        step = np.zeros(12)
-        step[free] = -np.linalg.solve(normal, gradient.sum(axis=0)[free, 0])
+        gradients = J_T @ (seen.gradient[..., None] - H_C @ own @ own_gradient)
+        gradient = gradients.sum(axis=0)[:, 0] + expected[:, 12] * log_scale
+        normal = ((J_T @ left @ J).sum(axis=0) + expected)[np.ix_(free, free)]
+        step = np.zeros(13)
+        step[free] = -np.linalg.solve(normal, gradient[free])
         corrections = -own @ (own_gradient + np.swapaxes(H_C, 1, 2) @ (J @ step)[..., None])
-        X, Z, D = X @ move(step[:6]), Z @ move(step[6:]), D @ move(corrections[..., 0])
+        X, Z, D = X @ move(step[:6]), Z @ move(step[6:12]), D @ move(corrections[..., 0])
+        log_scale += step[12]
         if max(np.abs(step).max(), np.abs(corrections).max()) < SMALLEST_STEP:
-            covariance = np.zeros((12, 12))
-            covariance[free, free] = np.linalg.inv(normal)
-            return Bundle(X, Z, covariance)
+            covariance = np.zeros((13, 13))
+            covariance[np.ix_(free, free)] = np.linalg.inv(normal)
+            return Bundle(X, Z, float(np.exp(log_scale)), covariance)
     raise InvalidInputError(
         f"calibration: the bundle still moves by {np.abs(step).max():.1e} after {MAX_ROUNDS} "
         "rounds; the views are inconsistent; check that both series were taken at the same times"
     )
 
 
-def predicted_jacobians(
-    Ts: np.ndarray, X_B: np.ndarray
-) -> tuple[Float64[np.ndarray, "n 6 12"], Float64[np.ndarray, "n 6 6"]]:
-    """Jacobians of the predicted poses B = X⁻¹ D⁻¹ W⁻¹ Z by X, Z and D.
+def free_unknowns(*, is_mount_known: bool, is_scale_known: bool) -> np.ndarray:
+    """Indices of the unknowns that are estimated: 0 … 5 the mount, 6 … 11 the target, 12 scale."""
+    return np.arange(6 if is_mount_known else 0, 12 if is_scale_known else 13)
 
-    `Ts` are the predicted poses B, `X_B` are X · B.
+
+def predicted_jacobians(
+    Ts: np.ndarray, X_B: np.ndarray, scale: float
+) -> tuple[Float64[np.ndarray, "n 6 13"], Float64[np.ndarray, "n 6 6"]]:
+    """Jacobians of the measured poses by X, Z and the logarithm of the scale, and by D.
+
+    `Ts` are the predicted poses B = X⁻¹ D⁻¹ W⁻¹ Z, measured with translations divided by the scale;
+    `X_B` are X · B.
     """
-    J = np.zeros((len(Ts), 6, 12))
+    J = np.zeros((len(Ts), 6, 13))
     J[:, :, :6] = -adjoint(invert(Ts))
-    J[:, :, 6:] = np.eye(6)
-    return J, -adjoint(invert(X_B))
+    J[:, :, 6:12] = np.eye(6)
+    C = -adjoint(invert(X_B))
+    J[:, 3:] /= scale
+    C[:, 3:] /= scale
+    J[:, 3:, 12] = -np.einsum("nji,nj->ni", Ts[:, :3, :3], Ts[:, :3, 3]) / scale
+    return J, C

@@ -18,6 +18,7 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert
 from services.alignment.calibration.bundle import (
+    Bundle,
     Component,
     Linearised,
     Measurement,
@@ -37,6 +38,7 @@ from services.alignment.calibration.motion import (
     missing_axes,
     move,
     view_errors,
+    wrong_scale,
 )
 
 TASK = "hand-eye"
@@ -46,6 +48,8 @@ MIN_CORNERS = 4
 ROBOT_SIGMA = (3e-4, 2e-4)
 # Where the tracker's place is given, the effector must at least move so far in two directions.
 MIN_SECOND_SPREAD_M = 0.05
+# A board whose size differs by more sigmas from the entered one is refused.
+NUM_SCALE_SIGMAS = 3.0
 # Poses of a board come from a solver; few steps bring them to the minimum of the pixels.
 POLISH_ROUNDS = 5
 
@@ -56,7 +60,8 @@ class HandEyeNoise(TrackerNoise):
 
     That of the tracker and the pixels holds for a Vive tracker and a sharp board. `board_*` are of
     a board's pose that a solver found, in the camera's axes; they count only where no corners are
-    given.
+    given. `board_scale` is how well the size of the print is known, as a share: by a ruler half a
+    millimetre of 25 cm.
     """
 
     pixel_px: float = 0.3
@@ -64,13 +69,20 @@ class HandEyeNoise(TrackerNoise):
     board_roll_rad: float = 5e-4
     board_sideways_m: float = 1.5e-4
     board_depth_m: float = 4e-4
+    board_scale: float = 2e-3
 
 
 @dataclass(frozen=True)
 class HandEyeResult(PoseEstimate):
-    """Where the camera sits on the tracker, and how well that is known."""
+    """Where the camera sits on the tracker, and how well that is known.
+
+    `board_scale` is the size of the board by the tracker's metres over the size that was entered,
+    estimated with the mount, so that its uncertainty is part of the mount's.
+    """
 
     T_tracker_camera: Float64[np.ndarray, "4 4"]
+    board_scale: float
+    sigma_board_scale: float
 
 
 @dataclass(frozen=True)
@@ -158,8 +170,8 @@ def solve_hand_eye(
     Raises:
         DegenerateMotionError: the tracker was rotated too little, or about one axis only, or the
             uncertainty of the mount exceeds half a degree or 10 mm.
-        InvalidInputError: too few views, or views that contradict each other (an inverted series
-            is named).
+        InvalidInputError: too few views, a board of another size than was entered, or views that
+            contradict each other (an inverted series is named).
         ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
     """
     tracker, board = checked_poses(
@@ -175,19 +187,27 @@ def solve_hand_eye(
     series = Series(TASK, "tracker", tracker, board, names)
     agreed = agreeing_views(series)
     if views is None:
-        bundle, sigmas = weighted_bundle(agreed, noise, board_components(agreed.predicted, noise))
+        own = board_components(agreed.predicted, noise)
+        bundle, sigmas = weighted_bundle(agreed, noise, own, scale_sigma=noise.board_scale)
     else:
         corners = views.only(agreed.views).measurement
         one_pixel = corners(1.0)
         polished = polish(one_pixel, agreed.series.Ts_mounted_target)
         agreed = agreed._replace(series=agreed.series._replace(Ts_mounted_target=polished))
-        own = Component(noise.pixel_px, np.linalg.inv(one_pixel(polished).information))
-        bundle, sigmas = weighted_bundle(agreed, noise, {"pixel_px": own}, corners=corners)
+        own = {
+            "pixel_px": Component(noise.pixel_px, np.linalg.inv(one_pixel(polished).information))
+        }
+        bundle, sigmas = weighted_bundle(
+            agreed, noise, own, scale_sigma=noise.board_scale, corners=corners
+        )
+    _check_scale(bundle, noise.board_scale, names)
     result = HandEyeResult(
         covariance=bundle.covariance[:6, :6],
         noise=sigmas,
         left_out_views=agreed.left_out,
         T_tracker_camera=bundle.X,
+        board_scale=bundle.scale,
+        sigma_board_scale=float(np.sqrt(bundle.covariance[12, 12])),
     )
     if not result.doubt:
         return result
@@ -203,6 +223,16 @@ def solve_hand_eye(
         f"{' and '.join(others)}, take more views, and move the board closer",
         missing_axes=others,
     )
+
+
+def _check_scale(bundle: Bundle, expected_sigma: float, names: tuple[str, str]) -> None:
+    """Refuse views that say, without what was expected, that the board is of another size."""
+    variance = bundle.covariance[12, 12]
+    # Information of the views alone; what was expected is a Gaussian about one.
+    own_variance = 1 / max(1 / variance - 1 / expected_sigma**2, np.finfo(float).tiny)
+    log_scale = np.log(bundle.scale) * own_variance / variance
+    if abs(log_scale) > NUM_SCALE_SIGMAS * np.hypot(np.sqrt(own_variance), expected_sigma):
+        raise wrong_scale(TASK, names, float(np.exp(log_scale)), float(np.sqrt(own_variance)))
 
 
 def board_components(Ts_camera_board: np.ndarray, noise: HandEyeNoise) -> dict[str, Component]:
@@ -314,7 +344,7 @@ def solve_robot_base(
     _, errors = view_errors(agreed.series, bundle.X)
     rotation_rms_rad, translation_rms_m = np.sqrt(np.square(errors).mean(axis=0)).tolist()
     result = RobotBaseResult(
-        covariance=bundle.covariance[6:, 6:],
+        covariance=bundle.covariance[6:12, 6:12],
         rotation_rms_rad=rotation_rms_rad,
         translation_rms_m=translation_rms_m,
         noise=sigmas,

@@ -170,6 +170,7 @@ def agreeing_views(series: Series, mount: np.ndarray | None = None) -> Agreement
         Z, errors = view_errors(used, X)
         if mount is None:
             check_sides(used, errors)
+            check_scale(used, errors)
         ratios = (errors / np.maximum(np.median(errors, axis=0), EXACT)).max(axis=1)
         if ratios.max() <= OUTLIER_RATIO:
             rms = _rms(errors)
@@ -195,6 +196,24 @@ def agreeing_views(series: Series, mount: np.ndarray | None = None) -> Agreement
 
 def park(Ts_world_body: np.ndarray, Ts_mounted_target: np.ndarray) -> Float64[np.ndarray, "4 4"]:
     """Hand-eye solution of Park and Martin (1994): rotation first, then translation."""
+    R, left, shifts, targets = _park_equations(Ts_world_body, Ts_mounted_target)
+    t, *_ = np.linalg.lstsq(left, targets - shifts, rcond=None)
+    return transform(R, t)
+
+
+def scaled_park(
+    Ts_world_body: np.ndarray, Ts_mounted_target: np.ndarray
+) -> tuple[Float64[np.ndarray, "4 4"], float]:
+    """As `park`, with true over measured lengths of the target's series as a fourth unknown."""
+    R, left, shifts, targets = _park_equations(Ts_world_body, Ts_mounted_target)
+    found, *_ = np.linalg.lstsq(np.column_stack([left, -targets]), -shifts, rcond=None)
+    return transform(R, found[:3]), float(found[3])
+
+
+def _park_equations(
+    Ts_world_body: np.ndarray, Ts_mounted_target: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The mount's rotation R, and the equations left @ t = targets - shifts of its place t."""
     pairs = view_pairs(len(Ts_world_body))
     A = invert(Ts_world_body[pairs[:, 1]]) @ Ts_world_body[pairs[:, 0]]
     B = Ts_mounted_target[pairs[:, 1]] @ invert(Ts_mounted_target[pairs[:, 0]])
@@ -206,9 +225,7 @@ def park(Ts_world_body: np.ndarray, Ts_mounted_target: np.ndarray) -> Float64[np
         use = np.ones(len(a_rad), dtype=bool)
     R = nearest_rotation(a_rad[use].T @ b_rad[use])
     left = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
-    right = ((R @ B[:, :3, 3:])[..., 0] - A[:, :3, 3]).reshape(-1)
-    t, *_ = np.linalg.lstsq(left, right, rcond=None)
-    return transform(R, t)
+    return R, left, A[:, :3, 3].reshape(-1), (R @ B[:, :3, 3:]).reshape(-1)
 
 
 def view_errors(
@@ -251,6 +268,38 @@ def check_sides(series: Series, errors: np.ndarray) -> None:
         f"{_told(errors)} RMS as given and by {_told(again)} when {name} is turned round (the "
         f"mount is then {length_m * 1e3:.0f} mm long); pass the inverse of each matrix of {name}",
         inverted=name,
+    )
+
+
+def check_scale(series: Series, errors: np.ndarray) -> None:
+    """Refuse a target's series in another unit, or of a board of another size than was entered.
+
+    Raises:
+        InvalidInputError: names the series and its scale.
+    """
+    if (_rms(errors) < EXACT).all():
+        return
+    X, scale = scaled_park(series.Ts_world_body, series.Ts_mounted_target)
+    if scale <= 0:
+        return
+    rescaled = series.Ts_mounted_target.copy()
+    rescaled[:, :3, 3] *= scale
+    _, again = view_errors(series._replace(Ts_mounted_target=rescaled), X)
+    if _rms(again)[1] < INVERTED_SHARE * _rms(errors)[1]:
+        raise wrong_scale(series.task, series.names, scale)
+
+
+def wrong_scale(
+    task: str, names: tuple[str, str], scale: float, sigma: float | None = None
+) -> InvalidInputError:
+    """Error for two series that measure lengths differently."""
+    known = f"{scale:.4g}" if sigma is None else f"{scale:.4f} ± {sigma:.4f}"
+    return InvalidInputError(
+        f"{task}: lengths of {names[0]} are {known} times those of {names[1]}, expected 1; measure "
+        "the printed board over several squares and enter that size (printers scale pages, and "
+        "other programs give millimetres), and check that the camera's K is of this camera and "
+        "image size",
+        scale=scale,
     )
 
 

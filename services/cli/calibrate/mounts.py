@@ -88,6 +88,8 @@ def calibrate_mount(options: argparse.Namespace) -> dict[str, object]:
         "left_out": left_out,
         "blurred": list(views.blurred),
         "translation_mm": (X[:3, 3] * 1e3).tolist(),
+        "board_scale": result.board_scale,
+        "sigma_board_scale": result.sigma_board_scale,
     }
     name = f"T_tracker_{TRACKERS[options.camera]}_camera_{options.camera}"
     sigma = (result.sigma_rotation_rad, result.sigma_translation_m)

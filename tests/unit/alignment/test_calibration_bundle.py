@@ -90,12 +90,15 @@ def test_predicted_poses_move_as_their_jacobians_say():
     W, X, Z = some_poses(1, 1), some_poses(1, 2)[0], some_poses(1, 3)[0]
     X_B = invert(W) @ Z
     Ts = invert(X) @ X_B
-    J, C = predicted_jacobians(Ts, X_B)
+    J, C = predicted_jacobians(Ts, X_B, 1.25)
     rng = np.random.default_rng(4)
     x, z, d = 1e-6 * rng.normal(size=(3, 6))
     moved = invert(X @ move(x)) @ invert(W @ move(d)) @ Z @ move(z)
-    expected = J @ np.concatenate([x, z]) + C @ d
-    np.testing.assert_allclose(twist(invert(Ts) @ moved), expected, atol=1e-11)
+    expected = J @ np.array([*x, *z, 2e-6]) + C @ d
+    measured, moved_measured = Ts.copy(), moved.copy()
+    measured[:, :3, 3] /= 1.25
+    moved_measured[:, :3, 3] /= 1.25 * np.exp(2e-6)
+    np.testing.assert_allclose(twist(invert(measured) @ moved_measured), expected, atol=5e-11)
 
 
 def test_the_schur_complement_gives_what_all_unknowns_together_give():
@@ -107,20 +110,30 @@ def test_the_schur_complement_gives_what_all_unknowns_together_give():
     weights = 1 / np.array([1.5e-3, 1.5e-3, 5e-4, 1.5e-4, 1.5e-4, 4e-4])
 
     def residuals(all_unknowns):
-        x, z, d = all_unknowns[:6], all_unknowns[6:12], all_unknowns[12:].reshape(-1, 6)
+        x, z, log_scale = all_unknowns[:6], all_unknowns[6:12], all_unknowns[12]
+        d = all_unknowns[13:].reshape(-1, 6)
         Ts = invert(X @ move(x)) @ invert(W @ move(d)) @ (Z @ move(z))
-        return np.concatenate([weights * twist(invert(B) @ Ts), d / sigma]).ravel()
+        Ts[:, :3, 3] /= np.exp(log_scale)
+        errors = np.concatenate([weights * twist(invert(B) @ Ts), d / sigma]).ravel()
+        return np.append(errors, log_scale / 0.004)
 
     plain = least_squares(
-        residuals, np.zeros(48), x_scale=np.tile(sigma, 8), xtol=1e-14, ftol=1e-14
+        residuals,
+        np.zeros(49),
+        x_scale=np.insert(np.tile(sigma, 8), 12, 1e-3),
+        xtol=1e-14,
+        ftol=1e-14,
     )
     information = np.broadcast_to(np.diag(weights**2), (6, 6, 6))
-    bundle = solve_bundle(W, pose_measurement(B, information), (9e-4, 5e-4), (X, Z))
+    bundle = solve_bundle(
+        W, pose_measurement(B, information), (9e-4, 5e-4), (X, Z), scale_sigma=0.004
+    )
+    np.testing.assert_allclose(np.log(bundle.scale), plain.x[12], atol=1e-7)
     np.testing.assert_allclose(bundle.X, X @ move(plain.x[:6]), atol=1e-7)
     np.testing.assert_allclose(bundle.Z, Z @ move(plain.x[6:12]), atol=1e-7)
-    covariance = np.linalg.inv(plain.jac.T @ plain.jac)[:12, :12]
+    covariance = np.linalg.inv(plain.jac.T @ plain.jac)[:13, :13]
     scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
-    np.testing.assert_allclose(bundle.covariance / scale, covariance / scale, atol=2e-3)
+    np.testing.assert_allclose(bundle.covariance / scale, covariance / scale, atol=3e-3)
 
 
 def test_corners_and_poses_with_their_information_say_the_same():
