@@ -193,20 +193,16 @@ def interval_table(lines: Sequence[Line]) -> ResultTable:
     rows = [
         (
             f"{line.task}: {line.what}",
-            _number(line.value),
+            line.text(line.value),
             "" if line.interval is None else f"{line.interval[0]:.3f} to {line.interval[1]:.3f}",
             str(line.num),
-            *([", ".join(map(_number, line.by_seed))] if several else []),
+            *([", ".join(map(line.text, line.by_seed))] if several else []),
         )
         for line in lines
     ]
     columns = ["", "figure", "95 % over starts", "rollouts or policies"]
     columns += ["training seeds"] * several
     return ResultTable("Imagined and real", tuple(columns), rows)
-
-
-def _number(value: float | None) -> str:
-    return "undefined" if value is None else f"{value:.3f}"
 
 
 def row_table(title: str, rows: Sequence[Mapping[str, Any]]) -> ResultTable:

@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.figures import Requirement, Sense
 from services.evaluation.calibration import expected_calibration_error
+from services.evaluation.comments import UNDEFINED, undefined_by
 from services.evaluation.resampling import (
     area_under_roc_of_draws,
     balanced_accuracy_of_draws,
@@ -19,6 +20,8 @@ from services.evaluation.statistics import interval_of_draws
 
 NUM_DRAWS: Final = 1000
 _NUM_CALIBRATION_DRAWS: Final = 200
+# First word of the lines that compare policies; their `num` counts policies.
+POLICIES: Final = "policies"
 Bound = tuple[Sense, float]
 
 
@@ -39,6 +42,12 @@ class Line:
     bound: float
     unit: str = ""
     by_seed: tuple[float | None, ...] = ()
+
+    def text(self, value: float | None) -> str:
+        """A figure of this line, or that it is undefined, with the number of policies if few."""
+        if value is not None:
+            return f"{value:.3f}"
+        return undefined_by(self.num) if self.what.startswith(POLICIES) else UNDEFINED
 
     def requirement(self) -> Requirement:
         """The line as a requirement."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.evaluator.chunk_lines import chunk_figures_drawn, chunk_rows
 from benchmarks.evaluator.drawn import (
+    POLICIES,
     Drawn,
     Line,
     Rolled,
@@ -138,7 +139,7 @@ def _policy_figures(
         ("all", everything, 0.90, 0.08),
     ):
         correlation, violation = (
-            f"policies ({name}), {word}" for word in ("Pearson", "MMRV with ties")
+            f"{POLICIES} ({name}), {word}" for word in ("Pearson", "MMRV with ties")
         )
         rates = _rates(rollouts, sampling.seeds)
         if rates is None:

@@ -55,10 +55,10 @@ def _table(task: str, lines: Sequence[Line]) -> str:
 def _row(line: Line, *, several: bool) -> str:
     is_met = line.requirement().is_met
     word = {None: "not measured", True: "met", False: "missed"}[is_met]
-    seeds = ", ".join("undefined" if one is None else f"{one:.3f}" for one in line.by_seed)
+    seeds = ", ".join(line.text(one) for one in line.by_seed)
     cells = (
         escape(line.what),
-        "" if line.value is None else f"{line.value:.3f} {escape(line.unit)}",
+        f"{line.text(line.value)} {'' if line.value is None else escape(line.unit)}",
         "" if line.interval is None else f"{line.interval[0]:.3f} … {line.interval[1]:.3f}",
         f"{escape(line.sense)} {line.bound:g}",
         f'<span class="{word.split()[-1]}">{word}</span>',

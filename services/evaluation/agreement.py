@@ -45,10 +45,10 @@ MAX_PERMUTATIONS: Final = 50_000
 class Figure:
     """An agreement figure with its 95 % interval.
 
-    `value` is NaN and `interval` None where it is undefined, as a correlation where all scores of a
-    world are equal; `undefined_share` is the share of hierarchical bootstrap draws in which it is.
-    The interval is that of the true scores: noise biases an observed correlation towards zero, so
-    the interval may lie above it.
+    `value` is NaN and `interval` None where it is undefined, as a correlation of two policies, or
+    where all scores of a world are equal; `undefined_share` is the share of hierarchical bootstrap
+    draws in which it is. The interval is that of the true scores: noise biases an observed
+    correlation towards zero, so the interval may lie above it.
     """
 
     value: float
@@ -114,7 +114,7 @@ def task_agreement(
         for row, name in enumerate(policies)
     }
     chance = chance_of_correlation([real], [imagined], generator)
-    return Agreement(_figures(real, imagined, draws), without, chance), draws
+    return Agreement(_figures(real[None], imagined[None], draws), without, chance), draws
 
 
 def pooled_agreement(
@@ -126,8 +126,9 @@ def pooled_agreement(
     """Agreement over all policies of all tasks at once, each pair one point.
 
     A pooled correlation also rewards separating easy from hard tasks; read it together with those
-    of the tasks. Permutations assign policies within each task only, and `without` omits a policy
-    in every task.
+    of the tasks. It is undefined for fewer than three policies, since their tasks alone would
+    decide it. Permutations assign policies within each task only, and `without` omits a policy in
+    every task.
 
     Args:
         policies: names, the same in every task.
@@ -143,14 +144,11 @@ def pooled_agreement(
         _joined([one.posterior for one in draws]), _joined([one.bootstrap for one in draws])
     )
     without = {
-        name: policy.pearson(
-            real=np.delete(real, row, axis=1).ravel(),
-            imagined=np.delete(imagined, row, axis=1).ravel(),
-        )
+        name: _value("pearson", np.delete(real, row, axis=1), np.delete(imagined, row, axis=1))
         for row, name in enumerate(policies)
     }
     chance = chance_of_correlation(list(real), list(imagined), generator)
-    return Agreement(_figures(real.ravel(), imagined.ravel(), joined), without, chance)
+    return Agreement(_figures(real, imagined, joined), without, chance)
 
 
 def _check_names(policies: Sequence[str], scores: MatchedScores) -> None:
@@ -167,11 +165,22 @@ def _joined(draws: Sequence[ScoreDraws]) -> ScoreDraws:
     )
 
 
+def _value(name: str, real: np.ndarray, imagined: np.ndarray) -> float:
+    """A figure over all scores [tasks, policies] at once; NaN where it is undefined."""
+    if name in CORRELATIONS and real.shape[1] < policy.MIN_POLICIES:
+        return math.nan
+    return float(FIGURES[name](real=real.ravel(), imagined=imagined.ravel()))
+
+
 def _figures(real: np.ndarray, imagined: np.ndarray, draws: Draws) -> dict[str, Figure]:
+    """Figures of scores [tasks, policies] with their intervals."""
     posterior, bootstrap = figures_of_draws(draws.posterior), figures_of_draws(draws.bootstrap)
-    found = {}
-    for name, figure in FIGURES.items():
-        value = float(figure(real=real, imagined=imagined))
+    num_policies, found = real.shape[1], {}
+    for name in FIGURES:
+        value = _value(name, real, imagined)
+        if name in CORRELATIONS and num_policies < policy.MIN_POLICIES:
+            found[name] = Figure(value, None, 1.0)
+            continue
         # Correlations crowd at their bound: the shortest interval contains it, quantiles do not.
         interval = shortest_interval if name in CORRELATIONS else central_interval
         drawn = posterior[name][np.isfinite(posterior[name])]
@@ -223,6 +232,8 @@ def chance_of_correlation(
         The p value; NaN where the correlation is undefined.
     """
     flat = np.concatenate(real)
+    if min(map(len, real)) < policy.MIN_POLICIES:
+        return math.nan
     observed = policy.pearson(real=flat, imagined=np.concatenate(imagined))
     if math.isnan(observed):
         return math.nan

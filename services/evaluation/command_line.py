@@ -199,12 +199,20 @@ def print_scores(report: Mapping[str, Any]) -> None:
             interval = f"({low:+.2f} … {high:+.2f})"
             print(f"  {pair}: {row['difference']:+.2f} {interval}, p {figure(row['p'])}")
     for task, figures in report["agreement"].items():
+        error = figure(figures.get("mean_absolute_error"))
         print(
-            f"\n{task}: Pearson {figure(figures['pearson'])}, MMRV {figure(figures['mmrv'])} "
-            f"with ties counted, {figure(figures['mmrv_paper'])} by the paper's rule"
+            f"\n{task}: Pearson {figure(figures['pearson'])}{_interval(figures, 'pearson')}, MMRV "
+            f"{figure(figures['mmrv'])} with ties counted, {figure(figures['mmrv_paper'])} by the "
+            f"paper's rule; mean absolute error of the success rates {error}"
+            f"{_interval(figures, 'mean_absolute_error')}"
         )
         for comment in report["comments"][task]:
             print(f"  {comment}")
+
+
+def _interval(figures: Mapping[str, Any], name: str) -> str:
+    interval = figures.get(f"{name}_interval")
+    return f" (95 % {interval[0]:.2f} … {interval[1]:.2f})" if isinstance(interval, list) else ""
 
 
 def print_failures(report: Mapping[str, Any], results: Path) -> None:

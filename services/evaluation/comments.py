@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from dextouch.metrics.policy import MIN_POLICIES
+
 UNDEFINED = "undefined"
 # Smaller mean differences of success are not mentioned.
 NOTABLE_BIAS = 0.05
@@ -10,6 +12,13 @@ NOTABLE_BIAS = 0.05
 NOTABLE_INFLUENCE = 0.1
 # A correlation that may be below this is not shown to be good.
 VAGUE_R = 0.5
+
+
+def undefined_by(num_policies: int) -> str:
+    """Text of an undefined figure; it names the number of policies if they are too few."""
+    if 0 < num_policies < MIN_POLICIES:
+        return f"{UNDEFINED} ({num_policies} {'policy' if num_policies == 1 else 'policies'})"
+    return UNDEFINED
 
 
 def task_comments(
@@ -26,7 +35,7 @@ def task_comments(
     if agreement["num_starts"] == 0:
         return [f"No start was completed in {both} by every policy: nothing to compare."]
     undefined = []
-    if agreement["pearson"] == UNDEFINED:
+    if isinstance(agreement["pearson"], str):
         undefined = [_why_undefined(list(agreement["rates"].values()), world)]
     return [
         _compared_starts(rows, agreement, both),
@@ -50,7 +59,7 @@ def _correlation(agreement: Mapping[str, Any]) -> list[str]:
         f"{vague}. {_chance(chance)}"
     ]
     r, without = agreement["pearson"], agreement["pearson_without"]
-    moved = {name: value - r for name, value in without.items() if value != UNDEFINED}
+    moved = {name: value - r for name, value in without.items() if not isinstance(value, str)}
     name = max(moved, key=lambda one: abs(moved[one]), default=None)
     if name is not None and abs(moved[name]) >= NOTABLE_INFLUENCE:
         sentences.append(f"Without {name!r}, r would be {without[name]:.2f} instead of {r:.2f}.")
@@ -123,8 +132,11 @@ def _widest_gaps(rows: Sequence[Mapping[str, Any]], world: str) -> list[str]:
 
 
 def _why_undefined(rates: Sequence[Mapping[str, float]], world: str) -> str:
-    if len(rates) < 2:
-        return "Pearson is undefined: it needs at least two policies."
+    if len(rates) < MIN_POLICIES:
+        return (
+            f"Pearson is {undefined_by(len(rates))}: it needs at least three policies, since two "
+            "points always lie on a line. The mean absolute error needs no more than one."
+        )
     same_real = len({rate["real"] for rate in rates}) == 1
     side, place = ("real", "the real world") if same_real else ("imagined", world)
     return (

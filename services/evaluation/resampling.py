@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import ShapeError
+from dextouch.metrics.policy import MIN_POLICIES
 
 Counts = Float64[np.ndarray, "draws starts"]
 
@@ -41,8 +42,8 @@ def rates_of_draws(outcomes: np.ndarray, counts: Counts) -> Float64[np.ndarray, 
 
 
 def pearson_of_draws(real: np.ndarray, imagined: np.ndarray) -> Float64[np.ndarray, " draws"]:
-    """Linear correlation of every row [draws, policies]; NaN where one side has no spread."""
-    if real.shape[1] < 2:
+    """Linear correlation of every row [draws, policies]; NaN where it is undefined."""
+    if real.shape[1] < MIN_POLICIES:
         return np.full(len(real), np.nan)
     a, b = (x - x.mean(axis=1, keepdims=True) for x in (real, imagined))
     flat = (np.ptp(real, axis=1) == 0) | (np.ptp(imagined, axis=1) == 0)

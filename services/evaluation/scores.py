@@ -17,7 +17,7 @@ from services.evaluation.agreement import (
     pooled_agreement,
     task_agreement,
 )
-from services.evaluation.comments import UNDEFINED, task_comments
+from services.evaluation.comments import UNDEFINED, task_comments, undefined_by
 from services.evaluation.rate_draws import MatchedScores
 from services.evaluation.statistics import wilson_interval
 
@@ -170,7 +170,8 @@ class ClosedLoopReport:
 
         `mmrv` counts ties (`ties="simpler"`); `mmrv_paper` does not, so it is 0 for a world that
         gives every policy the same score. `rates` are the compared success rates, over the
-        `num_starts` starts that finished in both worlds for every policy. With two policies and
+        `num_starts` starts that finished in both worlds for every policy. Correlations need three
+        policies; with fewer they are "undefined (2 policies)". With two policies and
         two starts or more, every figure has a 95 % interval of the true scores' figure and the
         share of bootstrap draws in which it is undefined; `pearson_without` leaves one policy out,
         `pearson_chance` is the permutation p value, and `differences` compares policies in pairs.
@@ -190,7 +191,7 @@ class ClosedLoopReport:
             [one.draws for one in compared],
             np.random.default_rng(_SEED),
         )
-        return by_task, _entries(pooled)
+        return by_task, _entries(pooled, len(compared[0].policies))
 
     def _agreement(self, world: str, task: str) -> tuple[dict[str, Any], "_Compared | None"]:
         outcomes = (self.outcomes(REAL, task), self.outcomes(world, task))
@@ -199,14 +200,14 @@ class ClosedLoopReport:
             undefined = dict.fromkeys(FIGURES, UNDEFINED)
             return undefined | {"num_policies": 0, "num_starts": 0, "rates": {}}, None
         pair = {"real": real.mean(axis=1), "imagined": imagined.mean(axis=1)}
-        found: dict[str, Any] = {n: defined(f(**pair)) for n, f in FIGURES.items()}
+        found: dict[str, Any] = {n: defined(f(**pair), len(real)) for n, f in FIGURES.items()}
         joined = None
         if min(real.shape) >= 2:
             generator = np.random.default_rng(_SEED)
             scores = MatchedScores(real[:, :, None], imagined[:, :, None])
             agreement, draws = task_agreement(compared, scores, generator)
             joined = _Compared(tuple(compared), scores, draws)
-            found |= _entries(agreement)
+            found |= _entries(agreement, len(real))
             found["differences"] = {
                 world: _differences(compared, outcomes, generator)
                 for world, outcomes in ((REAL, real), ("imagined", imagined))
@@ -287,19 +288,20 @@ def matched(
     return compared, real[rows][:, columns], imagined[rows][:, columns]
 
 
-def _entries(agreement: Agreement) -> dict[str, Any]:
+def _entries(agreement: Agreement, num_policies: int) -> dict[str, Any]:
     """Report entries of figures and intervals, correlations without one policy, and chance."""
     found: dict[str, Any] = {}
     for name, figure in agreement.figures.items():
         interval = figure.interval
-        found[name] = defined(figure.value)
+        found[name] = defined(figure.value, num_policies)
         found[f"{name}_interval"] = [interval.low, interval.high] if interval else UNDEFINED
         found[f"{name}_undefined_share"] = figure.undefined_share
-    found["pearson_without"] = {name: defined(r) for name, r in agreement.without.items()}
-    found["pearson_chance"] = defined(agreement.chance)
+    without = agreement.without.items()
+    found["pearson_without"] = {name: defined(r, num_policies - 1) for name, r in without}
+    found["pearson_chance"] = defined(agreement.chance, num_policies)
     return found
 
 
-def defined(value: float) -> float | str:
-    """The value, or "undefined" for NaN, which JSON does not have."""
-    return value if math.isfinite(value) else UNDEFINED
+def defined(value: float, num_policies: int) -> float | str:
+    """The value, or "undefined" for NaN, which JSON does not have, with the reason if it is few."""
+    return value if math.isfinite(value) else undefined_by(num_policies)

@@ -77,7 +77,11 @@ def test_lines_by_hand(rolled, tmp_path):
     # It decides two of the scripts' four endings, and is right.
     decided = lines["wrong among the decided imagined endings"]
     assert (decided.value, decided.num, decided.bound) == (0.0, 2, 0.05)
-    assert lines["policies (scripts), Pearson"].value == pytest.approx(1.0)
+    # Two scripts are no correlation. All three: real 1, 0, 0 and imagined 0.5, 0, 0.5.
+    two = lines["policies (scripts), Pearson"]
+    assert (two.value, two.interval, two.num) == (None, None, 2)
+    assert two.text(two.value) == "undefined (2 policies)"
+    assert lines["policies (all), Pearson"].value == pytest.approx(0.5)
     # Real 1, 0, 0 and imagined 0.5, 0, 0.5: the first is not above the last in imagination.
     worst = lines["policies (all), MMRV with ties"]
     assert worst.value == pytest.approx((1 + 0 + 0) / 3)
@@ -99,6 +103,9 @@ def test_lines_by_hand(rolled, tmp_path):
     assert 'class="missed"' in text
     assert 'class="met"' in text
     assert "training seeds" not in text
+    assert "undefined (2 policies)" in text
+    table = {row[0]: row[1] for row in interval_table(list(lines.values())).rows}
+    assert table["a: policies (scripts), Pearson"] == "undefined (2 policies)"
 
 
 def test_several_training_seeds_give_their_mean_and_the_worst(rolled, tmp_path):

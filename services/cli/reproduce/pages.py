@@ -8,14 +8,19 @@ from typing import Any, Final
 import numpy as np
 
 # References shown beside the models, with their headings; the JSON has all.
+NOT_AVAILABLE: Final = "n/a"
 REFERENCES_SHOWN: Final = {"copy": "copy", "warp": "warped start", "codec": "codec alone"}
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A figure measured once for each training seed; NaN where it is not available."""
+    """A figure measured once for each training seed; NaN where it is not available.
+
+    `missing` is what is shown then: the reason, if it is known.
+    """
 
     values: tuple[float, ...]
+    missing: str = NOT_AVAILABLE
 
     @property
     def mean(self) -> float:
@@ -40,7 +45,7 @@ class Measured:
     def text(self, *, signed: bool = False) -> str:
         """Mean and interval, with as many digits as the interval has meaning."""
         if not math.isfinite(self.mean):
-            return "n/a"
+            return self.missing
         sign = "+" if signed else ""
         if not math.isfinite(self.half_width):
             return f"{self.mean:{sign}.4g}"
@@ -65,8 +70,11 @@ class Row:
 
     @property
     def is_available(self) -> bool:
-        """Whether any column has a figure."""
-        return any(math.isfinite(cell.mean) for cell in self.cells.values())
+        """Whether any column has a figure, or a reason why it has none."""
+        return any(
+            math.isfinite(cell.mean) or cell.missing != NOT_AVAILABLE
+            for cell in self.cells.values()
+        )
 
 
 @dataclass(frozen=True)
@@ -131,7 +139,7 @@ def _name(row: Row) -> str:
 
 
 def _reference(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "n/a"
+    return f"{value:.4g}" if math.isfinite(value) else NOT_AVAILABLE
 
 
 def _with_paper(cell: Measured, paper: float | None) -> str:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -277,11 +277,8 @@ def _study_pages(
     for key, name, higher in (("pearson", "Pearson", True), ("mmrv", "MMRV", False)):
         for task in DOWNSTREAM:
             cells = {
-                world: Measured(
-                    tuple(
-                        _number(agreement[f"{world} {seed}"][task][key])
-                        for seed in experiments.seeds
-                    )
+                world: _agreed(
+                    agreement[f"{world} {seed}"][task][key] for seed in experiments.seeds
                 )
                 for world in ADAPTED
             }
@@ -294,5 +291,9 @@ def _study_pages(
     ]
 
 
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, int | float) else math.nan
+def _agreed(by_seed: Iterable[float | str]) -> Measured:
+    """A figure of agreement by training seed; a report has the reason where it is undefined."""
+    found = list(by_seed)
+    values = tuple(math.nan if isinstance(one, str) else float(one) for one in found)
+    reasons = [one for one in found if isinstance(one, str)]
+    return Measured(values, reasons[0]) if reasons else Measured(values)

@@ -58,16 +58,16 @@ function showFigures() {
   find("study_state").replaceChildren(badge(stateOf(summary)), progress(summary));
   setText(find("summary"), `${figures.num_disagreements} imagined outcomes differ from the real ones`);
   setText(find("rate_meaning"), `${meanings.rate} Unreliable: ${meanings.unreliable}`);
-  const named = [["Pearson", "pearson"], ["MMRV", "mmrv"], ["Bias", "bias"], ["Intervals", "interval"]];
+  const named = [["Pearson", "pearson"], ["Mean absolute error", "mean_absolute_error"], ["MMRV", "mmrv"], ["Bias", "bias"], ["Intervals", "interval"]];
   find("meanings").replaceChildren(...named.flatMap(([label, key]) => [element("dt", {}, label), element("dd", {}, meanings[key])]));
   showRates();
-  const heads = [["World", ""], ["Task", ""], ["Pearson", "number"], ["MMRV", "number"], ["Bias", "number"], ["Chance", "number"], ["Policies × starts", "number"], ["", ""]];
+  const heads = [["World", ""], ["Task", ""], ["Pearson", "number"], ["Mean absolute error", "number"], ["MMRV", "number"], ["Bias", "number"], ["Chance", "number"], ["Policies × starts", "number"], ["", ""]];
   const chance = "share of all pairings of the policies' rates that correlate at least as well";
   find("agreement").tHead.replaceChildren(element("tr", {}, ...heads.map(([label, kind]) =>
     element("th", { scope: "col", class: kind || null, title: label === "Chance" ? chance : null }, label))));
   const shown = figures.agreement.map(agreementRow);
   find("agreement").tBodies[0].replaceChildren(...(shown.length ? shown
-    : [element("tr", {}, element("td", { colspan: 8, class: "free" }, "This study has no imagined world."))]));
+    : [element("tr", {}, element("td", { colspan: 9, class: "free" }, "This study has no imagined world."))]));
 }
 
 async function findPlayable(found) {

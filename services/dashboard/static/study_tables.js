@@ -34,7 +34,7 @@ export function rateCell(rate, open) {
 function figureCell(one, name, caution = "") {
   return element("td", { class: "number", "data-figure": name },
     element("strong", {}, figure(one.figures[name])), " ",
-    element("span", { class: "quiet" }, one.figures[name] === null ? "undefined" : interval(one.intervals[name])),
+    element("span", { class: "quiet" }, one.figures[name] === null ? one.undefined : interval(one.intervals[name])),
     caution ? element("span", { class: "caution" }, caution) : null);
 }
 
@@ -44,7 +44,7 @@ export function agreementRow(one) {
   return element("tr", { "data-world": one.world, "data-task": one.task },
     element("td", { class: "name" }, one.world),
     element("td", {}, one.task || "all tasks together"),
-    figureCell(one, "pearson", one.is_vague ? "too wide to tell a faithful world from a poor one" : ""), figureCell(one, "mmrv"), figureCell(one, "bias"),
+    figureCell(one, "pearson", one.is_vague ? "too wide to tell a faithful world from a poor one" : ""), figureCell(one, "mean_absolute_error"), figureCell(one, "mmrv"), figureCell(one, "bias"),
     element("td", { class: "number" }, one.chance === null ? "–" : one.chance < 0.001 ? "< 0.001" : one.chance.toFixed(3)),
     element("td", { class: "number" }, `${one.num_policies} × ${one.num_starts}`),
     element("td", { class: "free" }, comments));

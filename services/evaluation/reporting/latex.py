@@ -7,7 +7,8 @@ packages booktabs and multirow.
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from services.evaluation.reporting.sections import is_number
+from services.evaluation.comments import UNDEFINED
+from services.evaluation.reporting.sections import figure, is_number
 from services.evaluation.scores import REAL, ClosedLoopReport
 
 _ESCAPED: Final = {letter: rf"\{letter}" for letter in "#$%&_{}"} | {
@@ -77,7 +78,7 @@ def _rate(row: Mapping[str, Any], world: str, report: ClosedLoopReport) -> str:
 
 def _with_interval(value: object, interval: object) -> str:
     if not is_number(value):
-        return "--"
+        return "--" if figure(value) == UNDEFINED else figure(value)
     if not isinstance(interval, list):
         return f"{value:.3f}"
     return rf"{value:.3f} {{\scriptsize [{interval[0]:.2f}, {interval[1]:.2f}]}}"

@@ -151,9 +151,12 @@ def is_number(value: object) -> bool:
 
 
 def figure(value: object, digits: int = 3) -> str:
-    """Format a figure with three significant digits; non-finite values are "undefined"."""
+    """Format a figure with three significant digits; non-finite values are "undefined".
+
+    The reason of an undefined figure stays: "undefined (2 policies)".
+    """
     if not is_number(value):
-        return UNDEFINED
+        return value if isinstance(value, str) and value.startswith(UNDEFINED) else UNDEFINED
     number = float(str(value))
     if number != 0 and not 1e-3 <= abs(number) < 1e5:
         return f"{number:.{digits - 1}e}"
@@ -286,10 +289,28 @@ def tiles(report: Mapping[str, Any]) -> list[Tile]:
         if best > 0:
             ratio = model["tactile_mse"] / best
             found.append(Tile("touch predicted", f"{ratio:.0%}", "of the best baseline's error"))
-    defined = [a["pearson"] for a in agreement.values() if is_number(a.get("pearson"))]
     if agreement:
-        value = figure(sum(defined) / len(defined)) if defined else UNDEFINED
-        found.append(
-            Tile("worlds agree", value, f"Pearson, {len(defined)} of {len(agreement)} tasks")
-        )
+        tasks = list(agreement.values())
+        found.append(_agreement_tile("worlds agree", "pearson", "Pearson", tasks))
+        if any(is_number(task.get("mean_absolute_error")) for task in tasks):
+            what = "mean absolute error of success rates"
+            found.append(_agreement_tile("rates differ by", "mean_absolute_error", what, tasks))
     return found
+
+
+def _agreement_tile(name: str, key: str, what: str, tasks: Sequence[Mapping[str, Any]]) -> Tile:
+    """Mean of a figure over tasks, with the range of their 95 % intervals."""
+    defined = [task for task in tasks if is_number(task.get(key))]
+    if not defined:
+        reasons = {figure(task.get(key)) for task in tasks}
+        return Tile(name, reasons.pop() if len(reasons) == 1 else UNDEFINED, f"{what}, no task")
+    value = figure(sum(task[key] for task in defined) / len(defined))
+    intervals = [task.get(f"{key}_interval") for task in defined]
+    known = [one for one in intervals if isinstance(one, list)]
+    interval = "no interval"
+    if known:
+        low, high = min(one[0] for one in known), max(one[1] for one in known)
+        interval = (
+            f"95 % {'interval' if len(tasks) == 1 else 'intervals within'} {low:.2f} to {high:.2f}"
+        )
+    return Tile(name, value, f"{what}, {len(defined)} of {len(tasks)} tasks; {interval}")

@@ -7,7 +7,7 @@ from typing import Any, Final
 from pydantic import AwareDatetime
 
 from dextouch.frozen_model import FrozenModel
-from services.evaluation.comments import UNDEFINED, VAGUE_R
+from services.evaluation.comments import UNDEFINED, VAGUE_R, undefined_by
 from services.evaluation.scores import REAL, ClosedLoopReport, RolloutFailure, RolloutScore
 from services.evaluation.studies.definition import StudyDefinition
 from services.evaluation.studies.results import (
@@ -24,9 +24,12 @@ MEANINGS: Final = {
     "rate": "Share of the starts from which the policy succeeded, with its 95 % Wilson interval. "
     "In an imagined world success is what the success probe finds more likely.",
     "pearson": "Pearson's r: 1 if the world's success rates of the policies are a straight line "
-    "over the real ones, 0 if they say nothing about them, negative if they reverse them.",
+    "over the real ones, 0 if they say nothing about them, negative if they reverse them. It needs "
+    "three policies: two points always lie on a line.",
     "mmrv": "Mean maximum rank violation: for each policy the largest real difference to a policy "
     "that the world ranks the other way, averaged over the policies; 0 if it never does.",
+    "mean_absolute_error": "Mean absolute difference of the world's success rates from the real "
+    "ones.",
     "bias": "Mean of the world's success rates minus the real ones; above 0 it is too optimistic.",
     "interval": "Intervals contain the true policies' figure with 95 % probability; with few "
     "policies or starts they are wide.",
@@ -78,6 +81,7 @@ class StudyAgreement(FrozenModel):
     """Agreement of an imagined world with the real one; `task` is empty for all tasks at once.
 
     `is_vague`: Pearson's interval is too wide to tell a faithful world from a poor one.
+    `undefined`: what to show for figures that are None.
     """
 
     world: str
@@ -85,6 +89,7 @@ class StudyAgreement(FrozenModel):
     figures: dict[str, float | None]
     intervals: dict[str, tuple[float, float] | None]
     is_vague: bool
+    undefined: str
     chance: float | None
     num_policies: int
     num_starts: int
@@ -256,10 +261,11 @@ def _agreed(
     return StudyAgreement(
         world=world,
         task=task,
-        figures={name: None if v == UNDEFINED else v for name, v in figures.items()},
+        figures={name: None if isinstance(v, str) else v for name, v in figures.items()},
         intervals={n: None if v == UNDEFINED else tuple(v) for n, v in intervals.items()},
         is_vague=intervals["pearson"] != UNDEFINED and intervals["pearson"][0] < VAGUE_R,
-        chance=None if chance == UNDEFINED else chance,
+        undefined=undefined_by(found["num_policies"]),
+        chance=None if isinstance(chance, str) else chance,
         num_policies=found["num_policies"],
         num_starts=found["num_starts"],
         comments=comments,

@@ -4,12 +4,19 @@ Arguments are keyword-only: MMRV is not symmetric, and swapping real and imagine
 mistake. Undefined values are NaN, never 0 or 1.
 """
 
+from typing import Final
+
 import numpy as np
 
 from dextouch.errors import UnknownNameError
 from dextouch.metrics.checks import checked_pair
 
 TIE_RULES = ("paper", "simpler")
+# Two points always lie on a line, and two ranks always agree or are reversed: every correlation
+# of two policies is 1 or -1, whatever their scores.
+MIN_POLICIES: Final = 3
+# Sums of equal shares differ by about 1e-16 in another order; rates of a million starts by 1e-6.
+_ROUNDING: Final = 1e-12
 
 
 def _scores(real: np.ndarray, imagined: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
@@ -20,10 +27,10 @@ def _scores(real: np.ndarray, imagined: np.ndarray, what: str) -> tuple[np.ndarr
 def pearson(*, real: np.ndarray, imagined: np.ndarray) -> float:
     """Linear correlation of scores [policies], in −1 … 1.
 
-    NaN when undefined: fewer than two policies, or all scores of one side equal.
+    NaN when undefined: fewer than three policies, or all scores of one side equal.
     """
     a, b = _scores(real, imagined, "Pearson")
-    if len(a) < 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
+    if len(a) < MIN_POLICIES or _all_equal(a) or _all_equal(b):
         return float("nan")
     a, b = a - a.mean(), b - b.mean()
     # Squares of tiny or huge numbers under- or overflow float64.
@@ -41,9 +48,11 @@ def spearman(*, real: np.ndarray, imagined: np.ndarray) -> float:
 def kendall(*, real: np.ndarray, imagined: np.ndarray) -> float:
     """Kendall's τ-b: concordant minus discordant pairs, corrected for ties.
 
-    NaN when undefined: fewer than two policies, or all scores of one side equal.
+    NaN when undefined: fewer than three policies, or all scores of one side equal.
     """
     a, b = _scores(real, imagined, "Kendall")
+    if len(a) < MIN_POLICIES:
+        return float("nan")
     order_a, order_b = _orders(a), _orders(b)
     pairs = np.count_nonzero(order_a) * np.count_nonzero(order_b)
     return float(np.sum(order_a * order_b) / np.sqrt(pairs)) if pairs else float("nan")
@@ -93,8 +102,13 @@ def mean_absolute_error(*, real: np.ndarray, imagined: np.ndarray) -> float:
 
 
 def _orders(scores: np.ndarray) -> np.ndarray:
-    """+1, 0 or −1 for every ordered pair."""
-    return np.sign(scores[:, None] - scores[None, :])
+    """+1, 0 or −1 for every ordered pair; scores that differ by rounding alone are equal."""
+    gaps = scores[:, None] - scores[None, :]
+    return np.where(np.abs(gaps) <= _ROUNDING * np.abs(scores).max(), 0.0, np.sign(gaps))
+
+
+def _all_equal(scores: np.ndarray) -> bool:
+    return bool(np.ptp(scores) <= _ROUNDING * np.abs(scores).max())
 
 
 def _mean_ranks(scores: np.ndarray) -> np.ndarray:

@@ -16,13 +16,15 @@ from safetensors.numpy import save_file
 
 from dextouch.errors import ConflictError, NotFoundError
 from services.cli.main import find_command, main
-from services.cli.reproduce.experiments import TABLES, Experiments
+from services.cli.reproduce.experiments import ADAPTED, TABLES, Experiments
 from services.cli.reproduce.pages import Measured, Page, Row
 from services.cli.reproduce.provenance import data_of
 from services.cli.reproduce.sizes import QUICK, Sizes
 from services.cli.reproduce.steps import Runner, Step
 from services.cli.reproduce.tables import METRICS, make_pages
+from services.evaluation.scores import ClosedLoopReport, RolloutScore
 from services.evaluation.studies.definition import read_definition
+from services.twin.tasks.registry import DOWNSTREAM
 
 # A command that appends its last word to a file and writes the result that its first word names.
 PROGRAM = (
@@ -217,6 +219,31 @@ def test_a_prediction_table_reads_the_figures_of_its_steps(tmp_path):
     assert line.endswith("| 18.25 | n/a | n/a |")
     assert page.to_json()["rows"][0]["references"]["copy"] == pytest.approx(18.25)
     assert "| PSNR, other actions ↓ | 17.0000 ± 0.0000 |" in text
+
+
+def test_a_table_of_two_policies_says_that_these_are_no_correlation(tmp_path):
+    experiments = Experiments(QUICK, (0,))
+    figures = {key: None for _, key, _ in METRICS} | {"psnr": 20.0}
+    sources = {"model": figures, "other_take": figures}
+    worlds = [f"{world} 0" for world in ADAPTED]
+    for world in ADAPTED:
+        path = tmp_path / f"evaluator/{world}/seed-0/prediction/result.json"
+        path.parent.mkdir(parents=True)
+        path.write_text(json.dumps({"windows": {"all": sources}}))
+    scores = [
+        RolloutScore(world, policy, task, seed, f"{task} {seed}", seed < wins, 0.5)
+        for world in ("real", *worlds)
+        for task in DOWNSTREAM
+        for policy, wins in (("first", 1), ("second", 2))
+        for seed in range(3)
+    ]
+    study = ClosedLoopReport(tuple(scores), tuple(worlds), ("first", "second")).to_report()
+    (tmp_path / "evaluator/study").mkdir(parents=True)
+    (tmp_path / "evaluator/study/result.json").write_text(json.dumps(study))
+    text = "\n".join(page.markdown() for page in make_pages(tmp_path, experiments, "evaluator"))
+    rows = [line for line in text.splitlines() if line.startswith("| Pearson, ")]
+    assert sum("undefined (2 policies)" in row for row in rows) == len(DOWNSTREAM)
+    assert not any("1.0" in row or "| 1 " in row for row in rows)
 
 
 def test_the_table_of_options_has_those_that_are_measured(tmp_path):

@@ -196,6 +196,35 @@ def test_a_world_without_spread_has_no_correlation():
     assert (pearson.interval, pearson.undefined_share) == (None, 1.0)
 
 
+def test_two_policies_have_no_correlation_also_over_several_tasks():
+    """Two points lie on a line; four points of two policies only tell easy tasks from hard ones."""
+    tasks = [
+        MatchedScores(binary(rates, 20, rng(40)), binary(rates, 20, rng(41)))
+        for rates in ([0.1, 0.3], [0.7, 0.9])
+    ]
+    alone, draws = zip(*(task_agreement("ab", scores, rng(42)) for scores in tasks), strict=True)
+    for agreement in (*alone, pooled_agreement("ab", tasks, draws, rng(43))):
+        for name in ("pearson", "spearman", "kendall"):
+            figure = agreement.figures[name]
+            assert math.isnan(figure.value)
+            assert (figure.interval, figure.undefined_share) == (None, 1.0)
+        assert all(math.isnan(r) for r in agreement.without.values())
+        assert math.isnan(agreement.chance)
+        # Ranks of two policies can be violated, and rates differ from real ones.
+        for name in ("mmrv", "bias", "mean_absolute_error"):
+            assert agreement.figures[name].interval is not None
+
+
+def test_three_policies_without_one_are_two():
+    tasks = [
+        MatchedScores(*(binary([0.1, 0.5, 0.9], 20, rng(k)) for k in (s, s + 1))) for s in (44, 46)
+    ]
+    alone, draws = zip(*(task_agreement("abc", scores, rng(48)) for scores in tasks), strict=True)
+    for agreement in (*alone, pooled_agreement("abc", tasks, draws, rng(49))):
+        assert math.isfinite(agreement.figures["pearson"].value)
+        assert all(math.isnan(r) for r in agreement.without.values())
+
+
 def test_absent_raters_are_left_out():
     full = rng(20).random((2, 6, 3))
     gaps = np.concatenate([np.full((2, 6, 1), np.nan), full[:, :, :1]], axis=2)

@@ -3,11 +3,11 @@
 from services.evaluation.reporting.latex import escape, latex_tables
 from services.evaluation.scores import ClosedLoopReport, RolloutScore
 
-# Two policies, four starts, two imagined worlds: rates 1, 0 | .75, .25 | .5, .5.
+# Three policies, four starts, two imagined worlds: rates 1, 0, .5 | .75, .25, .5 | .5, .5, .5.
 MARKS = {
-    "real": {"FTP-1": "1111", "a_b": "0000"},
-    "WM-Robot": {"FTP-1": "1110", "a_b": "1000"},
-    "WM-Mix": {"FTP-1": "1100", "a_b": "1100"},
+    "real": {"FTP-1": "1111", "a_b": "0000", "C": "1100"},
+    "WM-Robot": {"FTP-1": "1110", "a_b": "1000", "C": "1100"},
+    "WM-Mix": {"FTP-1": "1100", "a_b": "1100", "C": "1100"},
 }
 
 
@@ -18,7 +18,7 @@ def report(worlds):
         for policy, marks in policies.items()
         for n, mark in enumerate(marks)
     )
-    return ClosedLoopReport(scores, tuple(w for w in worlds if w != "real"), ("FTP-1", "a_b"))
+    return ClosedLoopReport(scores, tuple(w for w in worlds if w != "real"), tuple(worlds["real"]))
 
 
 def test_rates_by_hand():
@@ -37,14 +37,25 @@ def test_rates_by_hand():
         r"\multirow{3}{*}{a\_b} & Real world & 0.000 {\scriptsize [0.00, 0.49]} \\",
         r" & WM-Robot & 0.250 {\scriptsize [0.05, 0.70]} \\",
         r" & WM-Mix & 0.500 {\scriptsize [0.15, 0.85]} \\",
+        r"\midrule",
+        r"\multirow{3}{*}{C} & Real world & 0.500 {\scriptsize [0.15, 0.85]} \\",
+        r" & WM-Robot & 0.500 {\scriptsize [0.15, 0.85]} \\",
+        r" & WM-Mix & 0.500 {\scriptsize [0.15, 0.85]} \\",
         r"\bottomrule",
     ]
     rows = agreement.splitlines()
     assert rows[5].startswith(r"\multirow{3}{*}{WM-Robot} & Pearson & 1.000 {\scriptsize [")
     # Equal rates in the imagined world: no correlation, and a tie that the paper's rule misses.
     assert rows[9] == r"\multirow{3}{*}{WM-Mix} & Pearson & -- \\"
+    # MMRV: a tie hides that the first is 1 above the second and the third 0.5: (1 + 0 + 0.5) / 3.
     assert rows[10].startswith(r" & MMRV & 0.500")
     assert rows[11].startswith(r" & MMRV (paper) & 0.000")
+
+
+def test_two_policies_have_no_correlation():
+    two = {world: dict(list(marks.items())[:2]) for world, marks in MARKS.items()}
+    rows = latex_tables(report(two)).split("\\end{tabular}\n")[1].splitlines()
+    assert rows[5] == r"\multirow{3}{*}{WM-Robot} & Pearson & undefined (2 policies) \\"
 
 
 def test_a_real_world_alone_has_one_table():

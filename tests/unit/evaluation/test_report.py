@@ -210,7 +210,8 @@ def test_headlines():
 @pytest.mark.parametrize(
     ("value", "shown"),
     [(0, "0.0"), (0.9912, "0.991"), (12.34, "12.3"), (1234.5, "1234"), (-3.14159, "-3.14"),
-     (2e-5, "2.00e-05"), (None, "undefined"), ("undefined", "undefined"), (np.inf, "undefined")],
+     (2e-5, "2.00e-05"), (None, "undefined"), ("undefined", "undefined"), (np.inf, "undefined"),
+     ("undefined (2 policies)", "undefined (2 policies)"), ("x", "undefined")],
 )  # fmt: skip
 def test_figures_have_three_digits(value, shown):
     assert figure(value) == shown

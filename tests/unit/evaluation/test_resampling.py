@@ -67,6 +67,7 @@ def test_draws_without_both_outcomes_are_undefined():
     ]
     assert np.isnan(balanced_accuracy_of_draws(scores, success, start, counts))[0]
     assert np.isnan(pearson_of_draws(np.ones((1, 3)), np.eye(1, 3))).all()
+    assert np.isnan(pearson_of_draws(np.eye(2), np.eye(2))).all()
     assert np.isnan(mmrv_of_draws(np.ones((2, 1)), np.ones((2, 1)))).all()
 
 

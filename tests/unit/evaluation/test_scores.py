@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError
+from services.evaluation.command_line import print_scores
 from services.evaluation.reporting import ReportPictures, write_report
+from services.evaluation.reporting.sections import tiles
 from services.evaluation.scores import ClosedLoopReport, RolloutFailure, RolloutScore
 
 
@@ -124,7 +126,82 @@ def test_a_correlation_that_hangs_on_one_policy_is_named():
     sentences = report(worlds).to_report()["comments"]["stand"]
     assert any(sentence.startswith("Without 'a', r would be -0.") for sentence in sentences)
     alone = report({"real": {"a": "10"}, "dream": {"a": "10"}}).to_report()
-    assert alone["comments"]["stand"][-1].endswith("at least two policies.")
+    assert alone["comments"]["stand"][-1].startswith("Pearson is undefined (1 policy): it needs")
+    assert alone["agreement"]["stand"]["mmrv"] == "undefined (1 policy)"
+
+
+TWO = {
+    "real": {"a": "111110", "b": "100000"},
+    "dream": {"a": "111100", "b": "110000"},
+    "other": {"a": "111000", "b": "000000"},
+}
+
+
+def test_two_policies_are_no_correlation_anywhere_in_the_report(tmp_path, capsys):
+    found = report(TWO).to_report()
+    for agreement in (found["agreement"], found["agreement_of_other_worlds"]["other"]):
+        for name in ("pearson", "spearman", "kendall", "pearson_chance"):
+            assert agreement["stand"][name] == "undefined (2 policies)"
+        assert agreement["stand"]["pearson_interval"] == "undefined"
+    # By hand: |4/6 - 5/6| and |2/6 - 1/6|.
+    assert found["agreement"]["stand"]["mean_absolute_error"] == pytest.approx(1 / 6)
+    said = " ".join(found["comments"]["stand"])
+    assert "Pearson is undefined (2 policies): it needs at least three" in said
+    assert "Pearson's r is" not in said
+    print_scores(found)
+    line = next(one for one in capsys.readouterr().out.splitlines() if one.startswith("stand:"))
+    assert line.startswith("stand: Pearson undefined (2 policies), MMRV 0.0 with ties")
+    assert "mean absolute error of the success rates 0.167 (95 % " in line
+    (tile, beside) = tiles(found)
+    assert (tile.name, tile.value) == ("worlds agree", "undefined (2 policies)")
+    assert (beside.name, beside.value) == ("rates differ by", "0.167")
+    assert "95 % interval 0." in beside.note
+    write_report(found, ReportPictures(), tmp_path / "report.html")
+    shown = (tmp_path / "report.html").read_text().split("<details")[0]
+    assert "undefined (2 policies)" in shown
+    assert "1.00 to 1.00" not in shown
+
+
+def test_the_tile_of_three_policies_has_its_interval():
+    found = report(GOOD).to_report()
+    tile, error = tiles(found)
+    stand = found["agreement"]["stand"]
+    low, high = stand["pearson_interval"]
+    assert tile.value == f"{np.corrcoef([1, 0.5, 0], [0.75, 0.75, 0.25])[0, 1]:.3f}"
+    assert tile.note == f"Pearson, 1 of 1 tasks; 95 % interval {low:.2f} to {high:.2f}"
+    # By hand: (0.25 + 0.25 + 0.25) / 3.
+    assert error.value == "0.250"
+
+
+def test_one_policy_that_never_ended_leaves_two():
+    gone = [("model", "c", seed) for seed in range(4)]
+    assert lost(report(GOOD), *gone)["agreement"]["stand"]["pearson"] == "undefined (2 policies)"
+
+
+def test_two_policies_of_two_tasks_are_no_correlation_together():
+    first = report({name: TWO[name] for name in ("real", "dream")}).scores
+    second = tuple(replace(s, task="pour", success=not s.success) for s in first)
+    whole = ClosedLoopReport(first + second, ("dream",), ("a", "b")).to_report()
+    assert whole["agreement_of_all_tasks"]["pearson"] == "undefined (2 policies)"
+    assert whole["agreement_of_all_tasks"]["mmrv"] == 0.0
+
+
+def test_rates_that_differ_by_rounding_alone_are_equal():
+    """Three starts of ten repeats: shares 0.1, 0.2, 0.3 in another order are the same rate."""
+    scores = [
+        RolloutScore("real", policy, "stand", k, f"start {k}", k < wins, 0.5)
+        for policy, wins in (("a", 0), ("b", 1), ("c", 3))
+        for k in range(3)
+    ]
+    scores += [
+        RolloutScore("dream", policy, "stand", k, f"start {k}", n < wins, 0.5, repeat=n)
+        for policy, successes in (("a", (1, 2, 3)), ("b", (3, 2, 1)), ("c", (1, 2, 3)))
+        for k, wins in enumerate(successes)
+        for n in range(10)
+    ]
+    whole = ClosedLoopReport(tuple(scores), ("dream",), ("a", "b", "c")).to_report()
+    assert whole["agreement"]["stand"]["pearson"] == "undefined"
+    assert "the same success rate (0.20) in dream" in whole["comments"]["stand"][-1]
 
 
 def test_chance_below_its_resolution_is_said_in_words():

@@ -10,6 +10,7 @@ from services.evaluation.studies import study_folders
 from services.evaluation.studies.app import StudyServiceSettings, create_app
 from services.evaluation.studies.results import StudyResults
 from tests.unit.evaluation.study_rows import (
+    DEFINITION,
     DOUBTED,
     ROWS,
     WORLDS,
@@ -74,6 +75,22 @@ async def test_agreement_is_that_of_scipy_and_two_loops(root):
             assert one["comments"]
     assert ("", "model") in agreement
     assert set(found["meanings"]) >= {"rate", "pearson", "mmrv", "unreliable"}
+
+
+async def test_two_policies_are_no_correlation_in_a_task_nor_over_all(tmp_path, monkeypatch):
+    for task, policies in ROWS.items():
+        monkeypatch.setitem(ROWS, task, {name: policies[name] for name in ("careful", "clumsy")})
+    policies = {name: {"script": "hold"} for name in ("careful", "clumsy")}
+    monkeypatch.setitem(DEFINITION, "policies", policies)
+    write_study(tmp_path / "touch")
+    found = await read(tmp_path, "/v1/studies/touch")
+    assert [one["task"] for one in found["agreement"]].count("") == 2
+    for one in found["agreement"]:
+        assert (one["figures"]["pearson"], one["figures"]["spearman"]) == (None, None)
+        assert (one["intervals"]["pearson"], one["chance"], one["is_vague"]) == (None, None, False)
+        assert one["undefined"] == "undefined (2 policies)"
+        assert one["figures"]["mean_absolute_error"] is not None
+        assert not any("Pearson's r is" in text for text in one["comments"])
 
 
 async def test_disagreements_come_first_and_the_doubted_ones_last(root):

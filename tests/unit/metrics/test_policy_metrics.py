@@ -83,10 +83,32 @@ def test_ties_count_only_in_the_simpler_rule():
 
 @pytest.mark.parametrize("measure", [policy.pearson, policy.spearman, policy.kendall])
 @pytest.mark.parametrize(
-    ("real", "imagined"), [([0.5], [0.5]), ([0.1, 0.1, 0.1], [0.1, 0.2, 0.3]), ([1, 2], [3, 3])]
+    ("real", "imagined"),
+    [
+        ([0.5], [0.5]),
+        ([0.1, 0.1, 0.1], [0.1, 0.2, 0.3]),
+        ([1, 2], [3, 3]),
+        # Two points always lie on a line: |r| is 1 whatever the scores.
+        ([0.2, 0.8], [0.7, 0.1]),
+        ([0.2, 0.8], [0.3, 0.31]),
+        # Equal but for the order in which three shares were added.
+        ([0.1, 0.5, 0.9], [0.1 + 0.2 + 0.3, 0.3 + 0.2 + 0.1, 0.6]),
+    ],
 )
 def test_undefined_is_nan(measure, real, imagined):
     assert np.isnan(measure(real=np.array(real), imagined=np.array(imagined)))
+
+
+def test_rounding_makes_no_rank():
+    assert 0.1 + 0.2 + 0.3 != 0.3 + 0.2 + 0.1
+    scores = {
+        "real": np.array([0.2, 0.8, 1.0]),
+        "imagined": np.array([0.1 + 0.2 + 0.3, 0.3 + 0.2 + 0.1, 0.9]),
+    }
+    # As with equal scores: one tie of three pairs, and SciPy's τ-b of (1, 2, 3) and (1, 1, 2).
+    assert policy.kendall(**scores) == pytest.approx(stats.kendalltau([1, 2, 3], [1, 1, 2])[0])
+    assert policy.mmrv(**scores) == 0.0
+    assert policy.mmrv(**scores, ties="simpler") == pytest.approx(0.6 / 3)
 
 
 def test_mmrv_of_one_policy_is_undefined():
