@@ -37,7 +37,6 @@ from services.world_model.network.solvers import Sampler
 from services.world_model.placement import Placement
 from services.world_model.presets import PRESETS, PresetSource
 from services.world_model.rendering.configuration import RendererConfig
-from services.world_model.rendering.precision import has_fast_bfloat16
 from services.world_model.rendering.training import RendererTraining
 from services.world_model.wan.configuration import WanFiles
 
@@ -221,7 +220,9 @@ class ReaderSettings(FrozenModel):
     learning_rate: LearningRate = 2e-3
     ema_decay: AverageDecay = 0.995
     first_fraction: float = Field(default=0.6, ge=0, le=1, description="share of first steps")
-    bfloat16: bool = Field(default_factory=has_fast_bfloat16, description="convolve in bfloat16")
+    bfloat16: bool | None = Field(
+        default=None, description="convolve in bfloat16; default: if that is faster here"
+    )
 
 
 class CoreLossWeights(FrozenModel):
@@ -255,7 +256,9 @@ class CoreSettings(FrozenModel):
     weights: CoreLossWeights = Field(
         default=CoreLossWeights(), description="weights of the training targets"
     )
-    bfloat16: bool = Field(default_factory=has_fast_bfloat16, description="train in bfloat16")
+    bfloat16: bool | None = Field(
+        default=None, description="train in bfloat16; default: if that is faster here"
+    )
 
 
 class StateTrainSettings(FrozenModel):

@@ -17,7 +17,7 @@ from services.world_model.rendering.inputs import (
     drawing_inputs_from,
 )
 from services.world_model.rendering.network import RendererNetwork
-from services.world_model.rendering.precision import has_fast_bfloat16
+from services.world_model.rendering.precision import uses_bfloat16 as uses_bfloat16_here
 from services.world_model.rendering.scene_states import SceneState, SceneStates
 
 
@@ -26,13 +26,12 @@ class Renderer:
 
     Args:
         network: trained weights; they are copied.
-        uses_bfloat16: run convolutions in bfloat16; default: if the processor has instructions for
-            it.
+        uses_bfloat16: run convolutions in bfloat16; default: if that is clearly faster on this
+            processor, which is timed once in a process.
     """
 
     def __init__(self, network: RendererNetwork, *, uses_bfloat16: bool | None = None) -> None:
-        fast = has_fast_bfloat16() if uses_bfloat16 is None else uses_bfloat16
-        dtype = torch.bfloat16 if fast else torch.float32
+        dtype = torch.bfloat16 if uses_bfloat16_here(setting=uses_bfloat16) else torch.float32
         self._network = copy.deepcopy(network).eval().requires_grad_(requires_grad=False)
         self._network.to(dtype)
         # A rollout draws all its chunks from one start.

@@ -69,7 +69,7 @@ class RendererTraining(FrozenModel):
     shake_m: float = Field(default=0.003, ge=0, description="position noise per axis")
     shake_rad: float = Field(default=0.05, ge=0, description="rotation noise per axis")
     uses_bfloat16: bool = Field(
-        default=True, description="convolve in bfloat16 where the processor supports it"
+        default=True, description="convolve in bfloat16 where that is faster"
     )
 
 

@@ -16,6 +16,7 @@ from services.world_model.dynamics.features import command_features
 from services.world_model.dynamics.model import Commands
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.touch_codec import TouchCodec
+from services.world_model.rendering.precision import uses_bfloat16
 from services.world_model.settings import CoreSettings
 from services.world_model.training.averaging import OnStep, train_averaged
 from services.world_model.training.scene_table import SceneTable
@@ -200,7 +201,9 @@ def core_loss(
     features = command_features(
         commands.points_m, commands.axes, commands.joints_rad, start.objects
     )
-    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=settings.bfloat16):
+    with torch.autocast(
+        "cpu", dtype=torch.bfloat16, enabled=uses_bfloat16(setting=settings.bfloat16)
+    ):
         future, _ = core(features, start, core.first_state(start))
     future = _in_float32(future)
     table, rows = data.table, batch.rows

@@ -10,6 +10,7 @@ from torch.nn import functional
 from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import StartReader
+from services.world_model.rendering.precision import uses_bfloat16
 from services.world_model.settings import ReaderSettings
 from services.world_model.training.averaging import OnStep, train_averaged
 from services.world_model.training.scene_table import SceneTable
@@ -61,7 +62,12 @@ def train_reader(
         amid = torch.tensor(later)[torch.randint(len(later), rows.shape, generator=generator)]
         is_first = torch.rand(rows.shape, generator=generator) < settings.first_fraction
         steps = torch.where(is_first, 0, amid)
-        return _loss(reader, (table, rows, steps), generator, bfloat16=settings.bfloat16)
+        return _loss(
+            reader,
+            (table, rows, steps),
+            generator,
+            bfloat16=uses_bfloat16(setting=settings.bfloat16),
+        )
 
     return train_averaged(reader, loss, settings, weight_decay=_WEIGHT_DECAY, on_step=on_step)
 

@@ -26,6 +26,7 @@ from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.touch_codec import TouchCodec
 from services.world_model.recorded_commands import flags_of, last_name
 from services.world_model.rendering.network import RendererNetwork
+from services.world_model.rendering.precision import uses_bfloat16
 from services.world_model.rendering.training import RendererProgress, train_renderer
 from services.world_model.settings import StateTrainSettings
 from services.world_model.state_checkpoints import (
@@ -80,6 +81,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         InvalidInputError: no episodes, or episodes that do not fit together.
     """
     torch.set_num_threads(1)
+    settings = _with_precision(settings)
     episodes = _episodes(settings)
     training, heldout = split_by_scene(episodes, held_out_share=settings.heldout_share)
     refuse_shared_scenes(training, heldout)
@@ -169,6 +171,15 @@ class _Work:
         )
         text = f"{version} {chosen} {self.data_hash}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _with_precision(settings: StateTrainSettings) -> StateTrainSettings:
+    """Settings that name the precision: it is chosen once, and part of the keys of all parts."""
+    reader, core = (
+        part.model_copy(update={"bfloat16": uses_bfloat16(setting=part.bfloat16)})
+        for part in (settings.reader, settings.core)
+    )
+    return settings.model_copy(update={"reader": reader, "core": core})
 
 
 def _episodes(settings: StateTrainSettings) -> list[SceneEpisode]:
