@@ -64,6 +64,7 @@ def main(arguments: Sequence[str]) -> int:
     measured = [metrics[name] for name in chosen]
     result["metrics"] = described(measured)
     result["baselines"] = {name: BASELINES[name] for name in options.baselines}
+    result["missing_baselines"] = {}
     for horizon in [options.horizon] if options.horizon else _HORIZONS:
         scenes = [scene for one in wanted for scene in _HORIZONS[horizon](store.open(one))]
         if set(chosen) & set(GEOMETRY):
@@ -72,6 +73,7 @@ def main(arguments: Sequence[str]) -> int:
         found = measure_prediction(world, scenes, metrics=measured, baselines=options.baselines)
         result[horizon] = dict(found.by_task)
         result[f"num_{horizon}"] = found.num_scenes
+        result["missing_baselines"][horizon] = dict(found.missing)
         print(
             f"\n{horizon}: {found.num_scenes} from {len(wanted)} episodes\n{_table(found, metrics)}"
         )
@@ -122,6 +124,7 @@ def _table(found: PredictionResult, metrics: Mapping[str, Metric]) -> str:
         f"{metrics[n].title}: {metrics[n].missing}" for n in figures[MODEL] if metrics[n].missing
     ]
     about += [f"{name}: {BASELINES[name]}" for name in sources if name != MODEL]
+    about += [f"{name} is missing: {reason}" for name, reason in found.missing.items()]
     return "\n".join([*lines, "", *about])
 
 

@@ -4,6 +4,7 @@ Only the `World` interface is used, so that all kinds of world models are measur
 over windows of one chunk, or over whole open-loop rollouts.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -238,12 +239,14 @@ Figures = dict[str, dict[str, float | None]]
 class PredictionResult:
     """Figures by task (`all` for all together), source and metric; None where not available.
 
-    The source is `model` or a baseline. `pictures` are of the first scene of every task.
+    The source is `model` or a baseline. `missing` says of baselines why some scenes, or all, have
+    none; figures are then over the others. `pictures` are of the first scene of every task.
     """
 
     by_task: Mapping[str, Figures]
     num_scenes: int
     pictures: tuple[PredictionPicture, ...]
+    missing: Mapping[str, str]
 
     def flat(self) -> dict[str, float]:
         """Available figures of all tasks as `metric` and `metric_baseline`."""
@@ -286,11 +289,14 @@ def measure_prediction(
     if not scenes:
         raise InvalidInputError("prediction: got no scene, expected at least one")
     found: dict[str, list[tuple[Scene, Future]]] = {name: [] for name in (MODEL, *baselines)}
+    reasons: dict[str, Counter[str]] = {}
     with Progress("scenes", len(scenes)) as progress:
         for scene in scenes:
             for source, pairs in found.items():
                 future = _future(source, world, scene, scenes)
-                if future is not None:
+                if isinstance(future, str):
+                    reasons.setdefault(source, Counter())[future] += 1
+                else:
                     pairs.append((scene, future))
             progress.advance()
     tasks = list(dict.fromkeys(scene.start.task for scene in scenes))
@@ -304,13 +310,19 @@ def measure_prediction(
         },
         len(scenes),
         _pictures(found[MODEL]),
+        {
+            source: "; ".join(
+                f"{reason} ({num} of {len(scenes)} scenes)" for reason, num in counted.items()
+            )
+            for source, counted in reasons.items()
+        },
     )
 
 
-def _future(source: str, world: World[Any], scene: Scene, scenes: Sequence[Scene]) -> Future | None:
-    """Prediction of the world or of a baseline; None where a baseline does not apply."""
+def _future(source: str, world: World[Any], scene: Scene, scenes: Sequence[Scene]) -> Future | str:
+    """Prediction of the world or of a baseline, or why the baseline has none."""
     truth = scene.truth
-    simple: dict[str, Callable[[], Future | None]] = {
+    simple: dict[str, Callable[[], Future | str]] = {
         "copy": lambda: copied(scene),
         "warp": lambda: replace(truth, images=warped(scene)),
         "zero": lambda: replace(truth, tactile_kpa=np.zeros_like(truth.tactile_kpa)),
@@ -320,24 +332,26 @@ def _future(source: str, world: World[Any], scene: Scene, scenes: Sequence[Scene
     if source in simple:
         return simple[source]()
     asked = _asked(source, scene, scenes)
-    return None if asked is None else imagine(world, *asked)
+    return asked if isinstance(asked, str) else imagine(world, *asked)
 
 
 def _asked(
     source: str, scene: Scene, scenes: Sequence[Scene]
-) -> tuple[Scene, Float64[np.ndarray, "steps 67"]] | None:
-    """Scene and actions that the model is given; None if there is no other take or task."""
+) -> tuple[Scene, Float64[np.ndarray, "steps 67"]] | str:
+    """Scene and actions that the model is given, or why there are none."""
     actions = scene.actions
     if source == "other_take":
         other = other_take(scene, scenes)
-        return None if other is None else (scene, other.actions[: len(actions)])
+        changed = None if other is None else (scene, other.actions[: len(actions)])
+        return changed or "no other take of the task is as long from this step"
     if source in ("hold", "hands_still"):
         return scene, standing_still(scene, head_moves=source == "hands_still")
     if source == "no_instruction":
         return with_instruction(scene, ""), actions
     if source == "other_instruction":
         sentence = other_instruction(scene, scenes)
-        return None if sentence is None else (with_instruction(scene, sentence), actions)
+        changed = None if sentence is None else (with_instruction(scene, sentence), actions)
+        return changed or "no other task has another instruction"
     return scene, actions
 
 

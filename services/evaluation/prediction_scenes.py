@@ -147,14 +147,20 @@ def imagine(world: World[Any], scene: Scene, actions: Float64[np.ndarray, "steps
 
 
 def other_take(scene: Scene, scenes: Sequence[Scene]) -> Scene | None:
-    """The next scene of the same task, at the same step and as long, with another seed."""
+    """The next scene of another episode of the task, at the same step and as long.
+
+    One with another seed is preferred, whose objects lie elsewhere. Recorded episodes have no seed.
+    """
     key = (scene.start.task, scene.first_step)
     mine = [one for one in scenes if (one.start.task, one.first_step) == key]
     at = next(index for index, one in enumerate(mine) if one is scene)
-    for one in mine[at + 1 :] + mine[:at]:
-        if one.start.seed != scene.start.seed and len(one.actions) >= len(scene.actions):
-            return one
-    return None
+    others = [
+        one
+        for one in mine[at + 1 :] + mine[:at]
+        if one.episode_id != scene.episode_id and len(one.actions) >= len(scene.actions)
+    ]
+    elsewhere = (one for one in others if one.start.seed != scene.start.seed)
+    return next(elsewhere, others[0] if others else None)
 
 
 def other_instruction(scene: Scene, scenes: Sequence[Scene]) -> str | None:
@@ -209,16 +215,16 @@ def _warp(
     return warp_over_table(image, K_head, anchor.T_world_camera_head, T_world_now)
 
 
-def reconstructed(world: World[Any], scene: Scene) -> Future | None:
-    """The true future through the world's codecs, the best that it can predict.
+def reconstructed(world: World[Any], scene: Scene) -> Future | str:
+    """The true future through the world's codecs, the best that it can predict, or why it has none.
 
-    None if the world has no codecs, or the scene lacks images of some steps.
+    It needs codecs, and images of all steps.
     """
     truth = scene.truth
     if not isinstance(world, ReconstructingWorld):
-        return None
+        return "the world has no codecs"
     if truth.image_steps != tuple(range(1, len(truth.tactile_kpa) + 1)):
-        return None
+        return "it needs images of all steps"
     images = np.concatenate([scene.first.images[CAMERA], truth.images])
     touch = np.concatenate([scene.first.tactile_kpa, truth.tactile_kpa])
     seen, felt = world.reconstruct(images, touch)

@@ -159,6 +159,7 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
         "prediction": {
             "figures": prediction.by_task[ALL_TASKS],
             "metrics": described(metrics),
+            "missing": dict(prediction.missing),
         },
         **scores,
     }

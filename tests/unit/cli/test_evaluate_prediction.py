@@ -1,6 +1,7 @@
 """`dextouch evaluate prediction`: figures of recorded episodes by task, and what it refuses."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -43,6 +44,28 @@ def test_windows_are_measured_by_task_beside_all_baselines(store, tmp_path, caps
     assert figures["warp"]["contact_f1"] is None
     assert "rollouts" not in result
     assert "PSNR (dB) ↑" in capsys.readouterr().out
+
+
+def test_recorded_episodes_have_the_baseline_of_another_take(store, tmp_path, capsys):
+    """Those of a station have no seed; a single one names what is missing, and why."""
+    recorded = EpisodeStore(tmp_path / "recorded")
+    stage = Stage("stand_bottle", "robot", TwinSettings(image_height_px=64, image_width_px=64))
+    path, words = tmp_path / "result.json", ["--horizon", "windows", "--metrics", "psnr"]
+    missing = []
+    for seed in (60_000, 60_001):
+        take = record(stage, seed, TakeOptions(images=("camera_head",), frozen_from_step=30))
+        unnamed = {"origin": "recorded", "seed": None, "episode_id": f"take-{seed}"}
+        attributes = take.attributes.model_copy(update=unnamed)
+        write_episode(recorded, replace(take, attributes=attributes))
+        assert run(recorded, *words, "--json", str(path)) == 0
+        result = json.loads(path.read_text(encoding="utf-8"))
+        missing.append(result["missing_baselines"]["windows"])
+        shown = capsys.readouterr().out
+        why = "other_take is missing: no other take of the task is as long from this step"
+        assert (why in shown) is (seed == 60_000)
+    assert missing[0]["other_take"].startswith("no other take of the task is as long")
+    assert "other_take" not in missing[1]
+    assert result["windows"]["all"]["other_take"]["psnr"] is not None
 
 
 def test_unknown_metrics_name_the_valid_ones(store, capsys):

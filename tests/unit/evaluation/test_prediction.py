@@ -17,7 +17,7 @@ from services.evaluation.prediction import (
     MODEL,
     measure_prediction,
 )
-from services.evaluation.prediction_scenes import Future, Scene
+from services.evaluation.prediction_scenes import Future, Scene, other_take
 
 PX, NUM_STEPS = 16, 32
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -88,6 +88,69 @@ def test_a_lone_scene_has_no_other_and_no_scene_is_refused():
     assert "psnr_other_take" not in measure_prediction(world, [scene(1, 0.1)]).flat()
     with pytest.raises(InvalidInputError, match="no scene"):
         measure_prediction(world, [])
+
+
+def recorded(episode_id, depth_m):
+    """A scene of an episode that a station recorded: `read_windows` starts those without seed 0."""
+    return replace(scene(0, depth_m), episode_id=episode_id)
+
+
+@pytest.mark.parametrize(
+    ("scenes", "others"),
+    [
+        ([recorded("a", 0.2), recorded("b", 0.1)], ["b", "a"]),
+        ([recorded("a", 0.2), scene(7, 0.1)], ["e7", "a"]),
+        # The same scene twice, by person and robot: another take, but one elsewhere is better.
+        ([scene(7, 0.2), replace(scene(7, 0.1), episode_id="robot")], ["robot", "e7"]),
+        (
+            [scene(7, 0.2), replace(scene(7, 0.1), episode_id="robot"), scene(8, 0.1)],
+            ["e8", "e8", "e7"],
+        ),
+        # One episode, listed twice, is one take.
+        ([recorded("a", 0.2), recorded("a", 0.2)], [None, None]),
+        ([recorded("a", 0.2)], [None]),
+        # None of a window from another step, of another task, or too short.
+        ([recorded("a", 0.2), replace(recorded("b", 0.1), first_step=16)], [None, None]),
+        (
+            [recorded("a", 0.2), replace(recorded("b", 0.1), actions=np.zeros((16, 67)))],
+            [None, "a"],
+        ),
+    ],
+)
+def test_another_take_is_another_episode_also_without_seeds(scenes, others):
+    found = [other_take(one, scenes) for one in scenes]
+    assert [None if one is None else one.episode_id for one in found] == others
+
+
+def test_recorded_episodes_keep_the_baseline_of_another_take():
+    world = PressWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
+    found = measure_prediction(world, [recorded("a", 0.2), recorded("b", 0.1)])
+    # Row k is k/32 of 20 and of 10 kPa: their difference is k/32 of 10 kPa.
+    share = np.mean((np.arange(NUM_STEPS) / NUM_STEPS) ** 2)
+    assert found.flat()["tactile_mse_other_take"] == pytest.approx(100 * share, rel=1e-5)
+    assert found.missing == {"codec": "the world has no codecs (2 of 2 scenes)"}
+
+
+def test_a_baseline_without_a_figure_is_named_with_its_reason():
+    world = CodingWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
+    lone = replace(scene(3, 0.1), actions=np.zeros((16, 67)), first_step=16)
+    scenes = [scene(1, 0.2), scene(2, 0.1), lone]
+    baselines = ("codec", "other_take", "other_instruction", "hold")
+    found = measure_prediction(world, scenes[:2], baselines=baselines)
+    assert found.missing == {
+        "codec": "it needs images of all steps (2 of 2 scenes)",
+        "other_instruction": "no other task has another instruction (2 of 2 scenes)",
+    }
+    mixed = measure_prediction(
+        world, [*scenes[:2], recorded("late", 0.1)], baselines=("other_take",)
+    )
+    assert mixed.missing == {}
+    short = replace(scenes[2].truth, tactile_kpa=scenes[2].truth.tactile_kpa[:16])
+    lone = replace(lone, truth=replace(short, images=short.images[:1], image_steps=(16,)))
+    partly = measure_prediction(world, [*scenes[:2], lone], baselines=("other_take",))
+    assert partly.missing == {
+        "other_take": "no other take of the task is as long from this step (1 of 3 scenes)"
+    }
 
 
 def test_every_metric_stands_beside_every_baseline_that_has_it():

@@ -168,6 +168,10 @@ def test_all_figures_of_prediction_stand_beside_their_baselines(tmp_path):
     write_report({"prediction": {"figures": figures, "metrics": metrics}}, ReportPictures(), path)
     text = " ".join(re.sub("<[^>]*>", " ", path.read_text(encoding="utf-8")).split())
     assert "model other take PSNR ↑ dB 23.5 none LPIPS ↓ not here" in text
+    assert "is missing" not in text
+    prediction = {"figures": figures, "metrics": metrics, "missing": {"other_take": "no <other>"}}
+    write_report({"prediction": prediction}, ReportPictures(), path)
+    assert "other take is missing: no &lt;other&gt;." in path.read_text(encoding="utf-8")
 
 
 def test_raw_figures_come_along(tmp_path):
