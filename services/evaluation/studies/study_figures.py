@@ -34,7 +34,8 @@ MEANINGS: Final = {
     "interval": "Intervals contain the true policies' figure with 95 % probability; with few "
     "policies or starts they are wide.",
     "unreliable": "The success probe abstains: its probability is too close to 0.5, or the world "
-    "doubts its own prediction. The likelier outcome is counted all the same.",
+    "doubts its own prediction. The likelier outcome is counted all the same. Most wrong outcomes "
+    "of policies that the world model was not trained on are not marked.",
 }
 
 
