@@ -10,6 +10,7 @@ from services.dashboard.settings import DashboardSettings
 from services.evaluation.studies.app import StudyServiceSettings
 from services.evaluation.studies.app import create_app as create_studies
 from tests.unit.evaluation.study_rows import (
+    DEFINITION,
     DOUBTED,
     ROWS,
     WORLDS,
@@ -78,6 +79,23 @@ def test_a_study_that_runs_and_ends(opened, root):
             for name, expected in (("pearson", pearson), ("mmrv", mmrv)):
                 shown = opened.locator(f"{place} [data-figure={name}] strong").inner_text()
                 assert float(shown) == pytest.approx(expected(task, world), abs=0.0051)
+
+
+def test_two_policies_are_shown_without_a_correlation(opened, root, monkeypatch):
+    for task, policies in ROWS.items():
+        monkeypatch.setitem(ROWS, task, {name: policies[name] for name in ("careful", "clumsy")})
+    policies = {name: {"script": "hold"} for name in ("careful", "clumsy")}
+    monkeypatch.setitem(DEFINITION, "policies", policies)
+    monkeypatch.setitem(DEFINITION, "name", "two alone")
+    write_study(root / "two")
+    opened.reload()
+    opened.get_by_role("link", name="two alone").click()
+    for task in (*ROWS, ""):
+        row = opened.locator(f"#agreement tr[data-task='{task}'][data-world=model]")
+        expect(row.locator("[data-figure=pearson]")).to_contain_text("undefined (2 policies)")
+        expect(row.locator("[data-figure=mean_absolute_error] strong")).to_have_text(
+            re.compile(r"0\.\d\d")
+        )
 
 
 @pytest.mark.slow
