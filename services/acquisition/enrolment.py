@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import structlog
 from pydantic import SecretStr, ValidationError, field_serializer
 
 from dextouch.episodes import disk_errors, replace_file
@@ -9,6 +10,8 @@ from dextouch.errors import InvalidInputError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
 from services.acquisition.settings import AcquisitionSettings
+
+logger = structlog.get_logger(__name__)
 
 
 class Enrolment(FrozenModel):
@@ -66,4 +69,13 @@ def with_enrolment(settings: AcquisitionSettings) -> AcquisitionSettings:
     }
     if "station" not in settings.model_fields_set:
         changed["station"] = enrolment.station
+    elif settings.station != enrolment.station:
+        # The station still records: takes wait in the spool.
+        logger.warning(
+            "refused_station_name",
+            station=settings.station,
+            enrolled_as=enrolment.station,
+            advice="the store takes recordings of the enrolled name only: remove the setting "
+            "station, or enrol the station under its name",
+        )
     return settings.model_copy(update=changed)

@@ -1,4 +1,4 @@
-"""Enrolment of stations: one-time tokens, exchanged for keys of the scope `store_write`.
+"""Enrolment of stations: one-time tokens, exchanged for keys that upload for one station.
 
 Only hashes of tokens and keys are kept: of tokens in memory, so that a restart invalidates them, of
 keys in a file.
@@ -234,7 +234,10 @@ class Enrolments:
         self._kept = enrolments
         self._access.set_enrolled(
             [
-                (bytes.fromhex(one.key_sha256), Grant(name=one.station, scopes=STATION_SCOPES))
+                (
+                    bytes.fromhex(one.key_sha256),
+                    Grant(name=one.station, scopes=STATION_SCOPES, station=one.station),
+                )
                 for one in enrolments
                 if one.state == "enrolled"
             ]

@@ -26,6 +26,7 @@ from dextouch.schemas import (
 from dextouch.streams import read_batch
 from dextouch.tracing import current_trace_id
 from services.episode_store.committing import Commit, CommitProcess, commit_spool
+from services.episode_store.senders import ANYONE, Sender, owner_of
 from services.episode_store.settings import EpisodeStoreSettings
 
 logger = structlog.get_logger(__name__)
@@ -91,14 +92,16 @@ class Ingest:
         self._locks = KeyedLocks(patience_s=PATIENCE_S)
         self._guard = threading.Lock()
 
-    def create(self, attributes: RecordingAttributes) -> RecordingStatus:
+    def create(self, attributes: RecordingAttributes, sender: Sender = ANYONE) -> RecordingStatus:
         """Begin an upload, or return the status of an existing one.
 
         Raises:
             InvalidInputError: a recording without a stream.
-            ConflictError: the id is taken by another recording.
+            AccessDeniedError: the sender's key is bound to another station.
+            ConflictError: the id is taken by another recording, or by an upload of another key.
         """
         recording_id = attributes.recording_id
+        sender.check_station(attributes.station)
         with self._working_on(recording_id):
             if self._store.exists(recording_id, kind="recording"):
                 _check_same(attributes, self._store.recording(recording_id).attributes)
@@ -107,30 +110,45 @@ class Ingest:
             if path.exists():
                 spool = self._upload(recording_id)
                 _check_same(attributes, spool.attributes)
+                if not sender.may_continue(owner_of(path), attributes.station):
+                    raise ConflictError(
+                        f"upload {recording_id!r} was begun by another key; choose another id",
+                        reason=ID_TAKEN,
+                    )
                 return _status(spool)
             if attributes.trace_id is None:
                 attributes = attributes.model_copy(update={"trace_id": current_trace_id()})
-            spool = SpoolWriter(path, attributes, sync=self._sync)
+            spool = SpoolWriter(path, attributes, sync=self._sync, notes=sender.as_files())
             self._keep(recording_id, spool)
             logger.info("recording_created", recording_id=recording_id)
             return _status(spool)
 
-    def status(self, recording_id: str) -> RecordingStatus:
+    def status(self, recording_id: str, sender: Sender = ANYONE) -> RecordingStatus:
         """Status of an upload.
 
         Raises:
             NotFoundError: no such upload.
+            AccessDeniedError: it is none of the sender.
         """
         with self._working_on(recording_id):
             if self._store.exists(recording_id, kind="recording"):
+                sender.check_station(self._store.recording(recording_id).attributes.station)
                 return RecordingStatus(recording_id=recording_id, state="finished")
-            return _status(self._upload(recording_id))
+            return _status(self._upload(recording_id, sender))
 
-    def put_batch(self, recording_id: str, stream: str, number: int, data: bytes) -> BatchReceipt:
+    def put_batch(
+        self,
+        recording_id: str,
+        stream: str,
+        number: int,
+        data: bytes,
+        sender: Sender = ANYONE,
+    ) -> BatchReceipt:
         """Store a batch; it is durable when this returns.
 
         Raises:
             NotFoundError: no such recording.
+            AccessDeniedError: it is none of the sender.
             UnknownNameError: no such stream.
             ConflictError: a gap, other samples under a known number, or a finished recording.
             PacketError, InvalidInputError: not a valid batch of this stream.
@@ -138,21 +156,26 @@ class Ingest:
             StorageFullError: no space; acknowledged batches are kept.
         """
         with self._working_on(recording_id):
-            return _put_batch(self._upload(recording_id), stream, number, data)
+            return _put_batch(self._upload(recording_id, sender), stream, number, data)
 
-    def finish(self, recording_id: str, body: FinishRecording) -> RecordingStatus:
+    def finish(
+        self, recording_id: str, body: FinishRecording, sender: Sender = ANYONE
+    ) -> RecordingStatus:
         """Commit a complete upload; idempotent.
 
         Raises:
             NotFoundError: no such recording.
+            AccessDeniedError: it is none of the sender.
             ConflictError: batches are missing, or more are here than announced.
             InvalidInputError: not all streams are announced, or none has a sample.
             UnavailableError: it is being finished already; try again later.
             StorageFullError: no space; the upload is unchanged.
         """
         with self._working_on(recording_id):
-            if not self._store.exists(recording_id, kind="recording"):
-                spool = self._upload(recording_id)
+            if self._store.exists(recording_id, kind="recording"):
+                sender.check_station(self._store.recording(recording_id).attributes.station)
+            else:
+                spool = self._upload(recording_id, sender)
                 _check_complete(spool, body)
                 self._move(spool, body)
             shutil.rmtree(self._path(recording_id), ignore_errors=True)
@@ -211,8 +234,13 @@ class Ingest:
         with self._locks.holding(recording_id):
             yield
 
-    def _upload(self, recording_id: str) -> SpoolWriter:
-        """The spool of an upload; the caller holds its lock."""
+    def _upload(self, recording_id: str, sender: Sender = ANYONE) -> SpoolWriter:
+        """The spool of an upload that the sender may continue; the caller holds its lock."""
+        spool = self._opened(recording_id)
+        sender.check_upload(spool.path, spool.attributes.station)
+        return spool
+
+    def _opened(self, recording_id: str) -> SpoolWriter:
         with self._guard:
             if recording_id in self._open:
                 self._open.move_to_end(recording_id)

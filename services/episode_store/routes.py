@@ -1,7 +1,9 @@
 """HTTP routes of the store: uploads by stations, and lists of recordings and episodes."""
 
 import time
+from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
+from functools import partial
 from typing import Annotated
 
 import anyio
@@ -27,7 +29,16 @@ from dextouch.schemas import (
     ReviewItems,
     UploadList,
 )
-from dextouch.serving import AS_SET, JSON, KIB, OCTETS, JsonBody, RequireScope, takes
+from dextouch.serving import (
+    AS_SET,
+    JSON,
+    KIB,
+    OCTETS,
+    AccessControl,
+    JsonBody,
+    RequireScope,
+    takes,
+)
 from dextouch.streams import MAX_BATCH_BYTES
 from services.episode_store.catalog import Catalog
 from services.episode_store.filters import (
@@ -40,14 +51,33 @@ from services.episode_store.hours import HoursField, HoursFilter
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
 from services.episode_store.reviewing import review_items
+from services.episode_store.senders import ANYONE, Sender
 
 Attributes = Annotated[RecordingAttributes, Depends(JsonBody(RecordingAttributes))]
 Finish = Annotated[FinishRecording, Depends(JsonBody(FinishRecording))]
 MAY_READ = Depends(RequireScope("store_read"))
 MAY_DELETE = Depends(RequireScope("store_delete"))
 MAY_WRITE = Depends(RequireScope("store_write"))
+MAY_EXPIRE = Depends(RequireScope("store_expire"))
 # Room for the calibration and descriptors of a station, or the ledger of a take.
 MAX_ATTRIBUTES_BYTES = 256 * KIB
+
+
+def _sender(scope: str) -> Callable[[Request], Awaitable[Sender]]:
+    """Dependency that tells who sends a request that needs a scope."""
+
+    async def sender(request: Request) -> Sender:
+        access: AccessControl = request.app.state.access
+        if not access.has_keys:
+            return ANYONE
+        grant = access.granted(request.headers.get("authorization"), scope)
+        return Sender(name=grant.name, station=grant.station)
+
+    return sender
+
+
+Writer = Annotated[Sender, Depends(_sender("store_write"))]
+Reader = Annotated[Sender, Depends(_sender("store_read"))]
 
 
 def uploads_router(
@@ -58,11 +88,12 @@ def uploads_router(
 
     @router.post("/recordings", status_code=201, tags=["recordings"], dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def create(attributes: Attributes) -> RecordingStatus:
+    def create(attributes: Attributes, sender: Writer) -> RecordingStatus:
         """Begin an upload, or return the status of an existing one."""
+        sender.check_station(attributes.station)
         with metrics.counting_refusals():
             limits.check_new(attributes.station)
-        status = ingest.create(attributes)
+        status = ingest.create(attributes, sender)
         if status.state == "open":
             limits.begin(attributes)
         return status
@@ -74,7 +105,11 @@ def uploads_router(
     )
     @takes({OCTETS: AS_SET})
     async def put_batch(
-        recording_id: str, stream: str, number: Annotated[int, Path(ge=0)], request: Request
+        recording_id: str,
+        stream: str,
+        number: Annotated[int, Path(ge=0)],
+        request: Request,
+        sender: Writer,
     ) -> BatchReceipt:
         """Store batch n of a stream (wire format v2 or v1), exactly once even if repeated."""
         announced = request.headers.get("content-length", "")
@@ -88,7 +123,8 @@ def uploads_router(
             started = time.perf_counter()
             data = await request.body()
             receipt = await anyio.to_thread.run_sync(
-                ingest.put_batch, recording_id, stream, number, data, limiter=admission.threads
+                partial(ingest.put_batch, recording_id, stream, number, data, sender),
+                limiter=admission.threads,
             )
         metrics.ack_seconds.observe(time.perf_counter() - started)
         metrics.batches.labels(str(receipt.replayed).lower()).inc()
@@ -99,27 +135,27 @@ def uploads_router(
 
     @router.post("/recordings/{recording_id}/finish", tags=["recordings"], dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def finish(recording_id: str, body: Finish) -> RecordingStatus:
+    def finish(recording_id: str, body: Finish, sender: Writer) -> RecordingStatus:
         """Commit a complete upload."""
         started = time.perf_counter()
         with metrics.counting_refusals():
             limits.check_finish(recording_id)
-        status = ingest.finish(recording_id, body)
+        status = ingest.finish(recording_id, body, sender)
         limits.end(recording_id)
         metrics.finish_seconds.observe(time.perf_counter() - started)
         return status
 
     @router.get("/recordings/{recording_id}", tags=["recordings"], dependencies=[MAY_READ])
-    def status(recording_id: str) -> RecordingStatus:
-        """Status of an upload."""
-        return ingest.status(recording_id)
+    def status(recording_id: str, sender: Reader) -> RecordingStatus:
+        """Status of an upload, for those who may continue it, or of a finished recording."""
+        return ingest.status(recording_id, sender)
 
     @router.get("/uploads", tags=["uploads"], dependencies=[MAY_READ])
     def listing(idle_s: Annotated[float, Query(ge=0)] = 0.0) -> UploadList:
         """List unfinished uploads that have been idle for `idle_s`."""
         return limits.idle(idle_s=idle_s)
 
-    @router.post("/uploads/expire", tags=["uploads"], dependencies=[MAY_WRITE])
+    @router.post("/uploads/expire", tags=["uploads"], dependencies=[MAY_EXPIRE])
     def expire(wanted: ExpireUploads) -> UploadList:
         """Drop such uploads with their data; the response lists them."""
         return _expire(ingest, limits, wanted.idle_s)

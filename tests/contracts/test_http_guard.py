@@ -21,6 +21,7 @@ SCOPES = (
     "station",
     "store_read",
     "store_write",
+    "store_expire",
     "store_delete",
     "align",
     "rollout",

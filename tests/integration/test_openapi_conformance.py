@@ -37,6 +37,7 @@ SCOPES = (
     "station",
     "store_read",
     "store_write",
+    "store_expire",
     "store_delete",
     "align",
     "rollout",

@@ -25,7 +25,7 @@ from tests.unit.evaluation.toy_store import write
 pytestmark = pytest.mark.system
 START_LIMIT_S = 300
 SCOPES = {
-    "episode_store": ("store_read", "store_write", "store_delete", "enrol"),
+    "episode_store": ("store_read", "store_write", "store_expire", "store_delete", "enrol"),
     "alignment": ("align",),
     "acquisition": ("station",),
     "twin": ("rollout",),

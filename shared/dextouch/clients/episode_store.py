@@ -1,5 +1,6 @@
 """HTTP client of the episode store: uploads, queries, windows and samples."""
 
+import json
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import TypeVar
@@ -17,7 +18,6 @@ from dextouch.schemas import (
     CatalogHours,
     EpisodeDetail,
     EpisodeList,
-    ExpireUploads,
     FinishRecording,
     LedgerEntry,
     Problem,
@@ -159,8 +159,11 @@ class EpisodeStoreClient:
         return self._model(UploadList, "GET", "/v1/uploads", query={"idle_s": idle_s})
 
     def expire_uploads(self, *, idle_s: float) -> UploadList:
-        """Drop unfinished uploads that have been idle for at least `idle_s` and return them."""
-        body = ExpireUploads(idle_s=idle_s).model_dump_json()
+        """Drop unfinished uploads that have been idle for at least `idle_s` and return them.
+
+        The store refuses less than ten minutes.
+        """
+        body = json.dumps({"idle_s": idle_s})
         return self._model(UploadList, "POST", "/v1/uploads/expire", content=body)
 
     def episode(self, episode_id: str) -> EpisodeDetail:

@@ -6,6 +6,7 @@ Images of `jpeg` and `h264` streams are object arrays of bytes.
 
 import os
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -178,6 +179,7 @@ class SpoolWriter:
         attributes: of the recording; `streams` names all streams.
         sync: whether `flush` waits for the disk.
         resume: continue an existing folder (see the class method).
+        notes: further small files of a new folder, by name.
 
     Raises:
         ConflictError: the folder exists; continue it with `SpoolWriter.resume`.
@@ -191,12 +193,13 @@ class SpoolWriter:
         *,
         sync: bool = True,
         resume: bool = False,
+        notes: Mapping[str, bytes] | None = None,
     ) -> None:
         self.path, self.attributes = path, attributes
         self._sync = sync
         self._streams = {d.name: _Appended(number) for number, d in enumerate(attributes.streams)}
         if not resume:
-            _create(path, attributes)
+            _create(path, attributes, notes or {})
         lock = try_lock(path)
         if lock is None:
             raise ConflictError(f"spool {path.name!r}: another process is writing it")
@@ -362,7 +365,7 @@ class SpoolWriter:
         return records.end
 
 
-def _create(path: Path, attributes: RecordingAttributes) -> None:
+def _create(path: Path, attributes: RecordingAttributes, notes: Mapping[str, bytes]) -> None:
     if not attributes.streams:
         raise InvalidInputError(
             f"spool {attributes.recording_id!r}: a recording without a stream; "
@@ -382,4 +385,6 @@ def _create(path: Path, attributes: RecordingAttributes) -> None:
         unborn.mkdir(parents=True)
         write_file(unborn / RECORDING_FILE, attributes.model_dump_json().encode())
         write_file(unborn / LOG_FILE, LOG_MAGIC)
+        for name, data in notes.items():
+            write_file(unborn / name, data)
         unborn.rename(path)

@@ -18,6 +18,9 @@ from dextouch.streams import StreamDescriptor
 
 # Reason of the store's ConflictError when another recording has the id.
 ID_TAKEN = "id_taken"
+# Uploads that were idle for less are never dropped. Chosen: a living station pauses for at most a
+# request without an answer and a Retry-After, 30 s each; this is ten times as long.
+MIN_EXPIRE_IDLE_S = 600.0
 
 
 class LedgerEntry(FrozenModel):
@@ -141,4 +144,4 @@ class UploadList(FrozenModel):
 class ExpireUploads(FrozenModel):
     """Request to drop every upload that has been idle for at least `idle_s`."""
 
-    idle_s: float = Field(ge=0, allow_inf_nan=False)
+    idle_s: float = Field(ge=MIN_EXPIRE_IDLE_S, allow_inf_nan=False)

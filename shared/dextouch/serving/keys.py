@@ -14,10 +14,14 @@ from dextouch.schemas import KEY_NAME_PATTERN
 
 
 class Grant(FrozenModel):
-    """What a key allows; `name` appears in logs."""
+    """What a key allows; `name` appears in logs.
+
+    A key with a `station` uploads recordings of this station only.
+    """
 
     name: str = Field(pattern=KEY_NAME_PATTERN)
     scopes: tuple[str, ...] = Field(min_length=1)
+    station: str | None = Field(default=None, min_length=1, max_length=128)
 
     def require(self, scope: str) -> None:
         """Raise AccessDeniedError if the key lacks a scope."""

@@ -1,6 +1,7 @@
 """Too much at once, a full disk, a station above its quota: told before anything is read."""
 
 import asyncio
+import os
 import threading
 
 import pytest
@@ -220,7 +221,10 @@ def test_stale_uploads_go_only_when_told_to(start, attributes, batch_of, setting
     assert client.uploads(idle_s=3600.0).uploads == ()
     assert client.expire_uploads(idle_s=3600.0).uploads == ()
     client.finish("take-1", {"glove_left": 1, "wrist_left": 0})
-    gone = client.expire_uploads(idle_s=0.0).uploads
+    folder = EpisodeStore(settings.store_url).root / ".uploads" / "take-2"
+    for path in (*folder.iterdir(), folder):
+        os.utime(path, (0, 0))
+    gone = client.expire_uploads(idle_s=600.0).uploads
     assert [upload.recording_id for upload in gone] == ["take-2"]
     assert client.uploads().uploads == ()
     store = EpisodeStore(settings.store_url)

@@ -76,7 +76,7 @@ def test_a_token_becomes_a_key_once(make):
     assert len(got.key) == 43
     assert got.key != token
     assert allows(access, got.key) == "desk_3"
-    for scope in ("store_read", "store_delete", "enrol", "station"):
+    for scope in ("store_read", "store_expire", "store_delete", "enrol", "station"):
         assert allows(access, got.key, scope) == "missing_scope"
     assert reason_of(enrolments, token) == "used_token"
     assert reason_of(enrolments, token[:-1]) == "unknown_token"
