@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from structlog.contextvars import bound_contextvars
 
 from dextouch.clients import EpisodeStoreClient
-from dextouch.episodes import disk_errors, replace_file
+from dextouch.episodes import ContentDigest, disk_errors, replace_file
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import (
     ConflictError,
@@ -20,9 +20,16 @@ from dextouch.errors import (
     LimitExceededError,
     NotFoundError,
     StorageError,
+    UnavailableError,
 )
-from dextouch.schemas import ID_TAKEN, RecordingAttributes, RecordingStatus, UploadStatus
-from dextouch.streams import StreamDescriptor, frame_body
+from dextouch.schemas import (
+    ID_TAKEN,
+    RecordingAttributes,
+    RecordingStatus,
+    StreamContent,
+    UploadStatus,
+)
+from dextouch.streams import StreamDescriptor, decode_body, frame_body
 from dextouch.tracing import in_trace, new_trace
 from services.acquisition.memory import give_back_free_memory
 
@@ -236,21 +243,31 @@ class Uploader:
     def _upload(self, path: Path, spool: SpoolReader, store: EpisodeStoreClient) -> bool:
         status = _begin(store, spool.attributes)
         recording_id = status.recording_id
-        num_batches = {}
+        num_batches, content = {}, {}
         for name, descriptor in spool.streams.items():
             size, total = batch_samples(descriptor), spool.num_samples(name)
             num_batches[name] = -(-total // size)
-            if status.state == "finished":
-                continue
-            for number in range(status.next_batch.get(name, 0), num_batches[name]):
+            is_open, digest = status.state == "open", ContentDigest(descriptor)
+            # What the store has already is read too: it must have the same.
+            for number in range(num_batches[name]):
                 if self._stopping.is_set():
                     return False
                 start, stop = number * size, min((number + 1) * size, total)
                 body = spool.body(name, start, stop)
-                data = frame_body(name, body, stop - start, number=number)
-                store.send_batch(recording_id, descriptor, data, number=number)
+                digest.add(decode_body(descriptor, body, stop - start))
+                if is_open and number >= status.next_batch.get(name, 0):
+                    data = frame_body(name, body, stop - start, number=number)
+                    store.send_batch(recording_id, descriptor, data, number=number)
+            content[name] = digest.content()
         known = spool.attributes
-        status = store.finish(recording_id, num_batches, success=known.success, ledger=known.ledger)
+        status = store.finish(
+            recording_id,
+            num_batches,
+            success=known.success,
+            ledger=known.ledger,
+            content=content,
+        )
+        check_proof(status, content)
         logger.info("upload_take", recording_id=path.name, stored_as=recording_id)
         # Where this fails the take is sent again: the store then answers that it has everything.
         with disk_errors(f"note the upload of {path.name!r}"):
@@ -259,6 +276,25 @@ class Uploader:
             else:
                 shutil.rmtree(path)
         return True
+
+
+def check_proof(status: RecordingStatus, content: Mapping[str, StreamContent]) -> None:
+    """Check that the store committed all samples of a take; only then the spool may go.
+
+    Raises:
+        UnavailableError: the store does not say, as one of an earlier release.
+        ConflictError: it has others.
+    """
+    if not status.content:
+        raise UnavailableError(
+            f"{status.recording_id}: the store does not say what it has of the take, which stays "
+            "here; upgrade the store"
+        )
+    if status.content != content:
+        raise ConflictError(
+            f"{status.recording_id}: the store has {status.content}, expected {dict(content)}; "
+            "the take stays here"
+        )
 
 
 def _begin(store: EpisodeStoreClient, attributes: RecordingAttributes) -> RecordingStatus:

@@ -6,13 +6,20 @@ acknowledges batches.
 
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
-from dextouch.episodes import EpisodeStore, WriteOptions
+from dextouch.episodes import ContentDigest, EpisodeStore, WriteOptions
 from dextouch.episodes.spool import SpoolReader
-from dextouch.errors import DexTouchError, UnavailableError
-from dextouch.schemas import Problem, RecordingAttributes, error_from_problem, problem_from_error
+from dextouch.errors import ConflictError, DexTouchError, UnavailableError
+from dextouch.schemas import (
+    Problem,
+    RecordingAttributes,
+    StreamContent,
+    error_from_problem,
+    problem_from_error,
+)
 from dextouch.serving import ChildProcess, serve_parent
 from dextouch.streams import ENCODED_UNITS
 
@@ -24,17 +31,43 @@ COPY_BYTES = 4 << 20
 # Images take about 50 kB each.
 COPY_IMAGES = 32
 
-# Commits the spool in a folder with its final attributes.
-Commit = Callable[[Path, RecordingAttributes], dict[str, int]]
+# What each stream of a recording is to have; empty if the station did not say.
+Content = Mapping[str, StreamContent]
+NOTHING: Content = MappingProxyType({})
+# Commits the spool in a folder with its final attributes, if it has the announced content.
+Commit = Callable[[Path, RecordingAttributes, Content], dict[str, int]]
+
+
+def check_content(recording_id: str, got: Content, announced: Content) -> None:
+    """Raise ConflictError if streams have other samples than announced; none announced: nothing."""
+    differing = {
+        name: {"got": got[name].model_dump(), "expected": expected.model_dump()}
+        for name, expected in announced.items()
+        if got[name] != expected
+    }
+    if differing:
+        listed = ", ".join(
+            f"{name} has {got[name].num_samples} samples and sha256 {got[name].sha256[:12]}, "
+            f"expected {announced[name].num_samples} and {announced[name].sha256[:12]}"
+            for name in differing
+        )
+        raise ConflictError(
+            f"finish {recording_id}: the store has other samples: {listed}; keep the take, and "
+            "delete what the store has under this id, or expire the upload",
+            **differing,
+        )
 
 
 def commit_spool(
-    store: EpisodeStore, spool: Path, attributes: RecordingAttributes
+    store: EpisodeStore,
+    spool: Path,
+    attributes: RecordingAttributes,
+    announced: Content = NOTHING,
 ) -> dict[str, int]:
     """Copy a closed spool to a new recording; returns the number of samples by stream.
 
     Raises:
-        ConflictError: the recording exists.
+        ConflictError: the recording exists, or the spool has other samples than announced.
         CorruptDataError: the spool is damaged; nothing is written.
         StorageFullError: no space; nothing is written, the spool is kept.
     """
@@ -46,10 +79,15 @@ def commit_spool(
         for name, descriptor in reader.streams.items():
             fitting = max(1, min(COPY_SAMPLES, COPY_BYTES // descriptor.sample_bytes()))
             num_samples = COPY_IMAGES if descriptor.unit in ENCODED_UNITS else fitting
-            total = reader.num_samples(name)
+            total, digest = reader.num_samples(name), ContentDigest(descriptor)
             for start in range(0, total, num_samples):
                 batch = reader.read(name, start, min(start + num_samples, total))
                 writer.append(name, **vars(batch))
+                if name in announced:
+                    digest.add(batch)
+            if name in announced:
+                got = {name: digest.content()}
+                check_content(attributes.recording_id, got, {name: announced[name]})
     return {name: reader.num_samples(name) for name in reader.streams}
 
 
@@ -61,7 +99,9 @@ class CommitProcess:
         self._child: ChildProcess | None = None
         self._guard = threading.Lock()
 
-    def __call__(self, spool: Path, attributes: RecordingAttributes) -> dict[str, int]:
+    def __call__(
+        self, spool: Path, attributes: RecordingAttributes, announced: Content = NOTHING
+    ) -> dict[str, int]:
         """Commit a spool; raises as `commit_spool`.
 
         Raises:
@@ -70,7 +110,13 @@ class CommitProcess:
         with self._guard:
             if self._child is None or not self._child.is_running:
                 self._child = ChildProcess("services.episode_store.committing", self._store_url)
-            self._child.send({"spool": str(spool), "attributes": attributes.model_dump_json()})
+            self._child.send(
+                {
+                    "spool": str(spool),
+                    "attributes": attributes.model_dump_json(),
+                    "announced": {name: one.model_dump() for name, one in announced.items()},
+                }
+            )
             try:
                 answer = self._child.receive()
             except UnavailableError as error:
@@ -98,8 +144,12 @@ def serve(store_url: str) -> None:
     store = EpisodeStore(store_url)
     for order in orders:
         attributes = RecordingAttributes.model_validate_json(order["attributes"])
+        announced = {
+            name: StreamContent.model_validate(one) for name, one in order["announced"].items()
+        }
         try:
-            answer({"num_samples": commit_spool(store, Path(order["spool"]), attributes)})
+            counts = commit_spool(store, Path(order["spool"]), attributes, announced)
+            answer({"num_samples": counts})
         except DexTouchError as error:
             problem = problem_from_error(error, instance=attributes.recording_id, request_id="")
             answer({"problem": problem.model_dump()})

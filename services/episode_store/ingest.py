@@ -4,7 +4,7 @@ import shutil
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -22,10 +22,16 @@ from dextouch.schemas import (
     FinishRecording,
     RecordingAttributes,
     RecordingStatus,
+    StreamContent,
 )
 from dextouch.streams import read_batch
 from dextouch.tracing import current_trace_id
-from services.episode_store.committing import Commit, CommitProcess, commit_spool
+from services.episode_store.committing import (
+    Commit,
+    CommitProcess,
+    check_content,
+    commit_spool,
+)
 from services.episode_store.senders import ANYONE, Sender, owner_of
 from services.episode_store.settings import EpisodeStoreSettings
 
@@ -166,20 +172,23 @@ class Ingest:
         Raises:
             NotFoundError: no such recording.
             AccessDeniedError: it is none of the sender.
-            ConflictError: batches are missing, or more are here than announced.
+            ConflictError: batches are missing, more are here than announced, or the samples are
+                not those announced; also where the recording is finished already.
             InvalidInputError: not all streams are announced, or none has a sample.
             UnavailableError: it is being finished already; try again later.
             StorageFullError: no space; the upload is unchanged.
         """
         with self._working_on(recording_id):
-            if self._store.exists(recording_id, kind="recording"):
-                sender.check_station(self._store.recording(recording_id).attributes.station)
-            else:
+            is_finished = self._store.exists(recording_id, kind="recording")
+            if not is_finished:
                 spool = self._upload(recording_id, sender)
-                _check_complete(spool, body)
-                self._move(spool, body)
+                _check_announced(recording_id, _status(spool).next_batch, body)
+                is_finished = not self._move(spool, body)
+            content = {}
+            if is_finished or body.content:
+                content = self._check_committed(recording_id, body, sender)
             shutil.rmtree(self._path(recording_id), ignore_errors=True)
-        return RecordingStatus(recording_id=recording_id, state="finished")
+        return RecordingStatus(recording_id=recording_id, state="finished", content=content)
 
     def expire(self, recording_id: str, *, idle_s: float) -> bool:
         """Drop an unfinished upload that has been idle for `idle_s`; whether it was dropped.
@@ -207,12 +216,14 @@ class Ingest:
         if self._process is not None:
             self._process.close()
 
-    def _move(self, spool: SpoolWriter, body: FinishRecording) -> None:
+    def _move(self, spool: SpoolWriter, body: FinishRecording) -> bool:
+        """Commit an upload; whether we did, and not the process of a previous service."""
         known = spool.attributes
         attributes = known.model_copy(
             update={
                 "success": known.success if body.success is None else body.success,
                 "ledger": body.ledger or known.ledger,
+                "num_batches": body.num_batches,
             }
         )
         recording_id = attributes.recording_id
@@ -220,13 +231,29 @@ class Ingest:
             self._open.pop(recording_id)
         spool.close()
         try:
-            counts = self._commit(self._path(recording_id), attributes)
+            counts = self._commit(self._path(recording_id), attributes, body.content)
         except ConflictError:
-            # The commit process of a previous service may have completed it.
             if not self._store.exists(recording_id, kind="recording"):
                 raise
-            return
+            return False
         logger.info("recording_finished", recording_id=recording_id, num_samples=counts)
+        return True
+
+    def _check_committed(
+        self, recording_id: str, body: FinishRecording, sender: Sender
+    ) -> dict[str, StreamContent]:
+        """Compare a finished recording with what its station announced; what it has, if asked."""
+        reader = self._store.recording(recording_id)
+        sender.check_station(reader.attributes.station)
+        content = reader.content()
+        # Earlier releases did not note them: then any number that can hold the samples is right.
+        here = reader.attributes.num_batches or {
+            name: min(max(1, body.num_batches.get(name, 0)), one.num_samples)
+            for name, one in content.items()
+        }
+        _check_announced(recording_id, here, body)
+        check_content(recording_id, content, body.content)
+        return content if body.content else {}
 
     @contextmanager
     def _working_on(self, recording_id: str) -> Iterator[None]:
@@ -277,7 +304,11 @@ def idle_seconds(path: Path) -> float:
 
 def _check_same(got: RecordingAttributes, ours: RecordingAttributes) -> None:
     # Attributes known only at the end may differ from those at the beginning.
-    late: dict[str, object] = {"success": ours.success, "ledger": ours.ledger}
+    late: dict[str, object] = {
+        "success": ours.success,
+        "ledger": ours.ledger,
+        "num_batches": ours.num_batches,
+    }
     if got.trace_id is None:
         late["trace_id"] = ours.trace_id
     if got.model_copy(update=late) != ours:
@@ -287,14 +318,13 @@ def _check_same(got: RecordingAttributes, ours: RecordingAttributes) -> None:
         )
 
 
-def _check_complete(spool: SpoolWriter, body: FinishRecording) -> None:
-    recording_id = spool.attributes.recording_id
-    here = _status(spool).next_batch
-    if set(body.num_batches) != set(here):
-        raise InvalidInputError(
-            f"finish {recording_id}: got streams {sorted(body.num_batches)}, expected "
-            f"{sorted(here)}; announce 0 batches for a stream without samples"
-        )
+def _check_announced(recording_id: str, here: Mapping[str, int], body: FinishRecording) -> None:
+    for announced in (body.num_batches, body.content or here):
+        if set(announced) != set(here):
+            raise InvalidInputError(
+                f"finish {recording_id}: got streams {sorted(announced)}, expected "
+                f"{sorted(here)}; announce 0 batches for a stream without samples"
+            )
     differing = {
         name: {"got": here[name], "expected": expected}
         for name, expected in body.num_batches.items()

@@ -128,7 +128,7 @@ class RefusingStore(EpisodeStoreClient):
     def send_batch(self, recording_id, descriptor, batch, *, number):
         raise NotImplementedError
 
-    def finish(self, recording_id, num_batches, *, success=None, ledger=()):
+    def finish(self, recording_id, num_batches, *, success=None, ledger=(), content=None):
         raise NotImplementedError
 
 

@@ -24,6 +24,7 @@ from dextouch.schemas import (
     RecordingAttributes,
     RecordingList,
     RecordingStatus,
+    StreamContent,
     UploadList,
     error_from_problem,
 )
@@ -111,9 +112,19 @@ class EpisodeStoreClient:
         *,
         success: bool | None = None,
         ledger: tuple[LedgerEntry, ...] = (),
+        content: Mapping[str, StreamContent] | None = None,
     ) -> RecordingStatus:
-        """Finish an upload with its number of batches per stream; the recording becomes visible."""
-        body = FinishRecording(num_batches=dict(num_batches), success=success, ledger=ledger)
+        """Finish an upload with its number of batches per stream; the recording becomes visible.
+
+        With `content` (`dextouch.episodes.ContentDigest`) the store compares all samples, and the
+        status has what it committed.
+        """
+        body = FinishRecording(
+            num_batches=dict(num_batches),
+            content=dict(content or {}),
+            success=success,
+            ledger=ledger,
+        )
         path = f"/v1/recordings/{_part(recording_id)}/finish"
         return self._model(RecordingStatus, "POST", path, content=body.model_dump_json())
 

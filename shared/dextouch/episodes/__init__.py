@@ -7,6 +7,7 @@ from dextouch.lazy_exports import lazy_exports
 if TYPE_CHECKING:
     from dextouch.episodes import care as care
     from dextouch.episodes import spool as spool
+    from dextouch.episodes.content import ContentDigest as ContentDigest
     from dextouch.episodes.files import disk_errors as disk_errors
     from dextouch.episodes.files import folder_bytes as folder_bytes
     from dextouch.episodes.files import replace_file as replace_file

@@ -8,6 +8,7 @@ from typing import Literal, TypeVar, overload
 import numpy as np
 from jaxtyping import Int64
 
+from dextouch.episodes.content import committed_content
 from dextouch.episodes.format import STAMPS
 from dextouch.episodes.groups import GroupReader
 from dextouch.episodes.image_codecs import FULL_FORM, ImageForm
@@ -21,7 +22,12 @@ from dextouch.episodes.window import (
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.geometry import nearest_index
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
-from dextouch.schemas import ActionKind, EpisodeAttributes, RecordingAttributes
+from dextouch.schemas import (
+    ActionKind,
+    EpisodeAttributes,
+    RecordingAttributes,
+    StreamContent,
+)
 from dextouch.streams import SampleBatch
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
@@ -66,6 +72,11 @@ class RecordingReader(GroupReader[RecordingAttributes]):
             self._column(f"{name}_{stamp}")[low:high].copy() for stamp in STAMPS["recording"]
         )
         return SampleBatch(t_host_ns, t_device_ns, sequence, self._values(name, low, high))
+
+    def content(self) -> dict[str, StreamContent]:
+        """Number of samples and digest of each stream, as committed; nothing is read for it."""
+        entries = self._contents.entries
+        return {s.name: committed_content(s, entries) for s in self.attributes.streams}
 
     def stamps(self, name: str) -> SampleBatch:
         """All stamps of a stream, without the values (which are [n, 0] here).

@@ -91,6 +91,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.recordings import RecordingList as RecordingList
     from dextouch.schemas.recordings import RecordingStatus as RecordingStatus
     from dextouch.schemas.recordings import RecordingSummary as RecordingSummary
+    from dextouch.schemas.recordings import StreamContent as StreamContent
     from dextouch.schemas.recordings import UploadList as UploadList
     from dextouch.schemas.recordings import UploadSummary as UploadSummary
     from dextouch.schemas.rollouts import MAX_SEED as MAX_SEED

@@ -38,8 +38,8 @@ class RecordingAttributes(FrozenModel):
     `started_t_host_ns` is the station's monotonic clock at `started_at`; `calibration` holds named
     matrices (`K_head`, `T_tracker_left_wrist_left`, …); `ledger` the counted faults; `quality`
     named figures; `recovered` marks a take that the station did not finish.
-    `trace_id` is that of the request that saved the take, or else began its upload; if empty, it is
-    not written.
+    `trace_id` is that of the request that saved the take, or else began its upload; `num_batches`
+    the batches of each stream in the upload, which the store notes. Neither is written if empty.
     """
 
     format_version: Literal[1] = FORMAT_VERSION
@@ -59,6 +59,7 @@ class RecordingAttributes(FrozenModel):
     ledger: Annotated[tuple[LedgerEntry, ...], Field(fail_fast=True)] = ()
     quality: dict[str, FiniteFloat] = Field(default={})
     trace_id: TraceId | None = Field(default=None, exclude_if=not_)
+    num_batches: dict[str, int] = Field(default={}, exclude_if=not_)
     streams: Annotated[tuple[StreamDescriptor, ...], Field(fail_fast=True)] = ()
 
     def as_interrupted(self) -> "RecordingAttributes":
@@ -67,12 +68,27 @@ class RecordingAttributes(FrozenModel):
         return self.model_copy(update={"ledger": (*self.ledger, *marks), "recovered": True})
 
 
+class StreamContent(FrozenModel):
+    """What a recording has of one stream: number of samples, and a digest of them.
+
+    The digest is the sha256 of the hexadecimal sha256 of its arrays, as the commit record lists
+    them: values, t_host_ns, t_device_ns and sequence, with one space in between.
+    """
+
+    num_samples: int = Field(ge=0)
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+
+
 class RecordingStatus(FrozenModel):
-    """Progress of an upload: the batch number that each stream expects next."""
+    """Progress of an upload: the batch number that each stream expects next.
+
+    `content` is what the store committed of each stream, for those who announced theirs.
+    """
 
     recording_id: StoreId
     state: Literal["open", "finished"]
     next_batch: dict[str, int] = Field(default={})
+    content: dict[str, StreamContent] = Field(default={}, exclude_if=not_)
 
 
 class BatchReceipt(FrozenModel):
@@ -86,9 +102,13 @@ class BatchReceipt(FrozenModel):
 
 
 class FinishRecording(FrozenModel):
-    """The end of an upload: number of batches per stream, and attributes known only at the end."""
+    """The end of an upload: what each stream has, and attributes known only at the end.
+
+    Without `content`, as older stations send it, the answer proves nothing about the samples.
+    """
 
     num_batches: dict[str, int]
+    content: dict[str, StreamContent] = Field(default={})
     success: bool | None = None
     ledger: Annotated[tuple[LedgerEntry, ...], Field(fail_fast=True)] = ()
 

@@ -81,11 +81,13 @@ class FakeStore(EpisodeStoreClient):
             replayed=False,
         )
 
-    def finish(self, recording_id, num_batches, *, success=None, ledger=()):
+    def finish(self, recording_id, num_batches, *, success=None, ledger=(), content=None):
         self._reply()
         assert num_batches == {n: len(b) for n, b in self.batches[recording_id].items()}
+        counts = {n: sum(map(len, b)) for n, b in self.batches[recording_id].items()}
+        assert {n: one.num_samples for n, one in content.items()} == counts
         self.finished[recording_id] = (success, ledger)
-        return self._status(recording_id)
+        return self._status(recording_id).model_copy(update={"content": content})
 
     def _status(self, recording_id):
         return RecordingStatus(
@@ -139,10 +141,12 @@ class DyingStore(FakeStore):
         send = super().send_batch
         return self._die_or(lambda: send(recording_id, descriptor, batch, number=number))
 
-    def finish(self, recording_id, num_batches, *, success=None, ledger=()):
+    def finish(self, recording_id, num_batches, *, success=None, ledger=(), content=None):
         finish = super().finish
         return self._die_or(
-            lambda: finish(recording_id, num_batches, success=success, ledger=ledger)
+            lambda: finish(
+                recording_id, num_batches, success=success, ledger=ledger, content=content
+            )
         )
 
 

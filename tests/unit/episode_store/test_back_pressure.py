@@ -272,7 +272,7 @@ def test_a_recording_that_is_being_finished_says_come_again(
     monkeypatch.setattr(ingest_module, "PATIENCE_S", 0.05)
     began, go_on = threading.Event(), threading.Event()
 
-    def slow_commit(spool, attributes):
+    def slow_commit(spool, attributes, announced):
         began.set()
         assert go_on.wait(30)
         return {}

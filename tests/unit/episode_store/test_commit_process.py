@@ -5,8 +5,8 @@ import signal
 
 import pytest
 
-from dextouch.episodes import EpisodeStore
-from dextouch.errors import CorruptDataError, UnavailableError
+from dextouch.episodes import ContentDigest, EpisodeStore
+from dextouch.errors import ConflictError, CorruptDataError, UnavailableError
 from dextouch.schemas import FinishRecording
 from dextouch.streams import encode_batch
 from services.episode_store.committing import CommitProcess
@@ -63,6 +63,19 @@ def test_its_errors_are_ours(ingest, store):
         ingest.finish("take-1", COUNTS)
     assert not store.exists("take-1", kind="recording")
     assert ingest.finish("take-2", COUNTS).state == "finished"
+
+
+def test_it_commits_only_what_was_announced(ingest, store, attributes, batch_of):
+    digests = {s.name: ContentDigest(s) for s in attributes.streams}
+    digests["glove_left"].add(batch_of(0, 600))
+    content = {name: digest.content() for name, digest in digests.items()}
+    wrong = content | {"glove_left": content["glove_left"].model_copy(update={"sha256": "0" * 64})}
+    with pytest.raises(ConflictError, match="glove_left has 600 samples") as refused:
+        ingest.finish("take-1", COUNTS.model_copy(update={"content": wrong}))
+    assert refused.value.details["glove_left"]["expected"]["sha256"] == "0" * 64
+    assert not store.exists("take-1", kind="recording")
+    got = ingest.finish("take-1", COUNTS.model_copy(update={"content": content}))
+    assert got.content == content
 
 
 def test_its_death_is_survived(ingest, store, commit):

@@ -299,13 +299,12 @@ def upload(client, spool):
     status = client.create(spool.attributes)
     num_batches = {}
     for name, descriptor in spool.streams.items():
-        number = status.next_batch.get(name, 0)
+        total = spool.num_samples(name)
+        num_batches[name] = -(-total // 60)
         if status.state == "open":
-            for start in range(60 * number, spool.num_samples(name), 60):
-                batch = spool.read(name, start, min(start + 60, spool.num_samples(name)))
+            for number in range(status.next_batch[name], num_batches[name]):
+                batch = spool.read(name, 60 * number, min(60 * number + 60, total))
                 client.send_batch("take-1", descriptor, batch, number=number)
-                number += 1
-        num_batches[name] = number
     return client.finish("take-1", num_batches)
 
 
