@@ -12,6 +12,7 @@ from structlog.contextvars import bound_contextvars
 
 from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import ContentDigest, disk_errors, replace_file
+from dextouch.episodes.care import is_held
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import (
     ConflictError,
@@ -24,6 +25,7 @@ from dextouch.errors import (
 )
 from dextouch.schemas import (
     ID_TAKEN,
+    LedgerEntry,
     RecordingAttributes,
     RecordingStatus,
     StreamContent,
@@ -39,6 +41,8 @@ RECORDING_FILE = "recording.json"
 UPLOADED_FILE = "uploaded.json"
 # Holds the store's words about a take that it refused for good.
 REFUSED_FILE = "refused.txt"
+# Says why a take that a killed process left could not be recovered.
+DAMAGED_FILE = "damaged.txt"
 # A refusal may be a passing one (an upload that expired in between), but not so often in a row.
 MAX_REFUSALS = 3
 REFUSALS = (ConflictError, InvalidInputError, LimitExceededError)
@@ -118,15 +122,12 @@ class Uploader:
         found = []
         refused = [self._spool_root / name for name in self.refused]
         for path in refused if only_refused else _spools(self._spool_root):
-            damage = None
             try:
-                if not SpoolReader(path).closed:
-                    continue
+                is_closed, damage = _condition(path)
             except NotFoundError:
                 continue  # removed meanwhile
-            except StorageError as error:
-                damage = error.message
-            found.append(self._status(path, damage))
+            if is_closed or damage is not None:
+                found.append(self._status(path, damage))
         return found
 
     def status_of(self, recording_id: str) -> UploadStatus:
@@ -140,7 +141,7 @@ class Uploader:
             raise NotFoundError(
                 f"take {recording_id!r}: not in the spool; see GET /v1/uploads for those that are"
             )
-        return self._status(path, None)
+        return self._status(path, _condition(path)[1])
 
     def retry(self, recording_id: str) -> UploadStatus:
         """Send a quarantined take again.
@@ -323,9 +324,9 @@ def batch_samples(descriptor: StreamDescriptor) -> int:
 def recover_spool(spool_root: Path) -> list[str]:
     """Close what a killed process left open, so that it is uploaded; ids of what was recovered.
 
-    Every acknowledged sample is kept and the recording's ledger says `interrupted`. A take that
-    holds no sample is removed; one that another process is writing, or that is damaged, is left
-    alone.
+    Every acknowledged sample is kept and the recording's ledger says `interrupted`, and what was
+    cut off the log. A take that never had a sample is removed; one that another process is writing
+    is left alone, and so is a damaged one, with the reason in its folder.
     """
     recovered = []
     for path in _spools(spool_root):
@@ -337,25 +338,73 @@ def recover_spool(spool_root: Path) -> list[str]:
         except StorageError as error:
             # One damaged take must not keep the station from starting; it stays for a person.
             logger.error("fail_recovery", recording_id=path.name, error=error.message)  # noqa: TRY400
+            _note_damage(path, error)
     return recovered
 
 
 def _recover(path: Path) -> bool:
-    spool = SpoolWriter.resume(path)
-    if not any(spool.num_samples(stream.name) for stream in spool.attributes.streams):
-        spool.abandon()
-        shutil.rmtree(path)
+    if is_held(path):
         return False
-    spool.set_attributes(spool.attributes.as_interrupted())
+    if SpoolReader(path).is_empty():
+        SpoolWriter.resume(path).abandon()
+        shutil.rmtree(path)
+        logger.warning("remove_empty_take", recording_id=path.name)
+        return False
+    spool = SpoolWriter.resume(path)
+    spool.set_attributes(_with_losses(spool))
     spool.close()
-    logger.warning("recover_take", recording_id=path.name)
+    (path / DAMAGED_FILE).unlink(missing_ok=True)
+    logger.warning(
+        "recover_take",
+        recording_id=path.name,
+        num_samples={s.name: spool.num_samples(s.name) for s in spool.attributes.streams},
+        torn_bytes=spool.torn_bytes,
+        lost_samples=spool.lost_samples,
+    )
     return True
+
+
+def _with_losses(spool: SpoolWriter) -> RecordingAttributes:
+    """The attributes of an interrupted take, whose ledger says what was cut off its log."""
+    attributes = spool.attributes.as_interrupted()
+    torn = spool.torn_bytes
+    marks = [
+        LedgerEntry(stream=stream.name, event="torn_bytes", count=torn)
+        for stream in attributes.streams
+        if torn
+    ]
+    marks += [
+        LedgerEntry(stream=name, event="lost_to_damage", count=count)
+        for name, count in spool.lost_samples.items()
+    ]
+    return attributes.model_copy(update={"ledger": (*attributes.ledger, *marks)})
+
+
+def _note_damage(path: Path, damage: StorageError) -> None:
+    try:
+        with disk_errors(f"note the damage of {path.name!r}"):
+            replace_file(path / DAMAGED_FILE, damage.message.encode())
+    except StorageError as error:
+        logger.warning("fail_note_damage", recording_id=path.name, error=error.message)
+
+
+def _condition(path: Path) -> tuple[bool, str | None]:
+    """Whether a take is closed, and what is wrong with it."""
+    try:
+        is_closed = SpoolReader(path).closed
+    except StorageError as error:
+        return True, error.message
+    return is_closed, None if is_closed else _text(path / DAMAGED_FILE)
 
 
 def _refusal(path: Path) -> str | None:
     """Why the store refused a take for good; None where it did not."""
+    return _text(path / REFUSED_FILE)
+
+
+def _text(path: Path) -> str | None:
     try:
-        return (path / REFUSED_FILE).read_text(encoding="utf-8", errors="replace")
+        return path.read_text(encoding="utf-8", errors="replace")
     except FileNotFoundError:
         return None
 

@@ -12,23 +12,32 @@ from pathlib import Path
 from types import TracebackType
 
 import numpy as np
-from pydantic import ValidationError
 
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, try_lock, write_file
+from dextouch.episodes.format import sha256_hex
 from dextouch.episodes.spool_log import (
     LOG_FILE,
     LOG_MAGIC,
+    LogRecords,
     SpoolLogWriter,
     read_batch,
     read_bodies,
     read_records,
     trusted_records,
 )
+from dextouch.episodes.spool_seal import (
+    CLOSED_FILE,
+    RECORDING_FILE,
+    Seal,
+    decode_attributes,
+    encode_attributes,
+    read_recording_file,
+    read_seal,
+)
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
     InvalidInputError,
-    NotFoundError,
     StorageError,
     UnknownNameError,
 )
@@ -45,26 +54,35 @@ from dextouch.streams import (
 
 __all__ = ["LOG_FILE", "SpoolReader", "SpoolWriter", "read_attributes"]
 
-RECORDING_FILE = "recording.json"
-CLOSED_FILE = "closed"
-
 
 class SpoolReader:
     """Reads the complete records of a spool, even while it is being written.
 
-    The log is scanned on first access; records appended later are not visible.
+    The log is scanned on first access; records appended later are not visible. A closed spool must
+    be as it was when it was closed.
 
     Raises:
         NotFoundError: no spool there.
-        CorruptDataError: its attributes are damaged.
+        CorruptDataError: its attributes are damaged, or it is closed and has changed since.
     """
 
     def __init__(self, path: Path) -> None:
         self.path, self._where = path, f"spool {path.name!r}"
-        self.attributes = read_attributes(path)
-        self.closed = (path / CLOSED_FILE).exists()
+        # Before the attributes, which a writer that is closing the spool may change until then.
+        self.closed, self._seal = False, None
+        with disk_errors(f"open {self._where}"):
+            try:
+                self._seal = read_seal(path)
+                self.closed = True
+            except (FileNotFoundError, NotADirectoryError):
+                pass  # being written, or left by a crash
+        text = read_recording_file(path)
+        self.attributes = decode_attributes(text, what=self._where)
         self.streams = {d.name: d for d in self.attributes.streams}
-        self._rows: dict[str, np.ndarray] | None = None
+        self._records: LogRecords | None = None
+        self._rows: dict[str, np.ndarray] = {}
+        if self._seal is not None:
+            self._check_seal(self._seal, text)
 
     def num_samples(self, stream_name: str) -> int:
         """Number of samples of a stream when the log was scanned.
@@ -113,6 +131,64 @@ class SpoolReader:
         (body,) = read_bodies(self.path, self.streams[stream_name], rows[number : number + 1])
         return body
 
+    def scan(self) -> LogRecords:
+        """All records of the log, of which a torn tail is none; raises as `num_samples`."""
+        if self._records is None:
+            records = read_records(self.path)
+            self._check_records(records)
+            self._records = records
+        return self._records
+
+    def is_empty(self) -> bool:
+        """Whether nothing was ever appended.
+
+        Raises:
+            CorruptDataError: something was, but no sample of it is whole.
+        """
+        records = trusted_records(self.path, self.scan())
+        if not len(records.rows) and records.num_bytes > len(LOG_MAGIC):
+            raise CorruptDataError(
+                f"{self._where}: no record in the {records.num_bytes} bytes of its log is whole; "
+                "restore it from a copy, or remove the take"
+            )
+        return not len(records.rows)
+
+    def _check_records(self, records: LogRecords) -> None:
+        rows = records.rows
+        if self.closed and records.gaps:
+            start, stop = records.gaps[0]
+            raise self._changed(f"bytes {start} … {stop - 1} of its log are no record")
+        if len(rows) and int(rows["stream"].max()) >= len(self.streams):
+            raise CorruptDataError(
+                f"{self._where}: its log has a stream number "
+                f"{int(rows['stream'].max())}, {RECORDING_FILE} has {len(self.streams)} streams"
+            )
+        if self._seal is not None:
+            got = _num_samples(rows, list(self.streams))
+            if got != self._seal.num_samples:
+                raise self._changed(f"samples {got}, expected {self._seal.num_samples}")
+
+    def _check_seal(self, seal: Seal, text: bytes) -> None:
+        with disk_errors(f"open {self._where}"):
+            log = self.path / LOG_FILE
+            log_bytes = log.stat().st_size if log.is_file() else 0
+        what = ""
+        if sha256_hex(text) != seal.recording_sha256:
+            what = f"{RECORDING_FILE} is not the one it was closed with"
+        elif set(seal.num_samples) != set(self.streams):
+            what = f"streams {sorted(self.streams)}, expected {sorted(seal.num_samples)}"
+        elif log_bytes != seal.log_bytes:
+            what = f"its log has {log_bytes} bytes, expected {seal.log_bytes}"
+        if what:
+            raise self._changed(what)
+
+    def _changed(self, what: str) -> CorruptDataError:
+        return CorruptDataError(
+            f"{self._where} was closed and has changed since: {what}; restore its files from a "
+            f"copy, or remove {CLOSED_FILE!r}: then what is left is recovered as an interrupted "
+            "take"
+        )
+
     def _span(self, stream_name: str, start: int, stop: int) -> tuple[np.ndarray, int]:
         """The records with samples start … stop-1, and the number of samples in them before."""
         rows, total = self._stream_rows(stream_name), self.num_samples(stream_name)
@@ -128,17 +204,18 @@ class SpoolReader:
     def _stream_rows(self, name: str) -> np.ndarray:
         if name not in self.streams:
             raise UnknownNameError("stream", name, list(self.streams))
-        if self._rows is None:
-            rows = read_records(self.path).rows
-            if len(rows) and int(rows["stream"].max()) >= len(self.streams):
-                raise CorruptDataError(
-                    f"{self._where}: its log has a stream number "
-                    f"{int(rows['stream'].max())}, {RECORDING_FILE} has {len(self.streams)} streams"
-                )
-            self._rows = {
-                stream: rows[rows["stream"] == number] for number, stream in enumerate(self.streams)
-            }
+        if name not in self._rows:
+            rows = self.scan().rows
+            self._rows[name] = rows[rows["stream"] == list(self.streams).index(name)]
         return self._rows[name]
+
+
+def _num_samples(rows: np.ndarray, names: list[str]) -> dict[str, int]:
+    """Samples by stream in records of a log."""
+    return {
+        name: int(rows["num_samples"][rows["stream"] == number].sum())
+        for number, name in enumerate(names)
+    }
 
 
 def read_attributes(path: Path) -> RecordingAttributes:
@@ -148,14 +225,7 @@ def read_attributes(path: Path) -> RecordingAttributes:
         NotFoundError: no spool there.
         CorruptDataError: attributes that cannot be read.
     """
-    with disk_errors(f"open spool {path.name}"):
-        if not (path / RECORDING_FILE).is_file():
-            raise NotFoundError(f"spool {path.name!r}: there is none in {path.parent}")
-        text = (path / RECORDING_FILE).read_bytes()
-    try:
-        return RecordingAttributes.model_validate_json(text)
-    except ValidationError as error:
-        raise CorruptDataError(f"spool {path.name!r}: {RECORDING_FILE}: {error}") from error
+    return decode_attributes(read_recording_file(path), what=f"spool {path.name!r}")
 
 
 @dataclass
@@ -204,6 +274,7 @@ class SpoolWriter:
         if lock is None:
             raise ConflictError(f"spool {path.name!r}: another process is writing it")
         self._lock = lock
+        self.torn_bytes, self.lost_samples = 0, dict[str, int]()
         try:
             self._log = SpoolLogWriter(path, end=self._resume())
         except BaseException:
@@ -219,10 +290,12 @@ class SpoolWriter:
     def resume(cls, path: Path, *, sync: bool = True) -> "SpoolWriter":
         """Continue after the last valid record of a spool that was closed or crashed.
 
+        What is cut off is in `torn_bytes`, and in `lost_samples` where its stream is known.
+
         Raises:
             NotFoundError: no spool there.
             ConflictError: another process is writing it.
-            CorruptDataError: damage other than a torn tail.
+            CorruptDataError: damage other than a torn tail, or a closed spool that has changed.
         """
         return cls(path, read_attributes(path), sync=sync, resume=True)
 
@@ -311,7 +384,7 @@ class SpoolWriter:
                 f"spool {ours.recording_id!r}: new attributes must keep its id and streams"
             )
         with disk_errors(f"write attributes of spool {self.path.name}"):
-            replace_file(self.path / RECORDING_FILE, attributes.model_dump_json().encode())
+            replace_file(self.path / RECORDING_FILE, encode_attributes(attributes))
         self.attributes = attributes
 
     def close(self) -> None:
@@ -320,8 +393,13 @@ class SpoolWriter:
             return
         try:
             self.flush()
+            seal = Seal(
+                num_samples={name: s.num_samples for name, s in self._streams.items()},
+                log_bytes=self._log.end,
+                recording_sha256=sha256_hex(read_recording_file(self.path)),
+            )
             with disk_errors(f"close spool {self.path.name}"):
-                replace_file(self.path / CLOSED_FILE, b"")
+                replace_file(self.path / CLOSED_FILE, seal.model_dump_json().encode())
         finally:
             self.abandon()
 
@@ -353,7 +431,12 @@ class SpoolWriter:
 
     def _resume(self) -> int:
         """Count the samples of the log; returns where it goes on."""
-        records = trusted_records(self.path)
+        reader = SpoolReader(self.path)
+        records = trusted_records(self.path, reader.scan())
+        self.torn_bytes = max(0, records.num_bytes - records.end)
+        kept = _num_samples(records.rows, list(self._streams))
+        lost = {name: reader.num_samples(name) - count for name, count in kept.items()}
+        self.lost_samples = {name: count for name, count in lost.items() if count}
         with disk_errors(f"resume spool {self.path.name}"):
             (self.path / CLOSED_FILE).unlink(missing_ok=True)
         for stream in self._streams.values():
@@ -383,7 +466,7 @@ def _create(path: Path, attributes: RecordingAttributes, notes: Mapping[str, byt
             raise ConflictError(f"spool {path.name!r} exists; resume or remove it")
         shutil.rmtree(unborn, ignore_errors=True)
         unborn.mkdir(parents=True)
-        write_file(unborn / RECORDING_FILE, attributes.model_dump_json().encode())
+        write_file(unborn / RECORDING_FILE, encode_attributes(attributes))
         write_file(unborn / LOG_FILE, LOG_MAGIC)
         for name, data in notes.items():
             write_file(unborn / name, data)

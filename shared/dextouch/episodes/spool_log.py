@@ -89,7 +89,8 @@ class LogBytes:
     beyond the end of a mapping kills the process (SIGBUS).
     """
 
-    def __init__(self, file: BinaryIO) -> None:
+    def __init__(self, file: BinaryIO, what: str) -> None:
+        self.what = what
         self._file, self._num_bytes = file, os.fstat(file.fileno()).st_size
 
     def __len__(self) -> int:
@@ -124,7 +125,7 @@ def open_log(folder: Path) -> Iterator[LogBytes]:
         if not (folder / LOG_FILE).is_file():
             raise CorruptDataError(f"spool {folder.name!r}: {LOG_FILE} is missing")
         with (folder / LOG_FILE).open("rb", buffering=_BLOCK_BYTES) as file:
-            yield LogBytes(file)
+            yield LogBytes(file, f"log of spool {folder.name!r}")
 
 
 def find_records(data: LogBytes) -> LogRecords:
@@ -134,8 +135,9 @@ def find_records(data: LogBytes) -> LogRecords:
         CorruptDataError: the bytes are not a log.
     """
     magic = data.read(0, len(LOG_MAGIC))
-    if not any(known.startswith(magic) for known in _LOG_MAGICS):
-        raise CorruptDataError(f"log: begins with {magic!r}, expected {LOG_MAGIC!r}")
+    # Written and synced before the spool appears, so that no crash leaves less of it.
+    if magic not in _LOG_MAGICS:
+        raise CorruptDataError(f"{data.what}: begins with {magic!r}, expected {LOG_MAGIC!r}")
     # Packed rows: those of one minute of a station take 2 MB, against 14 MB as tuples.
     rows, gaps, place = bytearray(), [], len(LOG_MAGIC)
     while place < len(data):
@@ -294,6 +296,11 @@ class SpoolLogWriter:
         self._end = place + HEADER_BYTES + length
         return place
 
+    @property
+    def end(self) -> int:
+        """Length of the log in bytes."""
+        return self._end
+
     def undo(self, place: int) -> None:
         """Remove the last record, at the given offset."""
         with disk_errors(f"cut {self._what}"):
@@ -316,9 +323,8 @@ class SpoolLogWriter:
         os.lseek(self._file, size, os.SEEK_SET)
 
 
-def trusted_records(folder: Path) -> LogRecords:
+def trusted_records(folder: Path, records: LogRecords) -> LogRecords:
     """The records of a log without those at its end whose body never reached the disk."""
-    records = read_records(folder)
     num_rows = len(records.rows)
     with open_log(folder) as data:
         while num_rows and body_at(data, records.rows[num_rows - 1]) is None:

@@ -39,9 +39,10 @@ def batch(first, count):
 @pytest.fixture
 def spool(store):
     path = store.root / ".uploads" / "take-1"
-    with SpoolWriter(path, recording_attributes(), sync=False) as writer:
-        for number in range(50):
-            writer.append("force", batch(number, 1))
+    writer = SpoolWriter(path, recording_attributes(), sync=False)
+    for number in range(50):
+        writer.append("force", batch(number, 1))
+    writer.abandon()
     return path
 
 
@@ -91,12 +92,13 @@ def test_of_video_in_an_upload_whole_groups_are_kept(store, number, lost):
     attributes = recording_attributes().model_copy(update={"streams": (camera, FORCE)})
     spool = store.root / ".uploads" / "take-1"
     numbers = np.arange(20)
-    with SpoolWriter(spool, attributes, sync=False) as writer:
-        for k in range(9):
-            writer.append("force", batch(k, 1))
-        for k in range(20):
-            stamp = numbers[k : k + 1]
-            writer.append("camera", SampleBatch(stamp, stamp, stamp, encoded_values([units[k]])))
+    writer = SpoolWriter(spool, attributes, sync=False)
+    for k in range(9):
+        writer.append("force", batch(k, 1))
+    for k in range(20):
+        stamp = numbers[k : k + 1]
+        writer.append("camera", SampleBatch(stamp, stamp, stamp, encoded_values([units[k]])))
+    writer.abandon()
     camera_record = HEADER_BYTES + 3 * 8 + 4
     start = len(LOG_MAGIC) + 9 * RECORD + sum(camera_record + len(unit) for unit in units[:number])
     flip(spool / LOG_FILE, len(LOG_MAGIC) + HEADER_BYTES + 27)
@@ -120,6 +122,23 @@ def test_whole_and_torn_uploads_are_left_to_their_station(store, spool):
     flip(file, -RECORD)
     assert not inspect_upload(spool).damaged
     assert repair_unfinished(store.root) == []
+
+
+@pytest.mark.parametrize("lost_bytes", [3, RECORD, 30 * RECORD])
+def test_what_a_closed_upload_has_lost_is_named(store, spool, lost_bytes):
+    """Closed by a service that died before it had committed it."""
+    SpoolWriter.resume(spool, sync=False).close()
+    assert not inspect_upload(spool).damaged
+    file = spool / LOG_FILE
+    file.write_bytes(file.read_bytes()[:-lost_bytes])
+    (finding,) = inspect_upload(spool).findings
+    assert f"expected {8 + 50 * RECORD}" in finding.message
+    (result,) = repair_unfinished(store.root)
+    num_lost = -(-lost_bytes // RECORD)
+    assert (result.action, result.lost) == ("salvaged", {"force": num_lost})
+    reader = store.recording("take-1-salvaged-1")
+    assert reader.num_samples("force") == 50 - num_lost
+    assert [entry.count for entry in reader.attributes.ledger] == [num_lost]
 
 
 @pytest.fixture

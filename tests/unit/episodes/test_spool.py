@@ -35,11 +35,15 @@ def path(tmp_path):
     return tmp_path / "spool" / "take-1"
 
 
-def fill(path, count=10):
-    with spool.SpoolWriter(path, ATTRIBUTES) as writer:
-        for first in range(count):
-            writer.append("glove_left", glove_batch(first))
-        writer.append("camera_head", camera_batch(0, 3))
+def fill(path, count=10, *, close=True):
+    writer = spool.SpoolWriter(path, ATTRIBUTES)
+    for first in range(count):
+        writer.append("glove_left", glove_batch(first))
+    writer.append("camera_head", camera_batch(0, 3))
+    if close:
+        writer.close()
+    else:
+        writer.abandon()
     return path
 
 
@@ -103,16 +107,17 @@ GLOVE_RECORD = HEADER_BYTES + GLOVE_BODY
 
 @pytest.fixture
 def gloves(path):
-    """A spool whose log is ten records of the same length."""
-    with spool.SpoolWriter(path, ATTRIBUTES) as writer:
-        for first in range(10):
-            writer.append("glove_left", glove_batch(first))
+    """A spool whose process died; its log is ten records of the same length."""
+    writer = spool.SpoolWriter(path, ATTRIBUTES)
+    for first in range(10):
+        writer.append("glove_left", glove_batch(first))
+    writer.abandon()
     assert (path / LOG_FILE).stat().st_size == len(LOG_MAGIC) + 10 * GLOVE_RECORD
     return path
 
 
 def test_torn_ends_are_cut_and_counted(path):
-    fill(path)
+    fill(path, close=False)
     with (path / LOG_FILE).open("ab") as file:
         file.write(b"\x01" * 1234)
     assert spool.SpoolReader(path).num_samples("glove_left") == 10
@@ -131,8 +136,9 @@ def test_a_log_cut_off_anywhere_ends_with_its_last_whole_record(gloves, lost_byt
     expected = max(0, 10 * GLOVE_RECORD - lost_bytes) // GLOVE_RECORD
     assert recover(gloves).num_samples["glove_left"] == expected
     assert_same(spool.SpoolReader(gloves).read("glove_left"), glove_batch(0, expected))
-    with spool.SpoolWriter.resume(gloves) as writer:
-        writer.append("glove_left", glove_batch(expected))
+    writer = spool.SpoolWriter.resume(gloves)
+    writer.append("glove_left", glove_batch(expected))
+    writer.abandon()
     assert (
         file.read_bytes()[: len(LOG_MAGIC) + expected * GLOVE_RECORD]
         == (whole[: len(LOG_MAGIC) + expected * GLOVE_RECORD])
@@ -193,10 +199,9 @@ def test_a_log_inside_an_image_is_not_read_as_one(path):
         one = SampleBatch(*np.zeros((3, 1), dtype=np.int64), encoded_values([b"\0\0\1\x65"]))
         writer.append("camera_head", one)
     forged = b"\0\0\1\x65" + (path / LOG_FILE).read_bytes() * 3
-    with spool.SpoolWriter.resume(path) as writer:
-        writer.append(
-            "camera_head", SampleBatch(*np.ones((3, 1), np.int64), encoded_values([forged]))
-        )
+    writer = spool.SpoolWriter.resume(path)
+    writer.append("camera_head", SampleBatch(*np.ones((3, 1), np.int64), encoded_values([forged])))
+    writer.abandon()
     file = path / LOG_FILE
     whole = bytearray(file.read_bytes())
     second = len(whole) - len(forged) - 4 - 24 - HEADER_BYTES
@@ -207,7 +212,7 @@ def test_a_log_inside_an_image_is_not_read_as_one(path):
 
 
 def test_a_foreign_or_missing_log_is_refused(path):
-    fill(path)
+    fill(path, close=False)
     file = path / LOG_FILE
     file.write_bytes(b"DXTBLOG\x03" + file.read_bytes()[8:])
     with pytest.raises(CorruptDataError, match="expected"):
@@ -218,7 +223,7 @@ def test_a_foreign_or_missing_log_is_refused(path):
 
 
 def test_a_log_of_other_streams_is_refused(path):
-    fill(path)
+    fill(path, close=False)
     smaller = GLOVE.model_copy(update={"shape": (300,)})
     for streams in ((GLOVE,), (smaller, CAMERA)):
         attributes = ATTRIBUTES.model_copy(update={"streams": streams})

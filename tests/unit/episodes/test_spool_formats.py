@@ -61,7 +61,7 @@ def record(version, place, batch, *, first_sample, stream=0):
 def test_a_log_written_by_hand_is_read_if_its_samples_follow_each_other(
     path, first_sample, version
 ):
-    spool.SpoolWriter(path, ATTRIBUTES).close()
+    spool.SpoolWriter(path, ATTRIBUTES).abandon()
     data = FORMATS[version][0]
     data += record(version, len(data), glove_batch(0, 2), first_sample=0)
     data += record(version, len(data), glove_batch(2, 3), first_sample=first_sample)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from dextouch.episodes.care.inspection import inspect_stage as inspect_stage
     from dextouch.episodes.care.inspection import inspect_upload as inspect_upload
     from dextouch.episodes.care.inspection import interrupted_takes as interrupted_takes
+    from dextouch.episodes.care.inspection import is_held as is_held
     from dextouch.episodes.care.inspection import open_contents as open_contents
     from dextouch.episodes.care.inspection import unfinished_folders as unfinished_folders
     from dextouch.episodes.care.repair import LEFT as LEFT

@@ -5,7 +5,7 @@ A reader stops at the first damage; an inspection continues and lists all of it.
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +26,9 @@ from dextouch.episodes.group_contents import GroupContents, read_group
 from dextouch.episodes.journal import damaged_payload, log_paths, part_path, read_rows, scan_rows
 from dextouch.episodes.reviews import REVIEW_FILE
 from dextouch.episodes.sources import GroupFiles, LocalGroup
-from dextouch.episodes.spool import RECORDING_FILE, read_attributes
+from dextouch.episodes.spool import SpoolReader, read_attributes
 from dextouch.episodes.spool_log import body_at, find_records, open_log
+from dextouch.episodes.spool_seal import RECORDING_FILE
 from dextouch.episodes.staged_group import STAGE_FILE, STAGING, read_stage
 from dextouch.episodes.trash import HOMES
 from dextouch.errors import StorageError
@@ -142,7 +143,14 @@ def inspect_upload(folder: Path) -> ItemReport:
         names = [stream.name for stream in read_attributes(folder).streams]
     except StorageError as error:
         return ItemReport("upload", folder.name, findings=(Finding(error.message),))
-    return _inspect_batches(folder, names)
+    report = _inspect_batches(folder, names)
+    if not report.damaged:
+        try:
+            SpoolReader(folder).scan()
+        except StorageError as error:
+            # Closed, and not as it was then.
+            return replace(report, findings=(Finding(error.message),))
+    return report
 
 
 def _inspect_batches(folder: Path, names: list[str]) -> ItemReport:

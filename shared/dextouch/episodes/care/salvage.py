@@ -41,6 +41,7 @@ from dextouch.episodes.shards import (
 )
 from dextouch.episodes.sources import LocalFile, LocalGroup
 from dextouch.episodes.spool_log import body_at, body_of, find_records, open_log, read_batch
+from dextouch.episodes.spool_seal import read_seal
 from dextouch.episodes.staged_group import new_stage
 from dextouch.episodes.staging_recovery import free_id, ids_below
 from dextouch.episodes.writer import Block, write_blocks
@@ -161,10 +162,19 @@ def spool_streams(spool: Path, attributes: Attributes) -> list[SalvagedStream]:
             [_holds(attributes.streams, row, body_at(data, row)) for row in rows], bool
         )
     mine = [rows["stream"] == number for number in range(len(attributes.streams))]
+    closed_with = _sealed_samples(spool)
     return [
-        _spooled(spool, stream, rows[own], holds[own])
+        _spooled(spool, stream, rows[own], holds[own], closed_with.get(stream.name, 0))
         for stream, own in zip(attributes.streams, mine, strict=True)
     ]
+
+
+def _sealed_samples(spool: Path) -> dict[str, int]:
+    """Samples by stream that a spool had when it was closed, as far as it says."""
+    seal = None
+    with suppress(FileNotFoundError, CorruptDataError):
+        seal = read_seal(spool)
+    return {} if seal is None else seal.num_samples
 
 
 def write_salvaged(
@@ -273,13 +283,13 @@ def _holds(streams: Sequence[StreamDescriptor], row: np.void, body: bytes | None
 
 
 def _spooled(
-    spool: Path, descriptor: StreamDescriptor, rows: np.ndarray, holds: np.ndarray
+    spool: Path, descriptor: StreamDescriptor, rows: np.ndarray, holds: np.ndarray, num_sealed: int
 ) -> SalvagedStream:
-    # A torn tail was never acknowledged, so it does not count as lost.
+    # A torn tail was never acknowledged, so it does not count as lost, unless the spool was closed.
     count = int(np.flatnonzero(holds)[-1]) + 1 if holds.any() else 0
     rows = rows[:count][holds[:count]]
     ends = rows["first_sample"] + rows["num_samples"]
-    kept = np.zeros(int(ends[-1]) if len(rows) else 0, dtype=bool)
+    kept = np.zeros(max(int(ends[-1]) if len(rows) else 0, num_sealed), dtype=bool)
     for row in rows:
         kept[int(row["first_sample"]) :][: int(row["num_samples"])] = True
     if codec_of(descriptor) == "h264":

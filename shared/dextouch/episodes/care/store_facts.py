@@ -14,7 +14,7 @@ from dextouch.episodes.care.inspection import UPLOADS
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE
 from dextouch.episodes.reviews import REVIEW_FILE
-from dextouch.episodes.spool import RECORDING_FILE
+from dextouch.episodes.spool_seal import RECORDING_FILE
 from dextouch.episodes.staged_group import STAGE_FILE, STAGING
 from dextouch.episodes.trash import TRASH
 
