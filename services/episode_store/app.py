@@ -71,7 +71,9 @@ def _recover(store: EpisodeStore) -> None:
     """Commit the stages of terminated writers and remove unrecoverable ones."""
     try:
         for group in store.recover():
-            logger.warning("recording_recovered", kind=group.kind, id=group.item_id)
+            logger.warning(
+                "recording_recovered", kind=group.kind, id=group.item_id, lost=dict(group.lost)
+            )
     except StorageError as error:
         # The service still serves everything else; `dextouch store repair` reports details.
         logger.error("recovery_failed", error=error.message)  # noqa: TRY400

@@ -2,8 +2,8 @@
 
 import hashlib
 import shutil
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import reduce
 from itertools import count
 from pathlib import Path
@@ -23,9 +23,12 @@ from dextouch.episodes.format import (
     kind_of,
     shard_path,
     stream_arrays,
+    with_counts,
     with_rows,
 )
 from dextouch.episodes.journal import (
+    JOURNAL_MAGIC,
+    JOURNAL_ROW,
     JournalWriter,
     journal_path,
     part_path,
@@ -47,17 +50,23 @@ from dextouch.episodes.staged_group import (
 from dextouch.errors import CorruptDataError, DexTouchError, StorageError
 from dextouch.schemas import RecordingAttributes
 
+# Event of the ledger: samples of which only some arrays reached the disk.
+INCOMPLETE = "incomplete_samples"
 # Whether an id is in use.
 IsTaken = Callable[[Kind, str], bool]
 
 
 @dataclass(frozen=True)
 class RecoveredGroup:
-    """A group recovered from an interrupted take."""
+    """A group recovered from an interrupted take.
+
+    `lost` counts the samples that only some of their arrays had, by stream.
+    """
 
     kind: Kind
     item_id: str
     num_samples: dict[str, int]
+    lost: Mapping[str, int] = field(default_factory=dict)
 
 
 def ids_below(root: Path) -> IsTaken:
@@ -105,7 +114,8 @@ def recover_stage(
         The recovered group; None if there is nothing to recover, and the stage is unchanged.
 
     Raises:
-        CorruptDataError: damage other than a torn tail; nothing is changed.
+        CorruptDataError: damage other than a torn tail, or no sample is whole although some were
+            written; nothing is changed.
     """
     is_taken = is_taken or ids_below(root)
     record = _whole_commit(stage)
@@ -118,7 +128,7 @@ def recover_stage(
     # one.
     for name in (METADATA_FILE, COMMIT_FILE):
         (stage / name).unlink(missing_ok=True)
-    kind, num_samples = kind_of(attributes), _num_whole_samples(stage, attributes)
+    kind, (num_samples, lost) = kind_of(attributes), _whole_samples(stage, attributes)
     if not any(num_samples.values()):
         return None
     entries = {}
@@ -127,10 +137,10 @@ def recover_stage(
             entries[name] = _cut_array(stage, name, entry, num_samples[stream.name])
     if isinstance(attributes, RecordingAttributes):
         attributes = attributes.as_interrupted()
-    attributes = _as_recovered(attributes, is_taken)
+    attributes = with_counts(_as_recovered(attributes, is_taken), INCOMPLETE, lost)
     target = root / f"{kind}s" / attributes_id(attributes)
     commit_stage(stage, target, attributes, entries)
-    return RecoveredGroup(kind, target.name, num_samples)
+    return RecoveredGroup(kind, target.name, num_samples, lost)
 
 
 def _publish(
@@ -163,7 +173,7 @@ def is_recoverable(stage: Path, is_taken: IsTaken) -> bool:
         return (stage / STAGE_FILE).exists() or not is_taken(record.kind, record.id)
     try:
         attributes = read_stage(stage)
-        return attributes is not None and any(_num_whole_samples(stage, attributes).values())
+        return attributes is not None and any(_whole_samples(stage, attributes)[0].values())
     except CorruptDataError:
         return True
 
@@ -188,20 +198,36 @@ def _whole_commit(stage: Path) -> CommitRecord | None:
         return None
 
 
-def _num_whole_samples(stage: Path, attributes: Attributes) -> dict[str, int]:
-    """Samples of each stream up to the last chunk boundary common to all of its arrays."""
-    counts = {}
+def _whole_samples(stage: Path, attributes: Attributes) -> tuple[dict[str, int], dict[str, int]]:
+    """Samples of each stream up to the last chunk boundary common to all of its arrays.
+
+    And how many more some of the arrays have, where there are any.
+    """
+    counts, lost, is_damaged = {}, {}, False
     for stream in attributes.streams:
-        ends = [
-            np.cumsum(_trusted_rows(stage, name, entry)["num_rows"], dtype=np.int64)
-            for name, entry in stream_arrays(stream, kind_of(attributes)).items()
-        ]
+        ends, num_written = [], 0
+        for name, entry in stream_arrays(stream, kind_of(attributes)).items():
+            rows, num_trusted = _journal_rows(stage, name, entry)
+            written = np.cumsum(rows["num_rows"], dtype=np.int64)
+            num_written = max(num_written, int(written[-1]) if len(written) else 0)
+            # A kill leaves at most a part of a row.
+            row_bytes = journal_path(stage, name).stat().st_size - len(JOURNAL_MAGIC)
+            is_damaged |= row_bytes // JOURNAL_ROW.itemsize > num_trusted
+            ends.append(written[:num_trusted])
         common = reduce(np.intersect1d, ends)
         counts[stream.name] = int(common[-1]) if len(common) else 0
-    return counts
+        if num_written > counts[stream.name]:
+            lost[stream.name] = num_written - counts[stream.name]
+    if is_damaged and not any(counts.values()):
+        raise CorruptDataError(
+            f"{stage.name}: no sample is in all arrays of its stream, although there were {lost}; "
+            "restore the files of the stage from a copy, or delete it"
+        )
+    return counts, lost
 
 
-def _trusted_rows(stage: Path, name: str, entry: ArrayEntry) -> np.ndarray:
+def _journal_rows(stage: Path, name: str, entry: ArrayEntry) -> tuple[np.ndarray, int]:
+    """The rows of an array's journal, and how many of them have their payload."""
     shard = stage / name / shard_path(len(entry.shape))
     with disk_errors(f"recover {name}"):
         if shard.is_file():
@@ -213,19 +239,21 @@ def _trusted_rows(stage: Path, name: str, entry: ArrayEntry) -> np.ndarray:
         part_path(stage, name).touch()
         journal_path(stage, name).touch()
     rows = read_rows(stage, name)
+    num_trusted = len(rows)
     # After a power loss there may be rows without their payload.
-    while len(rows):
+    while num_trusted:
         try:
-            read_payload(stage, name, rows[-1])
+            read_payload(stage, name, rows[num_trusted - 1])
         except CorruptDataError:
-            rows = rows[:-1]
+            num_trusted -= 1
         else:
             break
-    return rows
+    return rows, num_trusted
 
 
 def _cut_array(stage: Path, name: str, entry: ArrayEntry, num_samples: int) -> ArrayEntry:
-    rows = _trusted_rows(stage, name, entry)
+    rows, num_trusted = _journal_rows(stage, name, entry)
+    rows = rows[:num_trusted]
     ends = np.cumsum(rows["num_rows"], dtype=np.int64)
     num_kept = int(np.searchsorted(ends, num_samples, side="right"))
     num_rows = int(ends[num_kept - 1]) if num_kept else 0

@@ -169,6 +169,63 @@ def test_a_whole_stage_is_recovered(store, stage):
     assert store.recording("take-1").num_samples("force") == 15
 
 
+TWO_FORCES = (FORCE, FORCE.model_copy(update={"name": "other"}))
+
+
+@pytest.fixture
+def stage_of_two(store):
+    """As `stage`, with a second stream of ten samples."""
+    attributes = recording_attributes().model_copy(update={"streams": TWO_FORCES})
+    writer = store.writer(
+        kind="recording", attributes=attributes, options=WriteOptions(recoverable=True)
+    )
+    for name, count in (("force", 17), ("other", 10)):
+        writer.append(name, **vars(batch(0, count)))
+    (stage,) = (store.root / ".staging").iterdir()
+    shutil.copytree(stage, store.root / "kept")
+    writer.discard()
+    writer.__exit__(None, None, None)
+    (store.root / "kept").rename(stage)
+    return stage
+
+
+def zero(path, start=0):
+    data = path.read_bytes()
+    path.write_bytes(data[:start] + bytes(len(data) - start))
+
+
+# Payloads of a column, and the rows of a journal behind its eight first bytes.
+ZEROED = [
+    *((f"{name}.part", 0) for name in ("force", "force_t_host_ns", "force_sequence")),
+    ("force_sequence.journal", 8),
+]
+
+
+@pytest.mark.parametrize(("file", "start"), ZEROED)
+def test_a_column_that_a_power_cut_zeroed_is_named_as_a_loss(store, stage_of_two, file, start):
+    """Of the stream 15 samples are written."""
+    zero(stage_of_two / file, start)
+    (result,) = repair_unfinished(store.root)
+    assert (result.action, result.lost) == ("recovered", {"force": 15})
+    reader = store.recording("take-1")
+    assert (reader.num_samples("force"), reader.num_samples("other")) == (0, 10)
+    events = {(e.stream, e.event): e.count for e in reader.attributes.ledger}
+    assert events["force", "incomplete_samples"] == 15
+    assert ("other", "incomplete_samples") not in events
+
+
+@pytest.mark.parametrize(("file", "start"), ZEROED)
+def test_a_take_whose_only_stream_lost_a_column_is_kept(store, stage, file, start):
+    zero(stage / file, start)
+    with pytest.raises(CorruptDataError, match=r"although there were \{'force': 15\}"):
+        store.recover()
+    assert store.sweep() == 0
+    (result,) = repair_unfinished(store.root)
+    assert (result.action, result.kind) == ("left", "stage")
+    assert "force" in result.notes[0]
+    assert stage.is_dir()
+
+
 @pytest.mark.parametrize(
     ("file", "place"), [("force.part", 30), ("force.journal", 10), ("force_sequence.part", 9)]
 )

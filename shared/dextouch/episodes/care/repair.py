@@ -58,7 +58,7 @@ class RepairReport:
     `action` is `whole` (nothing to do), `mended` (restored as it was before the damage), `salvaged`
     (the readable samples are in `new_id`, the damaged group in the trash), `recovered` (an
     interrupted take was committed as far as it was written) or `left` (unchanged, `notes` say why).
-    `lost` counts the samples that a salvage dropped.
+    `lost` counts the samples that a salvage or a recovery dropped.
     """
 
     kind: str
@@ -102,7 +102,7 @@ def repair_unfinished(root: Path) -> list[RepairReport]:
     for stage in unheld_folders(root / STAGING):
         try:
             if group := recover_stage(stage, root):
-                reports.append(RepairReport(group.kind, group.item_id, RECOVERED))
+                reports.append(RepairReport(group.kind, group.item_id, RECOVERED, lost=group.lost))
         except CorruptDataError as error:
             reports.append(_salvage(root, "stage", stage, (error.message,)))
     for spool in unheld_folders(root / UPLOADS):
