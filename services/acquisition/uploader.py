@@ -350,9 +350,8 @@ def _recover(path: Path) -> bool:
         shutil.rmtree(path)
         logger.warning("remove_empty_take", recording_id=path.name)
         return False
-    spool = SpoolWriter.resume(path)
-    spool.set_attributes(_with_losses(spool))
-    spool.close()
+    with SpoolWriter.resume(path) as spool:
+        spool.set_attributes(_with_losses(spool))
     (path / DAMAGED_FILE).unlink(missing_ok=True)
     logger.warning(
         "recover_take",

@@ -229,7 +229,10 @@ class Ingest:
         recording_id = attributes.recording_id
         with self._guard:
             self._open.pop(recording_id)
-        spool.close()
+        try:
+            spool.close()
+        finally:
+            spool.abandon()
         try:
             counts = self._commit(self._path(recording_id), attributes, body.content)
         except ConflictError:

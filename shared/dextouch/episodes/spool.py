@@ -388,20 +388,22 @@ class SpoolWriter:
         self.attributes = attributes
 
     def close(self) -> None:
-        """Flush and mark the recording as complete; closing twice does nothing."""
+        """Flush and seal the complete recording; closing twice does nothing.
+
+        Raises:
+            StorageError: the disk refused, and the spool is still open; try again or abandon it.
+        """
         if self._lock < 0:
             return
-        try:
-            self.flush()
-            seal = Seal(
-                num_samples={name: s.num_samples for name, s in self._streams.items()},
-                log_bytes=self._log.end,
-                recording_sha256=sha256_hex(read_recording_file(self.path)),
-            )
-            with disk_errors(f"close spool {self.path.name}"):
-                replace_file(self.path / CLOSED_FILE, seal.model_dump_json().encode())
-        finally:
-            self.abandon()
+        self.flush()
+        seal = Seal(
+            num_samples={name: s.num_samples for name, s in self._streams.items()},
+            log_bytes=self._log.end,
+            recording_sha256=sha256_hex(read_recording_file(self.path)),
+        )
+        with disk_errors(f"close spool {self.path.name}"):
+            replace_file(self.path / CLOSED_FILE, seal.model_dump_json().encode())
+        self.abandon()
 
     def abandon(self) -> None:
         """Close the files without marking the recording as complete."""
@@ -419,9 +421,10 @@ class SpoolWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if kind is None:
-            self.close()
-        else:
+        try:
+            if kind is None:
+                self.close()
+        finally:
             self.abandon()
 
     def _stream(self, name: str) -> _Appended:

@@ -244,7 +244,20 @@ def test_a_batch_that_cannot_be_flushed_is_not_there(path, monkeypatch):
     assert_same(spool.SpoolReader(path).read("glove_left"), glove_batch(0, 3))
 
 
-def _fail(_descriptor):
+def test_a_spool_that_cannot_be_sealed_is_open_until_it_can(path, monkeypatch):
+    """A full disk while a take is saved: saving it again must not do nothing."""
+    writer = spool.SpoolWriter(path, ATTRIBUTES)
+    writer.append("glove_left", glove_batch(0))
+    with monkeypatch.context() as patch:
+        patch.setattr("dextouch.episodes.spool.replace_file", _fail)
+        with pytest.raises(StorageError, match="close spool"):
+            writer.close()
+    assert not spool.SpoolReader(path).closed
+    writer.close()
+    assert spool.SpoolReader(path).closed
+
+
+def _fail(*_):
     raise OSError(errno.EIO, "the disk is broken")
 
 
