@@ -1,5 +1,7 @@
 """Formats of the spool: logs written by hand, golden ones, and those of version 1."""
 
+import hashlib
+import json
 import shutil
 import struct
 
@@ -12,6 +14,7 @@ from dextouch.episodes.spool_log import LOG_FILE
 from dextouch.errors import (
     CorruptDataError,
 )
+from dextouch.schemas import RecordingAttributes
 from dextouch.streams import encode_body
 from tests.unit.episodes.spooled_batches import (
     ATTRIBUTES,
@@ -101,6 +104,23 @@ def test_the_bytes_of_a_log_never_change(tmp_path):
             for first, count in ((0, 1), (1, 3), (4, 2)):
                 writer.append(stream.name, golden_batch(stream, first, count))
     assert (tmp_path / "take-1" / LOG_FILE).read_bytes() == (golden / LOG_FILE).read_bytes()
+
+
+def test_checksums_and_the_seal_are_as_documented(path):
+    with spool.SpoolWriter(path, ATTRIBUTES) as writer:
+        writer.append("glove_left", glove_batch(0, 7))
+        whole = (path / "recording.json").read_bytes()
+    start = whole.index(b',"sha256"')
+    plain = whole[:start] + b"}"
+    assert json.loads(whole) == json.loads(plain) | {"sha256": hashlib.sha256(plain).hexdigest()}
+    assert RecordingAttributes.model_validate_json(plain) == ATTRIBUTES
+    # The log's first bytes, a header of 40, and seven samples of three stamps and 360 values.
+    assert json.loads((path / "closed").read_text()) == {
+        "format_version": 1,
+        "num_samples": {"glove_left": 7, "camera_head": 0},
+        "log_bytes": 8 + 40 + 7 * (3 * 8 + 360 * 2),
+        "recording_sha256": hashlib.sha256(whole).hexdigest(),
+    }
 
 
 @pytest.mark.parametrize("stream", ["glove_left", "camera_head"])
