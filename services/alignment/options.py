@@ -6,6 +6,8 @@ from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
 
+# A stream that loses one sample has a gap of two periods, and half a period is left for jitter.
+MAX_GAP_PERIODS = 2.5
 WristChoice = Literal["tracked", "touch"]
 
 
@@ -20,7 +22,8 @@ class AlignmentOptions(FrozenModel):
         default=50.0,
         gt=0,
         le=10_000,
-        description="longest gap between samples that is interpolated",
+        description="longest gap between samples that is interpolated; of slow streams it is 2.5 "
+        "nominal periods",
     )
     min_num_steps: int = Field(
         default=17, ge=2, description="shortest gap-free interval that becomes an episode"
@@ -32,7 +35,6 @@ class AlignmentOptions(FrozenModel):
         "robot's hand touches where the person's did",
     )
 
-    @property
-    def max_gap_ns(self) -> int:
-        """The largest gap in nanoseconds."""
-        return round(self.max_gap_ms * 1e6)
+    def max_gap_ns(self, period_ns: int) -> int:
+        """The largest gap of a stream of that nominal period, in nanoseconds."""
+        return max(round(self.max_gap_ms * 1e6), round(MAX_GAP_PERIODS * period_ns))

@@ -7,15 +7,20 @@ import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 from dextouch.command_line import CommandParser, add_json, progress, write_result
 from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader, is_rejected
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
+from dextouch.system_files import is_system_file
 
 Reader = EpisodeReader | RecordingReader
+R = TypeVar("R", EpisodeReader, RecordingReader)
 Report = dict[str, object]
+# Of damaged images, in a message; the JSON report has all.
+MAX_NAMED = 20
 
 _EXPORT_HELP = """\
 formats:
@@ -124,6 +129,23 @@ def _is_rejected(store: EpisodeStore, about: EpisodeAttributes | RecordingAttrib
     return review is not None and review.verdict == "rejected"
 
 
+def _damaged_images(reader: Reader) -> dict[str, list[int]]:
+    """Images by camera that cannot be decoded, and so are in no export; says how many and which."""
+    found = {}
+    for name in reader.streams:
+        damaged = reader.damaged_images(name).tolist()
+        if damaged:
+            found[name] = damaged
+            shown = ", ".join(map(str, damaged[:MAX_NAMED])) + ", …" * (len(damaged) > MAX_NAMED)
+            print(
+                f"{reader.item_id}: {name}: {len(damaged)} of {reader.num_samples(name)} images "
+                f"cannot be decoded and are left out; where a step needs one, the nearest other "
+                f"image stands (images {shown})",
+                file=sys.stderr,
+            )
+    return found
+
+
 def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
     return store.recording(item_id) if kind == "recording" else store.open(item_id)
 
@@ -137,8 +159,16 @@ def _export(options: argparse.Namespace) -> Report:
     ids = _ids(store, options)
     report: Report = {"format": form, "kind": options.kind, "ids": ids}
     shown = progress(ids, f"export {form}", len(ids))
+    damaged: dict[str, dict[str, list[int]]] = {}
+    report["damaged_images"] = damaged
+
+    def checked(reader: R) -> R:
+        if found := _damaged_images(reader):
+            damaged[reader.item_id] = found
+        return reader
+
     if form in _JOINT:
-        num_steps = _export_all((store.open(item_id) for item_id in shown), options)
+        num_steps = _export_all((checked(store.open(item_id)) for item_id in shown), options)
         print(f"{to}  {len(ids)} episodes  {num_steps} steps")
         return report | {"path": str(to), "num_steps": num_steps}
     # One file for one id, a folder of files otherwise.
@@ -153,7 +183,7 @@ def _export(options: argparse.Namespace) -> Report:
     files: list[dict[str, object]] = []
     for item_id in shown:
         path = paths[item_id]
-        count = _export_one(_open(store, options.kind, item_id), path, options)
+        count = _export_one(checked(_open(store, options.kind, item_id)), path, options)
         files.append({"id": item_id, "path": str(path), "num_messages": count})
         print(f"{path}  {count} messages")
     return report | {"files": files}
@@ -166,7 +196,8 @@ def _import(options: argparse.Namespace) -> Report:
     if options.format == "mcap":
         from dextouch.bridges.mcap import import_mcap
 
-        files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        found = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        files = [file for file in found if file == path or not is_system_file(file.name)]
         if not files:
             raise NotFoundError(f"{path}: holds no .mcap file")
         names = progress(files, "import mcap", len(files))

@@ -37,7 +37,7 @@ def load_tasks(path: Path | None) -> tuple[TaskChoice, ...]:
     """
     path = path or DEFAULT_TASKS
     try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
         return _TaskFile.model_validate(tables).tasks
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InvalidInputError(f"task file {path}: cannot be read: {error}") from error

@@ -150,15 +150,19 @@ def _images(reader: Reader, camera: str, query: ImagesQuery, max_bytes: int) -> 
         )
     stamps_ns = reader.stamps_ns(camera)
     first = 0 if query.start_ns is None else int(stamps_ns.searchsorted(query.start_ns))
+    # A browser would fill in what is missing of a damaged image.
+    indices = np.arange(first, first + count)
+    indices = np.setdiff1d(indices, reader.damaged_images(camera, indices))
     if descriptor.unit == JPEG_UNIT and not query.half_size:
-        encoded = reader.encoded_images(camera, first, first + count)
+        images = reader.encoded_images(camera, first, first + count)
+        encoded = [images[index - first] for index in indices.tolist()]
     else:
-        pictures = reader.images(camera, first, first + count, form=form)
+        pictures = reader.images_at(camera, indices, form=form)
         encoded = [encode_jpeg(picture, quality=QUALITY) for picture in pictures]
     return pack(
         {"camera": camera},
         {
-            "t_ns": stamps_ns[first : first + count],
+            "t_ns": stamps_ns[indices],
             "num_bytes": np.array([len(one) for one in encoded], dtype=np.int64),
             "data": np.frombuffer(b"".join(encoded), dtype=np.uint8),
         },

@@ -97,7 +97,7 @@ def read_attempt(reader: EpisodeReader) -> LabelledAttempt:
     views = [
         View(image, cameras[step], _nearest(poses.t_ref_ns, poses.values, window.t_ref_ns[step]))
         for step, image in zip(
-            steps[chosen].tolist(), reader.images(CAMERA)[images[chosen]], strict=True
+            steps[chosen].tolist(), reader.images_at(CAMERA, images[chosen]), strict=True
         )
     ]
     actions = reader.read("action_commanded").values.astype(np.float64)

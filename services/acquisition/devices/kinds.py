@@ -333,6 +333,6 @@ def load_calibration(path: Path | None) -> dict[str, Matrix]:
     if path is None:
         return {}
     try:
-        return _MATRICES.validate_json(path.read_bytes())
+        return _MATRICES.validate_json(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:
         raise InvalidInputError(f"calibration {path}: no JSON of matrices ({error})") from error

@@ -21,9 +21,10 @@ from dextouch.episodes import (
     VideoSettings,
     check_video_size,
     decoder_of_this_thread,
+    first_gap,
     is_keyframe,
 )
-from dextouch.errors import DeviceError, NotFoundError
+from dextouch.errors import CorruptDataError, DeviceError, NotFoundError
 from dextouch.images import encode_jpeg
 from dextouch.streams import (
     Sample,
@@ -181,7 +182,8 @@ class GroupPreview:
 class WholeGroups:
     """Gives the H.264 samples of a device that encodes itself in whole groups only.
 
-    A group that lost an image is dropped as a whole: the store could not take the rest of it.
+    A group that lost an image is dropped as a whole: the store could not take the rest of it. The
+    images' own numbers tell what was lost before the device numbered its packets.
 
     Args:
         stream: for messages.
@@ -191,8 +193,10 @@ class WholeGroups:
     def __init__(self, stream: str, statistics: DecoderStatistics) -> None:
         self._stream, self._statistics = stream, statistics
         self._group: list[Sample] = []
-        # Of the sample that a group is expected to begin after; None where any may.
-        self._whole_until: int | None = None
+        # The last complete group, after which one is expected to begin; empty where any may.
+        self._complete: list[Sample] = []
+        # Length of the group before; None of the first one.
+        self._last_length: int | None = None
 
     def add(self, sample: Sample) -> list[Sample]:
         """The next sample; a whole group when it is the last one of it, [] before.
@@ -201,10 +205,14 @@ class WholeGroups:
             DeviceError: the device's groups have another length.
         """
         begins = is_keyframe(sample.values.item())
-        follows = bool(self._group) and sample.sequence == self._group[-1].sequence + 1
+        follows = _follow(self._group, sample)
         # Nothing is missing in either case: the device means its groups to be so long.
-        is_too_short = begins and follows
-        is_too_long = not begins and sample.sequence - 1 == self._whole_until
+        is_too_short = begins and follows and self._is_meant_short()
+        is_too_long = (
+            not begins
+            and _follow(self._complete, sample)
+            and not _is_of_later_group(self._complete, sample)
+        )
         if begins or not follows:
             self.reset()
         if is_too_short or is_too_long:
@@ -219,11 +227,38 @@ class WholeGroups:
         self._group.append(sample)
         if len(self._group) < GOP_IMAGES:
             return []
-        self._whole_until = sample.sequence
-        whole, self._group = self._group, []
-        return whole
+        self._last_length = GOP_IMAGES
+        self._complete, self._group = self._group, []
+        return self._complete
 
     def reset(self) -> None:
         """Drop the unfinished group; the next sample need not follow."""
         self._statistics.refused += len(self._group)
-        self._group, self._whole_until = [], None
+        self._group, self._complete = [], []
+
+    def _is_meant_short(self) -> bool:
+        """Whether the group, which ends too early, is as long as the device's groups are.
+
+        After a whole group, one short group has lost its last image before the device numbered it.
+        """
+        if not _is_complete(self._group):
+            return False
+        before, self._last_length = self._last_length, len(self._group)
+        return before in {None, len(self._group)}
+
+
+def _follow(samples: list[Sample], sample: Sample) -> bool:
+    return bool(samples) and sample.sequence == samples[-1].sequence + 1
+
+
+def _is_complete(samples: list[Sample]) -> bool:
+    """Whether no picture is missing between these, by their own numbers."""
+    try:
+        return first_gap([one.values.item() for one in samples]) is None
+    except CorruptDataError:
+        return False
+
+
+def _is_of_later_group(group: list[Sample], sample: Sample) -> bool:
+    """Whether a picture neither continues a group nor repeats its last number."""
+    return not (_is_complete([*group, sample]) or _is_complete([*group[:-1], sample]))

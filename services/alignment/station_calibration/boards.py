@@ -13,6 +13,7 @@ from dextouch.command_line import progress
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.geometry import apply, invert, transform
 from dextouch.geometry.rotations import rotation_from_vector, vector_from_rotation
+from dextouch.system_files import is_system_file
 from services.alignment.calibration.intrinsics import (
     DICTIONARIES,
     CharucoBoard,
@@ -127,15 +128,20 @@ def photo_paths(folder: Path) -> list[Path]:
     """The photos of a folder, sorted by name."""
     if not folder.is_dir():
         raise NotFoundError(f"{folder}: no such folder of photos")
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    paths = (path for path in folder.iterdir() if not is_system_file(path.name))
+    return sorted(path for path in paths if path.suffix.lower() in SUFFIXES)
 
 
 def decode_photo(data: bytes, *, where: str) -> UInt8[np.ndarray, "h w"]:
-    """Decode a photo to a grey image."""
+    """Decode a photo to a grey image, as its sensor delivered it.
+
+    EXIF orientation is ignored, as it is in recordings: K belongs to the sensor's raster.
+    """
     import cv2
 
     encoded = np.frombuffer(data, dtype=np.uint8)
-    photo = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE) if data else None
+    form = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    photo = cv2.imdecode(encoded, form) if data else None
     if photo is None:
         raise CorruptDataError(f"{where}: {len(data)} bytes are not an image")
     return np.asarray(photo, dtype=np.uint8)

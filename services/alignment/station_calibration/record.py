@@ -5,6 +5,7 @@ The folder holds named matrices for recordings, with accuracy, age and provenanc
 matrices too (`…_sigma…`, `…_calibrated_at_unix_s`), so that every recording contains them.
 """
 
+import codecs
 import csv
 import json
 from collections.abc import Callable, Mapping
@@ -113,7 +114,7 @@ def read_matrices(folder: Path) -> dict[str, Matrix]:
 
 def _read(path: Path, validate: Callable[[bytes], Named], what: str) -> Named:
     try:
-        return validate(path.read_bytes())
+        return validate(path.read_bytes().removeprefix(codecs.BOM_UTF8))
     except ValidationError as error:
         raise CorruptDataError(f"{path}: no JSON of {what} ({first_problems(error)})") from error
 
@@ -231,7 +232,7 @@ def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row
     """
     rows = []
     try:
-        with _existing(path, expected).open(encoding="utf-8", newline="") as file:
+        with _existing(path, expected).open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             for cells in reader:
                 given = {str(column): cell for column, cell in cells.items() if cell}

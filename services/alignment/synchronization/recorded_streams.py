@@ -275,8 +275,14 @@ def _image_blocks(
         begins_group = int(kept[first]) % GOP_IMAGES == 0
         if not begins_group or int(kept[stop - 1] - kept[first]) != stop - 1 - first:
             # Images without a timestamp are in between: the rest is not a complete group.
-            quality[f"{stream.name}_num_images_encoded_anew"] = float(stop - first)
-            yield from stream.pieces(first, stop)
+            damaged = stream.recording.damaged_images(stream.name, kept[first:stop])
+            places = first + np.flatnonzero(np.isin(kept[first:stop], damaged, invert=True))
+            quality[f"{stream.name}_num_images_encoded_anew"] = float(len(places))
+            rows = max(1, PIECE_BYTES // stream.descriptor.sample_bytes())
+            for low in range(0, len(places), rows):
+                part = places[low : low + rows]
+                images = stream.recording.images_at(stream.name, kept[part])
+                yield Block(stream.t_ns[part], images)
             return
     for low in range(first, stop, IMAGES_AT_ONCE):
         part = kept[low : min(low + IMAGES_AT_ONCE, stop)]

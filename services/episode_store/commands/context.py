@@ -8,6 +8,7 @@ from typing import Any
 
 from dextouch.episodes import KINDS, EpisodeStore, Kind, check_id, local_folder
 from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.system_files import is_system_file
 
 EXIT_DAMAGED = 1
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
@@ -65,7 +66,7 @@ class Context:
             names = set(self.store.list(kind=kind))
             folder = None if root is None else root / f"{kind}s"
             if folder is not None and folder.is_dir():
-                names |= {path.name for path in folder.iterdir()}
+                names |= {p.name for p in folder.iterdir() if not is_system_file(p.name)}
             found += [(kind, name) for name in sorted(names)]
         return found
 

@@ -114,7 +114,7 @@ def read_rubrics(path: Path | None = None) -> dict[str, Rubric]:
     """
     path = BUNDLED if path is None else path
     try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InvalidInputError(f"rubrics {path}: cannot be read ({error})") from error
     rubrics = {}

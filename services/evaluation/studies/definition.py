@@ -136,7 +136,7 @@ def read_definition(path: Path) -> StudyDefinition:
         InvalidInputError: it cannot be read, or does not define a study; all problems are listed.
     """
     try:
-        fields = tomllib.loads(path.read_text(encoding="utf-8"))
+        fields = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InvalidInputError(f"study {path}: cannot be read ({error})") from error
     try:

@@ -159,7 +159,7 @@ def _images(reader: EpisodeReader) -> tuple[np.ndarray, np.ndarray]:
     if CAMERA not in reader.streams or not reader.num_samples(CAMERA):
         return np.zeros((0, 0, 0, 3), dtype=np.uint8), np.zeros(0, dtype=np.int64)
     steps, images = reader.shown_steps(CAMERA)
-    return reader.images(CAMERA)[images], steps
+    return reader.images_at(CAMERA, images), steps
 
 
 def poses_at(reader: EpisodeReader, grid_ns: np.ndarray) -> Float32[np.ndarray, "steps objects 7"]:

@@ -11,9 +11,15 @@ from typing import Final
 import numpy as np
 from jaxtyping import Int64, Shaped
 
-from dextouch.episodes import EpisodeReader, RecordingReader, disk_errors
+from dextouch.episodes import GOP_IMAGES, EpisodeReader, RecordingReader, disk_errors
 from dextouch.errors import ConflictError
-from dextouch.streams import ENCODED_UNITS, NO_DEVICE_TIME, NO_SEQUENCE, encoded_values
+from dextouch.streams import (
+    ENCODED_UNITS,
+    H264_UNIT,
+    NO_DEVICE_TIME,
+    NO_SEQUENCE,
+    encoded_values,
+)
 
 Reader = EpisodeReader | RecordingReader
 BLOCK_SECONDS: Final = 1.0
@@ -37,12 +43,20 @@ class Block:
 
 
 def blocks(reader: Reader, name: str) -> Iterator[Block]:
-    """Iterate over a stream in order, about one second per block; encoded images stay encoded."""
+    """Iterate over a stream in order, about one second per block; encoded images stay encoded.
+
+    Damaged images are left out, of H.264 with their whole groups.
+    """
     descriptor, t_ns = reader.streams[name], reader.stamps_ns(name)
     t_device_ns, sequence = np.full_like(t_ns, NO_DEVICE_TIME), np.full_like(t_ns, NO_SEQUENCE)
     if isinstance(reader, RecordingReader):
         stamps = reader.stamps(name)
         t_device_ns, sequence = stamps.t_device_ns, stamps.sequence
+    damaged = reader.damaged_images(name)
+    if descriptor.unit == H264_UNIT:
+        groups = np.unique(damaged // GOP_IMAGES)
+        damaged = (groups[:, None] * GOP_IMAGES + np.arange(GOP_IMAGES)).ravel()
+    kept = np.isin(np.arange(len(t_ns)), damaged, invert=True)
     each = max(1, round(descriptor.nominal_rate_hz * BLOCK_SECONDS))
     for start in range(0, len(t_ns), each):
         stop = min(start + each, len(t_ns))
@@ -50,7 +64,10 @@ def blocks(reader: Reader, name: str) -> Iterator[Block]:
             values = encoded_values(reader.encoded_images(name, start, stop))
         else:
             values = reader.values(name, start, stop)
-        yield Block(t_ns[start:stop], t_device_ns[start:stop], sequence[start:stop], values)
+        part = np.flatnonzero(kept[start:stop])
+        if len(part):
+            columns = (column[start:stop][part] for column in (t_ns, t_device_ns, sequence))
+            yield Block(*columns, values[part])
 
 
 @contextmanager

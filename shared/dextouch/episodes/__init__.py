@@ -18,10 +18,12 @@ if TYPE_CHECKING:
     from dextouch.episodes.format import check_id as check_id
     from dextouch.episodes.format import shard_path as shard_path
     from dextouch.episodes.format import stream_arrays as stream_arrays
+    from dextouch.episodes.h264_headers import first_gap as first_gap
     from dextouch.episodes.image_codecs import FULL_FORM as FULL_FORM
     from dextouch.episodes.image_codecs import GopEncoder as GopEncoder
     from dextouch.episodes.image_codecs import ImageForm as ImageForm
     from dextouch.episodes.image_codecs import VideoSettings as VideoSettings
+    from dextouch.episodes.image_codecs import check_group as check_group
     from dextouch.episodes.image_codecs import check_video_size as check_video_size
     from dextouch.episodes.image_codecs import decoder_of_this_thread as decoder_of_this_thread
     from dextouch.episodes.image_codecs import is_keyframe as is_keyframe

@@ -3,11 +3,19 @@
 from typing import Generic, TypeVar
 
 import numpy as np
+from jaxtyping import Int64
 
 from dextouch.episodes.format import STAMPS, attributes_id, codec_of
 from dextouch.episodes.group_contents import GroupContents
 from dextouch.episodes.image_codecs import FULL_FORM, ImageChunks, ImageForm, transform_pixels
-from dextouch.errors import CorruptDataError, InvalidInputError, ShapeError, UnknownNameError
+from dextouch.errors import (
+    CorruptDataError,
+    InvalidInputError,
+    NotFoundError,
+    ShapeError,
+    UnknownNameError,
+)
+from dextouch.geometry import nearest_index
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes, Verification
 from dextouch.streams import StreamDescriptor
 
@@ -29,6 +37,8 @@ class GroupReader(Generic[A]):
         self.content_sha256 = contents.content_sha256
         self.streams: dict[str, StreamDescriptor] = {s.name: s for s in self.attributes.streams}
         self._whole: dict[str, np.ndarray] = {}
+        # By stream and storage chunk: how many of its first images can be decoded.
+        self._num_decodable: dict[tuple[str, int], int] = {}
         # Names and codecs of the streams, cached since every window needs them.
         stamp = STAMPS[self._kind][0]
         self._stamps = {name: f"{name}_{stamp}" for name in self.streams}
@@ -39,7 +49,7 @@ class GroupReader(Generic[A]):
         return self._contents.entries[self._stamps[self._stream(name).name]].shape[0]
 
     def count(self, name: str, start_ns: int | None = None, stop_ns: int | None = None) -> int:
-        """Number of samples that `read` would return; reads only the stamps."""
+        """Number of samples of a time span, damaged images included; reads only the stamps."""
         low, high = self._range(name, start_ns, stop_ns)
         return high - low
 
@@ -150,6 +160,52 @@ class GroupReader(Generic[A]):
             images += group
         return images[start - first * chunks.rows : stop - first * chunks.rows]
 
+    def damaged_images(
+        self, name: str, indices: np.ndarray | None = None
+    ) -> Int64[np.ndarray, " damaged"]:
+        """Those of a camera's images that cannot be decoded: decodes the chunks they are in.
+
+        What a decoder would fill in is no image: readers by time treat such an image, and those
+        of its H.264 group that depend on it, as images that were never recorded.
+
+        Args:
+            name: of the stream; one without encoded images has none.
+            indices: which images to look at; None for all.
+
+        Raises:
+            UnknownNameError: no such stream.
+            CorruptDataError: the store's bytes are damaged (`dextouch store verify`).
+        """
+        descriptor = self._stream(name)
+        if indices is None:
+            indices = np.arange(self.num_samples(name))
+        if descriptor.kind != "image" or self._codecs[name] == "zstd":
+            return np.zeros(0, dtype=np.int64)
+        chunks = self._image_chunks(descriptor)
+        numbers, inverse = np.unique(indices // chunks.rows, return_inverse=True)
+        num_decodable = [
+            self._num_decodable_in(chunks, name, number) for number in numbers.tolist()
+        ]
+        limits = np.array(num_decodable, dtype=np.int64)[inverse]
+        return indices[indices % chunks.rows >= limits].astype(np.int64)
+
+    def nearest_images(self, name: str, t_ns: np.ndarray) -> Int64[np.ndarray, " n"]:
+        """Index of the image nearest to each time, of those that can be decoded.
+
+        Raises:
+            UnknownNameError: no such stream.
+            NotFoundError: no image that can be decoded.
+            CorruptDataError: the store's bytes are damaged.
+        """
+        stamps, usable = self.stamps_ns(name), np.arange(self.num_samples(name))
+        while len(usable):
+            nearest = usable[nearest_index(stamps[usable], t_ns)]
+            damaged = self.damaged_images(name, nearest)
+            if not len(damaged):
+                return nearest
+            usable = np.setdiff1d(usable, damaged)
+        raise NotFoundError(f"{self._what}: {name!r} holds no image that can be decoded")
+
     def verify(self) -> Verification:
         """Read everything and compare it with the commit record.
 
@@ -197,6 +253,32 @@ class GroupReader(Generic[A]):
         low = 0 if start_ns is None else int(stamps.searchsorted(start_ns))
         high = len(stamps) if stop_ns is None else int(stamps.searchsorted(stop_ns))
         return low, max(low, high)
+
+    def _num_decodable_in(self, chunks: ImageChunks, name: str, number: int) -> int:
+        if (name, number) not in self._num_decodable:
+            payload, found = self._contents.shard(name).payload(number), chunks.rows
+            try:
+                chunks.check(payload, number)
+            except CorruptDataError as error:
+                # Without a place it is the storage chunk that is invalid.
+                if not isinstance(place := error.details.get("place"), int):
+                    raise
+                found = place
+            self._num_decodable[name, number] = found
+        return self._num_decodable[name, number]
+
+    def _without_damaged(
+        self, name: str, low: int, high: int, form: ImageForm = FULL_FORM
+    ) -> tuple[slice | np.ndarray, np.ndarray]:
+        """Samples low … high−1 and their values, without images that cannot be decoded."""
+        if self.streams[name].kind != "image":
+            return slice(low, high), self._values(name, low, high)
+        indices = np.arange(low, high)
+        try:
+            return slice(low, high), self.images_at(name, indices, form=form)
+        except CorruptDataError:
+            kept = np.setdiff1d(indices, self.damaged_images(name, indices))
+            return kept, self.images_at(name, kept, form=form)
 
     def _values(self, name: str, start: int, stop: int) -> np.ndarray:
         if self._codecs[name] == "zstd":

@@ -4,11 +4,15 @@ A `jpeg` storage chunk is the bytes of one JPEG image. An `h264` one is a closed
 u32 number of images, u32 length of each access unit, the access units; little endian. One access
 unit is one image; without B-frames their order is that of the input, so image k of a group needs
 exactly its first k + 1 access units. No other module of the store uses PyAV.
+
+A decoder fills in what is missing of a damaged image; such an image is refused here, and so are
+the images of its group that depend on it.
 """
 
 import struct
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import accumulate, pairwise
@@ -19,15 +23,22 @@ import simplejpeg
 from pydantic import Field
 
 from dextouch.episodes.format import GOP_IMAGES, Codec
+from dextouch.episodes.h264_headers import (
+    IDR_SLICE,
+    PICTURE_PARAMETERS,
+    SEQUENCE_PARAMETERS,
+    SLICE,
+    START_CODE,
+    first_gap,
+    nal_units,
+)
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.frozen_model import FrozenModel
-from dextouch.images import jpeg_size
+from dextouch.images import check_jpeg, jpeg_size
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
-_IDR_SLICE, _SLICE, _SEQUENCE_PARAMETERS, _PICTURE_PARAMETERS = 5, 1, 7, 8
-_START_CODE = b"\x00\x00\x01"
 # Averaging chroma over 2×2 pixels is as fast as nearest-neighbour and gains 0.25 dB.
 # SWS_AREA | SWS_FULL_CHR_H_INP of libswscale: with full chroma input it stays in its vectorized
 # path, which takes little more than half the time at the same PSNR.
@@ -67,17 +78,14 @@ def parameter_sets(access_unit: bytes) -> bytes:
     """The sequence and picture parameter sets before an IDR picture; empty if there are none."""
     kinds: set[int] = set()
     found = b""
-    start = access_unit.find(_START_CODE)
-    while start >= 0 and start + 3 < len(access_unit):
-        kind = access_unit[start + 3] & 0x1F
-        if kind in {_IDR_SLICE, _SLICE}:
-            whole = kinds == {_SEQUENCE_PARAMETERS, _PICTURE_PARAMETERS} and kind == _IDR_SLICE
+    for nal in nal_units(access_unit):
+        kind = nal[0] & 0x1F
+        if kind in {IDR_SLICE, SLICE}:
+            whole = kinds == {SEQUENCE_PARAMETERS, PICTURE_PARAMETERS} and kind == IDR_SLICE
             return found if whole else b""
-        stop = access_unit.find(_START_CODE, start + 3)
-        if kind in {_SEQUENCE_PARAMETERS, _PICTURE_PARAMETERS}:
+        if kind in {SEQUENCE_PARAMETERS, PICTURE_PARAMETERS}:
             kinds.add(kind)
-            found += access_unit[start : stop if stop >= 0 else len(access_unit)]
-        start = stop
+            found += START_CODE + nal
     return b""
 
 
@@ -188,25 +196,61 @@ class GopDecoder:
         Raises:
             CorruptDataError: invalid access units, or another number or size of images.
         """
+        rows = {place: row for row, place in enumerate(wanted)}
+        for place, frame in enumerate(self.frames(access_units)):
+            if place in rows:
+                self._write(frame, form, out[rows[place]])
+
+    def frames(self, access_units: Sequence[bytes]) -> Iterator["VideoFrame"]:
+        """Decode a group, or its first images, one by one; ends with an error at damage.
+
+        Raises:
+            CorruptDataError: an image is damaged or missing, or has another size; `place` in its
+                details is the first image that cannot be trusted.
+        """
         import av
 
-        rows = {place: row for row, place in enumerate(wanted)}
-        num_decoded = 0
+        gap = first_gap(access_units)
         self._begin(parameter_sets(access_units[0]))
+        place, late = 0, None
         try:
-            for access_unit in (*access_units, None):
+            for sent, access_unit in enumerate((*access_units, None)):
                 packet = None if access_unit is None else av.Packet(access_unit)
-                if packet is None and num_decoded == len(access_units):
+                if packet is None and place == len(access_units):
                     break
                 for frame in self._context.decode(packet):
-                    if num_decoded in rows:
-                        self._write(frame, form, out[rows[num_decoded]])
-                    num_decoded += 1
+                    self._check(frame, place, gap)
+                    yield frame
+                    place += 1
+                if late is None and place <= sent:
+                    late = sent
         except (av.FFmpegError, ValueError) as error:
-            raise CorruptDataError(f"H.264: group cannot be decoded ({error})") from error
-        if num_decoded != len(access_units):
             raise CorruptDataError(
-                f"H.264: got {num_decoded} images from {len(access_units)} access units"
+                f"H.264: image {place} of a group cannot be decoded ({error})", place=place
+            ) from error
+        if place != len(access_units):
+            # From the first access unit on that gave no image in time, numbers may be wrong.
+            raise CorruptDataError(
+                f"H.264: got {place} images from {len(access_units)} access units",
+                place=late or 0,
+            )
+
+    def _check(self, frame: "VideoFrame", place: int, gap: int | None) -> None:
+        if gap is not None and place >= gap:
+            raise CorruptDataError(
+                f"H.264: the picture before image {place} of a group is missing", place=place
+            )
+        if frame.is_corrupt:
+            raise CorruptDataError(
+                f"H.264: image {place} of a group is damaged, and the decoder filled in what is "
+                "missing",
+                place=place,
+            )
+        if (frame.height, frame.width) != self._shape:
+            raise CorruptDataError(
+                f"H.264: got an image of {frame.height} x {frame.width} pixels, "
+                f"expected {self._shape[0]} x {self._shape[1]}",
+                place=place,
             )
 
     def _begin(self, parameters: bytes) -> None:
@@ -223,15 +267,16 @@ class GopDecoder:
         self._context.thread_count = 1
         # The bound keeps a forged header from allocating gigabytes.
         pixels = (self._shape[0] + 16) * (self._shape[1] + 16)
-        self._context.options = {"flags": "+low_delay", "max_pixels": str(pixels)}
+        self._context.options = {
+            "flags": "+low_delay",
+            "max_pixels": str(pixels),
+            # Bits that are left over after the last macroblock are damage, too. With "explode",
+            # an invalid message beside an intact picture would count as well.
+            "err_detect": "aggressive",
+        }
         self._parameters = parameters
 
     def _write(self, frame: "VideoFrame", form: ImageForm, out: np.ndarray) -> None:
-        if (frame.height, frame.width) != self._shape:
-            raise CorruptDataError(
-                f"H.264: got an image of {frame.height} x {frame.width} pixels, "
-                f"expected {self._shape[0]} x {self._shape[1]}"
-            )
         height, width, channels = out.shape
         converted = self._reformatter.reformat(
             frame,
@@ -259,6 +304,16 @@ def decoder_of_this_thread(height: int, width: int) -> GopDecoder:
             known.pop(next(iter(known)))
         known[height, width] = GopDecoder(height, width)
     return known[height, width]
+
+
+def check_group(access_units: Sequence[bytes], size_px: tuple[int, int]) -> None:
+    """Decode a group of pictures, or its first images, and discard them.
+
+    Raises:
+        CorruptDataError: as `GopDecoder.frames`.
+    """
+    for _ in decoder_of_this_thread(*size_px).frames(access_units):
+        pass
 
 
 def pack_chunk(codec: Codec, images: Sequence[bytes]) -> bytes:
@@ -316,15 +371,39 @@ class ImageChunks:
                 f"{self.what}: storage chunk {number} holds {len(images)} images, "
                 f"expected image {places[-1]}"
             )
-        try:
+        with self._located(number):
             if self.codec == "jpeg":
                 self._decode_jpeg(images[0], form, out[0])
             else:
                 decoder = decoder_of_this_thread(*self.shape[:2])
                 decoder.decode(images[: places[-1] + 1], places, form, out)
+
+    def check(self, payload: bytes, number: int) -> None:
+        """Decode storage chunk `number` by the rule of `decode`, and discard the images.
+
+        Raises:
+            CorruptDataError: an invalid storage chunk; or an image that cannot be decoded, and then
+                `place` in the details is the first such image of the chunk.
+        """
+        images = self.unpack(payload, number)
+        with self._located(number):
+            if self.codec == "jpeg":
+                check_jpeg(images[0], self.shape[:2])
+            else:
+                check_group(images, self.shape[:2])
+
+    @contextmanager
+    def _located(self, number: int) -> Iterator[None]:
+        """Name the damaged image by its index in the stream."""
+        try:
+            yield
         except CorruptDataError as error:
+            place = int(str(error.details.get("place", 0)))
             raise CorruptDataError(
-                f"{self.what}: storage chunk {number}: {error.message}"
+                f"{self.what}: storage chunk {number}: image {number * self.rows + place}: "
+                f"{error.message}; readers by time leave out such images, and "
+                "`dextouch store repair` writes the item without them",
+                place=place,
             ) from error
 
     def _decode_jpeg(self, data: bytes, form: ImageForm, out: np.ndarray) -> None:

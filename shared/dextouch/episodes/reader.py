@@ -19,7 +19,7 @@ from dextouch.episodes.window import (
     mean_over_ranges,
     step_ranges,
 )
-from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
+from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.geometry import nearest_index
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import (
@@ -61,17 +61,18 @@ class RecordingReader(GroupReader[RecordingAttributes]):
     def read(
         self, name: str, start_ns: int | None = None, stop_ns: int | None = None
     ) -> SampleBatch:
-        """Samples with start_ns ≤ t_host_ns < stop_ns; images come decoded.
+        """Samples with start_ns ≤ t_host_ns < stop_ns; images come decoded, damaged ones never.
 
         Raises:
             UnknownNameError: no such stream.
             CorruptDataError: damaged bytes.
         """
         low, high = self._range(name, start_ns, stop_ns)
+        kept, values = self._without_damaged(name, low, high)
         t_host_ns, t_device_ns, sequence = (
-            self._column(f"{name}_{stamp}")[low:high].copy() for stamp in STAMPS["recording"]
+            self._column(f"{name}_{stamp}")[kept].copy() for stamp in STAMPS["recording"]
         )
-        return SampleBatch(t_host_ns, t_device_ns, sequence, self._values(name, low, high))
+        return SampleBatch(t_host_ns, t_device_ns, sequence, values)
 
     def content(self) -> dict[str, StreamContent]:
         """Number of samples and digest of each stream, as committed; nothing is read for it."""
@@ -104,15 +105,15 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     def read(
         self, name: str, start_ns: int | None = None, stop_ns: int | None = None
     ) -> StreamData:
-        """Samples with start_ns ≤ t_ref_ns < stop_ns; images come decoded.
+        """Samples with start_ns ≤ t_ref_ns < stop_ns; images come decoded, damaged ones never.
 
         Raises:
             UnknownNameError: no such stream.
             CorruptDataError: damaged bytes.
         """
         low, high = self._range(name, start_ns, stop_ns)
-        stamps = self.stamps_ns(name)[low:high].copy()
-        return StreamData(stamps, self._values(name, low, high))
+        kept, values = self._without_damaged(name, low, high)
+        return StreamData(self.stamps_ns(name)[kept].copy(), values)
 
     @overload
     def window(
@@ -170,20 +171,21 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         grid_ns = self._column("action_t_ref_ns")
         if not grid:
             return self._native_window(start, num_steps, cameras, form)
-        nearest = {name: self._nearest(name, grid_ns[start:stop]) for name in cameras}
-        pictures = each_camera(lambda name: self.images_at(name, nearest[name], form=form), cameras)
+        steps_ns = grid_ns[start:stop]
+        pictures = each_camera(lambda name: self._nearest_pictures(name, steps_ns, form), cameras)
         left, right = (self._tactile(side, start, stop) for side in SIDES)
         return Window(
-            images=pictures,
+            images={name: images for name, (_, images) in pictures.items()},
             image_dt_ns={
-                name: self.stamps_ns(name)[nearest[name]] - grid_ns[start:stop] for name in cameras
+                name: self.stamps_ns(name)[nearest] - steps_ns
+                for name, (nearest, _) in pictures.items()
             },
             tactile_kpa=np.stack([left[0], right[0]], axis=1),
             tactile_valid=np.stack([left[1], right[1]], axis=1),
             actions=self._actions(start, stop, action_kind),
             action_kind=action_kind,
             instruction=self.attributes.instruction,
-            t_ref_ns=grid_ns[start:stop].copy(),
+            t_ref_ns=steps_ns.copy(),
             anchor=self._anchor(start),
             K_head=self.attributes.K_head_matrix(),
         )
@@ -194,10 +196,12 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         grid_ns = self._column("action_t_ref_ns")
         first_ns, stop_ns = int(grid_ns[start]), int(grid_ns[start + num_steps - 1]) + 1
         ranges = {name: self._range(name, first_ns, stop_ns) for name in cameras}
-        pictures = each_camera(lambda name: self.images(name, *ranges[name], form=form), cameras)
+        pictures = each_camera(
+            lambda name: self._without_damaged(name, *ranges[name], form=form), cameras
+        )
         data = {
-            name: StreamData(self.stamps_ns(name)[slice(*ranges[name])].copy(), images)
-            for name, images in pictures.items()
+            name: StreamData(self.stamps_ns(name)[kept].copy(), images)
+            for name, (kept, images) in pictures.items()
         }
         data |= {
             name: self.read(name, first_ns, stop_ns)
@@ -218,14 +222,17 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     ) -> tuple[Int64[np.ndarray, " shown"], Int64[np.ndarray, " shown"]]:
         """Steps that have an image at most 0.6 steps away, and the index of that image.
 
+        Images that cannot be decoded do not count: those that are chosen are decoded once.
+
         Raises:
             UnknownNameError: no such camera.
+            NotFoundError: none of its images can be decoded.
         """
         self._check_cameras((camera,))
         stamps, grid_ns = self.stamps_ns(camera), self._column("action_t_ref_ns")
         if not len(stamps):
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-        nearest = nearest_index(stamps, grid_ns)
+        nearest = self.nearest_images(camera, grid_ns)
         reach_ns = OWN_IMAGE_SHARE * 1e9 / self.attributes.model_rate_hz
         steps = np.flatnonzero(np.abs(stamps[nearest] - grid_ns) <= reach_ns)
         return steps.astype(np.int64), nearest[steps]
@@ -248,11 +255,19 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
                 "images of every step (`dextouch train data --images 1`)"
             )
 
-    def _nearest(self, camera: str, t_ns: np.ndarray) -> np.ndarray:
-        stamps = self.stamps_ns(camera)
-        if not len(stamps):
+    def _nearest_pictures(
+        self, camera: str, t_ns: np.ndarray, form: ImageForm
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The images nearest to some times, and their indices."""
+        if not self.num_samples(camera):
             raise NotFoundError(f"{self._what}: {camera!r} holds no image")
-        return nearest_index(stamps, t_ns)
+        nearest = nearest_index(self.stamps_ns(camera), t_ns)
+        try:
+            return nearest, self.images_at(camera, nearest, form=form)
+        except CorruptDataError:
+            # A damaged image is treated as one that was never recorded: its neighbour is nearest.
+            nearest = self.nearest_images(camera, t_ns)
+            return nearest, self.images_at(camera, nearest, form=form)
 
     def _check_steps(self, start: int, num_steps: int) -> None:
         if num_steps < 1 or start < 0 or start + num_steps > self.num_steps:

@@ -43,6 +43,7 @@ from dextouch.episodes.journal import forget_journal
 from dextouch.episodes.sources import LocalGroup
 from dextouch.errors import ConflictError, CorruptDataError
 from dextouch.schemas import json_ready
+from dextouch.system_files import is_system_file
 
 STAGING = ".staging"
 STAGE_FILE = "stage.json"
@@ -63,6 +64,8 @@ def stages_of(root: Path, kind: Kind, item_id: str) -> list[Path]:
 def unheld_folders(parent: Path) -> Iterator[Path]:
     """Iterate over folders not locked by a writer, holding each one's lock meanwhile."""
     for folder in sorted(parent.iterdir()) if parent.is_dir() else []:
+        if is_system_file(folder.name):
+            continue
         try:
             lock = try_lock(folder)
         except FileNotFoundError:

@@ -14,6 +14,7 @@ from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import COMMIT_FILE, KINDS, Kind, decode_commit
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts
 from dextouch.errors import ConflictError, StorageError, UnavailableError
+from dextouch.system_files import is_system_file
 
 CLAIM_FILE = "claim"
 # A hash that no content has, so that nothing is written while a group is deleted.
@@ -118,6 +119,7 @@ def _is_committed(bucket: Bucket, group: str, content: str, name: str) -> bool:
 def _put_files(bucket: Bucket, group: str, folder: Path) -> None:
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     files = {path.relative_to(folder).as_posix(): path for path in paths}
+    files = {name: path for name, path in files.items() if not is_system_file(name)}
     del files[COMMIT_FILE]
     with ThreadPoolExecutor(_PARALLEL_REQUESTS) as pool:
         # The first failure cancels what has not begun.

@@ -10,6 +10,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,6 +30,8 @@ FILE_NAME: Final = "dextouch.toml"
 PREFIX: Final = "DEXTOUCH_"
 # The only setting outside of a section: the data folder of all commands.
 DATA: Final = "data"
+# Editors and spreadsheets of Windows begin a file with a byte-order mark.
+ENCODING: Final = "utf-8-sig"
 _HEADER = re.compile(r"\s*\[\[?\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?")
 _KEY = re.compile(r"\s*([\w.\"' -]+?)\s*=")
 
@@ -59,7 +62,14 @@ def file_source(settings_cls: type[BaseSettings]) -> tuple[PydanticBaseSettingsS
     path, section = configuration_path(), section_of(settings_cls)
     if path is None or section not in read_configuration(path):
         return ()
-    return (TomlConfigSettingsSource(settings_cls, path, (section,)),)
+    return (_TomlSource(settings_cls, path, (section,)),)
+
+
+class _TomlSource(TomlConfigSettingsSource):
+    """Settings of a section, also of a file that begins with a byte-order mark."""
+
+    def _read_file(self, file_path: Path | Traversable) -> dict[str, Any]:
+        return tomllib.loads(file_path.read_text(encoding=ENCODING))
 
 
 def section_of(settings_cls: type[BaseSettings]) -> str:
@@ -99,7 +109,7 @@ def read_configuration(path: Path) -> Mapping[str, Any]:
 
 @lru_cache(maxsize=8)
 def _read(path: Path, _: int) -> Mapping[str, Any]:
-    sections = tomllib.loads(path.read_text(encoding="utf-8"))
+    sections = tomllib.loads(path.read_text(encoding=ENCODING))
     for name, values in sections.items():
         if name == DATA:
             if not isinstance(values, str) or not values:
@@ -130,7 +140,7 @@ def _keys(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Tables and keys with their lines; elements of an array of tables have their number."""
     table: list[str] = []
     num_elements: Counter[str] = Counter()
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(path.read_text(encoding=ENCODING).splitlines(), start=1):
         if header := _HEADER.fullmatch(line):
             table = _parts(header[1])
             if line.lstrip().startswith("[["):

@@ -132,11 +132,12 @@ def test_quality_of_a_bridges_images(encoding):
     assert driver.quality.frozen
 
 
-def test_a_damaged_jpeg_is_counted_and_recorded_as_it_came():
+def test_a_damaged_jpeg_is_refused():
     decoder = decoder_of("jpeg")
     body = ImageEncoder("jpeg", (32, 48), rate_hz=30.0).encode(pictures(1)[0], begins=False).item()
-    (sample,) = decoder.decode(bridge_packet(body[:-200], 0, 1), 0)["camera_head"]
-    assert sample.values.item() == body[:-200]
+    assert decoder.decode(bridge_packet(body[:-200], 0, 1), 0) == {}
+    assert decoder.statistics.refused == 1
+    assert decoder.quality.num_images == 0
 
 
 def test_settings_of_a_bridge_take_h264():

@@ -1,14 +1,14 @@
 """Driver of a camera bridge, whose packets hold raw, JPEG or H.264 images."""
 
-import contextlib
 import struct
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
+from dextouch.episodes import check_group
 from dextouch.errors import CorruptDataError, DeviceError, InvalidInputError
-from dextouch.images import decode_jpeg, jpeg_size
+from dextouch.images import check_jpeg, decode_jpeg
 from dextouch.streams import (
     ClockCapabilities,
     Sample,
@@ -30,7 +30,7 @@ PAYLOAD_HEADER = struct.Struct("<HHB3x")
 ENCODING_CODES: dict[ImageEncoding, int] = {"rgb8": 0, "jpeg": 1, "h264": 2}
 NOMINAL_RATE_HZ = 30.0
 MAX_PAYLOAD_BYTES = 4 * 1024 * 1024
-# Decoding a JPEG image costs more than looking at it.
+# Full size for sharpness and exposure; every image is decoded at an eighth of it anyway.
 LOOK_AT_EVERY_JPEG = 10
 
 
@@ -54,8 +54,10 @@ def camera_descriptor(
 class CameraDecoder(StreamDecoder[Packet]):
     """Images of one fixed size and encoding; JPEG and H.264 images stay compressed.
 
-    H.264 images come in whole groups only, since the store takes no others: a group that lost an
-    image is dropped and counted as `refused`, as images are that are no images.
+    Every JPEG and H.264 image is decoded on arrival, by the rule of the store's readers, which is
+    also that of `dextouch store verify`: what a decoder would fill in is no image. H.264 images
+    come in whole groups only, since the store takes no others. A damaged JPEG image, and a group
+    that lost an image or has a damaged one, is dropped and counted as `refused`.
     """
 
     def __init__(
@@ -94,7 +96,17 @@ class CameraDecoder(StreamDecoder[Packet]):
         samples = super().feed(data, t_host_ns)
         if self._encoding != "h264":
             return samples
-        return [whole for sample in samples for whole in self._groups.add(sample)]
+        groups = (self._groups.add(sample) for sample in samples)
+        return [whole for group in groups if self._is_undamaged(group) for whole in group]
+
+    def _is_undamaged(self, group: list[Sample]) -> bool:
+        try:
+            if group:
+                check_group([sample.values.item() for sample in group], self._size)
+        except CorruptDataError:
+            self.statistics.refused += len(group)
+            return False
+        return True
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
         check_packet(packet, device=self._stream, source=None)
@@ -131,9 +143,10 @@ class CameraDecoder(StreamDecoder[Packet]):
     def _encoded(self, body: bytes) -> np.ndarray | None:
         try:
             if self._encoding == "h264":
+                # Its pictures are checked when its group is complete.
                 check_encoded_image(self._descriptor, body, where=self._stream)
-            elif jpeg_size(body, where=self._stream) != self._size:
-                return None
+            else:
+                check_jpeg(body, self._size, where=self._stream)
         except (CorruptDataError, InvalidInputError):
             return None
         return encoded_values([body]).reshape(())
@@ -145,9 +158,7 @@ class CameraDecoder(StreamDecoder[Packet]):
         data = sample.values.item()
         self._checker.note(data, sample.t_device_ns)
         if self._num_images % LOOK_AT_EVERY_JPEG == 0:
-            # A good header before a damaged image: recorded as it came.
-            with contextlib.suppress(CorruptDataError):
-                self._checker.look(decode_jpeg(data, where=self._stream))
+            self._checker.look(decode_jpeg(data, where=self._stream))
         self._num_images += 1
 
 

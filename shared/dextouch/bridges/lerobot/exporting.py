@@ -158,7 +158,7 @@ class _Dataset:
         if options.fps is None and rate_hz != round(rate_hz):
             raise InvalidInputError(
                 f"episode {first.attributes.episode_id!r}: got a model rate of {rate_hz} Hz, "
-                "LeRobot counts whole frames a second; give fps="
+                "LeRobot counts whole frames a second; give one (`dextouch export --fps`)"
             )
         self.fps = round(rate_hz) if options.fps is None else options.fps
         if not 1 <= self.fps <= 1000:

@@ -16,7 +16,7 @@ from dextouch.episodes import (
     step_ranges,
 )
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.geometry import bracket, interpolate_linear, interpolate_poses, nearest_index
+from dextouch.geometry import bracket, interpolate_linear, interpolate_poses
 from dextouch.hands.actions import (
     ACTION_DIM,
     AnchorPoses,
@@ -60,9 +60,9 @@ def frames_of(reader: EpisodeReader, cameras: Sequence[str], fps: int) -> Episod
     """The frames of an episode.
 
     On the model grid when `fps` is the model rate; at the first camera's own stamps when `fps` is
-    its rate; otherwise evenly spaced from step 0. Images are the nearest ones, tactile values the
-    mean since the frame before; off the model grid poses and joints are interpolated between its
-    steps.
+    its rate; otherwise evenly spaced from step 0. Images are the nearest ones that can be decoded,
+    tactile values the mean since the frame before; off the model grid poses and joints are
+    interpolated between its steps.
 
     Raises:
         InvalidInputError: an episode without steps or with fewer than one frame.
@@ -88,7 +88,7 @@ def frames_of(reader: EpisodeReader, cameras: Sequence[str], fps: int) -> Episod
     indices, offsets_ns = {}, np.zeros((len(t_ns), len(cameras)), dtype=np.int64)
     for column, camera in enumerate(cameras):
         stamps = _image_stamps(reader, camera)
-        indices[camera] = nearest_index(stamps, t_ns)
+        indices[camera] = reader.nearest_images(camera, t_ns)
         offsets_ns[:, column] = stamps[indices[camera]] - t_ns
     numbers = {layout.STATE: state, layout.ACTION: action, layout.MEASURED: measured}
     columns = {name: values.astype(np.float32) for name, values in numbers.items()} | {
@@ -117,7 +117,8 @@ def _frame_times(
         return "model", steps_ns.copy()
     half_ns = round(0.5e9 / fps)
     if cameras and fps == round(reader.streams[cameras[0]].nominal_rate_hz):
-        stamps = _image_stamps(reader, cameras[0])
+        damaged = reader.damaged_images(cameras[0])
+        stamps = np.delete(_image_stamps(reader, cameras[0]), damaged)
         inside = (stamps >= steps_ns[0] - half_ns) & (stamps <= steps_ns[-1] + half_ns)
         if not inside.any():
             raise InvalidInputError(

@@ -106,7 +106,8 @@ def import_lerobot(
             ) from error
         if store.exists(attributes.episode_id):
             raise ConflictError(
-                f"episode {attributes.episode_id!r} exists already; give another id_prefix"
+                f"episode {attributes.episode_id!r} exists already; give another prefix "
+                "(`dextouch import --id-prefix`)"
             )
         store_episode(store, attributes, episode, images=options.images)
         ids.append(attributes.episode_id)
@@ -142,7 +143,8 @@ def _map_features(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]
         has = "; ".join(f"{name!r} {_describe(f)}" for name, f in info.features.items())
         raise InvalidInputError(
             f"LeRobot dataset does not fit: {'; '.join(problems)}. It has: {has}. Name the right "
-            "ones, for example mapping={'camera_head': 'observation.images.top'}",
+            "ones in Python: dextouch.bridges.lerobot.import_lerobot(folder, store, "
+            "options=ImportOptions(mapping={'camera_head': 'observation.images.top'}))",
             missing=problems,
         )
     return roles | cameras
@@ -293,7 +295,9 @@ def _foreign_attributes(
     if options.K_head is None:
         raise InvalidInputError(
             f"{source.folder}: has no information about its head camera "
-            f"({features[HEAD]!r}); give K_head= in pixels"
+            f"({features[HEAD]!r}), which data sets of other origin lack; import it in Python: "
+            "dextouch.bridges.lerobot.import_lerobot(folder, store, "
+            "options=ImportOptions(K_head=…)), in pixels"
         )
     name = re.sub(r"[^a-z0-9_-]+", "-", source.folder.resolve().name.lower()).strip("-_")
     data_file = source.data_file(entry)

@@ -20,6 +20,7 @@ from dextouch.errors import (
     LimitExceededError,
     NotFoundError,
 )
+from dextouch.system_files import is_system_file
 
 MAX_INFO_BYTES: Final = 1 << 24
 MAX_SIDECAR_BYTES: Final = 1 << 22
@@ -231,7 +232,9 @@ def _episode_rows(folder: Path, info: DatasetInfo) -> Iterator[dict[str, Any]]:
     places = [f"{p}/{i}" for p in ("data", *(f"videos/{v}" for v in videos)) for i in _INDICES]
     starts = [f"videos/{name}/from_timestamp" for name in videos]
     wanted = ["episode_index", "length", "tasks", *places, *starts]
-    paths = sorted((folder / "meta" / "episodes").glob("*/*.parquet"))
+    tables = folder / "meta" / "episodes"
+    found = sorted(tables.glob("*/*.parquet"))
+    paths = [path for path in found if not is_system_file(path.relative_to(tables))]
     if not paths:
         raise NotFoundError(f"{folder}: meta/episodes holds no table of episodes")
     for path in paths:

@@ -27,6 +27,9 @@ from dextouch.episodes import (
 from dextouch.errors import CorruptDataError, LimitExceededError, NotFoundError, ShapeError
 
 MAX_SIDE_PX: Final = 8192
+# Images that H.264 and HEVC may decode before one that is shown earlier. A demuxer looks for the
+# entry point by the time of decoding, and could choose one that is shown too late.
+MAX_REORDERED: Final = 16
 T = TypeVar("T")
 
 
@@ -147,7 +150,8 @@ def read_images(span: VideoSpan) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
 def read_units(span: VideoSpan) -> list[bytes] | None:
     """Copy the access units of a span (Annex B) without decoding, where possible.
 
-    None where the video is not 4:2:0 H.264, begins in the middle of a GOP, or has B-frames.
+    None where the video is not 4:2:0 H.264, begins in the middle of a GOP, or has B-frames: its
+    packets come in the order of decoding, and `read_images` finds out whether an image is missing.
 
     Raises:
         NotFoundError: no such file.
@@ -157,11 +161,19 @@ def read_units(span: VideoSpan) -> list[bytes] | None:
     with _opened(span) as (container, stream):
         if stream.codec.canonical_name != "h264" or stream.pix_fmt != "yuv420p":
             return None
-        for data, is_reordered in _in_place(span, stream, _access_units(container, stream)):
-            if is_reordered or (not units and not is_keyframe(data)):
+        for pts, (data, is_reordered) in _access_units(container, stream):
+            place = _place(span, stream, pts)
+            if place is None or is_reordered:
                 return None
-            units.append(data)
-    return units
+            if place > len(units):
+                raise _missing(span, len(units), place)
+            if place == len(units):
+                if not units and not is_keyframe(data):
+                    return None
+                units.append(data)
+                if len(units) == span.count:
+                    return units
+    raise _missing(span, len(units), span.count)
 
 
 def _access_units(
@@ -198,8 +210,9 @@ def _opened(span: VideoSpan) -> Iterator[tuple[InputContainer, VideoStream]]:
                 raise CorruptDataError(f"{span.path}: got images {size}, expected {span.shape[:2]}")
             if stream.time_base is None:
                 raise CorruptDataError(f"{span.path}: has no timestamps")
-            start = max(0, round((span.from_s - 0.5 / span.fps) / stream.time_base))
-            container.seek(start, stream=stream)
+            early = MAX_REORDERED if stream.codec_context.has_b_frames else 0.5
+            start = max(0, round((span.from_s - early / span.fps) / stream.time_base))
+            container.seek(start + (stream.start_time or 0), stream=stream)
             yield container, stream
     except (av.error.FFmpegError, ValueError) as error:
         raise CorruptDataError(
@@ -207,13 +220,30 @@ def _opened(span: VideoSpan) -> Iterator[tuple[InputContainer, VideoStream]]:
         ) from error
 
 
+def _place(span: VideoSpan, stream: VideoStream, pts: int | None) -> int | None:
+    """Number of the image in its span, by its time after the start of the video."""
+    if pts is None:
+        return None
+    seconds = float((pts - (stream.start_time or 0)) * (stream.time_base or Fraction(1)))
+    return round((seconds - span.from_s) * span.fps)
+
+
 def _in_place(
     span: VideoSpan, stream: VideoStream, items: Iterable[tuple[int | None, T]]
 ) -> Iterator[T]:
-    """The items of a span by their time stamps; refuses a gap."""
-    done, place, base = 0, span.count, stream.time_base or Fraction(1)
+    """The items of a span by their time stamps; refuses a gap.
+
+    An item without a time stamp follows the one before, if that one's place is known.
+    """
+    done, place = 0, span.count
+    found = None if span.from_s else -1
     for pts, item in items:
-        found = -1 if pts is None else round((float(pts * base) - span.from_s) * span.fps)
+        stamped = _place(span, stream, pts)
+        if stamped is None and found is not None:
+            stamped = found + 1
+        found = stamped
+        if found is None:
+            continue
         if found > done:
             place = found
             break
@@ -222,7 +252,11 @@ def _in_place(
             done += 1
             if done == span.count:
                 return
-    raise CorruptDataError(
+    raise _missing(span, done, place)
+
+
+def _missing(span: VideoSpan, done: int, place: int) -> CorruptDataError:
+    return CorruptDataError(
         f"{span.path}: image {done} of {span.count} after {span.from_s:.3f} s is missing "
         f"(the next one is {place}); copy the dataset again"
     )

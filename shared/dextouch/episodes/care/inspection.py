@@ -33,6 +33,7 @@ from dextouch.episodes.staged_group import STAGE_FILE, STAGING, read_stage
 from dextouch.episodes.trash import HOMES
 from dextouch.errors import StorageError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
+from dextouch.system_files import is_system_file
 
 UPLOADS = HOMES["upload"]
 Group = GroupContents[EpisodeAttributes] | GroupContents[RecordingAttributes]
@@ -127,6 +128,8 @@ def _foreign_paths(folder: Path, entries: dict[str, ArrayEntry]) -> list[str]:
     with disk_errors(f"look through {folder.name}"):
         for path in sorted(folder.rglob("*")):
             relative = path.relative_to(folder).as_posix()
+            if is_system_file(relative):
+                continue
             right = relative in folders if path.is_dir() else relative in wanted
             if not right or path.is_symlink():
                 found.append(relative)
@@ -223,7 +226,7 @@ def unfinished_folders(root: Path) -> Iterator[tuple[str, Path]]:
         folder = root / name
         with disk_errors(f"list {name}"):
             paths = sorted(folder.iterdir()) if folder.is_dir() else []
-        yield from ((kind, path) for path in paths)
+        yield from ((kind, path) for path in paths if not is_system_file(path.name))
 
 
 def interrupted_takes(root: Path) -> Iterator[tuple[str, str]]:

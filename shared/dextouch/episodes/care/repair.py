@@ -181,14 +181,21 @@ def _repair_from(files: LocalGroup, kind: Kind, copy: GroupFiles) -> None:
         if (data := copy.get(name)) is not None:
             _put(files.folder, name, data)
     _rewrite_metadata(files, kind)
-    for name in sorted(_damaged_arrays(files, kind) - _damaged_arrays(copy, kind)):
+    ours, of_copy = _damaged_arrays(files, kind), _damaged_arrays(copy, kind)
+    # A damaged image is in the copy, too: what counts is that the rest is intact there.
+    for name in sorted(n for n in ours if of_copy.get(n, frozenset()) < ours[n]):
         path = f"{name}/{shard_path(len(theirs.entries[name].shape))}"
         source = copy.source(path)
         _put(files.folder, path, bytes(source.read(0, source.size() or 0)))
 
 
-def _damaged_arrays(files: GroupFiles, kind: Kind) -> set[str]:
-    return {f.array for f in inspect_group(files, kind).findings if f.array is not None}
+def _damaged_arrays(files: GroupFiles, kind: Kind) -> dict[str, frozenset[int | None]]:
+    """Damaged arrays with their damaged storage chunks; None for the whole array."""
+    found: dict[str, frozenset[int | None]] = {}
+    for finding in inspect_group(files, kind).findings:
+        if finding.array is not None:
+            found[finding.array] = found.get(finding.array, frozenset()) | {finding.chunk}
+    return found
 
 
 def _commit_of(files: LocalGroup, kind: Kind) -> tuple[CommitRecord, str] | None:

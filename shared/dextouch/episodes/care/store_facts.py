@@ -17,6 +17,7 @@ from dextouch.episodes.reviews import REVIEW_FILE
 from dextouch.episodes.spool_seal import RECORDING_FILE
 from dextouch.episodes.staged_group import STAGE_FILE, STAGING
 from dextouch.episodes.trash import TRASH
+from dextouch.system_files import is_system_file
 
 # Folders of a store and the kind of group in each.
 PLACES: dict[str, str] = {
@@ -67,7 +68,7 @@ def all_facts(root: Path) -> list[Facts]:
     for place in PLACES:
         with disk_errors(f"list {place}"):
             paths = sorted((root / place).iterdir()) if (root / place).is_dir() else []
-        found += [_facts(path, place) for path in paths]
+        found += [_facts(path, place) for path in paths if not is_system_file(path.name)]
     return found
 
 

@@ -103,7 +103,8 @@ class HandMapping(_Table):
 def read_mapping(path: Path) -> HandMapping:
     """Read the mapping of one hand, of at most 64 KiB."""
     try:
-        return HandMapping.model_validate(tomllib.loads(read_bounded(path, MAX_BYTES).decode()))
+        text = read_bounded(path, MAX_BYTES).decode("utf-8-sig")
+        return HandMapping.model_validate(tomllib.loads(text))
     except UnicodeDecodeError as error:
         raise InvalidInputError(f"{path.name}: got invalid UTF-8: {error}") from error
     # Deeply nested brackets hit the parser's recursion limit.
