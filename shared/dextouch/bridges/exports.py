@@ -42,21 +42,25 @@ class Block:
         return len(self.t_ns)
 
 
+def exported_samples(reader: Reader, name: str) -> Int64[np.ndarray, " kept"]:
+    """Indices of a stream's samples without damaged images; of H.264 whole groups are left out."""
+    damaged, unit = reader.damaged_images(name), reader.streams[name].unit
+    indices = np.arange(reader.num_samples(name), dtype=np.int64)
+    size = GOP_IMAGES if unit == H264_UNIT else 1
+    return indices[np.isin(indices // size, damaged // size, invert=True)]
+
+
 def blocks(reader: Reader, name: str) -> Iterator[Block]:
     """Iterate over a stream in order, about one second per block; encoded images stay encoded.
 
-    Damaged images are left out, of H.264 with their whole groups.
+    Only `exported_samples` are among them.
     """
     descriptor, t_ns = reader.streams[name], reader.stamps_ns(name)
     t_device_ns, sequence = np.full_like(t_ns, NO_DEVICE_TIME), np.full_like(t_ns, NO_SEQUENCE)
     if isinstance(reader, RecordingReader):
         stamps = reader.stamps(name)
         t_device_ns, sequence = stamps.t_device_ns, stamps.sequence
-    damaged = reader.damaged_images(name)
-    if descriptor.unit == H264_UNIT:
-        groups = np.unique(damaged // GOP_IMAGES)
-        damaged = (groups[:, None] * GOP_IMAGES + np.arange(GOP_IMAGES)).ravel()
-    kept = np.isin(np.arange(len(t_ns)), damaged, invert=True)
+    kept = np.isin(np.arange(len(t_ns)), exported_samples(reader, name))
     each = max(1, round(descriptor.nominal_rate_hz * BLOCK_SECONDS))
     for start in range(0, len(t_ns), each):
         stop = min(start + each, len(t_ns))

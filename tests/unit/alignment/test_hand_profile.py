@@ -6,7 +6,8 @@ import pytest
 from benchmarks.retargeting.pinches import people, pinch_motion
 from benchmarks.simulated.hand_motions import robot_motion
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.hands import CHAINS, NODE_INDEX
+from dextouch.geometry.rotations import rotation_from_vector
+from dextouch.hands import CHAINS, NODE_INDEX, chain_indices, mean_hand_m
 from services.alignment.retargeting import HandProfile, HandRetargeter
 from services.alignment.retargeting.hand_profile import calibrated_profile, profile_name
 
@@ -97,6 +98,26 @@ def test_what_is_no_hand_is_refused(pinches):
     broken[3, 1] = 0.5
     with pytest.raises(InvalidInputError, match="bones"):
         HandProfile.from_rows(broken.tolist())
+
+
+@pytest.mark.parametrize("size", [0.55, 0.6, 0.62, 1.5])
+def test_the_documented_sizes_of_hands_are_accepted(size):
+    """0.55 … 1.5 of the mean hand (docs/hand_frames.md), whose fingers bend here."""
+    hand = np.array(mean_hand_m("right"))
+    take = []
+    for share in np.linspace(0, 1, 60):
+        bent = hand.copy()
+        for chain in CHAINS[1:]:
+            nodes = chain_indices(chain)
+            for joint, degrees in enumerate((85, 95, 65)):
+                turn = rotation_from_vector(np.deg2rad(degrees * share) * np.array([1.0, 0, 0]))
+                node, later = nodes[1 + joint], nodes[2 + joint :]
+                bent[later] = (bent[later] - bent[node]) @ turn.T + bent[node]
+        take.append(bent)
+    noise = np.random.default_rng(0).normal(scale=3e-4, size=(60, len(hand), 3))
+    keypoints_m = size * np.array(take) + noise
+    result = HandRetargeter("right").retarget(keypoints_m, t_s=np.arange(60) / 60)
+    assert result.solved.mean() > 0.9
 
 
 def test_another_persons_hand_is_not_followed(pinches):

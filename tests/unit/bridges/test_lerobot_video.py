@@ -155,3 +155,42 @@ def test_images_before_the_first_step_stop_the_copying(store, tmp_path):
         list(read_images(VideoSpan(tmp_path / "x" / VIDEO, 0.0, 30, 30, (48, 64, 3))))
     )
     assert np.abs(decoded.astype(int) - reader.images("camera_head", 3, 33)).mean() < 4
+
+
+def write_reordered(path, images, *, x264="", **movie):
+    """A video with B-frames as x264 makes them, and what a player shows of it."""
+    with av.open(path, "w", format="mp4", options=movie) as output:
+        stream = output.add_stream("libx264", rate=15, options={"x264-params": x264})
+        stream.height, stream.width, stream.pix_fmt = *images.shape[1:3], "yuv420p"
+        for image in images:
+            output.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        output.mux(stream.encode(None))
+    with av.open(path) as shown:
+        frames = shown.decode(video=0)
+        return np.array([f.to_ndarray(format="rgb24", interpolation="BICUBIC") for f in frames])
+
+
+@pytest.mark.parametrize(
+    ("x264", "movie"),
+    [
+        ("", {}),
+        ("keyint=7:bframes=3", {}),
+        ("open-gop=1:keyint=17:bframes=3", {}),
+        ("keyint=20", {"use_editlist": "0"}),
+        ("keyint=20", {"movflags": "negative_cts_offsets"}),
+        ("keyint=20", {"movflags": "frag_keyframe+empty_moov"}),
+    ],
+    ids=["defaults", "short groups", "open groups", "no edit list", "negative", "fragments"],
+)
+def test_episodes_anywhere_in_a_video_with_b_frames_are_decoded(tmp_path, x264, movie):
+    path, count = tmp_path / "video.mp4", 60
+    shown = write_reordered(path, pictures(count), x264=x264, **movie)
+    assert len(shown) == count
+    for first in (0, 1, 6, 16, 19, 20, 33, 58):
+        for length in {1, min(12, count - first), count - first}:
+            wanted = span(path, length, first=first)
+            assert read_units(wanted) is None
+            images = np.array(list(read_images(wanted)))
+            np.testing.assert_array_equal(images, shown[first : first + length])
+    with pytest.raises(CorruptDataError, match="image 5 of 9"):
+        list(read_images(span(path, 9, first=55)))

@@ -4,12 +4,16 @@ import json
 import sys
 from datetime import UTC, datetime
 
+import numpy as np
 import pytest
 import zarr
 
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, GopEncoder, VideoSettings
+from dextouch.images import encode_jpeg
 from dextouch.schemas import Review
+from dextouch.streams import encoded_values
 from services.cli import main
+from tests.unit.bridges.lerobot_episodes import make_episode, pictures
 from tests.unit.bridges.takes import differing_streams, write_episode, write_recording
 
 
@@ -152,6 +156,46 @@ def test_lerobot_replaces_only_what_is_a_data_set(store, dextouch, tmp_path):
     status, _, err = dextouch(*words, "--force")
     assert status == main.EXIT_REFUSED
     assert "not a LeRobot data set" in err
+
+
+@pytest.mark.parametrize("form", ["lerobot", "umi", "mcap"])
+@pytest.mark.parametrize("unit", ["jpeg", "h264"])
+def test_damaged_images_are_left_out_and_named(store, dextouch, tmp_path, form, unit):
+    write_damaged(store, unit, damaged=(5, 18))
+    lost = [5, 18] if unit == "jpeg" else [5, 6, 7, 18, 19, 20]
+    report = tmp_path / "report.json"
+    to = tmp_path / {"lerobot": "set", "umi": "set.zarr.zip", "mcap": "take.mcap"}[form]
+    words = ("export", "--format", form, "take", "--to", to, "--json", report)
+    status, _, err = dextouch(*words)
+    assert status == 0
+    assert f"take: camera_head: {len(lost)} of 21 images cannot be decoded" in err
+    assert json.loads(report.read_text())["damaged_images"] == {"take": {"camera_head": lost}}
+    status, _, err = dextouch("import", "--format", form, to, store="again")
+    assert status == 0, err
+    (name,) = EpisodeStore(tmp_path / "again").list(kind="episode")
+    again = EpisodeStore(tmp_path / "again").open(name)
+    assert not len(again.damaged_images("camera_head"))
+    # On the grid the neighbours' images have their own times; else whole groups are left out.
+    kept = np.delete(np.arange(21), lost)
+    if (form, unit) == ("mcap", "h264"):
+        kept = np.arange(8, 16)
+    stamps = store.open("take").stamps_ns("camera_head")
+    np.testing.assert_array_equal(again.stamps_ns("camera_head"), stamps[kept])
+
+
+def write_damaged(store, unit, damaged):
+    """An episode of 21 images, one a step, of which some are cut."""
+    made = make_episode(num_steps=21)
+    made.set_unit(unit, "camera_head")
+    images = pictures(21)
+    encoder = GopEncoder(48, 64, rate_hz=15.0, settings=VideoSettings())
+    encode = encode_jpeg if unit == "jpeg" else encoder.encode
+    encoded = [encode(image) for image in images]
+    for index in damaged:
+        encoded[index] = encoded[index][: len(encoded[index]) * 6 // 10]
+    made.values["camera_head"] = encoded_values(encoded)
+    made.stamps_ns["camera_head"] = made.stamps_ns["action"].copy()
+    made.write(store, episode_id="take")
 
 
 def test_rerun_files_are_written(store, dextouch, tmp_path):

@@ -12,7 +12,7 @@ from mcap.writer import CompressionType, Writer
 from pydantic import ValidationError
 
 from dextouch import __version__
-from dextouch.bridges.exports import Reader, blocks, new_file
+from dextouch.bridges.exports import Reader, blocks, exported_samples, new_file
 from dextouch.bridges.mcap.messages import (
     CALIBRATION,
     MessageCodec,
@@ -79,7 +79,7 @@ class _Export:
         self._is_episode = isinstance(reader, EpisodeReader)
         self._sources = list(reader.attributes.streams)
         self._streams = [self._as_sent(stream) for stream in self._sources]
-        counts = {stream.name: reader.num_samples(stream.name) for stream in self._streams}
+        counts = {s.name: len(exported_samples(reader, s.name)) for s in self._streams}
         self._counts = counts
         firsts = [int(reader.stamps_ns(name)[0]) for name, count in counts.items() if count]
         # MCAP's times cannot be negative; the messages' own stamps are unchanged.
