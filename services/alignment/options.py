@@ -6,8 +6,6 @@ from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
 
-# A stream that loses one sample has a gap of two periods, and half a period is left for jitter.
-MAX_GAP_PERIODS = 2.5
 WristChoice = Literal["tracked", "touch"]
 
 
@@ -35,6 +33,7 @@ class AlignmentOptions(FrozenModel):
         "robot's hand touches where the person's did",
     )
 
-    def max_gap_ns(self, period_ns: int) -> int:
-        """The largest gap of a stream of that nominal period, in nanoseconds."""
-        return max(round(self.max_gap_ms * 1e6), round(MAX_GAP_PERIODS * period_ns))
+    @property
+    def max_gap_ns(self) -> int:
+        """The largest gap in nanoseconds; slow streams may have longer ones (`stream_gap_ns`)."""
+        return round(self.max_gap_ms * 1e6)

@@ -4,10 +4,9 @@ import argparse
 import shutil
 import sys
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TypeVar
 
 from dextouch.command_line import CommandParser, add_json, progress, write_result
 from dextouch.data_folder import default_store
@@ -17,8 +16,9 @@ from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 from dextouch.system_files import is_system_file
 
 Reader = EpisodeReader | RecordingReader
-R = TypeVar("R", EpisodeReader, RecordingReader)
 Report = dict[str, object]
+# By id and camera.
+DamagedImages = dict[str, dict[str, list[int]]]
 # Of damaged images, in a message; the JSON report has all.
 MAX_NAMED = 20
 
@@ -129,21 +129,28 @@ def _is_rejected(store: EpisodeStore, about: EpisodeAttributes | RecordingAttrib
     return review is not None and review.verdict == "rejected"
 
 
-def _damaged_images(reader: Reader) -> dict[str, list[int]]:
-    """Images by camera that cannot be decoded, and so are in no export; says how many and which."""
-    found = {}
+def _note_damaged(reader: Reader, damaged: DamagedImages) -> None:
+    """Note the images that cannot be decoded, and say how many and which: no export has them."""
     for name in reader.streams:
-        damaged = reader.damaged_images(name).tolist()
-        if damaged:
-            found[name] = damaged
-            shown = ", ".join(map(str, damaged[:MAX_NAMED])) + ", …" * (len(damaged) > MAX_NAMED)
+        lost = reader.damaged_images(name).tolist()
+        if lost:
+            damaged.setdefault(reader.item_id, {})[name] = lost
+            shown = ", ".join(map(str, lost[:MAX_NAMED])) + ", …" * (len(lost) > MAX_NAMED)
             print(
-                f"{reader.item_id}: {name}: {len(damaged)} of {reader.num_samples(name)} images "
-                f"cannot be decoded and are left out; where a step needs one, the nearest other "
+                f"{reader.item_id}: {name}: {len(lost)} of {reader.num_samples(name)} images "
+                "cannot be decoded and are left out; where a step needs one, the nearest other "
                 f"image stands (images {shown})",
                 file=sys.stderr,
             )
-    return found
+
+
+def _episodes(
+    store: EpisodeStore, ids: Iterable[str], damaged: DamagedImages
+) -> Iterator[EpisodeReader]:
+    for item_id in ids:
+        episode = store.open(item_id)
+        _note_damaged(episode, damaged)
+        yield episode
 
 
 def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
@@ -159,16 +166,10 @@ def _export(options: argparse.Namespace) -> Report:
     ids = _ids(store, options)
     report: Report = {"format": form, "kind": options.kind, "ids": ids}
     shown = progress(ids, f"export {form}", len(ids))
-    damaged: dict[str, dict[str, list[int]]] = {}
+    damaged: DamagedImages = {}
     report["damaged_images"] = damaged
-
-    def checked(reader: R) -> R:
-        if found := _damaged_images(reader):
-            damaged[reader.item_id] = found
-        return reader
-
     if form in _JOINT:
-        num_steps = _export_all((checked(store.open(item_id)) for item_id in shown), options)
+        num_steps = _export_all(_episodes(store, shown, damaged), options)
         print(f"{to}  {len(ids)} episodes  {num_steps} steps")
         return report | {"path": str(to), "num_steps": num_steps}
     # One file for one id, a folder of files otherwise.
@@ -183,7 +184,9 @@ def _export(options: argparse.Namespace) -> Report:
     files: list[dict[str, object]] = []
     for item_id in shown:
         path = paths[item_id]
-        count = _export_one(checked(_open(store, options.kind, item_id)), path, options)
+        reader = _open(store, options.kind, item_id)
+        _note_damaged(reader, damaged)
+        count = _export_one(reader, path, options)
         files.append({"id": item_id, "path": str(path), "num_messages": count})
         print(f"{path}  {count} messages")
     return report | {"files": files}

@@ -10,7 +10,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile import pad_forces_n
-from services.alignment.options import MAX_GAP_PERIODS, AlignmentOptions
+from services.alignment.options import AlignmentOptions
 from services.alignment.synchronization.grid_actions import (
     COMMANDED_STREAMS,
     REQUIRED,
@@ -34,7 +34,13 @@ from services.alignment.synchronization.refused_parts import (
     refused_matrices,
     refused_stretches,
 )
-from services.alignment.synchronization.resampling import EDGE_PERIODS, grid_times_ns, longest_run
+from services.alignment.synchronization.resampling import (
+    EDGE_PERIODS,
+    MAX_GAP_PERIODS,
+    grid_times_ns,
+    longest_run,
+    stream_gap_ns,
+)
 
 
 @dataclass(frozen=True)
@@ -141,7 +147,7 @@ def _find_stretch(
     # Relative to the origin from here on: int64 stays exact, floats stay small.
     moved = {name: replace(stream, t_ns=stream.t_ns - origin_ns) for name, stream in parts.items()}
     grid_ns = grid_times_ns(num_steps, options.model_rate_hz)
-    gridded = place_streams(moved, grid_ns, options)
+    gridded = place_streams(moved, grid_ns, max_gap_ns=options.max_gap_ns)
     valid = {name: gridded.at[name].valid for name in needed}
     first, stop = longest_run(gridded.valid)
     if stop - first < options.min_num_steps:
@@ -158,7 +164,7 @@ def _find_stretch(
     refused = refused_edges(first_ns, last_ns, start_ns)
     refused += refused_stretches(grid_ns + origin_ns, valid, (first, stop), start_ns)
     return _Stretch(
-        place_streams(moved, grid_ns[first:stop], options),
+        place_streams(moved, grid_ns[first:stop], max_gap_ns=options.max_gap_ns),
         origin_ns + int(grid_ns[first]),
         num_steps - (stop - first),
         refused_matrices(refused),
@@ -287,7 +293,7 @@ def _stream_quality(
     quality: dict[str, float] = {}
     for name, stream in streams.items():
         quality |= stream.quality
-        max_gap_ns = options.max_gap_ns(stream.descriptor.period_ns())
+        max_gap_ns = stream_gap_ns(options.max_gap_ns, stream.descriptor.period_ns())
         quality[f"{name}_num_gaps"] = float((np.diff(stream.t_ns) > max_gap_ns).sum())
         if stream.timing.report.num_steps:
             quality[f"{name}_num_clock_steps"] = float(stream.timing.report.num_steps)

@@ -11,7 +11,7 @@ from dextouch.hands.actions import AnchorPoses, HandTrajectory, actions_from_pos
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.schemas import Domain, Matrix
 from dextouch.tactile.layout import SIDES, Side
-from services.alignment.options import AlignmentOptions, WristChoice
+from services.alignment.options import WristChoice
 from services.alignment.retargeting import HandRetargeter, RetargetResult, RetargetStatus
 from services.alignment.retargeting.hand_profile import calibrated_profile
 from services.alignment.retargeting.touch_transfer import transfer_by_touch
@@ -23,6 +23,7 @@ from services.alignment.synchronization.resampling import (
     GridPlacement,
     place_on_grid,
     poses_on_grid,
+    stream_gap_ns,
     vectors_on_grid,
 )
 
@@ -78,16 +79,16 @@ class GridActions:
 
 
 def place_streams(
-    streams: Mapping[str, LoadedStream], grid_ns: np.ndarray, options: AlignmentOptions
+    streams: Mapping[str, LoadedStream], grid_ns: np.ndarray, *, max_gap_ns: int
 ) -> GriddedStreams:
-    """Find the neighbouring samples of every step in every stream."""
+    """Find the neighbouring samples of every step in every stream, which may be slow."""
     at = {}
     for name, stream in streams.items():
         period_ns = stream.descriptor.period_ns()
-        max_gap_ns = options.max_gap_ns(period_ns)
+        gap_ns = stream_gap_ns(max_gap_ns, period_ns)
         if name in TOUCH_STREAMS:
-            max_gap_ns = max(max_gap_ns, TOUCH_GAP_NS)
-        at[name] = place_on_grid(stream.t_ns, grid_ns, period_ns=period_ns, max_gap_ns=max_gap_ns)
+            gap_ns = max(gap_ns, TOUCH_GAP_NS)
+        at[name] = place_on_grid(stream.t_ns, grid_ns, period_ns=period_ns, max_gap_ns=gap_ns)
     return GriddedStreams(grid_ns, streams, at)
 
 

@@ -281,8 +281,8 @@ def _image_blocks(
             rows = max(1, PIECE_BYTES // stream.descriptor.sample_bytes())
             for low in range(0, len(places), rows):
                 part = places[low : low + rows]
-                images = stream.recording.images_at(stream.name, kept[part])
-                yield Block(stream.t_ns[part], images)
+                pictures = stream.recording.images_at(stream.name, kept[part])
+                yield Block(stream.t_ns[part], pictures)
             return
     for low in range(first, stop, IMAGES_AT_ONCE):
         part = kept[low : min(low + IMAGES_AT_ONCE, stop)]

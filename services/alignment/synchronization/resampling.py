@@ -9,6 +9,8 @@ from dextouch.geometry import bracket, interpolate_linear, interpolate_poses, tr
 
 # How far beyond its first and last sample a stream may be continued, in nominal periods.
 EDGE_PERIODS = 1.5
+# A stream that loses one sample has a gap of two periods, and half a period is left for jitter.
+MAX_GAP_PERIODS = 2.5
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,11 @@ class GridPlacement:
 def grid_times_ns(num_steps: int, rate_hz: float) -> Int64[np.ndarray, " n"]:
     """Times of steps 0 … num_steps - 1; step k at k / rate, rounded to the nanosecond."""
     return np.rint(np.arange(num_steps) * (1e9 / rate_hz)).astype(np.int64)
+
+
+def stream_gap_ns(max_gap_ns: int, period_ns: int) -> int:
+    """The longest gap that is interpolated in a stream of a nominal period: it follows its rate."""
+    return max(max_gap_ns, round(MAX_GAP_PERIODS * period_ns))
 
 
 def place_on_grid(

@@ -70,8 +70,8 @@ def blocks(reader: Reader, name: str) -> Iterator[Block]:
             values = reader.values(name, start, stop)
         part = np.flatnonzero(kept[start:stop])
         if len(part):
-            columns = (column[start:stop][part] for column in (t_ns, t_device_ns, sequence))
-            yield Block(*columns, values[part])
+            rows = start + part
+            yield Block(t_ns[rows], t_device_ns[rows], sequence[rows], values[part])
 
 
 @contextmanager

@@ -385,12 +385,12 @@ class ImageChunks:
             CorruptDataError: an invalid storage chunk; or an image that cannot be decoded, and then
                 `place` in the details is the first such image of the chunk.
         """
-        images = self.unpack(payload, number)
+        images, size_px = self.unpack(payload, number), (self.shape[0], self.shape[1])
         with self._located(number):
             if self.codec == "jpeg":
-                check_jpeg(images[0], self.shape[:2])
+                check_jpeg(images[0], size_px)
             else:
-                check_group(images, self.shape[:2])
+                check_group(images, size_px)
 
     @contextmanager
     def _located(self, number: int) -> Iterator[None]:
