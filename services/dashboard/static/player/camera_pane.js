@@ -61,7 +61,8 @@ export class CameraPane {
     this.state("loading", "");
     let bitmap;
     try {
-      bitmap = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
+      // As the sensor delivered it: EXIF orientation is ignored everywhere.
+      bitmap = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }), { imageOrientation: "none" });
     } catch {
       if (key === this.wanted_key) this.state("failed", "this image cannot be decoded");
       return;

@@ -20,6 +20,7 @@ from dextouch.errors import (
     LimitExceededError,
     NotFoundError,
 )
+from dextouch.schemas import first_problems
 from dextouch.system_files import is_system_file
 
 MAX_INFO_BYTES: Final = 1 << 24
@@ -212,7 +213,9 @@ def _read_info(folder: Path) -> DatasetInfo:
     try:
         return DatasetInfo.model_validate(plain)
     except ValidationError as error:
-        raise CorruptDataError(f"{path}: is not a valid dataset description ({error})") from error
+        raise CorruptDataError(
+            f"{path}: is not a valid dataset description ({first_problems(error)})"
+        ) from error
 
 
 def _read_tasks(folder: Path) -> list[str]:
