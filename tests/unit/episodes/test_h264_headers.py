@@ -10,11 +10,18 @@ from dextouch.episodes import first_gap, is_keyframe
 from dextouch.errors import CorruptDataError
 from tests.unit.bridges.lerobot_episodes import SIZE_PX, pictures
 
+
+def levels(count):
+    """Different weights, so that none is left to the decoder."""
+    return ",".join(str(16 + 3 * index % 32) for index in range(count))
+
+
 # Parameter sets of many profiles: with scaling lists, other chroma, slices, wrapping numbers.
 ENCODERS = {
     "baseline": ("baseline", "yuv420p", ""),
     "high": ("high", "yuv420p", "cabac=1:8x8dct=1"),
     "scaling lists": ("high", "yuv420p", "cqm=jvt"),
+    "other scaling lists": ("high", "yuv420p", f"8x8dct=1:cqm4={levels(16)}:cqm8={levels(64)}"),
     "10 bits": ("high10", "yuv420p10le", ""),
     "4:4:4": ("high444", "yuv444p", "cqm=jvt"),
     "slices": ("main", "yuv420p", "slices=4"),
