@@ -10,18 +10,11 @@ from dextouch.episodes import first_gap, is_keyframe
 from dextouch.errors import CorruptDataError
 from tests.unit.bridges.lerobot_episodes import SIZE_PX, pictures
 
-
-def levels(count):
-    """Different weights, so that none is left to the decoder."""
-    return ",".join(str(16 + 3 * index % 32) for index in range(count))
-
-
-# Parameter sets of many profiles: with scaling lists, other chroma, slices, wrapping numbers.
+# Parameter sets of many profiles, with other chroma, several slices and numbers that wrap.
 ENCODERS = {
     "baseline": ("baseline", "yuv420p", ""),
     "high": ("high", "yuv420p", "cabac=1:8x8dct=1"),
     "scaling lists": ("high", "yuv420p", "cqm=jvt"),
-    "other scaling lists": ("high", "yuv420p", f"8x8dct=1:cqm4={levels(16)}:cqm8={levels(64)}"),
     "10 bits": ("high10", "yuv420p10le", ""),
     "4:4:4": ("high444", "yuv444p", "cqm=jvt"),
     "slices": ("main", "yuv420p", "slices=4"),
@@ -56,6 +49,75 @@ def test_a_missing_picture_is_found_where_it_was(name):
     for lost in (1, 2, 7, 15, 16, 17, 33, 38):
         assert first_gap(units[:lost] + units[lost + 1 :]) == lost
     assert first_gap([*units[:5], units[4], *units[5:]]) == 5
+
+
+def ue(value):
+    """Exp-Golomb code of an unsigned number (9.1)."""
+    bits = f"{value + 1:b}"
+    return "0" * (len(bits) - 1) + bits
+
+
+def se(value):
+    """Of a signed one (9.1.1)."""
+    return ue(2 * value - 1 if value > 0 else -2 * value)
+
+
+def nal(header, bits):
+    """A NAL unit behind its start code, with its trailing bits and emulation prevention."""
+    bits += "1"
+    bits += "0" * (-len(bits) % 8)
+    data = bytearray()
+    for byte in (int(bits[i : i + 8], 2) for i in range(0, len(bits), 8)):
+        if data[-2:] == b"\0\0" and byte <= 3:
+            data.append(3)
+        data.append(byte)
+    return b"\0\0\1" + bytes([header]) + bytes(data)
+
+
+def parameters(*, number_bits=4, lists=(), order=0, may_skip=0):
+    """A sequence parameter set of the profile High (7.3.2.1.1); `lists` by number."""
+    bits = "01100100" + "00000000" + "00011110" + ue(0)  # profile, constraints, level, id
+    bits += ue(1) + ue(0) + ue(0) + "0" + "1"  # 4:2:0, 8 bits, 8 bits, lists follow
+    bits += "".join("1" + lists[k] if k in lists else "0" for k in range(8))
+    bits += ue(number_bits - 4) + ue(order)
+    bits += {0: ue(2), 1: "0" + se(-3) + se(2) + ue(2) + se(1) + se(-1), 2: ""}[order]
+    bits += ue(1) + str(may_skip) + ue(3) + ue(2) + "1" + "1" + "0" + "0"
+    return nal(0x67, bits)
+
+
+def slices(number_bits, numbers):
+    """Units of one slice each (7.3.3): its first macroblock, type, parameter set, number."""
+    return [
+        nal(0x65 if index == 0 else 0x41, ue(0) + ue(7) + ue(0) + f"{number:0{number_bits}b}")
+        for index, number in enumerate(numbers)
+    ]
+
+
+# A weight of 12, which is 8 + 4, then 0, which ends the list (7.3.2.1.1.1).
+ENDED_LIST = se(4) + se(-12)
+SCALING_LISTS = {
+    "none": {},
+    "small": {1: "".join(map(se, [1, -1] * 8))},
+    "large": {6: "".join(map(se, [1, -1] * 32)), 7: ENDED_LIST},
+    "default": {0: se(-8), 6: se(-8)},
+}
+
+
+@pytest.mark.parametrize("lists", SCALING_LISTS)
+@pytest.mark.parametrize("order", [0, 1, 2])
+@pytest.mark.parametrize("number_bits", [4, 9])
+def test_parameter_sets_written_by_hand(lists, order, number_bits):
+    about = parameters(number_bits=number_bits, lists=SCALING_LISTS[lists], order=order)
+    units = slices(number_bits, [number % (1 << number_bits) for number in range(20)])
+    units[0] = about + units[0]
+    assert first_gap(units) is None
+    assert first_gap(units[:7] + units[8:]) == 7
+
+
+def test_an_encoder_that_may_skip_numbers_is_not_judged():
+    first, *rest = slices(4, [0, 1, 4, 5])
+    assert first_gap([parameters(may_skip=1) + first, *rest]) is None
+    assert first_gap([parameters() + first, *rest]) == 2
 
 
 def test_pictures_that_nothing_refers_to_do_not_count():
