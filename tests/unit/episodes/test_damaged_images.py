@@ -1,5 +1,7 @@
 """Images whose bytes are intact but which are damaged: treated as images never recorded."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -133,6 +135,24 @@ def test_verify_lists_every_damaged_image_and_repair_leaves_it_out(make_episode,
     again = store.recording(repaired.new_id)
     again.verify()
     np.testing.assert_array_equal(again.stamps_ns(CAMERA), kept * 33_333_333)
+
+
+def test_a_copy_with_the_same_damaged_image_still_mends_the_rest(make_episode, store, tmp_path):
+    images = encoded(make_episode(), "jpeg")[:24]
+    images[9] = images[9][:-60]
+    recording_of(store, images, "jpeg")
+    shutil.copytree(store.root, tmp_path / "copy")
+    shard = next((store.root / "recordings/take" / CAMERA).rglob("c/0/0/0/0"))
+    data = bytearray(shard.read_bytes())
+    data[sum(map(len, images[:15])) + 15 * 4 + 100] ^= 1
+    shard.write_bytes(data)
+    findings = inspect_group(store.files("take", kind="recording"), "recording").findings
+    assert [finding.chunk for finding in findings] == [9, 15]
+    copy = EpisodeStore(tmp_path / "copy").files("take", kind="recording")
+    repaired = repair_group(store.root, "recording", "take", copy=copy)
+    assert repaired.lost == {CAMERA: 1}
+    again = store.recording(repaired.new_id).stamps_ns(CAMERA)
+    np.testing.assert_array_equal(again, np.delete(np.arange(24), 9) * 33_333_333)
 
 
 def test_a_missing_picture_is_found_by_the_numbers_of_its_neighbours(make_episode):

@@ -106,8 +106,8 @@ def import_lerobot(
             ) from error
         if store.exists(attributes.episode_id):
             raise ConflictError(
-                f"episode {attributes.episode_id!r} exists already; give another prefix "
-                "(`dextouch import --id-prefix`)"
+                f"episode {attributes.episode_id!r} exists already; give another "
+                "id_prefix (`dextouch import --id-prefix`)"
             )
         store_episode(store, attributes, episode, images=options.images)
         ids.append(attributes.episode_id)
