@@ -6,7 +6,6 @@ page ends after 30 s, so that a loaded machine is slow and a broken page is stil
 
 import asyncio
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +20,7 @@ from services.acquisition.app import create_app as create_station
 from services.acquisition.mocks import pattern
 from services.acquisition.settings import AcquisitionSettings
 from services.cli.servers import bind, serve_all
+from tests.programs import needed_program
 
 PATIENCE_S = 30
 FLAGS = (
@@ -51,9 +51,8 @@ def pytest_runtest_makereport(item, call):
 @pytest.fixture(scope="module")
 def chromium():
     """One browser a module: playwright's loop must be gone before other modules run theirs."""
-    program = os.environ.get("DEXTOUCH_CHROMIUM") or shutil.which("chromium")
-    if program is None:
-        pytest.skip("no chromium on the PATH; install it, or name one in DEXTOUCH_CHROMIUM")
+    named = os.environ.get("DEXTOUCH_CHROMIUM")
+    program = named or needed_program("chromium", package="chromium")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=program, args=list(FLAGS), timeout=1000 * PATIENCE_S

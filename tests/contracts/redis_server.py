@@ -1,6 +1,5 @@
-"""A real redis-server on a free loopback port for the tests that need one; skips where absent."""
+"""A real redis-server on a free loopback port for the tests that need one."""
 
-import shutil
 import socket
 import subprocess
 from collections.abc import Iterator
@@ -9,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.programs import needed_program
+
 
 @contextmanager
 def running_redis(folder: Path) -> Iterator[str]:
     """The address of an empty server that lives as long as the context."""
-    program = shutil.which("redis-server")
-    if program is None:
-        pytest.skip("no redis-server on PATH; the same suite ran on memory://")
+    program = needed_program("redis-server", package="redis-server")
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

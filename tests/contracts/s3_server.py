@@ -1,4 +1,4 @@
-"""An S3 server of the moto package on a free loopback port; skips where the package is absent."""
+"""An S3 server of the moto package on a free loopback port."""
 
 import http.client
 import importlib.util
@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
+
+from tests.programs import skip_or_fail
 
 BUCKET = "takes"
 # What the server accepts while it checks no credentials.
@@ -52,7 +54,7 @@ class S3Server:
 def running_s3() -> Iterator[S3Server]:
     """A server with one empty bucket that lives as long as the context."""
     if importlib.util.find_spec("moto") is None or importlib.util.find_spec("flask") is None:
-        pytest.skip("no moto with flask installed; the same suite ran on a folder")
+        skip_or_fail("no moto with flask installed; the same suite ran on a folder")
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

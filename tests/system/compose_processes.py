@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -13,6 +12,8 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import yaml
+
+from tests.programs import needed_program
 
 VARIABLE = re.compile(r"\$\{(\w+)(?::([-?])([^}]*))?\}")
 CONTAINER_PORTS = {"redis": 6379}
@@ -147,7 +148,7 @@ class ComposeProcesses:
             return [sys.executable, "-m", "services.cli.main", *words[1:]]
         if words[0] == "redis-server":
             port = ["--port", str(self.ports[name]), "--bind", "127.0.0.1"]
-            return [shutil.which("redis-server"), *words[1:], *port]
+            return [needed_program("redis-server", package="redis-server"), *words[1:], *port]
         raise AssertionError(f"{name}: a command this test cannot start: {command}")
 
     def _environment(self, name):
@@ -182,7 +183,8 @@ class ComposeProcesses:
         assert test[0] == "CMD", f"{name}: health checks are written as CMD lists"
         command = [sys.executable if word == "python" else word for word in test[1:]]
         if command[0] == "redis-cli":
-            command = [shutil.which("redis-cli"), "-p", str(running.port), *command[1:]]
+            program = needed_program("redis-cli", package="redis-tools")
+            command = [program, "-p", str(running.port), *command[1:]]
         deadline_s = time.monotonic() + HEALTH_TIMEOUT_S
         while True:
             assert running.process.poll() is None, f"{name} ended by itself\n{running.log_tail()}"

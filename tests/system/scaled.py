@@ -3,7 +3,6 @@
 import hashlib
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -21,6 +20,7 @@ import psutil
 
 from dextouch.clients import RolloutClient
 from dextouch.schemas import ReturnSelector
+from tests.programs import needed_program
 from tests.unit.worlds.fakes import actions
 
 ROOT = Path(__file__).parents[2]
@@ -110,6 +110,7 @@ class Service:
 @contextmanager
 def haproxy(folder, services):
     """The gateway's own configuration, with these services in place of those of compose."""
+    program = needed_program("haproxy", package="haproxy")
     text = (ROOT / "deploy/haproxy/haproxy.cfg").read_text()
     port = free_port()
     head, _, _ = text.partition("frontend world_model")
@@ -121,7 +122,7 @@ def haproxy(folder, services):
     path.write_text(head)
     with (
         (folder / "haproxy.log").open("wb") as log,
-        subprocess.Popen([shutil.which("haproxy"), "-f", path], stdout=log, stderr=log) as process,
+        subprocess.Popen([program, "-f", path], stdout=log, stderr=log) as process,
     ):
         try:
             url = f"http://127.0.0.1:{port}"

@@ -1,6 +1,5 @@
 """docker-compose.yml as plain processes: a recording goes in, an episode and a rollout come out."""
 
-import shutil
 from pathlib import Path
 
 import httpx
@@ -9,6 +8,7 @@ import pytest
 
 from dextouch.clients import RolloutClient
 from dextouch.hands.actions import ACTION_DIM
+from tests.programs import needed_program
 from tests.system.compose_processes import ComposeProcesses, record_take, wait_for
 
 ROOT = Path(__file__).parents[2]
@@ -23,18 +23,13 @@ WITHOUT = () if list(PRETRAINED.glob("*.safetensors")) else ("world_model",)
 # It finds its workers by the names of a compose network; test_worker_kills.py runs it here.
 OTHERWISE_TESTED = ("gateway",)
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.skipif(
-        shutil.which("redis-server") is None,
-        reason="no redis-server on the PATH: apt-get install redis-server",
-    ),
-]
+pytestmark = pytest.mark.system
 
 
 @pytest.fixture(scope="module")
 def composed(tmp_path_factory):
     """All lasting services of the compose file, healthy."""
+    needed_program("redis-server", package="redis-server")
     processes = ComposeProcesses(
         ROOT / "docker-compose.yml",
         tmp_path_factory.mktemp("compose"),

@@ -2,7 +2,6 @@
 
 import os
 import random
-import shutil
 import signal
 import subprocess
 import time
@@ -14,6 +13,7 @@ import yaml
 from dextouch.clients import RolloutClient
 from dextouch.errors import UnavailableError
 from tests.contracts.redis_server import running_redis
+from tests.programs import needed_program
 from tests.system.scaled import (
     ASKED,
     LAST,
@@ -50,8 +50,6 @@ def one_port(tmp_path, redis_url):
 @pytest.fixture
 def gateway(tmp_path, redis_url):
     """Two processes behind HAProxy: its address, and the processes."""
-    if shutil.which("haproxy") is None:
-        pytest.skip("no haproxy on the PATH: apt-get install haproxy")
     services = [Service(tmp_path, redis_url, ("--drain-s", 60)) for _ in range(2)]
     for service in services:
         wait_until(lambda service=service: is_ready(service.url), "service")
@@ -182,11 +180,11 @@ def test_a_worker_that_cannot_start_ends_the_service(tmp_path, redis_url):
 
 def start_redis(folder, port):
     """Redis as in the compose file."""
-    if shutil.which("redis-server") is None:
-        pytest.skip("no redis-server on the PATH: apt-get install redis-server")
+    program = needed_program("redis-server", package="redis-server")
     services = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
     here = ["--port", str(port), "--bind", "127.0.0.1", "--dir", str(folder)]
-    return subprocess.Popen([*services["redis"]["command"], *here], stdout=subprocess.DEVNULL)
+    options = services["redis"]["command"][1:]
+    return subprocess.Popen([program, *options, *here], stdout=subprocess.DEVNULL)
 
 
 def test_rollouts_outlast_a_restart_of_redis(tmp_path):

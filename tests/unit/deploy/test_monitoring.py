@@ -3,13 +3,13 @@
 import asyncio
 import json
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 import yaml
 
+from tests.programs import needed_program
 from tests.unit.deploy.exported_metrics import exported_metrics
 
 promql = pytest.importorskip("promql_parser", reason="pip install promql-parser (extra dev)")
@@ -174,13 +174,11 @@ def test_every_alert_has_a_unit_test():
     assert {rule["alert"] for rule in RULES if "alert" in rule} == fired | counted
 
 
-PROMTOOL = shutil.which("promtool")
-needs_promtool = pytest.mark.skipif(
-    PROMTOOL is None, reason="no promtool on the PATH: apt-get install prometheus"
-)
+@pytest.fixture(scope="module")
+def promtool():
+    return needed_program("promtool", package="prometheus")
 
 
-@needs_promtool
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -189,15 +187,14 @@ needs_promtool = pytest.mark.skipif(
         ("test", "rules", "tests/unit/deploy/rules_test.yml"),
     ],
 )
-def test_promtool_agrees(arguments):
+def test_promtool_agrees(arguments, promtool):
     done = subprocess.run(
-        [PROMTOOL, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+        [promtool, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@needs_promtool
-def test_a_wrong_limit_fails_the_unit_tests(tmp_path):
+def test_a_wrong_limit_fails_the_unit_tests(tmp_path, promtool):
     rules = (PROMETHEUS / "rules.yml").read_text()
     (tmp_path / "rules.yml").write_text(
         rules.replace("sample_age_seconds > 2", "sample_age_seconds > 1")
@@ -205,5 +202,5 @@ def test_a_wrong_limit_fails_the_unit_tests(tmp_path):
     tests = Path(__file__).with_name("rules_test.yml").read_text()
     path = tmp_path / "rules_test.yml"
     path.write_text(tests.replace("../../../deploy/prometheus/rules.yml", "rules.yml"))
-    done = subprocess.run([PROMTOOL, "test", "rules", str(path)], capture_output=True, check=False)
+    done = subprocess.run([promtool, "test", "rules", str(path)], capture_output=True, check=False)
     assert done.returncode != 0
