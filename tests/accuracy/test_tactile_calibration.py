@@ -207,6 +207,23 @@ def test_a_wandering_touch_shows_the_still_taxels_among_the_moving():
     assert all(states[taxel] == "unproven" for taxel in range(80))
 
 
+def test_saturated_is_what_never_leaves_the_end_of_its_scale():
+    """A scale of 4000 counts ends at 0.995 of it, 3980; the rest take is among the takes."""
+    glove = Glove(9)
+    rest, pressed = glove.take(0.0), glove.take(5.0)
+    cells = raw_indices(side="left")
+    for taxel, at_rest, under_load in (
+        (100, 4000, 4000),
+        (110, 3980, 3980),
+        (120, 3979, 3979),
+        (130, int(rest[0, cells[130]]), 4000),
+    ):
+        rest[:, cells[taxel]], pressed[:, cells[taxel]] = at_rest, under_load
+    tare = measure_tare(glove.take(0.0), side="left")
+    states = named(classify_taxels([rest, pressed], tare, full_scale_counts=4000.0))
+    assert [taxel for taxel, state in states.items() if state == "saturated"] == [100, 110]
+
+
 def test_weak_saturated_bent_and_missing_presses_are_refused():
     glove = Glove(10)
     tare = measure_tare(glove.take(0.0), side="left")

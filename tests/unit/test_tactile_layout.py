@@ -97,6 +97,19 @@ def packet_of(kpa, glove, side):
     return packet
 
 
+def test_the_cells_around_the_taxels_are_zero_and_the_type_stays():
+    raw = layout.expand_taxels(np.full(320, 7, dtype=np.uint16), side="left")
+    assert raw.dtype == np.uint16
+    assert np.bincount(raw).tolist() == [40, 0, 0, 0, 0, 0, 0, 320]
+
+
+def test_taxels_of_the_palm_are_larger_than_those_of_the_fingertips():
+    """4 by 4 mm, and 6 by 5 mm in the palm."""
+    areas = layout.taxel_areas_m2()
+    np.testing.assert_allclose(areas[:80], 16e-6)
+    np.testing.assert_allclose(areas[80:], 30e-6)
+
+
 def test_left_glove_is_wired_as_the_mirror_image():
     left = layout.raw_indices(side="left").reshape(-1)
     right = layout.raw_indices(side="right").reshape(-1)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from services.acquisition.health.evaluation import MIN_ROLLING, Rolling
+from services.acquisition.health.evaluation import MIN_ROLLING, CountWindow, Rolling
 
 
 def test_only_the_last_span_is_kept_whatever_comes(rng):
@@ -29,3 +29,14 @@ def test_its_arrays_stay_the_same_once_a_span_is_full(rng):
             arrays.add((id(rolling._t_ns), id(rolling._values), len(rolling._t_ns)))
     assert len(arrays) == 1
     assert len(rolling._t_ns) == 8 * MIN_ROLLING
+
+
+def test_counts_grow_since_the_last_look_that_is_ten_seconds_old():
+    # Second of each look, the counter then, and by hand its growth: since the first look, from 10 s
+    # on since the one at 0, 4, 8 and 19 s.
+    looks = [(4, 1, 1), (8, 2, 2), (10, 4, 4), (14, 8, 7), (19, 16, 14), (40, 20, 4)]
+    counts = {"lost": 0}
+    window = CountWindow(lambda: dict(counts))
+    for second, count, grown in looks:
+        counts["lost"] = count
+        assert window.growth(second * 10**9)["lost"] == grown

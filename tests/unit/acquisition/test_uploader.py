@@ -2,6 +2,7 @@ import errno
 import os
 import shutil
 import socket
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
@@ -28,13 +29,13 @@ STREAMS = tuple(
 )
 
 
-def spool(root, name="take", count=270, *, close=True):
+def spool(root, name="take", count=270, *, streams=STREAMS, close=True):
     attributes = RecordingAttributes(
         recording_id=name, task="t", instruction="i", domain="human", station="s", streams=STREAMS
     )
     writer = SpoolWriter(root / name, attributes)
     stamps = np.arange(count, dtype=np.int64)
-    for stream in STREAMS:
+    for stream in streams:
         values = np.arange(count * 7.0).reshape(count, 7)
         writer.append(stream.name, SampleBatch(stamps, stamps, stamps, values))
     if close:
@@ -239,6 +240,28 @@ def refusing(tmp_path):
     return uploader
 
 
+def test_only_refusals_in_a_row_set_a_take_aside(tmp_path):
+    """Three of them, since one may be a passing one; a store that is away refuses nothing."""
+    spool(tmp_path)
+    store = FakeStore()
+    uploader = Uploader(tmp_path, store, period_s=1.0)
+
+    def refused_after(error, count):
+        def fail(_):
+            raise error("take: no")
+
+        store.create = fail
+        for _ in range(count):
+            uploader.upload_all()
+        return listed(uploader) == ["take"]
+
+    assert not refused_after(UnavailableError, 10)
+    assert not refused_after(ConflictError, 2)
+    assert not refused_after(UnavailableError, 1)
+    assert not refused_after(ConflictError, 2)
+    assert refused_after(ConflictError, 1)
+
+
 def listed(uploader):
     return [status.recording_id for status in uploader.status(only_refused=True)]
 
@@ -280,8 +303,16 @@ def test_a_second_id_is_valid_and_of_one_take_alone():
         for station in ("Desk 1", "Desk 2")
     ]
     ids = [second_id(take) for take in takes]
-    assert ids == [second_id(take) for take in takes]
+    assert ids == [second_id(take.model_copy()) for take in takes]
     assert len(set(ids)) == len(takes)
+    # The next take of the same station and name is another one, by whichever of its clocks.
+    start = datetime(2026, 5, 4, 12, tzinfo=UTC)
+    starts = [(start, 5), (start + timedelta(seconds=1), 5), (start, 6), (None, 5), (start, None)]
+    repeated = [
+        takes[0].model_copy(update={"started_at": at, "started_t_host_ns": t_host_ns})
+        for at, t_host_ns in starts
+    ]
+    assert len({ids[0], *map(second_id, repeated)}) == 1 + len(starts)
     for take, other in zip(takes, ids, strict=True):
         # As an id, it is checked against the pattern of the store.
         renamed = RecordingAttributes.model_validate(take.model_dump() | {"recording_id": other})
@@ -320,8 +351,11 @@ def test_no_connection_outlives_the_uploads(tmp_path):
 def test_recovery_closes_what_was_left_open(tmp_path):
     spool(tmp_path, "left", close=False)
     spool(tmp_path, "empty", count=0, close=False)
+    # The other tracker had not sent anything yet.
+    spool(tmp_path, "only_head", streams=STREAMS[:1], close=False)
     spool(tmp_path, "whole")
-    assert recover_spool(tmp_path) == ["left"]
+    assert recover_spool(tmp_path) == ["left", "only_head"]
+    assert SpoolReader(tmp_path / "only_head").num_samples("head") == 270
     left = SpoolReader(tmp_path / "left")
     assert left.closed
     assert {(e.stream, e.event) for e in left.attributes.ledger} == {

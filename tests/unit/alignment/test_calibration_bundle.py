@@ -86,6 +86,17 @@ def test_points_behind_the_camera_are_refused():
         project(board_points()[None], np.eye(4)[None] * 1.0, K, DISTORTION)
 
 
+@pytest.mark.parametrize(("depth_m", "is_refused"), [(-0.01, True), (0.0, True), (0.01, False)])
+def test_one_corner_behind_the_camera_is_enough(depth_m, is_refused):
+    """Nor has a corner in the plane of the camera's centre an image."""
+    corners = np.array([[[0.0, 0, 0.5], [0.001, 0, depth_m], [0.1, 0, 0.5]]])
+    if is_refused:
+        with pytest.raises(InvalidInputError, match="behind"):
+            project(corners, np.eye(4)[None], K, DISTORTION)
+    else:
+        assert np.isfinite(project(corners, np.eye(4)[None], K, DISTORTION)[0]).all()
+
+
 def test_predicted_poses_move_as_their_jacobians_say():
     W, X, Z = some_poses(1, 1), some_poses(1, 2)[0], some_poses(1, 3)[0]
     X_B = invert(W) @ Z

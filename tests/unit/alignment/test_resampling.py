@@ -8,7 +8,12 @@ from dextouch.streams import StreamDescriptor
 from services.alignment.retargeting import RetargetStatus
 from services.alignment.synchronization.grid_actions import retarget_hands, status_on_grid
 from services.alignment.synchronization.recorded_streams import LoadedStream
-from services.alignment.synchronization.resampling import place_on_grid, vectors_on_grid
+from services.alignment.synchronization.resampling import (
+    longest_run,
+    place_on_grid,
+    poses_on_grid,
+    vectors_on_grid,
+)
 from services.twin.hands import twin_hand
 
 MS = 1_000_000
@@ -30,6 +35,27 @@ def test_a_stream_goes_on_for_one_and_a_half_periods_at_its_ends():
     # A value that rises by 2 a millisecond.
     values = vectors_on_grid(np.array([[0.0], [20.0], [40.0]]), at)[:, 0]
     np.testing.assert_allclose(values[at.valid], [-30, -2, 0, 8, 20, 40, 70], atol=1e-9)
+
+
+def test_a_pose_between_two_samples_has_its_share_of_both():
+    """From 0 to 1 m and from 0 to 80 degrees about z, at a quarter and at three quarters."""
+    half_rad = np.deg2rad(40)
+    poses = np.array(
+        [[0.0, 0, 0, 1, 0, 0, 0], [1.0, 0, 0, np.cos(half_rad), 0, 0, np.sin(half_rad)]]
+    )
+    Ts = poses_on_grid(poses, placed([0, 20], [5, 15]))
+    np.testing.assert_allclose(Ts[:, :3, 3], [[0.25, 0, 0], [0.75, 0, 0]], atol=1e-12)
+    turned_deg = np.rad2deg(np.arctan2(Ts[:, 1, 0], Ts[:, 0, 0]))
+    np.testing.assert_allclose(turned_deg, [20, 60], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("valid", "expected"),
+    [("..xxx.x", (2, 5)), ("x.xx..xx", (2, 4)), ("xxxx", (0, 4)), ("....", (0, 0)), ("", (0, 0))],
+)
+def test_an_episode_is_the_longest_run(valid, expected):
+    """The first one of equal length."""
+    assert longest_run(np.array([step == "x" for step in valid], dtype=bool)) == expected
 
 
 def test_no_line_is_drawn_through_a_gap():

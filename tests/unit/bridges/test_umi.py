@@ -4,6 +4,7 @@ import json
 import tracemalloc
 import zipfile
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from numcodecs import Zstd
 
 from dextouch.bridges.umi import export_umi, import_umi
 from dextouch.bridges.umi.zarr_zip import ZarrZipReader, ZarrZipWriter
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
@@ -120,6 +121,19 @@ def test_equal_episodes_give_equal_bytes(two, tmp_path):
     export_umi(two, tmp_path / "one.zip")
     export_umi(two, tmp_path / "two.zip")
     assert (tmp_path / "one.zip").read_bytes() == (tmp_path / "two.zip").read_bytes()
+
+
+def test_commands_beside_the_grid_of_actions_are_refused(two, tmp_path, monkeypatch):
+    read = EpisodeReader.read
+
+    def beside(reader, stream, *span):
+        batch = read(reader, stream, *span)
+        shift_ns = 1 if stream == "action_commanded" else 0
+        return replace(batch, t_ref_ns=batch.t_ref_ns + shift_ns)
+
+    monkeypatch.setattr(EpisodeReader, "read", beside)
+    with pytest.raises(InvalidInputError, match="not on the grid"):
+        export_umi(two, tmp_path / "take.zarr.zip")
 
 
 def test_episodes_that_do_not_fit_together_are_refused(store, tmp_path):

@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from dextouch.clocks import OnlineClock, fit_clock
+from dextouch.clocks.clock_model import ClockModel, ClockSegment
 from dextouch.clocks.lower_hull import LowerHull
 from dextouch.clocks.online_clock import DeviceCounter
 from dextouch.clocks.steps import find_steps, find_wrong_stamps
+from dextouch.errors import ClockFitError, InvalidInputError
 from dextouch.streams import ClockCapabilities, SampleBatch, StreamDescriptor
 from services.alignment.synchronization.stream_clock import time_stream
 
@@ -40,6 +42,17 @@ def test_a_counter_goes_on_after_a_pause_of_any_length(pause_s):
     # The second sample waits 3 ms longer than the first.
     t_host_ns = 10**15 + (pause_s * 1000 + 3) * MS
     assert counter.straighten(t_host_ns, after_ms % 65_536 * MS, None) == after_ms * MS
+
+
+@pytest.mark.parametrize(
+    ("bits", "before", "after"), [(62, 2**62 - 1, 2**62 + 3), (63, 2**62 + 2**61, 3)]
+)
+def test_a_counter_too_wide_to_wrap_starts_anew(bits, before, after):
+    """62 bits of nanoseconds come round after 146 years, and a stamp still holds the sum."""
+    wide = ClockCapabilities(device_time=True, device_time_bits=bits, tick_ns=1)
+    counter = DeviceCounter(descriptor(wide))
+    counter.straighten(10**15, before, None)
+    assert counter.straighten(10**15 + 4, 3, None) == after
 
 
 def test_a_pause_of_more_than_half_a_wrap_is_no_step():
@@ -148,6 +161,63 @@ def test_no_sample_is_dated_after_its_arrival():
     ahead_ns = device_ns[300:301] + 7 * MS
     assert model.to_host_ns(ahead_ns, host_ns[300:301]).tolist() == host_ns[300:301].tolist()
     assert model.to_host_ns(ahead_ns).tolist() == (host_ns[300:301] + 7 * MS).tolist()
+
+
+def test_an_arrival_between_two_segments_belongs_to_the_nearer_one():
+    """The clock is set back by 3 s between two samples; later samples of others are dated too."""
+    taken_ns = np.arange(800, dtype=np.int64) * PERIOD_NS
+    stepped_ns = (np.arange(800) >= 400) * 3_000_000_000
+    model = fit_clock(taken_ns - stepped_ns, 10**15 + taken_ns)
+    for after_ms, device_ns in ((4, 3_992 * MS), (6, 994 * MS)):
+        # Sent by the old clock, and by the new one; both arrive 2 ms later.
+        arrived_ns = np.array([10**15 + (3_990 + after_ms) * MS])
+        dated_ns = model.to_host_ns(np.array([device_ns]), arrived_ns)
+        np.testing.assert_allclose(dated_ns - arrived_ns, -2 * MS, atol=10)
+
+
+def test_late_samples_beside_a_gap_do_not_bend_the_line():
+    """Of the window from 60 to 120 s, 10 s and two late samples are left: a slope of 0.4 %."""
+    device_ns = np.arange(15_000, dtype=np.int64) * PERIOD_NS
+    device_ns = device_ns[(device_ns <= 70 * 10**9) | (device_ns >= 119_980_000_000)]
+    late_ns = np.where(device_ns // 10**9 == 119, 200 * MS, 0)
+    host_ns = np.maximum.accumulate(10**15 + device_ns + late_ns)
+    model = fit_clock(device_ns, host_ns)
+    assert model.num_steps == 0
+    np.testing.assert_allclose(model.to_host_ns(device_ns) - device_ns - 10**15, 0, atol=MS)
+
+
+def segment(start_device_ns, stop_device_ns, offset_ns):
+    start_host_ns = start_device_ns + offset_ns
+    knots = np.array([0.0, 1.0]), np.zeros(2)
+    return ClockSegment(start_device_ns, stop_device_ns, start_host_ns, 0, offset_ns, *knots)
+
+
+@pytest.mark.parametrize(("back_to_ns", "is_ambiguous"), [(1001, False), (1000, True), (5, True)])
+def test_a_device_time_that_came_twice_needs_an_arrival(back_to_ns, is_ambiguous):
+    segments = segment(0, 1000, 10**15), segment(back_to_ns, 3000, 10**15 + 2000)
+    model = ClockModel(segments, skew_ppm=0.0, residual_rms_ns=0.0)
+    assert model.is_ambiguous == is_ambiguous
+    if is_ambiguous:
+        with pytest.raises(InvalidInputError, match="two moments"):
+            model.to_host_ns(np.array([1000]))
+    else:
+        assert model.to_host_ns(np.array([1000, 1001])).tolist() == [10**15 + 1000, 10**15 + 3001]
+
+
+@pytest.mark.parametrize(
+    ("count", "backs", "is_refused"),
+    [(12, 1, False), (12, 2, True), (300, 3, False), (300, 4, True)],
+)
+def test_a_clock_may_be_set_back_once_or_every_hundredth_sample(count, backs, is_refused):
+    device_ns = np.arange(count, dtype=np.int64) * PERIOD_NS + 10**12
+    host_ns = device_ns + 10**15
+    for number in range(1, backs + 1):
+        device_ns[number * count // (backs + 1) :] -= 3_000_000_000
+    if not is_refused:
+        assert fit_clock(device_ns, host_ns).num_steps == backs
+        return
+    with pytest.raises(ClockFitError, match=f"{backs} of {count} device stamps run back"):
+        fit_clock(device_ns, host_ns)
 
 
 def test_samples_of_one_clump_lie_on_their_own_side_of_a_step():

@@ -138,7 +138,7 @@ def test_online_clock_follows_wrapping_and_sequence_only_devices():
 
 def test_online_clock_without_stamps_gives_arrivals_in_order():
     clock = OnlineClock()
-    assert [clock.update(t_host_ns=t, t_device_ns=-1) for t in (5, 9, 9)] == [5, 9, 10]
+    assert [clock.update(t_host_ns=t, t_device_ns=-1) for t in (5, 9, 9, 9)] == [5, 9, 10, 11]
     assert clock.source == "arrival"
 
 

@@ -87,3 +87,25 @@ async def test_a_viewer_that_leaves_while_it_fetches_leaves_nothing_old(source):
 async def test_a_failed_fetch_does_not_end_the_news(topic, source):
     source.fails = True
     assert await anext(topic.updates()) == ["2"]
+
+
+async def test_a_period_begins_when_its_fetch_begins(source, monkeypatch):
+    """Each fetch takes 4 s of a clock that only the test moves."""
+    now_s = [100.0]
+
+    async def fetch():
+        now_s[0] += 4.0
+        return await source.fetch()
+
+    topic = Topic("news", 10.0, fetch)
+    monkeypatch.setattr(asyncio.get_running_loop(), "time", lambda: now_s[0])
+    for at_s, expected in ((100.0, "1"), (109.9, "1"), (110.0, "2"), (119.9, "2")):
+        now_s[0] = at_s
+        assert await topic.newest() == [expected]
+
+
+async def test_a_source_that_fails_is_asked_again_after_a_period_too(source):
+    topic = Topic("news", 3600.0, source.fetch)
+    source.fails = True
+    assert [await topic.newest() for _ in range(3)] == [[], [], []]
+    assert source.count == 1

@@ -135,6 +135,16 @@ def test_a_station_that_is_enrolled_is_revoked_first(make):
     assert (newest.state, oldest.state, oldest.revoked_by) == ("enrolled", "revoked", "kim")
 
 
+def test_the_keys_of_all_enrolled_stations_are_accepted(make):
+    enrolments, access = make()
+    stations = ["desk_1", "desk_2", "desk_3"]
+    tokens = [enrolments.issue(station, by="admin").token for station in stations]
+    keys = [enrolments.exchange(token, client="").key for token in tokens]
+    _, restarted = make()
+    for service in (access, restarted):
+        assert [allows(service, key) for key in keys] == stations
+
+
 def test_a_second_token_replaces_the_first(make):
     enrolments, _ = make()
     first, second = (enrolments.issue("desk_3", by="admin").token for _ in range(2))

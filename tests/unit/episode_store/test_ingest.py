@@ -23,6 +23,7 @@ from dextouch.errors import (
 from dextouch.schemas import FinishRecording, LedgerEntry
 from dextouch.streams import SampleBatch, encode_batch, pack
 from services.episode_store import ingest as ingest_module
+from services.episode_store.committing import commit_spool
 from services.episode_store.ingest import Ingest
 from tests.unit.episodes.spooled_batches import GOLDEN, golden_batch
 
@@ -230,6 +231,31 @@ def test_a_crash_after_the_commit_is_finished_by_repeating(
     finish(second, 1)
     assert_complete(store, batch_of, 5)
     assert not (store.root / ".uploads" / "take-1").exists()
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_commit_in_conflict_is_a_success_only_if_the_recording_is_there(
+    store, settings, attributes, send, batch_of, is_there
+):
+    """It is there if the commit process of a service before completed it meanwhile."""
+
+    def commit(path, finished):
+        if is_there:
+            commit_spool(store, path, finished)
+        raise ConflictError("recording 'take-1': exists already")
+
+    ingest = Ingest(store, settings, commit=commit)
+    ingest.create(attributes)
+    send(ingest, 0)
+    if is_there:
+        assert finish(ingest, 1).state == "finished"
+        assert_complete(store, batch_of, 5)
+        return
+    with pytest.raises(ConflictError, match="exists already"):
+        finish(ingest, 1)
+    # What was acknowledged is still there, to be finished later.
+    again = Ingest(store, settings)
+    assert again.status("take-1").next_batch["glove_left"] == 1
 
 
 def test_a_full_disk_refuses_the_batch_and_keeps_the_rest(

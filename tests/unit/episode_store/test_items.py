@@ -69,6 +69,7 @@ TAKES = ["episode/dream-1", "recording/take-1", "recording/take-2", "episode/twi
         # A take is found by the id of its episode, too.
         ({"text": "1-ALIGNED"}, ["recording/take-1"]),
         ({"flagged": True}, ["recording/take-2"]),
+        ({"flagged": False}, [one for one in TAKES if one != "recording/take-2"]),
         ({"id": ["take-2", "twin-1", "no"]}, ["recording/take-2", "episode/twin-1"]),
         ({"created_after": "2026-05-04T12:00:00Z"}, ["recording/take-1"]),
     ],

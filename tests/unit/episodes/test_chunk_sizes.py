@@ -5,6 +5,7 @@ import os
 
 import numpy as np
 import pytest
+import zstandard
 from pydantic import ValidationError
 
 from dextouch.episodes import WriteOptions, stream_arrays
@@ -13,7 +14,13 @@ from dextouch.episodes.shards import with_crc
 from dextouch.errors import CorruptDataError
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import StreamDescriptor
-from tests.unit.episodes.hostile_group import forge_record, memory_bound, shard_of, write_shard
+from tests.unit.episodes.hostile_group import (
+    chunks_of,
+    forge_record,
+    memory_bound,
+    shard_of,
+    write_shard,
+)
 
 MEBIBYTE = 2**20
 
@@ -153,3 +160,16 @@ def test_a_stored_chunk_of_gigabytes_is_refused_before_it_is_unpacked(store):
         with memory_bound(), pytest.raises(CorruptDataError, match=r"'raw'.*2000000000 bytes"):
             read()
     assert canonical_json(json.loads((folder / "commit.json").read_bytes()))
+
+
+def test_rows_behind_the_last_one_are_zero(store):
+    """A last storage chunk is filled up with zeros, not with what the one before held."""
+    force = stream((2,), "float32", 10)
+    with store.writer(kind="recording", attributes=take(force)) as writer:
+        numbers = np.arange(1, 13)
+        values = np.repeat(numbers[:, None], 2, axis=1).astype("f4")
+        writer.append("raw", values=values, t_host_ns=numbers)
+    chunks, _ = chunks_of(shard_of(store.root / "recordings" / "take-1", "raw"), 3)
+    # Five rows of two numbers, and a checksum of four bytes.
+    last = np.frombuffer(zstandard.decompress(chunks[-1][:-4]), "<f4").reshape(5, 2)
+    assert last[:, 0].tolist() == [11, 12, 0, 0, 0]

@@ -148,6 +148,22 @@ def test_what_follows_a_block_that_was_broken_off_is_refused(store, monkeypatch)
     assert kept_numbers(store) == list(range(9))
 
 
+def test_whole_storage_chunks_need_no_space_to_be_kept(store, monkeypatch):
+    """Samples 4 and 9 complete storage chunks; then the disk is full and a block breaks off."""
+
+    def full(*_):
+        raise StorageFullError("no space left")
+
+    def fill(writer):
+        record(writer, 0, 10)
+        monkeypatch.setattr(JournalWriter, "append", full)
+        monkeypatch.setattr(ShardWriter, "append", _fail_at_the_stamps)
+        record(writer, 10)
+
+    break_off(store, fill, FORCE)
+    assert kept_numbers(store) == list(range(10))
+
+
 def test_a_take_with_a_block_broken_off_is_not_committed_as_if_whole(store, monkeypatch):
     monkeypatch.setattr(ShardWriter, "append", _fail_at_the_stamps)
     writer = store.writer(kind="recording", attributes=take(FORCE))

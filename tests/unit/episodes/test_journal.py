@@ -1,13 +1,16 @@
 """Journals of a stage, written byte by byte as docs/episode_format.md describes them."""
 
+import errno
+import os
 import struct
+from pathlib import Path
 
 import google_crc32c
 import numpy as np
 import pytest
 
-from dextouch.episodes.journal import read_payload, read_rows
-from dextouch.errors import CorruptDataError
+from dextouch.episodes.journal import JournalWriter, read_payload, read_rows
+from dextouch.errors import CorruptDataError, StorageFullError
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import StreamDescriptor
 
@@ -91,3 +94,51 @@ def test_the_live_view_ends_before_a_payload_that_is_not_there_yet(store):
     assert (batch.values == 1).all()
     writer.discard()
     writer.__exit__(None, None, None)
+
+
+def test_short_writes_go_on_where_they_ended(tmp_path, monkeypatch):
+    whole = os.write
+    monkeypatch.setattr(os, "write", lambda file, data: whole(file, bytes(data)[:7]))
+    writer = JournalWriter(tmp_path, "force")
+    for payload in PAYLOADS:
+        writer.append(payload, 5)
+    writer.close()
+    assert (tmp_path / "force.part").read_bytes() == b"".join(PAYLOADS)
+    assert read_rows(tmp_path, "force")["offset"].tolist() == OFFSETS
+
+
+@pytest.mark.parametrize("write", [1, 2])
+def test_what_follows_a_failed_append_lies_where_its_row_says(tmp_path, monkeypatch, write):
+    """The first write is that of the payload, the second that of its row."""
+    calls = []
+
+    def full(file, data):
+        calls.append(file)
+        whole(file, bytes(data)[:3])
+        if len(calls) == write:
+            raise OSError(errno.ENOSPC, "no space")
+        return whole(file, bytes(data)[3:]) + 3
+
+    whole = os.write
+    writer = JournalWriter(tmp_path, "force")
+    writer.append(PAYLOADS[0], 5)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        with pytest.raises(StorageFullError):
+            writer.append(b"lost", 5)
+    writer.append(PAYLOADS[1], 5)
+    writer.close()
+    found = read_rows(tmp_path, "force")
+    assert [read_payload(tmp_path, "force", row) for row in found] == PAYLOADS[:2]
+
+
+def test_payloads_are_synced_before_the_rows_that_vouch_for_them(tmp_path, monkeypatch):
+    synced = []
+    writer = JournalWriter(tmp_path, "force")
+    writer.append(PAYLOADS[0], 5)
+    monkeypatch.setattr(
+        os, "fdatasync", lambda file: synced.append(Path(f"/proc/self/fd/{file}").readlink().name)
+    )
+    writer.sync()
+    writer.close()
+    assert synced == ["force.part", "force.journal"]

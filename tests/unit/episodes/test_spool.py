@@ -2,12 +2,13 @@
 
 import errno
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dextouch.episodes import spool
-from dextouch.episodes.spool_log import HEADER_BYTES, LOG_FILE, LOG_MAGIC
+from dextouch.episodes.spool_log import HEADER_BYTES, LOG_FILE, LOG_MAGIC, open_log
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
@@ -83,6 +84,27 @@ def test_resume_goes_on_where_it_stopped(path):
     assert_same(reader.read("camera_head"), camera_batch(0, 3))
 
 
+def test_a_spool_that_is_resumed_takes_nothing_from_before_its_last_sample(path):
+    with spool.SpoolWriter(path, ATTRIBUTES) as writer:
+        writer.append("glove_left", glove_batch(0, 5))
+    with spool.SpoolWriter.resume(path) as writer:
+        with pytest.raises(InvalidInputError, match="goes back"):
+            writer.append("glove_left", glove_batch(3))
+        writer.append("glove_left", glove_batch(5))
+
+
+def test_what_a_crashed_process_wrote_is_synced_before_it_counts(path, monkeypatch):
+    writer = spool.SpoolWriter(path, ATTRIBUTES)
+    writer.append("glove_left", glove_batch(0))
+    writer.abandon()
+    synced = []
+    monkeypatch.setattr(
+        "os.fdatasync", lambda file: synced.append(Path(f"/proc/self/fd/{file}").readlink().name)
+    )
+    spool.SpoolWriter.resume(path).abandon()
+    assert LOG_FILE in synced
+
+
 def test_samples_come_back_by_place_and_by_append(path):
     with spool.SpoolWriter(path, ATTRIBUTES) as writer:
         for first, count in ((0, 3), (3, 1), (4, 5)):
@@ -153,6 +175,34 @@ def test_zeroed_bytes_at_the_end_are_dropped(gloves):
     report = recover(gloves)
     assert report.num_samples["glove_left"] == 8
     assert report.dropped_bytes == 2 * GLOVE_RECORD
+
+
+def test_all_records_whose_bodies_did_not_reach_the_disk_are_dropped(path):
+    """Their headers did, in a take that was not closed before the power went."""
+    writer = spool.SpoolWriter(path, ATTRIBUTES)
+    for first in range(5):
+        writer.append("glove_left", glove_batch(first))
+    writer.abandon()
+    file = path / LOG_FILE
+    data = bytearray(file.read_bytes())
+    for number in (3, 4):
+        start = len(LOG_MAGIC) + number * GLOVE_RECORD + HEADER_BYTES
+        data[start : start + GLOVE_BODY] = bytes(GLOVE_BODY)
+    file.write_bytes(data)
+    with spool.SpoolWriter.resume(path) as writer:
+        assert writer.num_samples("glove_left") == 3
+        writer.append("glove_left", glove_batch(3, 2))
+    assert_same(spool.SpoolReader(path).read("glove_left"), glove_batch(0, 5))
+
+
+def test_a_mark_is_found_across_the_blocks_that_are_searched(tmp_path):
+    """Blocks are of 1 MiB; the mark begins before, on and behind their border."""
+    file = tmp_path / LOG_FILE
+    for place in range(2**20 - 4, 2**20 + 2):
+        file.write_bytes(LOG_MAGIC + bytes(place - len(LOG_MAGIC)) + b"DXTS" + bytes(100))
+        with open_log(tmp_path) as log:
+            assert log.find(b"DXTS", len(LOG_MAGIC) - 8) == place
+            assert log.find(b"DXTS", place + 1) == -1
 
 
 @pytest.mark.parametrize("place", [0, 5, 13, 20, 25, 30, 37])

@@ -9,6 +9,7 @@ from scipy import stats
 from dextouch.errors import InvalidInputError, ShapeError
 from services.evaluation.agreement import (
     FIGURES,
+    MAX_PERMUTATIONS,
     chance_of_correlation,
     figures_of_draws,
     paired_differences,
@@ -84,6 +85,11 @@ def test_sign_flips_are_those_of_scipy(num_starts):
     assert sign_flip_p(np.zeros(5), rng()) == 1.0
 
 
+def test_a_p_value_of_drawn_signs_is_never_zero():
+    """Of 2^60 sign patterns none that is drawn is as large as the true one, which counts."""
+    assert sign_flip_p(np.ones(60), rng()) == pytest.approx(1 / (MAX_PERMUTATIONS + 1))
+
+
 def test_paired_difference_by_hand():
     # Three starts of ten that only the first policy solves: p12 = 4/12, p21 = 1/12, so the centre
     # is 0.25 and the variance (5/12 - 0.0625) / 12.
@@ -107,6 +113,16 @@ def test_noise_of_ten_successes_by_hand():
     assert found[0, 0] == pytest.approx((11 / 12) * (1 / 12) / 10, rel=1e-5)
     assert found[1, 1] == pytest.approx(0.25 / 10, rel=1e-5)
     assert found[0, 1] == 0
+
+
+def test_correlations_of_few_starts_are_shrunk_by_hand():
+    """By 1 - 4 / starts: to a third with six, to nothing with four and fewer."""
+    six = np.array([[1.0, 1, 1, 0, 0, 1], [1, 0, 1, 0, 0, 1]])
+    found = noise_covariance(six)
+    correlation = found[0, 1] / math.sqrt(found[0, 0] * found[1, 1])
+    assert correlation == pytest.approx(np.corrcoef(six)[0, 1] / 3, rel=1e-4)
+    for num_starts in (2, 3, 4):
+        assert noise_covariance(six[:, 1 : 1 + num_starts])[0, 1] == 0
 
 
 def test_noise_shared_by_series_is_seen():

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 
 from dextouch.errors import InvalidInputError
 from services.evaluation.command_line import print_scores
@@ -42,6 +43,16 @@ def test_rates_and_intervals():
     assert row["imagined_rollouts"] == 4
     assert row["imagined_probability"] == pytest.approx((3 * 0.9 + 0.2) / 4)
     assert row["other_worlds"]["copy"]["success"] == 0.0
+
+
+def test_repeats_of_a_start_do_not_narrow_its_interval():
+    """Three of four starts solved, each five times: the interval is that of three of four."""
+    repeated = report({"real": {"a": "1110"}})
+    repeated = replace(repeated, scores=repeated.scores * 5)
+    (row,) = repeated.policy_rows()
+    expected = binomtest(3, 4).proportion_ci(method="wilson")
+    assert row["real_interval"] == pytest.approx([expected.low, expected.high])
+    assert row["real_rollouts"] == 20
 
 
 def test_agreement_by_hand():
@@ -243,6 +254,12 @@ def test_agreement_of_all_tasks_correlates_all_policies_of_all_tasks():
 
 def test_probe_is_judged_on_real_rollouts():
     assert report(GOOD).to_report()["probe_accuracy_on_real"] == 1.0
+    # From one half on, a probability says success.
+    two = report({"real": {"a": "10"}})
+    even = replace(two, scores=tuple(replace(score, probability=0.5) for score in two.scores))
+    assert even.probe_accuracy() == 0.5
+    sure = replace(two, scores=(even.scores[0], two.scores[1]))
+    assert sure.probe_accuracy() == 1.0
 
 
 def test_different_starts_are_not_compared():

@@ -96,6 +96,16 @@ def test_the_shortest_interval_reaches_the_bound_where_draws_crowd():
     assert (interval.low, interval.high) == pytest.approx((0.7, 1.0), abs=0.02)
 
 
+@pytest.mark.parametrize(
+    ("confidence", "high"), [(0.8, 7.0), (0.81, 8.0), (0.9, 8.0), (0.91, 99.0)]
+)
+def test_the_shortest_interval_holds_at_least_its_share(confidence, high):
+    """Of ten draws: eight, nine and all of them."""
+    draws = np.array([99.0, 8, 7, 6, 5, 4, 3, 2, 1, 0])
+    interval = shortest_interval(draws, confidence=confidence)
+    assert (interval.low, interval.high) == (0.0, high)
+
+
 def test_an_interval_of_mostly_undefined_draws_is_none():
     draws = np.full(10, np.nan)
     draws[:5] = 0.5

@@ -64,6 +64,8 @@ def test_a_run_ends_with_the_tighter_limit(clock):
     assert run(Budget(5.0)) == [0.0, 0.4, 0.8, 1.2]
     assert run(Budget(1e9, 4)) == [0.25, 0.5, 0.75, 1.0]
     assert run(Budget(max_steps=2)) == [0.5, 1.0]
+    # The steps lead at first, then the time.
+    assert run(Budget(5.0, 4)) == [0.25, 0.5, 0.8, 1.2]
 
 
 def test_paused_time_does_not_count_and_a_resumed_run_goes_on(clock):

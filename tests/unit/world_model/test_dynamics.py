@@ -127,6 +127,16 @@ def test_features_of_empty_slots_are_zero_and_of_moved_scenes_the_same():
     torch.testing.assert_close(one, other, atol=1e-4, rtol=0)
 
 
+def test_features_end_with_the_axes_and_twice_the_joint_angles():
+    """In the order and scale that trained weights expect."""
+    points = torch.zeros(1, 1, 2, 2, 6, 3)
+    axes = torch.arange(12.0).reshape(1, 1, 2, 6)
+    joints = torch.arange(40.0).reshape(1, 1, 2, 20) / 10
+    found = command_features(points, axes, joints, objects())[0, 0]
+    np.testing.assert_allclose(found[-52:-40], np.arange(12))
+    np.testing.assert_allclose(found[-40:], np.arange(40) / 5, rtol=1e-6)
+
+
 def test_distances_are_compressed_as_written():
     assert float(compressed(torch.tensor(0.0))) == 0.0
     np.testing.assert_allclose(float(compressed(torch.tensor(0.01))), np.log(1 + np.sqrt(2)) / 2)

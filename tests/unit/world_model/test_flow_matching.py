@@ -7,6 +7,7 @@ from dextouch.errors import InvalidInputError
 from services.world_model.network.flow_matching import (
     MIN_TIME,
     add_noise,
+    implied_noise,
     sample,
     shift_time,
     training_times,
@@ -22,6 +23,17 @@ def test_both_ends_of_the_path_are_exact():
     (clean, _), (noise, _) = _pair(0), _pair(1)
     assert torch.equal(add_noise(clean, noise, torch.zeros(3)), clean)
     assert torch.equal(add_noise(clean, noise, torch.ones(3)), noise)
+
+
+def test_the_noise_of_a_point_of_the_path_is_that_of_its_end():
+    """By hand: a third of the way from 3 to 9 lies 5."""
+    third, clean = torch.tensor([1 / 3]), torch.tensor([[3.0]])
+    torch.testing.assert_close(
+        add_noise(clean, torch.tensor([[9.0]]), third), torch.tensor([[5.0]])
+    )
+    torch.testing.assert_close(
+        implied_noise(torch.tensor([[5.0]]), clean, third), torch.tensor([[9.0]])
+    )
 
 
 def test_shifted_times_keep_their_ends_and_lean_to_noise():

@@ -17,7 +17,7 @@ from dextouch.errors import (
 from dextouch.geometry import transform
 from dextouch.hands.actions import AnchorPoses
 from dextouch.hands.robot_hand import RobotHand
-from services.world_model.network.conditioning import SceneEncoder
+from services.world_model.network.conditioning import ActionNormalizer, SceneEncoder
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.instruction import NO_WORD, hash_words
 from services.world_model.network.mirroring import (
@@ -65,6 +65,25 @@ def test_a_camera_shift_to_the_right_is_one_to_the_left_for_the_left_hand():
     camera = camera_features(actions)
     np.testing.assert_allclose(camera[0, 0], [-0.1, 0.2, 0.3, 1, 0, 0, 0, 1, 0])
     np.testing.assert_allclose(camera[0, 1], actions[0, 58:67])
+
+
+def test_each_hand_sees_itself_first_then_the_other_within_ten_deviations(request_, tiny_config):
+    inputs = build_inputs([request_], tiny_config)
+    hands, camera = torch.empty_like(inputs.hands), torch.zeros_like(inputs.camera)
+    hands[:, :, 0], hands[:, :, 1] = 2.0, -30.0
+    # Turns are relative to none, shifts in 5 cm.
+    camera[..., 3] = camera[..., 7] = 1.0
+    camera[:, :, 0, 0] = 0.1
+    camera[:, :, 1, 0] = 9.0
+    # Places are in 10 cm from half a metre before the camera.
+    layout = torch.zeros_like(inputs.layout)
+    layout[:, 0, 2], layout[:, 1, :3] = 0.7, torch.tensor([0.1, 0.0, 0.5])
+    seen = ActionNormalizer()(replace(inputs, hands=hands, camera=camera, layout=layout))
+    left, right = [2.0] * 29, [-10.0] * 29
+    rows = [[*left, *right, 2.0, *[0.0] * 8], [*right, *left, 10.0, *[0.0] * 8]]
+    torch.testing.assert_close(seen.per_hand[0, 5], torch.tensor(rows))
+    near, aside = [0.0, 0.0, 2.0, *[0.0] * 6], [1.0, *[0.0] * 8]
+    torch.testing.assert_close(seen.layout[0], torch.tensor([near + aside, aside + near]))
 
 
 def test_the_raster_shows_the_hands_where_they_are(toy_episode, tiny_config):

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents
 from services.world_model.training.dataset import WindowSampler
-from services.world_model.training.objective import losses
+from services.world_model.training.objective import LossOptions, contact_or_changing, losses
 from services.world_model.training.training_run import TrainingRun
 
 
@@ -56,6 +57,50 @@ def test_touch_that_was_not_measured_does_not_count(tiny_model, batch):
     batch.tactile_valid[:, 0, 1] = False
     loss = _loss_of_errors(tiny_model, batch, video=video, tactile=tactile)
     assert loss.tactile.item() == pytest.approx(1.0)
+
+
+def test_tokens_in_contact_or_changing_by_hand():
+    """Contact begins at 2 kPa, a change at 0.5 kPa since the step before."""
+    touch = torch.zeros(1, 4, 2, 320)
+    touch[0, :, 0, 0] = torch.tensor([2.0, 0.0, 0.0, 0.0])
+    touch[0, :, 0, 16] = torch.tensor([0.0, 0.5, 0.5, 0.5])
+    touch[0, :, 0, 32] = torch.tensor([1.0, 1.0, 0.5, 0.5])
+    touch[0, :, 0, 48] = torch.tensor([1.5, 1.75, 2.0, 1.75])
+    touch[0, :, 0, 64] = torch.tensor([0.0, 0.4, 0.8, 1.2])
+    touch[0, :, 1, 319] = torch.tensor([1.9, 1.9, 1.9, 2.4])
+    # Contact at the start counts for the whole window.
+    left = ["xxxx", ".x..", "..x.", "..x.", "....", "...."]
+    right = ["....", "....", "....", "....", "....", "...x"]
+    found = contact_or_changing(touch, 6)[0]
+    assert found.shape == (4, 2, 6)
+    for hand, expected in enumerate((left, right)):
+        assert ["".join(".x"[int(on)] for on in token) for token in found[:, hand].T] == expected
+    assert contact_or_changing(touch, 1)[0, :, :, 0].tolist() == [[True, False]] * 3 + [
+        [True, True]
+    ]
+
+
+def test_noise_on_the_start_is_at_most_its_share(tiny_model, batch):
+    given = []
+    truth = tiny_model.first_latents(build_inputs(batch.requests, tiny_model.config))
+    target = tiny_model.targets(batch.images, batch.tactile_kpa)
+
+    def forward(_inputs, first, *_):
+        given.append(first)
+        return target
+
+    tiny_model.forward = forward
+    for share in (0.0, 0.1):
+        options, generator = LossOptions(context_noise=share), torch.Generator().manual_seed(0)
+        losses(tiny_model, batch, generator=generator, options=options)
+    for name in ("video", "tactile"):
+        clean, plain, noisy = (getattr(first, name) for first in (truth, *given))
+        assert torch.equal(plain, clean)
+        # Of each window from none to a tenth of the deviation, within the scatter of few numbers.
+        deviation = (noisy - clean).flatten(1).square().mean(dim=1).sqrt() / clean.std()
+        assert (deviation > 0).all()
+        assert (deviation < 0.13).all()
+        assert deviation.max() > 0.01
 
 
 def test_the_weight_of_touch_scales_its_gradients(toy_episodes, train_settings):

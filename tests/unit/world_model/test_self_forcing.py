@@ -38,7 +38,11 @@ def test_the_second_chunk_begins_like_that_of_a_served_rollout(
     checkpoint, batch, toy_episodes, monkeypatch
 ):
     monkeypatch.setattr(self_forcing, "OWN_CONTEXT_SHARE", 1.0)
+    # Not measured: step 3 of the first chunk, and step 4 of the second, of one hand each.
+    batch.tactile_valid[1, 3, 1] = batch.tactile_valid[2, 16 + 4, 0] = False
     seconds = own_context(checkpoint.model, batch, generator=generator(), processes=Processes())
+    assert (~seconds.tactile_valid).nonzero().tolist() == [[2, 4, 0]]
+    assert seconds.tactile_valid.shape == (3, 17, 2)
     world = ModelWorld(checkpoint)
     for index, (given, made) in enumerate(zip(batch.requests, seconds.requests, strict=True)):
         start = make_start(toy_episodes[index], 2 * index)

@@ -125,6 +125,32 @@ async def test_in_a_failed_batch_only_the_guilty_fails():
     worker.close()
 
 
+class NotedBatch(GatedBatch):
+    """Keeps what each single step began with."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.totals: list[float] = []
+
+    def step(self, state, actions, *, seed, selector=EVERYTHING):
+        self.totals.append(state.total)
+        return super().step(state, actions, seed=seed, selector=selector)
+
+
+async def test_a_failed_batch_is_repeated_in_order_before_what_came_later():
+    worker = WorldWorker(NotedBatch())
+    bad = StepJob(SumState(0, 2.0), actions(4, 1e6), 1)
+    jobs = [job(1.0), bad, job(3.0), job(4.0, num_steps=8)]
+    first, others = await queue_behind_one(worker, jobs)
+    worker.world.totals.clear()
+    worker.world.gate.set()
+    await first
+    await asyncio.gather(*others, return_exceptions=True)
+    # The failed batch may have stepped some of its own before.
+    assert worker.world.totals[-4:] == [1.0, 2.0, 3.0, 4.0]
+    worker.close()
+
+
 async def test_a_full_queue_refuses_and_recovers():
     worker = WorldWorker(GatedSum(), max_waiting=2)
     first, others = await queue_behind_one(worker, [job(), job()])

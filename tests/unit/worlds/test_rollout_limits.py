@@ -147,6 +147,21 @@ async def test_memory_stays_flat_over_abandoned_rollouts():
     made.close()
 
 
+async def test_as_many_states_are_held_as_rollouts_may_live():
+    made, other = (service(store, max_rollouts=3) for store in [MemoryState()] * 2)
+    first, second, third = [await begin(made) for _ in range(3)]
+    assert made.num_live == 3
+    await made.delete(second)
+    assert made.num_live == 2
+    # One that another process deletes and replaces makes room: the least recently used one goes.
+    await made.step(first, 0, actions(4), ALL)
+    await other.delete(third)
+    fourth, fifth = [await begin(made) for _ in range(2)]
+    assert list(made._live) == [first, fourth, fifth]
+    for each in (made, other):
+        each.close()
+
+
 async def test_the_states_of_abandoned_rollouts_are_dropped():
     now_s = [0.0]
     store = MemoryState(clock_s=lambda: now_s[0])

@@ -40,6 +40,16 @@ async def test_rollouts_of_one_key_are_limited(state):
     made.close()
 
 
+async def test_keys_do_not_share_their_limit():
+    """Seventeen keys: of their ids two begin with the same hexadecimal digit."""
+    made = service(max_rollouts=100, max_rollouts_per_key=1)
+    for number in range(17):
+        await made.start("sum", START, ALL, owner=f"key-{number}")
+    with pytest.raises(LimitExceededError, match="of 1 of one key"):
+        await made.start("sum", START, ALL, owner="key-3")
+    made.close()
+
+
 async def test_a_draining_service_continues_but_begins_nothing():
     made = service()
     rollout = await begin(made)
@@ -90,6 +100,8 @@ async def test_a_rollout_keeps_the_digest_it_began_with(state):
     assert decoded(await after.start("sum", START, ALL)).rollout.world_digest == "d2"
     with pytest.raises(ConflictError, match="of digest d0, this process has d2"):
         await after.step(lost, 0, actions(4), ALL)
+    with pytest.raises(ConflictError, match="of digest d0, this process has d2"):
+        await after.fork(lost)
     before.close()
     after.close()
 

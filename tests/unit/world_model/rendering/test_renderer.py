@@ -11,6 +11,7 @@ from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from services.world_model.rendering.camera_motion import CameraMotion, sample_images
 from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.inputs import Scenes, drawing_inputs
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.renderer import Renderer
 from services.world_model.rendering.scene_states import SceneState, SceneStates
@@ -74,6 +75,38 @@ def test_without_redrawing_the_table_only_bodies_change_under_a_moving_camera(im
     expected = (warped[0].permute(1, 2, 0).clamp(0, 1) * 255).round().numpy()
     # The right edge shows what the start image lacks, and is the network's.
     np.testing.assert_array_equal(drawn[:, :55], expected[:, :55].astype(np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("at_start", "now", "is_drawn"),
+    [(True, True, True), (True, False, False), (False, True, False), (False, False, False)],
+)
+def test_an_object_is_drawn_that_was_there_at_the_start_and_still_is(
+    image, still, small, at_start, now, is_drawn
+):
+    """Its colours come from the start image; the other object is never there."""
+    first, then = (
+        replace(still, object_present=np.array([present, False])) for present in (at_start, now)
+    )
+    scenes = Scenes(image[None], K[None], SceneStates.stack([first]), BOXES_M[None])
+    drawn = drawing_inputs(scenes, SceneStates.stack([then]), np.zeros(1, dtype=np.int64), small)
+    # Three channels of the warped start image, then those of the objects.
+    assert bool(drawn.fine[:, 3:6].any()) == is_drawn
+
+
+@pytest.mark.parametrize("redraws_table", [True, False])
+def test_the_table_is_redrawn_as_the_camera_moves_if_it_may_be(image, still, redraws_table):
+    """By 1 mm of 60 cm: a tenth of a pixel or so. The box moves, too."""
+    config = RendererConfig(widths=(8, 16), depths=(1, 1), redraws_table=redraws_table)
+    moved = shifted(still, camera_m=(0.001, 0.0, 0.0), objects_m=(0.03, 0.0, 0.0))
+    scenes = Scenes(image[None], K[None], SceneStates.stack([still]), BOXES_M[None])
+    states, owner = SceneStates.stack([moved]), np.zeros(1, dtype=np.int64)
+    change = drawing_inputs(scenes, states, owner, config).change[0, 0]
+    # A shift of focal length / 600, of a quarter of a pixel that counts as all.
+    share = K[0, 0] / 600 / 0.25
+    assert change.max() == 1.0
+    table = change[-4:, 20:44]
+    np.testing.assert_allclose(table, share if redraws_table else 0.0, rtol=1e-3)
 
 
 @pytest.mark.parametrize("uses_bfloat16", [False, True])
