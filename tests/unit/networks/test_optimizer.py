@@ -64,8 +64,15 @@ def test_a_run_ends_with_the_tighter_limit(clock):
     assert run(Budget(5.0)) == [0.0, 0.4, 0.8, 1.2]
     assert run(Budget(1e9, 4)) == [0.25, 0.5, 0.75, 1.0]
     assert run(Budget(max_steps=2)) == [0.5, 1.0]
-    # The steps lead at first, then the time.
-    assert run(Budget(5.0, 4)) == [0.25, 0.5, 0.8, 1.2]
+
+
+def test_a_run_is_as_complete_as_the_tighter_limit_says(clock):
+    budget = Budget(10.0, 4)
+    # 1 of 10 s and 1 of 4 steps; then 8 of 10 s and 2 of 4 steps.
+    for seconds, share in ((1.0, 0.25), (7.0, 0.8)):
+        clock[0] += seconds
+        budget.advance()
+        assert budget.share() == share
 
 
 def test_paused_time_does_not_count_and_a_resumed_run_goes_on(clock):
