@@ -10,11 +10,13 @@ from starlette.concurrency import run_in_threadpool
 from dextouch.episodes import disk_errors
 from dextouch.serving import create_service_app, serve
 from services.acquisition.clock import StationClock
+from services.acquisition.deleted_takes import DeletedTakes, OperatorNames
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.enrolment import with_enrolment
 from services.acquisition.health import HealthCollector
 from services.acquisition.memory import keep_for_life
-from services.acquisition.metrics import RecorderCollector
+from services.acquisition.metrics import RecorderCollector, SpoolCollector
+from services.acquisition.recorder import Recorder
 from services.acquisition.routes import (
     live_router,
     recorder_router,
@@ -23,7 +25,7 @@ from services.acquisition.routes import (
 )
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import Station
-from services.acquisition.uploader import Uploader, recover_spool
+from services.acquisition.uploader import Uploader, ids_in_store, recover_spool
 
 if TYPE_CHECKING:
     from services.acquisition.mock_station import MockStation
@@ -73,7 +75,7 @@ def _mock_station(settings: AcquisitionSettings) -> "MockStation":
     )
 
 
-def _make_uploader(settings: AcquisitionSettings) -> Uploader:
+def _make_uploader(settings: AcquisitionSettings, recorder: Recorder) -> Uploader:
     store = None
     if settings.episode_store_url is not None:
         from dextouch.clients import EpisodeStoreClient
@@ -86,7 +88,13 @@ def _make_uploader(settings: AcquisitionSettings) -> Uploader:
         settings.spool,
         store,
         period_s=settings.upload_period_s,
-        keep_uploaded=settings.keep_uploaded,
+        retention=settings,
+        deleted=DeletedTakes(
+            settings.spool,
+            settings.station,
+            stored_as=ids_in_store,
+            operators=OperatorNames(recorder.session_operators, recorder.forget_operator),
+        ),
     )
 
 
@@ -107,7 +115,7 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
     recover_spool(settings.spool)
     mock = _mock_station(settings) if settings.mock else None
     station = _real_station(settings) if mock is None else mock.station
-    uploads = uploader or _make_uploader(settings)
+    uploads = uploader or _make_uploader(settings, station.recorder)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -115,6 +123,7 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
         collectors = (
             HealthCollector(station.health.report, station.health.raised),
             RecorderCollector(station.recorder.status, uploads.counts),
+            SpoolCollector(uploads.retention),
         )
         for collector in collectors:
             app.state.registry.register(collector)

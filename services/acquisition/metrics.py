@@ -1,4 +1,4 @@
-"""Prometheus metrics of a station's recorder and uploads."""
+"""Prometheus metrics of a station's recorder, uploads and spool."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import get_args
@@ -8,6 +8,7 @@ from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
 from dextouch.schemas import RecorderState, RecorderStatus
+from services.acquisition.retention import DAY_S, GIGABYTE, SpoolRetention
 
 
 class RecorderCollector(Collector):
@@ -38,3 +39,32 @@ class RecorderCollector(Collector):
         for upload, number in self._takes().items():
             takes.add_metric((upload,), number)
         yield takes
+
+
+class SpoolCollector(Collector):
+    """Shows how much of the disk takes occupy, and how long acknowledged ones stay.
+
+    Args:
+        retention: of the spool.
+    """
+
+    def __init__(self, retention: SpoolRetention) -> None:
+        self._retention = retention
+
+    def collect(self) -> Iterator[Metric]:
+        """All metrics of this moment."""
+        text = "Bytes of takes in the spool by what became of their upload."
+        sizes = GaugeMetricFamily("dextouch_spool_bytes", text, labels=("state",))
+        for state, num_bytes in self._retention.use().items():
+            sizes.add_metric((state,), num_bytes)
+        yield sizes
+        limits = self._retention.limits
+        text = "How long takes stay in the spool after the store acknowledged them."
+        yield GaugeMetricFamily(
+            "dextouch_spool_keep_seconds", text, limits.keep_uploaded_days * DAY_S
+        )
+        if limits.keep_uploaded_gb is not None:
+            text = "Bytes of acknowledged takes that stay in the spool at most."
+            yield GaugeMetricFamily(
+                "dextouch_spool_keep_bytes", text, limits.keep_uploaded_gb * GIGABYTE
+            )

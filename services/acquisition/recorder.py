@@ -186,6 +186,16 @@ class Recorder:
             self._session.begin()
             return self.status()
 
+    def session_operators(self) -> tuple[str, ...]:
+        """Pseudonyms that the session's counts name."""
+        with self._lock:
+            return self._session.operators()
+
+    def forget_operator(self, operator: str) -> None:
+        """Remove a pseudonym from the session's counts."""
+        with self._lock:
+            self._session.forget(operator)
+
     def close(self) -> None:
         """Give the files back; an unsaved take stays in the spool for the next start."""
         with self._lock:

@@ -45,6 +45,16 @@ class SessionCount:
         )
         self._write(self.now.model_copy(update={"saved": saved, "last_saved": recording_id}))
 
+    def operators(self) -> tuple[str, ...]:
+        """All operators that the counts name."""
+        names = {item.operator for item in self.now.saved}
+        return tuple(sorted(name for name in names if name is not None))
+
+    def forget(self, operator: str) -> None:
+        """Remove an operator's counts."""
+        saved = tuple(item for item in self.now.saved if item.operator != operator)
+        self._write(self.now.model_copy(update={"saved": saved}))
+
     def _write(self, session: RecorderSession) -> None:
         self.now = session
         try:

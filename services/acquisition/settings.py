@@ -10,6 +10,7 @@ from dextouch.frozen_model import FrozenModel
 from dextouch.serving import ServiceSettings, service_config
 from services.acquisition.devices.kinds import ChosenDevice
 from services.acquisition.mock_links import MockLinks
+from services.acquisition.retention import Retention
 
 
 class SpoolSafety(FrozenModel):
@@ -28,7 +29,7 @@ class SpoolSafety(FrozenModel):
     )
 
 
-class AcquisitionSettings(ServiceSettings, SpoolSafety):
+class AcquisitionSettings(ServiceSettings, SpoolSafety, Retention):
     """Record the gloves, trackers, robots and cameras of a station, and serve them over HTTP.
 
     --devices lists the real devices. With --mock devices are simulated and replay an episode of a
@@ -84,7 +85,6 @@ class AcquisitionSettings(ServiceSettings, SpoolSafety):
     upload_period_s: float = Field(
         default=2.0, gt=0, le=3600, description="seconds between checks for takes to upload"
     )
-    keep_uploaded: bool = Field(default=True, description="keep uploaded takes in the spool")
 
     @model_validator(mode="after")
     def _mock_or_devices(self) -> "AcquisitionSettings":

@@ -1,7 +1,6 @@
 """Upload of saved takes from a station's spool to the episode store, each exactly once."""
 
 import hashlib
-import shutil
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,6 +24,7 @@ from dextouch.errors import (
 )
 from dextouch.schemas import (
     ID_TAKEN,
+    TAKE_DELETED,
     LedgerEntry,
     RecordingAttributes,
     RecordingStatus,
@@ -33,14 +33,21 @@ from dextouch.schemas import (
 )
 from dextouch.streams import StreamDescriptor, decode_body, frame_body
 from dextouch.tracing import in_trace, new_trace
+from services.acquisition.deleted_takes import DeletedTakes
 from services.acquisition.memory import give_back_free_memory
+from services.acquisition.retention import (
+    RECORDING_FILE,
+    REFUSED_FILE,
+    UPLOADED_FILE,
+    Retention,
+    SpoolRetention,
+    remove_take,
+    spooled_takes,
+    sweep_safely,
+)
 
 logger = structlog.get_logger(__name__)
 
-RECORDING_FILE = "recording.json"
-UPLOADED_FILE = "uploaded.json"
-# Holds the store's words about a take that it refused for good.
-REFUSED_FILE = "refused.txt"
 # Says why a take that a killed process left could not be recovered.
 DAMAGED_FILE = "damaged.txt"
 # A refusal may be a passing one (an upload that expired in between), but not so often in a row.
@@ -61,13 +68,15 @@ class Uploader:
     store says which batch it expects next.
 
     A take whose id another recording of the store has is stored under a second one, `second_id`. A
-    take that the store refuses permanently is quarantined: it stays in the spool until `retry`.
+    take that the store refuses permanently is quarantined: it stays in the spool until `retry`. One
+    that was deleted in the store is removed.
 
     Args:
         spool_root: folder of the takes.
         store: where they go, closed by `stop`; None keeps them in the spool.
         period_s: pause between two looks into the spool, and after a failure.
-        keep_uploaded: whether a take stays in the spool when the store has it.
+        retention: how long a take stays in the spool when the store has it.
+        deleted: removes takes that were deleted in the store; None leaves them.
     """
 
     def __init__(
@@ -76,12 +85,14 @@ class Uploader:
         store: EpisodeStoreClient | None,
         *,
         period_s: float,
-        keep_uploaded: bool = True,
+        retention: Retention | None = None,
+        deleted: DeletedTakes | None = None,
     ) -> None:
         self._spool_root = spool_root
         self._store = store
         self._period_s = period_s
-        self._keep_uploaded = keep_uploaded
+        self.retention = SpoolRetention(spool_root, retention or Retention())
+        self._deleted = deleted
         # The last error of each take, and how often in a row the store refused it.
         self._failures: dict[str, tuple[str, int]] = {}
         # How long the store asked to be left alone.
@@ -111,7 +122,7 @@ class Uploader:
 
     def counts(self) -> dict[str, int]:
         """Takes of the spool that wait, are uploaded, or were refused; a running one waits too."""
-        paths = _spools(self._spool_root)
+        paths = spooled_takes(self._spool_root)
         uploaded = sum((path / UPLOADED_FILE).exists() for path in paths)
         refused = sum((path / REFUSED_FILE).exists() for path in paths)
         waiting = len(paths) - uploaded - refused
@@ -121,7 +132,7 @@ class Uploader:
         """Every saved take, and every damaged one; or those alone that the store refused."""
         found = []
         refused = [self._spool_root / name for name in self.refused]
-        for path in refused if only_refused else _spools(self._spool_root):
+        for path in refused if only_refused else spooled_takes(self._spool_root):
             try:
                 is_closed, damage = _condition(path)
             except NotFoundError:
@@ -170,7 +181,7 @@ class Uploader:
         """
         done = []
         self._retry_after_s = 0.0
-        for path in _spools(self._spool_root):
+        for path in spooled_takes(self._spool_root):
             if (path / UPLOADED_FILE).exists() or (path / REFUSED_FILE).exists():
                 continue
             if self._stopping.is_set():
@@ -182,6 +193,8 @@ class Uploader:
                     self._failures.pop(path.name, None)
                     give_back_free_memory()
             except DexTouchError as error:
+                if self._is_removed_as_deleted(path, error):
+                    continue
                 self._note_failure(path, error)
                 if "retry_after_s" in error.details:
                     self._retry_after_s = float(str(error.details["retry_after_s"]))
@@ -206,6 +219,18 @@ class Uploader:
             error=error,
         )
 
+    def _is_removed_as_deleted(self, path: Path, refusal: DexTouchError) -> bool:
+        """Remove a take of which the store says that it was deleted; whether it is gone."""
+        if self._deleted is None or refusal.details.get("reason") != TAKE_DELETED:
+            return False
+        try:
+            self._deleted.remove_refused(path)
+        except StorageError as error:
+            self._note_failure(path, error)
+            return False
+        self._failures.pop(path.name, None)
+        return True
+
     def _note_failure(self, path: Path, error: DexTouchError) -> None:
         """Remember why a take was not sent, and set it aside once it is clear that it never is."""
         name = path.name
@@ -227,7 +252,10 @@ class Uploader:
 
     def _run(self) -> None:
         while not self._stopping.is_set():
+            if self._deleted is not None and self._store is not None:
+                self._deleted.remove(self._store)
             self.upload_all()
+            sweep_safely(self.retention)
             self._stopping.wait(max(self._period_s, self._retry_after_s))
 
     def _upload_traced(self, path: Path) -> bool:
@@ -272,10 +300,7 @@ class Uploader:
         logger.info("upload_take", recording_id=path.name, stored_as=recording_id)
         # Where this fails the take is sent again: the store then answers that it has everything.
         with disk_errors(f"note the upload of {path.name!r}"):
-            if self._keep_uploaded:
-                replace_file(path / UPLOADED_FILE, status.model_dump_json().encode())
-            else:
-                shutil.rmtree(path)
+            replace_file(path / UPLOADED_FILE, status.model_dump_json().encode())
         return True
 
 
@@ -316,6 +341,17 @@ def second_id(attributes: RecordingAttributes) -> str:
     return attributes.recording_id[: MAX_ID_CHARACTERS - len(suffix)] + suffix
 
 
+def ids_in_store(path: Path, about: RecordingAttributes | None) -> tuple[str, ...]:
+    """The id that the store has of a take; before its upload those that it may get.
+
+    `about` is None of a damaged take.
+    """
+    stored_as = _stored_as(path)
+    if stored_as is not None:
+        return (stored_as,)
+    return (path.name,) if about is None else (about.recording_id, second_id(about))
+
+
 def batch_samples(descriptor: StreamDescriptor) -> int:
     """Samples in each batch of a stream: fixed by what the stream is, never by chance."""
     return max(1, min(MAX_BATCH_SAMPLES, MAX_BATCH_BYTES // descriptor.sample_bytes()))
@@ -329,7 +365,7 @@ def recover_spool(spool_root: Path) -> list[str]:
     is left alone, and so is a damaged one, with the reason in its folder.
     """
     recovered = []
-    for path in _spools(spool_root):
+    for path in spooled_takes(spool_root):
         try:
             if not SpoolReader(path).closed and _recover(path):
                 recovered.append(path.name)
@@ -347,7 +383,7 @@ def _recover(path: Path) -> bool:
         return False
     if SpoolReader(path).is_empty():
         SpoolWriter.resume(path).abandon()
-        shutil.rmtree(path)
+        remove_take(path)
         logger.warning("remove_empty_take", recording_id=path.name)
         return False
     with SpoolWriter.resume(path) as spool:
@@ -415,7 +451,3 @@ def _stored_as(path: Path) -> str | None:
         return RecordingStatus.model_validate_json(note).recording_id
     except (ValidationError, FileNotFoundError):
         return None
-
-
-def _spools(spool_root: Path) -> list[Path]:
-    return sorted(path.parent for path in spool_root.glob(f"*/{RECORDING_FILE}"))

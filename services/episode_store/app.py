@@ -8,9 +8,11 @@ import structlog
 from fastapi import FastAPI
 
 from dextouch.episodes import EpisodeStore
+from dextouch.episodes.care import DeletionRecords
 from dextouch.errors import StorageError
 from dextouch.serving import create_service_app, serve
 from services.episode_store.catalog import Catalog
+from services.episode_store.deletions import DeletionWatch, deletions_router
 from services.episode_store.enrolment import Enrolments
 from services.episode_store.enrolment_routes import enrolment_router
 from services.episode_store.ingest import Ingest
@@ -36,6 +38,8 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         max_requests=settings.max_batches_in_flight, max_bytes=settings.max_bytes_in_flight
     )
     metrics = UploadMetrics()
+    deletions = DeletionRecords(store.root)
+    watch = DeletionWatch(deletions, ingest.drop_deleted, limits.end)
     enrolments = Enrolments(settings.enrolments or store.root / ENROLMENTS_FILE)
 
     @asynccontextmanager
@@ -43,9 +47,11 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         _recover(store)
         # The first listing of a large store takes seconds, so it is warmed up in the background.
         threading.Thread(target=_warm_up, args=(catalog,), name="warm-up", daemon=True).start()
+        watch.start()
         try:
             yield
         finally:
+            watch.stop()
             ingest.close()
 
     app = create_service_app(
@@ -58,6 +64,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
             content_router(store, settings),
             playback_router(store, settings),
             trash_router(store, max_page=settings.max_page),
+            deletions_router(deletions, enrolments.is_enrolled),
             enrolment_router(enrolments),
         ],
         lifespan=lifespan,

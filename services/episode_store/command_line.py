@@ -31,6 +31,7 @@ _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
     "show": inspect.show,
     "verify": inspect.verify,
     "delete": delete.delete,
+    "deletions": delete.deletions,
     "restore": delete.restore,
     "purge": delete.purge,
     "repair": repair.repair,
@@ -76,6 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_ids(_command(commands, kind, "migrate", "upgrade items of older format versions"))
     does = "move items to the trash, or delete them permanently"
     _add_delete(_command(commands, kind, "delete", does, "take-7 take-8"))
+    _add_deletions(_command(commands, shared, "deletions", _DELETIONS))
     restore = _command(commands, shared, "restore", "restore items from the trash", "take-7")
     restore.add_argument("--kind", choices=TRASH_KINDS, help="required if an id has several kinds")
     restore.add_argument("ids", nargs="+", metavar="ID", help="of what is restored")
@@ -108,6 +110,19 @@ def _add_ids(command: argparse.ArgumentParser) -> None:
     command.add_argument("ids", nargs="*", metavar="ID", help="default: all")
 
 
+_DELETIONS = "list permanent deletions and what stations have yet to remove"
+
+
+def _add_deletions(command: argparse.ArgumentParser) -> None:
+    chosen = command.add_mutually_exclusive_group()
+    chosen.add_argument("--operator", metavar="P", help="only that of this operator pseudonym")
+    chosen.add_argument("--recording", metavar="ID", help="only that of this recording")
+    command.add_argument("--readmit", metavar="P", help="let a deleted operator record again")
+    command.add_argument(
+        "--settle", metavar="STATION", help="state that its spool no longer exists"
+    )
+
+
 def _add_delete(command: argparse.ArgumentParser) -> None:
     command.add_argument("ids", nargs="*", metavar="ID", help="of what is deleted")
     command.add_argument(
@@ -116,6 +131,11 @@ def _add_delete(command: argparse.ArgumentParser) -> None:
     command.add_argument("--operator", metavar="P", help="all data of this operator pseudonym")
     command.add_argument("--recording", metavar="ID", help="delete this recording")
     command.add_argument("--derived", action="store_true", help="also everything derived from it")
+    command.add_argument(
+        "--unsent",
+        action="store_true",
+        help="with --operator: also if the store has nothing of him and only stations may",
+    )
     command.add_argument("--yes", action="store_true", help="skip the confirmation")
     command.add_argument("--receipt", metavar="PATH", help="file for the deletion receipt")
     command.add_argument(

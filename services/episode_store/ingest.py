@@ -13,9 +13,15 @@ from weakref import WeakValueDictionary
 import structlog
 
 from dextouch.episodes import EpisodeStore, check_id, disk_errors
-from dextouch.episodes.care import UPLOADS
-from dextouch.episodes.spool import SpoolReader, SpoolWriter
-from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnavailableError
+from dextouch.episodes.care import UPLOADS, DeletionRecords
+from dextouch.episodes.spool import SpoolReader, SpoolWriter, read_attributes
+from dextouch.errors import (
+    ConflictError,
+    InvalidInputError,
+    NotFoundError,
+    StorageError,
+    UnavailableError,
+)
 from dextouch.schemas import (
     ID_TAKEN,
     BatchReceipt,
@@ -32,6 +38,7 @@ from services.episode_store.committing import (
     check_content,
     commit_spool,
 )
+from services.episode_store.deletions import refuse_deleted
 from services.episode_store.senders import ANYONE, Sender, owner_of
 from services.episode_store.settings import EpisodeStoreSettings
 
@@ -97,6 +104,7 @@ class Ingest:
         self._open: OrderedDict[str, SpoolWriter] = OrderedDict()
         self._locks = KeyedLocks(patience_s=PATIENCE_S)
         self._guard = threading.Lock()
+        self._deletions = DeletionRecords(store.root)
 
     def create(self, attributes: RecordingAttributes, sender: Sender = ANYONE) -> RecordingStatus:
         """Begin an upload, or return the status of an existing one.
@@ -104,11 +112,13 @@ class Ingest:
         Raises:
             InvalidInputError: a recording without a stream.
             AccessDeniedError: the sender's key is bound to another station.
-            ConflictError: the id is taken by another recording, or by an upload of another key.
+            ConflictError: the id is taken by another recording, or by an upload of another key, or
+                this one was deleted.
         """
         recording_id = attributes.recording_id
         sender.check_station(attributes.station)
         with self._working_on(recording_id):
+            refuse_deleted(self._deletions, attributes)
             if self._store.exists(recording_id, kind="recording"):
                 _check_same(attributes, self._store.recording(recording_id).attributes)
                 return RecordingStatus(recording_id=recording_id, state="finished")
@@ -162,7 +172,9 @@ class Ingest:
             StorageFullError: no space; acknowledged batches are kept.
         """
         with self._working_on(recording_id):
-            return _put_batch(self._upload(recording_id, sender), stream, number, data)
+            spool = self._upload(recording_id, sender)
+            refuse_deleted(self._deletions, spool.attributes)
+            return _put_batch(spool, stream, number, data)
 
     def finish(
         self, recording_id: str, body: FinishRecording, sender: Sender = ANYONE
@@ -182,8 +194,10 @@ class Ingest:
             is_finished = self._store.exists(recording_id, kind="recording")
             if not is_finished:
                 spool = self._upload(recording_id, sender)
+                refuse_deleted(self._deletions, spool.attributes)
                 _check_announced(recording_id, _status(spool).next_batch, body)
                 is_finished = not self._move(spool, body)
+                self._undo_deleted(spool.attributes)
             content = {}
             if is_finished or body.content:
                 content = self._check_committed(recording_id, body, sender)
@@ -200,13 +214,27 @@ class Ingest:
             path = self._path(recording_id)
             if not path.exists() or idle_seconds(path) < idle_s:
                 return False
-            with self._guard:
-                spool = self._open.pop(recording_id, None)
-            if spool is not None:
-                spool.abandon()
-            shutil.rmtree(path)
+            self._drop(recording_id)
         logger.warning("upload_expired", recording_id=recording_id)
         return True
+
+    def drop_deleted(self) -> list[str]:
+        """Drop unfinished uploads of takes that were deleted permanently, and return their ids."""
+        gone = []
+        with disk_errors("list uploads"):
+            paths = sorted(self.folder.iterdir()) if self.folder.is_dir() else []
+        for path in (path for path in paths if "." not in path.name):
+            with self._working_on(path.name):
+                try:
+                    refuse_deleted(self._deletions, read_attributes(path))
+                    continue
+                except ConflictError:
+                    self._drop(path.name)
+                except (NotFoundError, StorageError):
+                    continue  # finished meanwhile, or damaged
+            logger.warning("deleted_upload_dropped", recording_id=path.name)
+            gone.append(path.name)
+        return gone
 
     def close(self) -> None:
         """Close all files, after a running commit; uploads continue after a restart."""
@@ -215,6 +243,22 @@ class Ingest:
                 self._open.popitem()[1].abandon()
         if self._process is not None:
             self._process.close()
+
+    def _drop(self, recording_id: str) -> None:
+        """Remove an upload; the caller holds its lock."""
+        with self._guard:
+            spool = self._open.pop(recording_id, None)
+        if spool is not None:
+            spool.abandon()
+        shutil.rmtree(self._path(recording_id), ignore_errors=True)
+
+    def _undo_deleted(self, attributes: RecordingAttributes) -> None:
+        """Remove a recording that was deleted while it was committed, when nothing lists it."""
+        try:
+            refuse_deleted(self._deletions, attributes)
+        except ConflictError:
+            self._store.delete(attributes.recording_id, kind="recording", for_good=True)
+            raise
 
     def _move(self, spool: SpoolWriter, body: FinishRecording) -> bool:
         """Commit an upload; whether we did, and not the process of a previous service."""

@@ -1,20 +1,23 @@
-"""Commands `delete`, `restore` and `purge`."""
+"""Commands `delete`, `deletions`, `restore` and `purge`."""
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
 from dextouch.episodes import TrashKind
 from dextouch.episodes.care import (
+    DeletionRecords,
     DeletionRequest,
     delete_for_good,
     plan_deletion,
     reviews_by,
 )
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, NotFoundError
 from services.episode_store.commands.context import EXIT_DAMAGED, Context, Outcome, readable_size
+from services.episode_store.deletions import deletion_statuses
 
 
 def delete(context: Context) -> Outcome:
@@ -26,9 +29,10 @@ def delete(context: Context) -> Outcome:
         raise InvalidInputError(
             "delete: got nothing to delete, expected ids, --operator or --recording"
         )
-    if options.derived or options.receipt or options.checkpoints:
+    if options.derived or options.receipt or options.checkpoints or options.unsent:
         raise InvalidInputError(
-            "delete: --derived, --receipt and --checkpoints go with --operator or --recording"
+            "delete: --derived, --receipt, --checkpoints and --unsent go with --operator or "
+            "--recording"
         )
     for item_id, kind in [(item_id, context.kind_of(item_id)) for item_id in options.ids]:
         context.store.delete(item_id, kind=kind, for_good=options.for_good)
@@ -60,11 +64,14 @@ def _delete_all_of(context: Context) -> Outcome:
         raise InvalidInputError("delete: not confirmed; nothing was removed")
     path = Path(options.receipt or f"deletion-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json")
     checkpoints = Path(options.checkpoints) if options.checkpoints else None
-    receipt = delete_for_good(root, request, path, checkpoints=checkpoints)
+    unsent = options.unsent and options.operator is not None
+    receipt = delete_for_good(root, request, path, checkpoints=checkpoints, unsent=unsent)
     for reference in receipt.remaining:
         context.say(f"{reference.where}  still names {', '.join(reference.names)}")
     for place in receipt.unreadable:
         context.say(f"{place}  cannot be read; repair or delete it, then repeat")
+    for one in receipt.outstanding:
+        context.say(_outstanding_line(one.station, one.recordings, has_answered=one.has_answered))
     context.say(
         f"{len(receipt.deleted)} removed, {len(receipt.unnamed_reviews)} reviews without a name, "
         f"{len(receipt.remaining)} references left, "
@@ -72,6 +79,39 @@ def _delete_all_of(context: Context) -> Outcome:
         f"receipt {path}"
     )
     return json.loads(json.dumps(asdict(receipt))), 0 if receipt.complete else EXIT_DAMAGED
+
+
+def _outstanding_line(station: str, recordings: Sequence[str], *, has_answered: bool) -> str:
+    held = ", ".join(recordings) or "takes not uploaded yet, if there are any"
+    why = "still in its spool" if has_answered else "it removes them when it next asks the store"
+    return f"station {station}  outstanding: {held} ({why})"
+
+
+def deletions(context: Context) -> Outcome:
+    """List permanent deletions and what stations have yet to remove."""
+    options, records = context.options, DeletionRecords(context.need_local_root())
+    if options.readmit is not None:
+        if not records.readmit(options.readmit):
+            raise NotFoundError(f"deletions: no deleted operator {options.readmit!r}")
+        context.say("readmitted: takes of this operator may be uploaded again")
+    if options.settle is not None:
+        records.confirm(options.settle, revision=records.revision, held={})
+        context.say(f"station {options.settle}  nothing outstanding: its spool is gone")
+    found = deletion_statuses(records)
+    if options.operator is not None or options.recording is not None:
+        key = records.key_of(operator=options.operator, recording=options.recording)
+        found = [one for one in found if one.key == key]
+    for one in found:
+        what = "an operator" if one.is_of_operator else "a recording"
+        count = sum(len(left.recordings) for left in one.outstanding)
+        context.say(
+            f"{one.deleted_at:%Y-%m-%d %H:%M:%S} UTC  {what}, {one.num_recordings} recordings, "
+            f"{count} outstanding at {len(one.outstanding)} stations"
+        )
+        for left in one.outstanding:
+            line = _outstanding_line(left.station, left.recordings, has_answered=left.has_answered)
+            context.say(f"  {line}")
+    return {"deletions": [one.model_dump(mode="json") for one in found]}, 0
 
 
 def _answer(question: str) -> str:

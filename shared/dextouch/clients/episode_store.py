@@ -16,6 +16,10 @@ from dextouch.schemas import (
     ActionKind,
     BatchReceipt,
     CatalogHours,
+    CheckedTakes,
+    CheckTakes,
+    ConfirmRemoval,
+    DeletionsRevision,
     EpisodeDetail,
     EpisodeList,
     FinishRecording,
@@ -127,6 +131,25 @@ class EpisodeStoreClient:
         )
         path = f"/v1/recordings/{_part(recording_id)}/finish"
         return self._model(RecordingStatus, "POST", path, content=body.model_dump_json())
+
+    def deletions_revision(self) -> str:
+        """A text that changes with every permanent deletion."""
+        path = "/v1/deletions/revision"
+        return self._model(DeletionsRevision, "GET", path).revision
+
+    def check_takes(self, spooled: CheckTakes) -> CheckedTakes:
+        """Which takes of a station's spool were deleted permanently."""
+        path, body = "/v1/deletions/check", spooled.model_dump_json()
+        return self._model(CheckedTakes, "POST", path, content=body)
+
+    def confirm_removal(self, removed: ConfirmRemoval) -> None:
+        """Say that a station holds no deleted takes any more, except those that it names.
+
+        Raises:
+            ConflictError: there was another deletion since `removed.revision`.
+        """
+        path, body = "/v1/deletions/confirm", removed.model_dump_json()
+        self._model(DeletionsRevision, "POST", path, content=body)
 
     def recordings(self, **wanted: Scalar | Sequence[str] | None) -> RecordingList:
         """Finished recordings that match every given filter.

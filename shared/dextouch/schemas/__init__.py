@@ -26,6 +26,18 @@ if TYPE_CHECKING:
     from dextouch.schemas.catalog import TrashContents as TrashContents
     from dextouch.schemas.catalog import TrashedItem as TrashedItem
     from dextouch.schemas.catalog import Verdict as Verdict
+    from dextouch.schemas.deletions import MAX_CHECKED_TAKES as MAX_CHECKED_TAKES
+    from dextouch.schemas.deletions import OPERATOR_DELETED as OPERATOR_DELETED
+    from dextouch.schemas.deletions import TAKE_DELETED as TAKE_DELETED
+    from dextouch.schemas.deletions import CheckedTakes as CheckedTakes
+    from dextouch.schemas.deletions import CheckTakes as CheckTakes
+    from dextouch.schemas.deletions import ConfirmRemoval as ConfirmRemoval
+    from dextouch.schemas.deletions import Deletions as Deletions
+    from dextouch.schemas.deletions import DeletionsRevision as DeletionsRevision
+    from dextouch.schemas.deletions import DeletionStatus as DeletionStatus
+    from dextouch.schemas.deletions import FoundDeletion as FoundDeletion
+    from dextouch.schemas.deletions import OutstandingTakes as OutstandingTakes
+    from dextouch.schemas.deletions import SpooledTake as SpooledTake
     from dextouch.schemas.enrolment import KEY_NAME_PATTERN as KEY_NAME_PATTERN
     from dextouch.schemas.enrolment import EnrolmentToken as EnrolmentToken
     from dextouch.schemas.enrolment import EnrolStation as EnrolStation

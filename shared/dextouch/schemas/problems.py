@@ -42,6 +42,7 @@ STATUS_OF_CLASS: tuple[tuple[type[DexTouchError], int], ...] = (
 )
 STATUS_OF_REASON = {
     "missing_scope": 403,
+    "foreign_station": 403,
     "foreign_origin": 403,
     "unknown_token": 403,
     "used_token": 403,

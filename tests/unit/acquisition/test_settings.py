@@ -29,7 +29,8 @@ OPTIONS = {
     "episode_store_key",
     "enrolment",
     "upload_period_s",
-    "keep_uploaded",
+    "keep_uploaded_days",
+    "keep_uploaded_gb",
 }
 DEVICES = (
     {"kind": "tactile_glove", "side": "left", "serial_number": "G1"},

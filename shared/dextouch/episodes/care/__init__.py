@@ -9,6 +9,11 @@ if TYPE_CHECKING:
     from dextouch.episodes.care.deletion import delete_for_good as delete_for_good
     from dextouch.episodes.care.deletion import plan_deletion as plan_deletion
     from dextouch.episodes.care.deletion import reviews_by as reviews_by
+    from dextouch.episodes.care.deletion_records import Covered as Covered
+    from dextouch.episodes.care.deletion_records import DeletionRecords as DeletionRecords
+    from dextouch.episodes.care.deletion_records import Outstanding as Outstanding
+    from dextouch.episodes.care.deletion_records import TakeFacts as TakeFacts
+    from dextouch.episodes.care.deletion_records import take_start as take_start
     from dextouch.episodes.care.inspection import UPLOADS as UPLOADS
     from dextouch.episodes.care.inspection import Finding as Finding
     from dextouch.episodes.care.inspection import ItemReport as ItemReport

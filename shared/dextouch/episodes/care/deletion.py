@@ -1,7 +1,8 @@
 """Permanent deletion of all data of an operator or a recording, with a receipt as proof.
 
 The plan is journaled first (`.deletions/`), so that repeating an interrupted deletion completes it,
-even when the recordings that led to derived episodes are already gone.
+even when the recordings that led to derived episodes are already gone. What was deleted is
+remembered (`dextouch.episodes.care.deletion_records`), so that stations remove their copies.
 """
 
 import json
@@ -15,6 +16,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
 
+from dextouch.episodes.care.deletion_records import DeletionRecords, Outstanding, TakeFacts
 from dextouch.episodes.care.store_facts import PLACES, Facts, Wanted, all_facts, small_files
 from dextouch.episodes.files import disk_errors, replace_file, try_lock
 from dextouch.episodes.format import Kind, sha256_hex
@@ -57,7 +59,7 @@ class DeletionRequest:
 
 @dataclass(frozen=True)
 class Victim:
-    """One item to delete, and the reason."""
+    """One item to delete, and the reason; of a recording also its station and `take_start`."""
 
     kind: str
     id: str
@@ -65,6 +67,14 @@ class Victim:
     folder: str
     sha256: str | None
     reason: str
+    station: str | None = None
+    started: str = ""
+
+    def as_take(self) -> TakeFacts | None:
+        """By what a station recognises a recording; None of other items."""
+        if self.kind != "recording" or self.station is None:
+            return None
+        return TakeFacts(self.id, self.station, self.started)
 
 
 class _Intent(BaseModel):
@@ -89,6 +99,8 @@ class DeletionReceipt:
     """Record of a deletion: deleted items, time, and files searched afterwards; saved as JSON.
 
     `unnamed_reviews` are places of other people's items whose review lost its reviewer's name.
+    `outstanding` are takes that stations may still hold in their spools; they remove them when they
+    next ask the store, and `dextouch store deletions` shows what is left.
     """
 
     request: DeletionRequest
@@ -101,12 +113,13 @@ class DeletionReceipt:
     unreadable: tuple[str, ...]
     num_files_searched: int
     unnamed_reviews: tuple[str, ...] = ()
+    outstanding: tuple[Outstanding, ...] = ()
     receipt_version: int = RECEIPT_VERSION
     counts: dict[str, int] = field(default_factory=dict)
 
     @property
     def complete(self) -> bool:
-        """Whether no readable file refers to the deleted data any more."""
+        """Whether no readable file of the store refers to the deleted data any more."""
         return not self.remaining and not self.unreadable
 
 
@@ -133,15 +146,27 @@ def plan_deletion(
             if reason is None:
                 continue
             waiting.remove(facts)
-            name, sha256 = facts.folder.name, facts.sha256
-            found.append(Victim(facts.kind, facts.item_id, facts.place, name, sha256, reason))
+            found.append(_victim(facts, reason))
             if spreads:
                 grown = True
                 # And earlier versions, left behind by a repair or a migration.
                 versions = [(k, i, h) for k, i, h in facts.lineage if _is_version(facts, k, i)]
                 names |= {(facts.kind, facts.item_id), *((k, i) for k, i, _ in versions)}
-                hashes |= {sha256, *(h for _, _, h in versions)} - {None}
+                hashes |= {facts.sha256, *(h for _, _, h in versions)} - {None}
     return found
+
+
+def _victim(facts: Facts, reason: str) -> Victim:
+    return Victim(
+        kind=facts.kind,
+        id=facts.item_id,
+        place=facts.place,
+        folder=facts.folder.name,
+        sha256=facts.sha256,
+        reason=reason,
+        station=facts.station if facts.kind == "recording" else None,
+        started=facts.started if facts.kind == "recording" else "",
+    )
 
 
 def reviews_by(root: Path, request: DeletionRequest) -> list[Facts]:
@@ -197,8 +222,11 @@ def delete_for_good(
     receipt_path: Path,
     *,
     checkpoints: Path | None = None,
+    unsent: bool = False,
 ) -> DeletionReceipt:
     """Delete all that a request covers, search the remaining files, and write the receipt.
+
+    What the service of the store must refuse from now on is remembered before anything is removed.
 
     Uploads and stages locked by a writer are kept and listed as remaining: stop the writer and
     repeat. Reviews that the operator wrote of other people's items lose their name. Checkpoints are
@@ -209,6 +237,7 @@ def delete_for_good(
         request: operator or recording.
         receipt_path: new file outside the store.
         checkpoints: folder with models that may have been trained on the deleted data.
+        unsent: delete an operator of whom the store holds nothing, but a station may.
 
     Raises:
         NotFoundError: nothing in the store matches, and the operator reviewed nothing.
@@ -220,14 +249,18 @@ def delete_for_good(
         )
     path = _intent_path(root, request)
     intent = _read_intent(path, root, request)
+    records = DeletionRecords(root)
+    key = records.key_of(operator=request.operator, recording=request.recording)
     known, reviewed = intent.victims, list[Facts]()
     for _ in range(_MAX_ROUNDS):
         known += [v for v in plan_deletion(root, request, known=known) if v not in known]
-        if not known and not reviewed and not reviews_by(root, request):
-            raise NotFoundError(f"deletion: nothing in {root} stems from {request.name!r}")
+        if not (known or reviewed or unsent or reviews_by(root, request)):
+            raise NotFoundError(_nothing(root, request))
         with disk_errors("write down what is to be deleted"):
             path.parent.mkdir(parents=True, exist_ok=True)
             replace_file(path, json.dumps(intent.model_dump()).encode())
+        takes = [take for take in (victim.as_take() for victim in known) if take is not None]
+        records.add(key, takes, operator=request.operator)
         went = [_remove(root, victim) for victim in known]
         for facts in reviews_by(root, request):
             _remove_reviewer(facts)
@@ -249,6 +282,7 @@ def delete_for_good(
         unreadable=tuple(unreadable),
         num_files_searched=num_files,
         unnamed_reviews=tuple(f"{facts.place}/{facts.folder.name}" for facts in reviewed),
+        outstanding=records.outstanding(key),
         counts={p: sum(v.place == p for v in deleted) for p in PLACES},
     )
     with disk_errors(f"write {receipt_path}"):
@@ -258,6 +292,16 @@ def delete_for_good(
             with suppress(OSError):
                 path.parent.rmdir()
     return receipt
+
+
+def _nothing(root: Path, request: DeletionRequest) -> str:
+    text = f"deletion: nothing in {root} stems from {request.name!r}"
+    if request.operator is None:
+        return text
+    return (
+        f"{text}; expected the pseudonym as takes have it. --unsent also deletes takes of it that "
+        "stations have not uploaded, and `dextouch store deletions` shows what is outstanding"
+    )
 
 
 def _search(

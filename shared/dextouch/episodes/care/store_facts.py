@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dextouch.episodes.care.deletion_records import take_start
 from dextouch.episodes.care.inspection import UPLOADS
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE
@@ -48,7 +49,7 @@ class Facts:
 
     `item_id` and `kind` are those of its (intended) group; `lineage` the kinds, ids and hashes of
     its sources, `reviewer` the pseudonym in its review; `readable` is false where nothing could be
-    parsed.
+    parsed. `started` is `take_start` of a recording.
     """
 
     folder: Path
@@ -60,6 +61,8 @@ class Facts:
     lineage: tuple[tuple[str, str, str | None], ...]
     sha256: str | None
     readable: bool
+    station: str | None = None
+    started: str = ""
 
 
 def all_facts(root: Path) -> list[Facts]:
@@ -94,6 +97,8 @@ def _facts(folder: Path, place: str) -> Facts:
         lineage=lineage,
         sha256=_text(_dict(folder / COMMIT_FILE).get("sha256")),
         readable=bool(attributes) or not any(small_files(folder)),
+        station=_text(attributes.get("station")),
+        started=take_start(attributes.get("started_at"), attributes.get("started_t_host_ns")),
     )
 
 

@@ -1,0 +1,183 @@
+"""Removal of spooled takes that were deleted permanently in the store, confirmed to it."""
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import structlog
+
+from dextouch.clients import EpisodeStoreClient
+from dextouch.episodes import disk_errors
+from dextouch.episodes.spool import SpoolReader
+from dextouch.errors import DexTouchError, NotFoundError, StorageError
+from dextouch.schemas import (
+    MAX_CHECKED_TAKES,
+    CheckTakes,
+    ConfirmRemoval,
+    FoundDeletion,
+    RecordingAttributes,
+    SpooledTake,
+)
+from services.acquisition.retention import empty_removed, remove_take, spooled_takes
+
+logger = structlog.get_logger(__name__)
+
+# One line of JSON for each take that was removed because it was deleted in the store.
+REMOVALS_FILE: Final = "removals.jsonl"
+
+
+@dataclass(frozen=True)
+class OperatorNames:
+    """Operators that the station remembers besides those of takes, and how it forgets one."""
+
+    known: Callable[[], Sequence[str]]
+    forget: Callable[[str], None]
+
+
+class DeletedTakes:
+    """Asks the store which takes of the spool were deleted, removes them and confirms it.
+
+    The store says by a revision whether there was a deletion, so that the spool is only read then,
+    and once after a start.
+
+    Args:
+        spool_root: folder of the takes.
+        station: name of this station; takes of an earlier name are asked about under that.
+        stored_as: the ids under which the store has a take, or would have it.
+        operators: of the session.
+    """
+
+    def __init__(
+        self,
+        spool_root: Path,
+        station: str,
+        *,
+        stored_as: Callable[[Path, RecordingAttributes | None], Sequence[str]],
+        operators: OperatorNames,
+    ) -> None:
+        self._spool_root, self._station = spool_root, station
+        self._stored_as, self._operators = stored_as, operators
+        self._revision: str | None = None
+        self._problem: str | None = None
+
+    def remove(self, store: EpisodeStoreClient) -> list[str]:
+        """Remove what was deleted since the last call; ids of what was removed.
+
+        A store that does not answer is asked again by the next call, which a warning says once.
+        """
+        removed: list[str] = []
+        try:
+            empty_removed(self._spool_root)
+            revision = store.deletions_revision()
+            if revision != self._revision:
+                # What cannot be removed yet, such as a take that is being recorded, is tried again.
+                is_done = self._work_off(store, removed)
+                self._revision = revision if is_done else None
+            self._problem = None
+        except DexTouchError as error:
+            if error.message != self._problem:
+                logger.warning("fail_deletions", error=error.message)
+            self._problem = error.message
+        return removed
+
+    def remove_refused(self, path: Path) -> None:
+        """Remove a take whose upload the store refused since it was deleted.
+
+        Raises:
+            StorageError: it cannot be removed.
+        """
+        self._remove(path, "refused by the store as deleted")
+
+    def _work_off(self, store: EpisodeStoreClient, removed: list[str]) -> bool:
+        """Remove all deleted takes; whether none of them is left."""
+        takes: defaultdict[str, list[SpooledTake]] = defaultdict(list, {self._station: []})
+        for station, take in self._spooled():
+            takes[station].append(take)
+        num_held = 0
+        for station, spooled in takes.items():
+            held, revision = self._remove_of(store, station, spooled, removed)
+            num_held += len(held)
+            confirmed = ConfirmRemoval(
+                station=station, revision=revision, held=tuple(held[:MAX_CHECKED_TAKES])
+            )
+            store.confirm_removal(confirmed)
+        return num_held == 0
+
+    def _remove_of(
+        self,
+        store: EpisodeStoreClient,
+        station: str,
+        spooled: Sequence[SpooledTake],
+        removed: list[str],
+    ) -> tuple[list[FoundDeletion], str]:
+        """Remove the deleted takes of a station; those that are held, and the first revision."""
+        operators = tuple(self._operators.known())
+        held: list[FoundDeletion] = []
+        first_revision: str | None = None
+        for start in range(0, max(1, len(spooled)), MAX_CHECKED_TAKES):
+            part = tuple(spooled[start : start + MAX_CHECKED_TAKES])
+            checked = store.check_takes(
+                CheckTakes(station=station, takes=part, operators=operators)
+            )
+            # A deletion in between makes the confirmation of an earlier revision fail.
+            first_revision = first_revision or checked.revision
+            for found in checked.takes:
+                if self._try_remove(self._spool_root / found.recording_id):
+                    removed.append(found.recording_id)
+                else:
+                    held.append(found)
+            for operator in checked.operators:
+                self._operators.forget(operator)
+        return held, first_revision or ""
+
+    def _try_remove(self, path: Path) -> bool:
+        """Remove a take, unless it is being recorded or the disk refuses."""
+        try:
+            if not SpoolReader(path).closed:
+                return False
+        except NotFoundError:
+            return True  # removed meanwhile
+        except StorageError:
+            pass  # damaged, and deleted all the same
+        try:
+            self._remove(path, "deleted in the store")
+        except StorageError as error:
+            logger.warning("fail_remove_deleted", recording_id=path.name, error=error.message)
+            return False
+        return True
+
+    def _remove(self, path: Path, why: str) -> None:
+        remove_take(path)
+        logger.warning("remove_deleted_take", recording_id=path.name, reason=why)
+        line = {"at": datetime.now(UTC).isoformat(), "recording_id": path.name, "reason": why}
+        with disk_errors(f"write {REMOVALS_FILE}"), self._removals.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    @property
+    def _removals(self) -> Path:
+        return self._spool_root / REMOVALS_FILE
+
+    def _spooled(self) -> Iterator[tuple[str, SpooledTake]]:
+        """All takes of the spool, with the station that recorded each."""
+        for path in spooled_takes(self._spool_root):
+            try:
+                about = SpoolReader(path).attributes
+            except NotFoundError:
+                continue
+            except StorageError:
+                ids = tuple(self._stored_as(path, None))
+                damaged = SpooledTake(recording_id=path.name, stored_as=ids, is_damaged=True)
+                yield self._station, damaged
+                continue
+            take = SpooledTake(
+                recording_id=path.name,
+                stored_as=tuple(self._stored_as(path, about)),
+                operator=about.operator,
+                started_at=about.started_at,
+                started_t_host_ns=about.started_t_host_ns,
+            )
+            yield about.station, take

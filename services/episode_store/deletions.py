@@ -1,0 +1,212 @@
+"""What became of permanently deleted takes: refused uploads, and stations that remove their copies.
+
+Deletions are made by `dextouch store delete` on the same folder, also while the service runs.
+"""
+
+import threading
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Annotated, Final
+
+import structlog
+from fastapi import APIRouter, Depends
+
+from dextouch.episodes.care import DeletionRecords, TakeFacts, take_start
+from dextouch.errors import AccessDeniedError, ConflictError, DexTouchError
+from dextouch.schemas import (
+    OPERATOR_DELETED,
+    TAKE_DELETED,
+    CheckedTakes,
+    CheckTakes,
+    ConfirmRemoval,
+    Deletions,
+    DeletionsRevision,
+    DeletionStatus,
+    FoundDeletion,
+    OutstandingTakes,
+    RecordingAttributes,
+    SpooledTake,
+)
+from dextouch.serving import JSON, KIB, JsonBody, RequireScope, takes
+
+logger = structlog.get_logger(__name__)
+
+# How soon a deletion reaches an upload that nobody continues.
+WATCH_PERIOD_S: Final = 1.0
+MAX_CHECK_BYTES: Final = 512 * KIB
+MAY_WRITE: Final = Depends(RequireScope("store_write"))
+MAY_DELETE: Final = Depends(RequireScope("store_delete"))
+Checked = Annotated[CheckTakes, Depends(JsonBody(CheckTakes))]
+
+
+def refuse_deleted(records: DeletionRecords, attributes: RecordingAttributes) -> None:
+    """Refuse a recording that was deleted permanently, or whose operator was.
+
+    Raises:
+        ConflictError: with the reason `take_deleted`, or `operator_deleted` where the take began
+            after the deletion.
+    """
+    covered = records.find(TakeFacts.of(attributes))
+    if covered is None:
+        return
+    when = covered.deleted_at.isoformat(timespec="seconds")
+    if not covered.is_later:
+        raise ConflictError(
+            f"recording {attributes.recording_id!r}: it was deleted permanently on {when}, with "
+            "the operator or by its id; the store takes it no more, remove it from the spool",
+            reason=TAKE_DELETED,
+        )
+    raise ConflictError(
+        f"recording {attributes.recording_id!r}: its operator was deleted permanently on {when}, "
+        "before this take began. If it is the same person, delete again; if the pseudonym is used "
+        "anew, run `dextouch store deletions --readmit PSEUDONYM` and send the take again",
+        reason=OPERATOR_DELETED,
+    )
+
+
+def deletions_router(records: DeletionRecords, is_station: Callable[[str], bool]) -> APIRouter:
+    """Create the routes below /v1/deletions.
+
+    Args:
+        records: of the store.
+        is_station: whether a name of a key is that of an enrolled station, which may ask about its
+            own takes only.
+    """
+    router = APIRouter(prefix="/v1/deletions", tags=["deletions"])
+
+    @router.get("", dependencies=[MAY_DELETE])
+    def listing() -> Deletions:
+        """Deletions, and the takes that stations have yet to remove."""
+        return Deletions(deletions=tuple(deletion_statuses(records)))
+
+    @router.get("/revision", dependencies=[MAY_WRITE])
+    def revision() -> DeletionsRevision:
+        """Changes with every deletion; a station then checks its spool."""
+        return DeletionsRevision(revision=records.revision)
+
+    @router.post("/check")
+    @takes({JSON: MAX_CHECK_BYTES})
+    def check(wanted: Checked, by: Annotated[str, MAY_WRITE]) -> CheckedTakes:
+        """Which of these takes were deleted, and which operators."""
+        _check_own(wanted.station, by)
+        # Before the takes, so that a deletion in between is found by the next check.
+        revision = records.revision
+        found = ((take, _deletion_of(records, wanted.station, take)) for take in wanted.takes)
+        return CheckedTakes(
+            revision=revision,
+            takes=tuple(
+                FoundDeletion(recording_id=take.recording_id, deletion=key)
+                for take, key in found
+                if key is not None
+            ),
+            operators=tuple(name for name in wanted.operators if records.has_operator(name)),
+        )
+
+    @router.post("/confirm")
+    @takes({JSON: MAX_CHECK_BYTES})
+    def confirm(
+        removed: Annotated[ConfirmRemoval, Depends(JsonBody(ConfirmRemoval))],
+        by: Annotated[str, MAY_WRITE],
+    ) -> DeletionsRevision:
+        """Note that a station holds none of the deleted takes, except those that it names."""
+        _check_own(removed.station, by)
+        held: defaultdict[str, list[str]] = defaultdict(list)
+        for one in removed.held:
+            held[one.deletion].append(one.recording_id)
+        records.confirm(removed.station, revision=removed.revision, held=held)
+        logger.info("removal_confirmed", station=removed.station, num_held=len(removed.held))
+        return DeletionsRevision(revision=removed.revision)
+
+    def _check_own(station: str, by: str) -> None:
+        if is_station(by) and by != station:
+            raise AccessDeniedError(
+                f"deletions: the key of station {by!r} asks about takes of station {station!r}; "
+                "expected its own",
+                reason="foreign_station",
+            )
+
+    return router
+
+
+def _deletion_of(records: DeletionRecords, station: str, take: SpooledTake) -> str | None:
+    started = take_start(take.started_at, take.started_t_host_ns)
+    for recording_id in take.stored_as or (take.recording_id,):
+        covered = records.find(
+            TakeFacts(
+                recording_id=recording_id,
+                station=station,
+                started=started,
+                operator=take.operator,
+                started_at=take.started_at,
+                is_damaged=take.is_damaged,
+            )
+        )
+        if covered is not None and not covered.is_later:
+            return covered.key
+    return None
+
+
+def deletion_statuses(records: DeletionRecords) -> list[DeletionStatus]:
+    """All deletions, oldest first, with what is outstanding of each."""
+    return [
+        DeletionStatus(
+            key=key,
+            deleted_at=record.deleted_at,
+            is_of_operator=record.operator_digest is not None,
+            num_recordings=len(record.takes),
+            outstanding=tuple(
+                OutstandingTakes.model_validate(asdict(one)) for one in records.outstanding(key)
+            ),
+        )
+        for key, record in records.read().items()
+    ]
+
+
+class DeletionWatch:
+    """Drops uploads of deleted takes that nobody continues, soon after the deletion.
+
+    Args:
+        records: of the store.
+        drop: drops uploads of deleted takes, and returns their ids.
+        ended: called with the id of each dropped upload.
+    """
+
+    def __init__(
+        self,
+        records: DeletionRecords,
+        drop: Callable[[], list[str]],
+        ended: Callable[[str], None],
+    ) -> None:
+        self._records, self._drop, self._ended = records, drop, ended
+        self._revision = ""
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="deletions", daemon=True)
+
+    def start(self) -> None:
+        """Start watching."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread."""
+        self._stopping.set()
+        self._thread.join()
+
+    def look(self) -> None:
+        """Drop uploads if there was a deletion since the last look."""
+        revision = self._records.revision
+        if revision != self._revision:
+            for recording_id in self._drop():
+                self._ended(recording_id)
+            self._revision = revision
+
+    def _run(self) -> None:
+        problem = ""
+        while not self._stopping.is_set():
+            try:
+                self.look()
+            except DexTouchError as error:
+                if error.message != problem:
+                    logger.warning("fail_deletions", reason=error.message)
+                problem = error.message
+            self._stopping.wait(WATCH_PERIOD_S)
