@@ -136,9 +136,7 @@ def scripted(serve, tmp_path, monkeypatch):
     clock, calibration = VirtualClock(), pattern_calibration()
     mock = MockStation(streams, script, 5, clock, spool_root=tmp_path, calibration=calibration)
     settings = AcquisitionSettings(spool=tmp_path, mock=True)
-    routes = station_router(
-        mock.station, Uploader(tmp_path, None, period_s=1.0)
-    )
+    routes = station_router(mock.station, Uploader(tmp_path, None, period_s=1.0))
     with mock:
         take = mock.run_take(PROMPT, recording_id="take-1")
     monkeypatch.setattr(history_body, "time", SimpleNamespace(time=lambda: NOW_UNIX_S))

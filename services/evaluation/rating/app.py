@@ -83,7 +83,7 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
         rubric_of(task, rubrics)
     store = EpisodeStore(settings.store_url)
     marks = MarkLog(settings.marks)
-    rollouts = rated_rollouts(store, tasks)
+    rollouts = rated_rollouts(store, tasks, study=settings.study)
     queue = RatingQueue(
         rollouts,
         marks,

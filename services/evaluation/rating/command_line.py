@@ -16,7 +16,7 @@ def report_main(argv: Sequence[str]) -> int:
     """Print scores and agreement by task, and write the report on request."""
     settings = load_settings(RatingReportSettings, list(argv))
     rubrics, store = read_rubrics(settings.rubrics), EpisodeStore(settings.store_url)
-    rollouts = rated_rollouts(store, tuple(rubrics))
+    rollouts = rated_rollouts(store, tuple(rubrics), study=settings.study)
     marks = MarkLog(settings.marks).latest().values()
     tasks = {one.episode_id: one.task for one in rollouts}
     report = rating_report(marks, tasks, rubrics, state_scores(store, rollouts, rubrics))

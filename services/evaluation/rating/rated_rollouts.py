@@ -11,7 +11,7 @@ from PIL import Image
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.images import encode_jpeg
-from dextouch.schemas import is_rollout
+from dextouch.schemas import EpisodeAttributes, is_rollout
 from services.evaluation.rating.rating_queue import RatedRollout, token_of
 from services.evaluation.rating.rubrics import Rubric
 from services.evaluation.reporting.pictures import touch_image
@@ -21,12 +21,15 @@ IMAGE_HEIGHT_PX: Final = 384
 _BACKGROUND: Final = 24
 
 
-def rated_rollouts(store: EpisodeStore, tasks: Collection[str]) -> list[RatedRollout]:
-    """Rollouts of a store that have head images.
+def rated_rollouts(
+    store: EpisodeStore, tasks: Collection[str], *, study: str | None = None
+) -> list[RatedRollout]:
+    """Rollouts of a store that have head images; what people recorded is none.
 
     Args:
         store: of episodes.
         tasks: tasks with a rubric; episodes of others are skipped.
+        study: the study whose rollouts are rated; None for all rollouts.
 
     Raises:
         InvalidInputError: nothing to rate.
@@ -35,7 +38,8 @@ def rated_rollouts(store: EpisodeStore, tasks: Collection[str]) -> list[RatedRol
     for episode_id in store.list():
         episode = store.open(episode_id)
         about = episode.attributes
-        if about.task in tasks and CAMERA in episode.streams:
+        is_wanted = _is_rated(about) if study is None else study in _studies(about)
+        if is_wanted and about.task in tasks and CAMERA in episode.streams:
             found.append(
                 RatedRollout(
                     token_of(episode_id),
@@ -47,11 +51,25 @@ def rated_rollouts(store: EpisodeStore, tasks: Collection[str]) -> list[RatedRol
                 )
             )
     if not found:
+        of_study = "" if study is None else f" of the study {study!r}"
         raise InvalidInputError(
-            f"store {store.root}: has no episode of {', '.join(sorted(tasks))} with the stream "
-            f"{CAMERA}, expected at least one"
+            f"store {store.root}: has no episode of {', '.join(sorted(tasks))} that is a "
+            f"rollout{of_study} with the stream {CAMERA}, expected at least one; takes of "
+            "operators are not rated"
         )
     return found
+
+
+def _is_rated(about: EpisodeAttributes) -> bool:
+    """Whether an episode is a rollout: of a study, of a world model, or of the twin by itself."""
+    if is_rollout(about) or about.origin == "imagined":
+        return True
+    return about.origin == "twin" and about.operator is None
+
+
+def _studies(about: EpisodeAttributes) -> set[str]:
+    """Names of the studies whose rollout an episode is."""
+    return {entry.id.partition(": ")[0] for entry in about.lineage if entry.kind == "rollout"}
 
 
 def state_scores(

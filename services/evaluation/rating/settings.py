@@ -10,6 +10,7 @@ from dextouch.serving import CommandSettings, ServiceSettings, service_config
 
 DEFAULT_MARKS = Path("runs/ratings.sqlite")
 _MARKS = "append-only SQLite file of the marks"
+_STUDY = "name of the study whose rollouts are rated; default: all rollouts of the store"
 _RUBRICS = "TOML file of rubrics by task; default: the package's"
 
 
@@ -34,6 +35,7 @@ class RatingSettings(ServiceSettings):
     tasks: tuple[str, ...] = Field(
         default=(), description="tasks to rate; default: all that have a rubric"
     )
+    study: str | None = Field(default=None, min_length=1, description=_STUDY)
     raters_per_rollout: int = Field(
         default=5, ge=1, le=100, description="number of people who rate each rollout"
     )
@@ -56,4 +58,5 @@ class RatingReportSettings(CommandSettings):
     )
     marks: Path = Field(default=DEFAULT_MARKS, description=_MARKS)
     rubrics: Path | None = Field(default=None, description=_RUBRICS)
+    study: str | None = Field(default=None, min_length=1, description=_STUDY)
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)

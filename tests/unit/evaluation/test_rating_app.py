@@ -13,7 +13,7 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from services.cli.main import main
 from services.evaluation.rating.app import create_rating_app
 from services.evaluation.rating.marks import MarkLog
-from services.evaluation.rating.rated_rollouts import side_by_side
+from services.evaluation.rating.rated_rollouts import rated_rollouts, side_by_side
 from services.evaluation.rating.settings import RatingSettings
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.toy_store import write
@@ -110,6 +110,52 @@ async def test_the_report_compares_people_with_the_twin(settings, tmp_path):
     }
     # Ada gave two points of three to both: one third too few, two thirds too many.
     assert report["tasks"]["reach"]["less_state_score"] == pytest.approx((2 / 3 - 1 + 2 / 3) / 2)
+
+
+def entry(study):
+    return {"kind": "rollout", "id": f"{study}: hold in real"}
+
+
+def queued(settings, **changes):
+    """Ids of the episodes that are rated."""
+    store, study = EpisodeStore(settings["store_url"]), changes.get("study")
+    return {one.episode_id for one in rated_rollouts(store, ("reach",), study=study)}
+
+
+@pytest.mark.parametrize(
+    "about",
+    [
+        {"origin": "recorded", "operator": "op-1"},
+        {"origin": "recorded", "domain": "human"},
+        {"origin": "recorded", "station": "desk_1"},
+        {"origin": "twin", "operator": "op-1"},
+    ],
+)
+def test_takes_of_operators_are_never_rated(settings, about):
+    store = EpisodeStore(settings["store_url"])
+    write(store, toy.demonstration("reach", 3, name="a-take"), **about)
+    assert queued(settings) == {"imagined-dream-1", "imagined-dream-2"}
+
+
+def test_a_rollout_of_a_real_robot_is_rated(settings):
+    store = EpisodeStore(settings["store_url"])
+    write(
+        store,
+        toy.demonstration("reach", 3, name="real"),
+        origin="recorded",
+        lineage=[entry("Shoes")],
+    )
+    assert "real" in queued(settings)
+
+
+def test_one_studys_rollouts_are_rated_when_asked(settings):
+    store = EpisodeStore(settings["store_url"])
+    for seed, study in ((3, "shoes"), (4, "shoes_2")):
+        item = toy.demonstration("reach", seed, name=f"of-{study}")
+        write(store, item, lineage=[entry(study)])
+    assert queued(settings, study="shoes") == {"of-shoes"}
+    with pytest.raises(InvalidInputError, match="'cups'"):
+        create_rating_app(RatingSettings(**settings, study="cups"))
 
 
 async def test_a_program_is_a_rater_of_its_own_kind(settings):
