@@ -34,6 +34,7 @@ from services.acquisition.path_latency import add_latencies
 from services.acquisition.session import SessionCount
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.take import Take, check_free_space
+from services.acquisition.take_cause import incomplete_cause
 from services.acquisition.take_check import DeviceEvents, TakeWatch
 
 logger = structlog.get_logger(__name__)
@@ -284,6 +285,8 @@ class Recorder:
         changed = {
             "calibration": add_latencies(known, measured, stated=self._stated),
             "success": how.success,
+            "complete": check.complete,
+            "incomplete_cause": incomplete_cause(check),
             "ledger": take.watch.ledger(),
             "quality": take.watch.quality(),
             "trace_id": current_trace_id(),
@@ -293,7 +296,9 @@ class Recorder:
         self._saved_as = how.success
         logger.info("save_take", recording_id=spool.attributes.recording_id)
         if self._prompt is not None:
-            self._session.add(self._prompt, spool.attributes.recording_id)
+            saved = spool.attributes
+            cause = saved.incomplete_cause
+            self._session.add(self._prompt, saved.recording_id, incomplete=cause)
         give_back_free_memory()
 
     def _discard(self) -> None:

@@ -31,11 +31,11 @@ class SessionCount:
 
     def begin(self) -> None:
         """Begin a new session, in which nothing was saved yet."""
-        last_saved = self.now.last_saved
-        self._write(RecorderSession(started_at=datetime.now(UTC), last_saved=last_saved))
+        fresh = {"started_at": datetime.now(UTC), "saved": ()}
+        self._write(self.now.model_copy(update=fresh))
 
-    def add(self, prompt: TakePrompt, recording_id: str) -> None:
-        """Count a saved take."""
+    def add(self, prompt: TakePrompt, recording_id: str, *, incomplete: str = "") -> None:
+        """Count a saved take; `incomplete` says why it is, if it is."""
         key = (prompt.task, prompt.operator)
         counts = {(item.task, item.operator): item.num_saved for item in self.now.saved}
         counts[key] = counts.get(key, 0) + 1
@@ -43,7 +43,8 @@ class SessionCount:
             SavedTakes(task=task, operator=operator, num_saved=count)
             for (task, operator), count in counts.items()
         )
-        self._write(self.now.model_copy(update={"saved": saved, "last_saved": recording_id}))
+        last = {"last_saved": recording_id, "last_incomplete": incomplete}
+        self._write(self.now.model_copy(update={"saved": saved, **last}))
 
     def operators(self) -> tuple[str, ...]:
         """All operators that the counts name."""

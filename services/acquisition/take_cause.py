@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from typing import Final
 
-from dextouch.schemas import HealthCause, TakeCause, TakeProblem
+from dextouch.schemas import MAX_CAUSE, HealthCause, TakeCause, TakeCheck, TakeProblem
 from services.acquisition.health import CODES
 from services.acquisition.health.causes import SIMULATED_ADVICE
 
@@ -55,6 +55,14 @@ def root_cause(
     if worst.stream in simulated:
         advice = SIMULATED_ADVICE
     return TakeCause(message=worst.message + more, advice=advice)
+
+
+def incomplete_cause(check: TakeCheck) -> str:
+    """Why a take is incomplete, for its attributes; empty of a complete one."""
+    if check.complete:
+        return ""
+    errors = "; ".join(p.message for p in check.problems if p.level == "ERROR")
+    return (check.cause.message if check.cause else errors)[:MAX_CAUSE]
 
 
 def _rank(problem: TakeProblem) -> tuple[bool, int]:

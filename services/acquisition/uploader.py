@@ -42,9 +42,9 @@ from services.acquisition.retention import (
     Retention,
     SpoolRetention,
     remove_take,
-    spooled_takes,
     sweep_safely,
 )
+from services.acquisition.retention import spooled_takes as _spools
 
 logger = structlog.get_logger(__name__)
 
@@ -122,7 +122,7 @@ class Uploader:
 
     def counts(self) -> dict[str, int]:
         """Takes of the spool that wait, are uploaded, or were refused; a running one waits too."""
-        paths = spooled_takes(self._spool_root)
+        paths = _spools(self._spool_root)
         uploaded = sum((path / UPLOADED_FILE).exists() for path in paths)
         refused = sum((path / REFUSED_FILE).exists() for path in paths)
         waiting = len(paths) - uploaded - refused
@@ -132,7 +132,7 @@ class Uploader:
         """Every saved take, and every damaged one; or those alone that the store refused."""
         found = []
         refused = [self._spool_root / name for name in self.refused]
-        for path in refused if only_refused else spooled_takes(self._spool_root):
+        for path in refused if only_refused else _spools(self._spool_root):
             try:
                 is_closed, damage = _condition(path)
             except NotFoundError:
@@ -181,7 +181,7 @@ class Uploader:
         """
         done = []
         self._retry_after_s = 0.0
-        for path in spooled_takes(self._spool_root):
+        for path in _spools(self._spool_root):
             if (path / UPLOADED_FILE).exists() or (path / REFUSED_FILE).exists():
                 continue
             if self._stopping.is_set():
@@ -365,7 +365,7 @@ def recover_spool(spool_root: Path) -> list[str]:
     is left alone, and so is a damaged one, with the reason in its folder.
     """
     recovered = []
-    for path in spooled_takes(spool_root):
+    for path in _spools(spool_root):
         try:
             if not SpoolReader(path).closed and _recover(path):
                 recovered.append(path.name)

@@ -43,7 +43,17 @@ async def last_take(acquisition: Upstream, alignment: Upstream | None) -> TakeSt
     session = (await acquisition.read(RecorderStatus, "/v1/recorder")).session
     if session is None or session.last_saved is None:
         return None
-    recording_id = session.last_saved
+    view = await _last_state(session.last_saved, acquisition, alignment)
+    if not session.last_incomplete:
+        return view
+    reason = " · ".join(filter(None, (f"incomplete: {session.last_incomplete}", view.reason)))
+    level: HealthLevel = "WARN" if view.level == "OK" else view.level
+    return view.model_copy(update={"level": level, "reason": reason})
+
+
+async def _last_state(
+    recording_id: str, acquisition: Upstream, alignment: Upstream | None
+) -> TakeStateView:
     try:
         upload = await acquisition.read(UploadStatus, f"/v1/uploads/{quote(recording_id, safe='')}")
     except NotFoundError:

@@ -22,6 +22,7 @@ from dextouch.schemas import (
 )
 from services.episode_store.figures import figures_of
 from services.episode_store.filters import Entry, ItemsKind
+from services.episode_store.limits import beyond_limits
 from services.episode_store.outliers import MIN_ITEMS, find_outliers
 
 AnyEntry = Entry[Any]
@@ -29,6 +30,7 @@ Entries = Mapping[str, AnyEntry]
 Group = tuple[str, str, str, str]
 _SHARED: Final = (
     "task", "instruction", "domain", "station", "operator", "success", "recovered", "trace_id",
+    "complete", "incomplete_cause",
 )  # fmt: skip
 
 
@@ -52,6 +54,7 @@ def item_of(
     duration_s = summary.duration_s
     figures = figures_of(about, num_steps=num_steps, duration_s=duration_s)
     fields |= {"id": reader.item_id, "duration_s": duration_s, "figures": figures}
+    fields["findings"] = beyond_limits(about, figures)
     return CatalogItem.model_validate(fields | {"review": review})
 
 
@@ -152,7 +155,10 @@ def _take(recording: AnyEntry, episodes: Entries) -> AnyEntry:
 def _compare(
     entries: list[AnyEntry],
 ) -> tuple[dict[tuple[str, str], tuple[Finding, ...]], tuple[ComparedGroup, ...]]:
-    """Findings by id and kind, and the groups that were compared; rejected items are left out."""
+    """Findings by id and kind, and the groups that were compared; rejected items are left out.
+
+    Items come with the findings that need no comparison.
+    """
     groups: defaultdict[Group, list[CatalogItem]] = defaultdict(list)
     found: dict[tuple[str, str], tuple[Finding, ...]] = {}
     for entry in entries:
@@ -165,7 +171,7 @@ def _compare(
     for (task, *_), items in sorted(groups.items()):
         outliers = find_outliers([item.figures for item in items])
         for item, own in zip(items, outliers, strict=True):
-            found[item.id, item.kind] = (*own, *_other_findings(item))
+            found[item.id, item.kind] = (*_incomplete(item), *item.findings, *own, *_other(item))
         row = ComparedGroup(
             kind=items[0].kind,
             task=task,
@@ -179,7 +185,14 @@ def _compare(
     return found, tuple(rows)
 
 
-def _other_findings(item: CatalogItem) -> list[Finding]:
+def _incomplete(item: CatalogItem) -> list[Finding]:
+    if item.complete:
+        return []
+    text = f"incomplete: {item.incomplete_cause or 'no cause noted'}"
+    return [Finding(code="incomplete", message=text)]
+
+
+def _other(item: CatalogItem) -> list[Finding]:
     found = []
     if item.time_doubts:
         text = f"times in doubt: {', '.join(item.time_doubts)}"

@@ -10,7 +10,7 @@ import numpy as np
 
 from dextouch.clocks import CountingClock, OnlineClock
 from dextouch.errors import InvalidInputError
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import StreamDescriptor, residual_limits_s
 from services.acquisition.health.codes import CODES
 from services.acquisition.health.evaluation import Block, Evaluation, Rolling
 
@@ -32,8 +32,6 @@ RATE_SHARE = 0.02
 DEPARTURE_NS = 500_000
 BORNE_OUT_NS = 5_000_000_000
 BINS = 10
-# Counting tolerates delays of almost a period; warn before that.
-RESIDUAL_SHARES = (0.25, 0.5)
 
 
 class ClockJudge:
@@ -186,8 +184,7 @@ class CountingJudge:
 
     def __init__(self, descriptor: StreamDescriptor) -> None:
         self._period_ns = descriptor.period_ns()
-        warn_s, error_s = (share * self._period_ns * 1e-9 for share in RESIDUAL_SHARES)
-        self._limits_s = (warn_s, error_s)
+        self._limits_s = residual_limits_s(self._period_ns * 1e-9)
         self._residuals = Rolling()
         self._num_resets = 0
         self._restart()

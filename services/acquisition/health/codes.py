@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from dextouch.schemas import CauseCode, HealthLevel
+from dextouch.streams import RATE_ERROR, RATE_WARN, RESIDUAL_ERROR_S, RESIDUAL_WARN_S
 
 SEVERITY: tuple[HealthLevel, ...] = ("OK", "WARN", "ERROR", "STALE")
 NEVER = math.inf
@@ -51,7 +52,7 @@ CODES: Final[Mapping[str, Rule]] = {
         "Power-cycle the device; if it stays silent, try another cable or port."),
     "late": Rule(3.0, NEVER, "periods", "now", "age of the newest sample, if all else is OK",
         "Wait a second; if it happens again, check the load of this computer."),
-    "rate": Rule(0.02, 0.10, "%", "10 s", "deviation from the nominal rate",
+    "rate": Rule(RATE_WARN, RATE_ERROR, "%", "10 s", "deviation from the nominal rate",
         "Set the device to the rate that the station expects, and charge it."),
     "loss": Rule(0.001, 0.01, "%", "10 s", "packets lost by sequence number",
         "Move the receiver closer, or use another port without a hub."),
@@ -85,7 +86,8 @@ CODES: Final[Mapping[str, Rule]] = {
         "If it happened during a take, record it again; then check cable and hub."),
     "clock_skew": Rule(200.0, 1000.0, "ppm", "60 s", "skew between the clocks of device and host",
         "Let the device warm up; if it continues, its clock is faulty."),
-    "clock_residual": Rule(4e-3, 10e-3, "ms", "10 s", "95 % of arrivals lie closer to their median",
+    "clock_residual": Rule(RESIDUAL_WARN_S, RESIDUAL_ERROR_S, "ms", "10 s",
+        "95 % of arrivals lie closer to their median",
         "Use a direct link; the latency of its packets varies too much."),
     "clock_step": Rule(0.0, 3.0, "", "1 h", "steps of the device's clock; one is shown for 60 s",
         "Record the take again; leave the device on between takes."),

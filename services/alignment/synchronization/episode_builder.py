@@ -192,6 +192,8 @@ def _episode_attributes(
         K_head=source.calibration["K_head"],
         success=source.success,
         recovered=source.recovered,
+        complete=source.complete,
+        incomplete_cause=source.incomplete_cause,
         lineage=(*source.lineage, origin),
         calibration=source.calibration
         | {name: rows for stream in streams.values() for name, rows in stream.calibration.items()},

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.enrolment import StationKey as StationKey
     from dextouch.schemas.enrolment import UseToken as UseToken
     from dextouch.schemas.episodes import ID_PATTERN as ID_PATTERN
+    from dextouch.schemas.episodes import MAX_CAUSE as MAX_CAUSE
     from dextouch.schemas.episodes import CatalogHours as CatalogHours
     from dextouch.schemas.episodes import ClockMethod as ClockMethod
     from dextouch.schemas.episodes import ClockReport as ClockReport

@@ -116,10 +116,13 @@ class ReviewedItems(FrozenModel):
 class Finding(FrozenModel):
     """A reason to look at an item.
 
-    `figure`, `value`, `median` and `score` (robust z-score) belong to the code `outlier`.
+    `figure` and `value` belong to the codes `outlier` and `beyond_limit`, `median` and `score`
+    (robust z-score) to `outlier`.
     """
 
-    code: Literal["outlier", "not_judged", "doubtful_clock", "recovered"]
+    code: Literal[
+        "outlier", "beyond_limit", "incomplete", "not_judged", "doubtful_clock", "recovered"
+    ]
     message: str
     figure: str | None = None
     value: float | None = None
@@ -133,7 +136,8 @@ class CatalogItem(FrozenModel):
     `consent` of an episode is that of its recording, None where that is not stored. `figures` are
     figures of its quality, the same for all items. `recordings` and `episodes` are the stored
     recordings that it was made from and the episodes that were made from it; `aligned` is the last
-    of these, in the list of takes only. `time_doubts` names streams whose times are in doubt.
+    of these, in the list of takes only. `complete` is False of a take that was saved although its
+    check found it incomplete. `time_doubts` names streams whose times are in doubt.
     """
 
     kind: ItemKind
@@ -147,6 +151,8 @@ class CatalogItem(FrozenModel):
     consent: bool | None = None
     success: bool | None = None
     recovered: bool = False
+    complete: bool = True
+    incomplete_cause: str = ""
     duration_s: float = Field(ge=0)
     at: AwareDatetime | None = None
     trace_id: str | None = Field(default=None, exclude_if=not_)

@@ -27,6 +27,8 @@ ClockMethod = Literal["device", "sequence", "counting", "arrival"]
 # Reasons to doubt the times of a stream: its clock is far off its nominal rate, even the promptest
 # samples arrive more than a sample period later than fitted, or a stop of the clock cannot be
 # distinguished from an increase of the path delay.
+# Characters of the reason why a take is incomplete.
+MAX_CAUSE = 500
 ClockWarning = Literal["skew", "residual", "stop"]
 StoreId = Annotated[str, Field(pattern=ID_PATTERN)]
 # Of a W3C trace (docs/operations.md#traces).
@@ -117,7 +119,8 @@ class EpisodeAttributes(FrozenModel):
     per object, centre and half sizes in the object's own frame. `event_times_s` is the time at
     which each milestone of the task was first reached, in seconds from step 0; milestones never
     reached are absent. `trace_id` is that of the recording, or of the client that ran the rollout.
-    If empty, these three are not written, so that older releases can read the episode.
+    If empty, these three are not written, so that older releases can read the episode; nor are
+    `complete` and `incomplete_cause` unless the recording was incomplete.
     """
 
     format_version: Literal[1] = FORMAT_VERSION
@@ -134,6 +137,8 @@ class EpisodeAttributes(FrozenModel):
     K_head: Matrix
     success: bool | None = None
     recovered: bool = False
+    complete: bool = Field(default=True, exclude_if=bool)
+    incomplete_cause: str = Field(default="", max_length=MAX_CAUSE, exclude_if=not_)
     generator_command: str | None = None
     lineage: tuple[LineageEntry, ...] = ()
     object_names: tuple[str, ...] = ()

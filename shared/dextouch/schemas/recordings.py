@@ -8,6 +8,7 @@ from pydantic import AwareDatetime, Field, FiniteFloat
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.episodes import (
     FORMAT_VERSION,
+    MAX_CAUSE,
     Domain,
     LineageEntry,
     Matrix,
@@ -38,6 +39,8 @@ class RecordingAttributes(FrozenModel):
     `started_t_host_ns` is the station's monotonic clock at `started_at`; `calibration` holds named
     matrices (`K_head`, `T_tracker_left_wrist_left`, …); `ledger` the counted faults; `quality`
     named figures; `recovered` marks a take that the station did not finish.
+    `complete` is False of a take that was saved although its check found it incomplete, for the
+    reason `incomplete_cause`; both are only written then.
     `trace_id` is that of the request that saved the take, or else began its upload; `num_batches`
     the batches of each stream in the upload, which the store notes. Neither is written if empty.
     """
@@ -54,6 +57,8 @@ class RecordingAttributes(FrozenModel):
     started_t_host_ns: int | None = None
     success: bool | None = None
     recovered: bool = False
+    complete: bool = Field(default=True, exclude_if=bool)
+    incomplete_cause: str = Field(default="", max_length=MAX_CAUSE, exclude_if=not_)
     calibration: dict[str, Matrix] = Field(default={})
     lineage: Annotated[tuple[LineageEntry, ...], Field(fail_fast=True)] = ()
     ledger: Annotated[tuple[LedgerEntry, ...], Field(fail_fast=True)] = ()

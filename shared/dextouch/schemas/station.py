@@ -1,5 +1,6 @@
 """Bodies of a station's routes: recorder, live views, uploads and health."""
 
+from operator import not_
 from typing import Literal
 
 from pydantic import AwareDatetime, Field, FiniteFloat
@@ -91,12 +92,14 @@ class SavedTakes(FrozenModel):
 class RecorderSession(FrozenModel):
     """Takes saved since an operator began a session; it outlives the station's process.
 
-    `last_saved` is the id of the newest saved take, also of an earlier session.
+    `last_saved` is the id of the newest saved take, also of an earlier session, and
+    `last_incomplete` why its check found it incomplete, empty if it did not.
     """
 
     started_at: AwareDatetime
     saved: tuple[SavedTakes, ...] = ()
     last_saved: str | None = None
+    last_incomplete: str = Field(default="", exclude_if=not_)
 
 
 class RecorderStatus(FrozenModel):

@@ -15,6 +15,12 @@ if TYPE_CHECKING:
     from dextouch.streams.batch import frame_body as frame_body
     from dextouch.streams.batch import read_batch as read_batch
     from dextouch.streams.batch import sample_ends as sample_ends
+    from dextouch.streams.limits import LEAST_SHARE_KEPT as LEAST_SHARE_KEPT
+    from dextouch.streams.limits import RATE_ERROR as RATE_ERROR
+    from dextouch.streams.limits import RATE_WARN as RATE_WARN
+    from dextouch.streams.limits import RESIDUAL_ERROR_S as RESIDUAL_ERROR_S
+    from dextouch.streams.limits import RESIDUAL_WARN_S as RESIDUAL_WARN_S
+    from dextouch.streams.limits import residual_limits_s as residual_limits_s
     from dextouch.streams.openpi import pack_openpi as pack_openpi
     from dextouch.streams.openpi import unpack_openpi as unpack_openpi
     from dextouch.streams.packing import pack as pack

@@ -254,3 +254,26 @@ def test_the_real_clock_tells_of_sleep_and_settings(monkeypatch):
 def test_impossible_safety_is_refused(wrong):
     with pytest.raises(ValidationError, match=next(iter(wrong))):
         SpoolSafety(**wrong)
+
+
+def test_an_incomplete_take_keeps_that_and_the_cause(make_recorder, clock):
+    recorder = make_recorder()
+    for name, is_complete in (("whole", True), ("torn", False)):
+        recorder.arm(PROMPT)
+        recorder.record(name)
+        play(recorder, clock, 150)
+        if not is_complete:
+            advance(clock, 2_000_000_000)
+            play(recorder, clock, 150, first=150)
+        recorder.stop()
+        status = recorder.save(ANYWAY)
+        about = SpoolReader(recorder.spool_root / name).attributes
+        assert about.complete is is_complete
+        # As the check words a gap: the stream, and the two seconds without a sample.
+        expected = "" if is_complete else "head: 2.01 s without a sample"
+        assert about.incomplete_cause.startswith(expected)
+        assert bool(about.incomplete_cause) is not is_complete
+        assert status.session.last_incomplete == about.incomplete_cause
+    # Older releases read complete takes: they do not know the fields.
+    whole = (recorder.spool_root / "whole" / "recording.json").read_text()
+    assert "complete" not in whole

@@ -13,6 +13,7 @@ from dextouch.errors import ConflictError, StorageFullError, UnavailableError
 from dextouch.schemas import BatchReceipt, RecordingAttributes, RecordingStatus
 from dextouch.streams import SampleBatch, StreamDescriptor, decode_batch
 from services.acquisition import uploader as uploader_module
+from services.acquisition.retention import Retention
 from services.acquisition.uploader import (
     UPLOADED_FILE,
     Uploader,
@@ -197,7 +198,10 @@ def test_open_takes_wait(tmp_path):
 
 def test_uploaded_takes_are_removed_when_asked(tmp_path):
     path = spool(tmp_path)
-    Uploader(tmp_path, FakeStore(), period_s=1.0, keep_uploaded=False).upload_all()
+    limits = Retention(keep_uploaded_days=0)
+    uploader = Uploader(tmp_path, FakeStore(), period_s=1.0, retention=limits)
+    uploader.upload_all()
+    uploader.retention.sweep()
     assert not path.exists()
 
 

@@ -99,3 +99,18 @@ async def test_stored_and_no_further(service, facts):
     facts["upload"] = None
     await stage(service)
     assert facts["asked"][-1] == "take-7"
+
+
+@pytest.mark.parametrize(
+    ("job", "expected"),
+    [
+        ({"state": "done", "report": REPORT}, ("aligned", "WARN", "5.4 s, 81 steps")),
+        ({"state": "failed", "problem": PROBLEM | {"detail": "no K"}}, ("failed", "ERROR", "no K")),
+    ],
+)
+async def test_an_incomplete_take_is_never_shown_as_in_order(service, facts, job, expected):
+    facts["session"] = SESSION | {"last_incomplete": "camera_head: 2.1 s without a sample"}
+    facts["jobs"] = [JOB | job]
+    expected_stage, level, reason = expected
+    said = f"incomplete: camera_head: 2.1 s without a sample · {reason}"
+    assert await stage(service) == (expected_stage, level, said)

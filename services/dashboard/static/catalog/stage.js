@@ -27,6 +27,8 @@ export function stageOf({ item, upload, job }) {
   const reason = item.review?.reason ?? "";
   if (item.review) return { done, ...VERDICTS[item.review.verdict], detail: reason };
   if (!isAligned && job && JOBS[job.state]) return { done, ...JOBS[job.state](job) };
+  // Seen before anything else: such a take is never "Checked" without a person.
+  if (!item.complete) return { done, label: "Incomplete", level: "WARN", detail: item.incomplete_cause };
   if (!isAligned) return { done, label: "Not aligned", level: "STALE" };
   if (item.origin !== "recorded" && !item.findings.length) return { done, label: "", level: "OK" };
   return item.findings.length
