@@ -28,6 +28,9 @@ LOW_LEFT_S: Final = 86_400.0
 STORE_FREE: Final = "dextouch_store_free_bytes"
 SPOOL_FREE: Final = "dextouch_disk_free_bytes"
 SPOOL_LEFT: Final = "dextouch_disk_left_seconds"
+SPOOL_BYTES: Final = "dextouch_spool_bytes"
+SPOOL_KEEP_S: Final = "dextouch_spool_keep_seconds"
+SPOOL_KEEP_BYTES: Final = "dextouch_spool_keep_bytes"
 UPLOADS: Final = "dextouch_upload_takes"
 ALIGNMENTS: Final = "dextouch_alignment_jobs"
 ALIGNMENTS_LIMIT: Final = "dextouch_alignment_open_jobs_limit"
@@ -36,6 +39,7 @@ CHUNKS_LIMIT: Final = "dextouch_rollout_queue_limit_chunks"
 SHOWN_METRICS: Final = (
     "process_",
     *(STORE_FREE, SPOOL_FREE, SPOOL_LEFT, UPLOADS),
+    *(SPOOL_BYTES, SPOOL_KEEP_S, SPOOL_KEEP_BYTES),
     *(ALIGNMENTS, ALIGNMENTS_LIMIT, CHUNKS, CHUNKS_LIMIT),
 )
 # Samples by their name: value by label values, separated by commas.
@@ -80,6 +84,21 @@ class DiskStatus(FrozenModel):
     left_s: float | None
 
 
+class SpoolStatus(FrozenModel):
+    """Takes in a station's spool, and how long those stay that the store has acknowledged.
+
+    `waiting` includes takes that the store refused; `keep_bytes` is None without such a limit.
+    """
+
+    name: str
+    waiting_bytes: float
+    num_waiting: int
+    uploaded_bytes: float
+    num_uploaded: int
+    keep_s: float
+    keep_bytes: float | None
+
+
 class QueueStatus(FrozenModel):
     """What waits at a service, and how many may wait; None without a limit."""
 
@@ -96,6 +115,7 @@ class SystemView(FrozenModel):
     version: str
     services: tuple[ServiceStatus, ...]
     disks: tuple[DiskStatus, ...]
+    spools: tuple[SpoolStatus, ...]
     queues: tuple[QueueStatus, ...]
 
 
@@ -130,6 +150,9 @@ class System:
                 for service, place in zip(services, places, strict=True)
             ),
             disks=tuple(disk for probe, (_, metrics) in pairs for disk in probe.disks(metrics)),
+            spools=tuple(
+                spool for probe, (_, metrics) in pairs for spool in spools_of(probe.name, metrics)
+            ),
             queues=tuple(
                 queue for probe, (_, metrics) in pairs for queue in queues_of(probe.name, metrics)
             ),
@@ -254,6 +277,25 @@ def shown_metrics(text: str) -> Metrics:
         if isfinite(sample.value):
             found.setdefault(sample.name, {})[", ".join(sample.labels.values())] = sample.value
     return found
+
+
+def spools_of(name: str, metrics: Metrics) -> list[SpoolStatus]:
+    """The spool of a station by its metrics; none of other services."""
+    keep_s = _value(metrics, SPOOL_KEEP_S)
+    if keep_s is None:
+        return []
+    sizes, counts = metrics.get(SPOOL_BYTES, {}), metrics.get(UPLOADS, {})
+    return [
+        SpoolStatus(
+            name=name,
+            waiting_bytes=sizes.get("waiting", 0.0) + sizes.get("refused", 0.0),
+            num_waiting=int(counts.get("waiting", 0) + counts.get("refused", 0)),
+            uploaded_bytes=sizes.get("uploaded", 0.0),
+            num_uploaded=int(counts.get("uploaded", 0)),
+            keep_s=keep_s,
+            keep_bytes=_value(metrics, SPOOL_KEEP_BYTES),
+        )
+    ]
 
 
 def queues_of(place: str, metrics: Metrics) -> list[QueueStatus]:

@@ -97,6 +97,29 @@ async def test_queues_are_those_of_the_metrics():
     }
 
 
+SPOOL = """\
+dextouch_upload_takes{state="waiting"} 2.0
+dextouch_upload_takes{state="uploaded"} 70.0
+dextouch_upload_takes{state="refused"} 1.0
+dextouch_spool_bytes{state="waiting"} 3e+09
+dextouch_spool_bytes{state="uploaded"} 9e+10
+dextouch_spool_bytes{state="refused"} 1e+09
+dextouch_spool_keep_seconds 604800.0
+"""
+
+
+@pytest.mark.parametrize(
+    ("more", "keep_bytes"), [("", None), ("dextouch_spool_keep_bytes 2e11\n", 2e11)]
+)
+async def test_spools_say_what_they_hold_and_for_how_long(more, keep_bytes):
+    desk = Service("acquisition", metrics=SPOOL + more).upstream("a")
+    (spool,) = (await System({"desk": desk}, {"twin": Service("twin").upstream("b")}).read()).spools
+    assert spool.name == "station desk"
+    assert (spool.waiting_bytes, spool.num_waiting) == (4e9, 3)
+    assert (spool.uploaded_bytes, spool.num_uploaded) == (9e10, 70)
+    assert (spool.keep_s, spool.keep_bytes) == (7 * 86_400, keep_bytes)
+
+
 async def test_cpu_is_the_growth_between_two_probes(monkeypatch):
     service = Service("twin")
     now_s = 100.0

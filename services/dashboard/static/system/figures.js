@@ -26,6 +26,14 @@ export function filling(rate) {
   return rate > 0 ? `${bytes(rate)}/s` : `${bytes(-rate)}/s freed`;
 }
 
+// How long acknowledged takes stay in a spool.
+export function retention({ keep_s, keep_bytes }) {
+  if (keep_s === 0 || keep_bytes === 0) return "removed once the store has them";
+  const days = keep_s / 86_400;
+  const most = keep_bytes === null ? "" : `, at most ${bytes(keep_bytes)}`;
+  return `kept for ${Number(days.toFixed(1))} ${days === 1 ? "day" : "days"}${most}`;
+}
+
 export function latency(value_s) {
   return value_s === null ? MISSING : number(1000 * value_s, value_s < 0.01 ? 1 : 0, "ms");
 }

@@ -6,7 +6,7 @@ import { LiveLink } from "../live.js";
 import { badge, why } from "../study_parts.js";
 import { startTheme } from "../theme.js";
 import { AuditTable } from "./audit_table.js";
-import { bytes, cpu, filling, latency } from "./figures.js";
+import { bytes, cpu, filling, latency, retention } from "./figures.js";
 import { Jobs } from "./jobs.js";
 import { StationKeys } from "./stations.js";
 
@@ -44,6 +44,13 @@ function diskRow(disk) {
     number(age(disk.left_s)));
 }
 
+function spoolRow(spool) {
+  return element("tr", {}, element("td", { class: "name" }, spool.name),
+    number(`${bytes(spool.waiting_bytes)} in ${plural(spool.num_waiting, "take")}`),
+    number(`${bytes(spool.uploaded_bytes)} in ${plural(spool.num_uploaded, "take")}`),
+    element("td", {}, retention(spool)));
+}
+
 function queueRow(queue) {
   return element("tr", { "data-level": queue.level === "OK" ? null : queue.level },
     element("td", {}, levelBadge(queue.level)),
@@ -55,7 +62,7 @@ function fill(id, rows, columns, empty) {
     : [element("tr", {}, element("td", { colspan: columns, class: "free" }, empty))]));
 }
 
-function show({ version, services, disks, queues }) {
+function show({ version, services, disks, spools, queues }) {
   const ready = services.filter((one) => one.state === "ready").length;
   setText(find("summary"), `${ready} of ${plural(services.length, "service")} ready`);
   setText(find("own_version"), `dashboard ${version}`);
@@ -64,6 +71,8 @@ function show({ version, services, disks, queues }) {
   const store = services.find((one) => one.name === "episode store");
   if (store) stations.suggest(store.address);
   fill("disk_rows", disks.map(diskRow), 5, "No service measures its disk.");
+  find("spools").hidden = !spools.length;
+  fill("spool_rows", spools.map(spoolRow), 4, "");
   fill("queue_rows", queues.map(queueRow), 5, "No service has a queue.");
 }
 
