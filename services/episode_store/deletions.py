@@ -85,7 +85,7 @@ def deletions_router(records: DeletionRecords, is_station: Callable[[str], bool]
         """Changes with every deletion; a station then checks its spool."""
         return DeletionsRevision(revision=records.revision)
 
-    @router.post("/check")
+    @router.post("/check", dependencies=[MAY_WRITE])
     @takes({JSON: MAX_CHECK_BYTES})
     def check(wanted: Checked, by: Annotated[str, MAY_WRITE]) -> CheckedTakes:
         """Which of these takes were deleted, and which operators."""
@@ -103,7 +103,7 @@ def deletions_router(records: DeletionRecords, is_station: Callable[[str], bool]
             operators=tuple(name for name in wanted.operators if records.has_operator(name)),
         )
 
-    @router.post("/confirm")
+    @router.post("/confirm", dependencies=[MAY_WRITE])
     @takes({JSON: MAX_CHECK_BYTES})
     def confirm(
         removed: Annotated[ConfirmRemoval, Depends(JsonBody(ConfirmRemoval))],
