@@ -29,7 +29,13 @@ _COMPARED = (
     "task", "operator", "station", "domain", "success", "recovered", "origin", "trace_id",
 )  # fmt: skip
 # Order of items by their findings, where those without a score are among the outliers.
-_WEIGHTS = {"doubtful_clock": 10.0, "recovered": 5.0, "not_judged": 1.0}
+_WEIGHTS = {
+    "incomplete": 20.0,
+    "beyond_limit": 15.0,
+    "doubtful_clock": 10.0,
+    "recovered": 5.0,
+    "not_judged": 1.0,
+}
 _SUCCESS: dict[Outcome, bool | None] = {"success": True, "failure": False, "not_judged": None}
 
 

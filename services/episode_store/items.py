@@ -118,9 +118,10 @@ def _with(entry: AnyEntry, **changes: object) -> AnyEntry:
 
 
 def _linked_episode(entry: AnyEntry, recordings: Entries, episodes: Entries) -> AnyEntry:
-    """An episode with its stored recordings, their consent, and the rejection of its sources."""
+    """An episode with what its stored sources say: consent, incompleteness, rejection."""
     names = [one.id for one in entry.lineage if one.kind == "recording" and one.id in recordings]
     sources = [recordings[name].item for name in names]
+    torn = next((one for one in (entry.item, *sources) if not one.complete), entry.item)
     review = entry.item.review
     if review is None:
         sources += [
@@ -131,7 +132,14 @@ def _linked_episode(entry: AnyEntry, recordings: Entries, episodes: Entries) -> 
         reviews = (one.review for one in sources)
         review = next((one for one in reviews if one and one.verdict == "rejected"), None)
     consent = all(recordings[name].item.consent for name in names) if names else None
-    return _with(entry, recordings=tuple(names), consent=consent, review=review)
+    return _with(
+        entry,
+        recordings=tuple(names),
+        consent=consent,
+        review=review,
+        complete=torn.complete,
+        incomplete_cause=torn.incomplete_cause,
+    )
 
 
 def _take(recording: AnyEntry, episodes: Entries) -> AnyEntry:

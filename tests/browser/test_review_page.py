@@ -83,6 +83,20 @@ def test_what_is_unusual_comes_first_and_leaves_with_a_verdict(page, address, st
 
 
 @pytest.mark.slow
+def test_the_first_take_of_a_task_is_listed_with_why_it_is_incomplete(page, address, store):
+    cause = "camera_head: 2.10 s without a sample, expected at most 0.5 s"
+    about = {"task": "first_of_all", "success": True, "started_at": NOON}
+    write_take(store, "torn", num_steps=30, complete=False, incomplete_cause=cause, **about)
+    page.goto(f"{address}/review?task=first_of_all")
+    expect(names(page)).to_have_text(["torn"])
+    expect(page.locator("#rows tr").first).to_contain_text(f"incomplete: {cause}")
+    page.goto(f"{address}/episodes?task=first_of_all")
+    stage = page.locator("#rows tr .stage")
+    expect(stage).to_contain_text("Incomplete")
+    expect(stage).not_to_contain_text("Checked")
+
+
+@pytest.mark.slow
 def test_many_are_rejected_for_a_reason_of_ones_own_and_taken_back(page, address, store):
     page.goto(f"{address}/review")
     expect(names(page)).to_have_count(4)

@@ -9,6 +9,8 @@ from playwright.sync_api import expect
 
 from dextouch import __version__
 from dextouch.episodes import EpisodeStore
+from services.acquisition.app import create_app as create_station
+from services.acquisition.settings import AcquisitionSettings
 from services.alignment import job_runner
 from services.alignment.app import create_app as create_alignment
 from services.alignment.settings import AlignmentSettings
@@ -110,6 +112,26 @@ def test_services_jobs_and_audit(page, serve_dashboard, urls, folder, worker):
     expect(rows).to_have_count(1)
     expect(rows).to_contain_text("open access")
     assert problems == []
+
+
+@pytest.mark.slow
+def test_spools_show_what_they_hold_and_for_how_long(page, serve, serve_dashboard, tmp_path):
+    spool = tmp_path / "spool"
+    for name, extra in (("a", ()), ("b", ("uploaded.json",)), ("c", ("uploaded.json",))):
+        (spool / name).mkdir(parents=True)
+        for file in ("recording.json", *extra):
+            (spool / name / file).write_bytes(b"{}")
+        (spool / name / "batches.log").write_bytes(bytes(10**6))
+    settings = AcquisitionSettings(
+        mock=True, spool=spool, keep_uploaded_days=3, keep_uploaded_gb=200, upload_period_s=3600
+    )
+    address = serve_dashboard(acquisition_url=serve(create_station(settings)))
+    page.goto(f"{address}/system")
+    row = page.locator("#spool_rows tr")
+    expect(row).to_contain_text("station desk")
+    expect(row).to_contain_text("1.0 MB in 1 take")
+    expect(row).to_contain_text("2.0 MB in 2 takes")
+    expect(row).to_contain_text("kept for 3 days, at most 200 GB")
 
 
 @pytest.mark.slow

@@ -54,6 +54,25 @@ async def test_an_incomplete_take_is_to_be_reviewed(settings, store, is_aligned,
         assert findings == [("incomplete", f"incomplete: {CAUSE}")]
 
 
+async def test_an_episode_that_an_older_release_aligned_is_as_incomplete_as_its_recording(
+    settings, store
+):
+    write_recording(store, "take-1", success=True, complete=False, incomplete_cause=CAUSE)
+    episode_of(store, "take-1")
+    for kind, name in (("take", "take-1"), ("episode", "take-1-episode")):
+        assert await flagged(settings, kind) == {name: [("incomplete", f"incomplete: {CAUSE}")]}
+
+
+async def test_incomplete_takes_come_before_those_in_doubt(settings, store):
+    write_recording(store, "a-not-judged")
+    write_recording(store, "b-incomplete", complete=False, incomplete_cause=CAUSE)
+    transport = httpx.ASGITransport(app=create_app(settings))
+    async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as http:
+        query = {"flagged": "true", "sort": "findings", "descending": "true"}
+        items = (await http.get("/v1/catalog/items", params=query)).json()["items"]
+    assert [item["id"] for item in items] == ["b-incomplete", "a-not-judged"]
+
+
 @pytest.mark.parametrize(
     ("num_refused", "is_listed"), [(1, False), (2, True)], ids=["9 of 10 kept", "9 of 11 kept"]
 )
