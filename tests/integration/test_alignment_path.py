@@ -32,7 +32,8 @@ def test_whole_path_keeps_the_truth(domain, tmp_path, capsys):
         prompt = TakePrompt(task="stand-bottle", instruction="stand it up", domain=domain)
         take = station.run_take(prompt, recording_id="take")
     spool = SpoolReader(take.spool_path)
-    attributes = spool.attributes.model_copy(update={"streams": ()})
+    torn = {"complete": False, "incomplete_cause": "head: 0.3 s without a sample"}
+    attributes = spool.attributes.model_copy(update={"streams": ()} | torn)
     with store.writer(kind="recording", attributes=attributes) as writer:
         for name, stream in spool.streams.items():
             batch = spool.read(name)
@@ -63,3 +64,5 @@ def test_whole_path_keeps_the_truth(domain, tmp_path, capsys):
             sys.stdout.write(f"\npath {domain:5s} {name:28s} {error:8.4f} | bound {bound}")
     assert all(error <= bound for _, error, bound in rows)
     assert report.num_steps >= 80
+    about = store.open(report.episode_id).attributes
+    assert {name: getattr(about, name) for name in torn} == torn
