@@ -58,7 +58,7 @@ def align_recording(
     caller's thread.
 
     Raises:
-        NotFoundError: no such recording.
+        NotFoundError: no such recording, or it was deleted meanwhile.
         InvalidInputError: the recording lacks data that an episode needs (the message names it).
         CorruptDataError, StorageError: the store's bytes are damaged or cannot be written.
     """
@@ -69,6 +69,12 @@ def align_recording(
         episode = build_episode(
             recording, episode_id=episode_id, options=options, on_progress=on_progress
         )
+        # What was read before a deletion must not come back after it.
+        if not store.exists(recording_id, kind="recording"):
+            raise NotFoundError(
+                f"recording {recording_id!r}: it was deleted while it was aligned; no episode is "
+                "written"
+            )
         # Another process may write the same episode meanwhile.
         with suppress(ConflictError):
             with store.writer(kind="episode", attributes=episode.attributes) as writer:

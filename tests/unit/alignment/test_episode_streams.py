@@ -6,7 +6,9 @@ import pytest
 from dextouch import images
 from dextouch.episodes import GOP_IMAGES, EpisodeStore
 from dextouch.episodes.image_codecs import ImageChunks
+from dextouch.errors import NotFoundError
 from dextouch.streams import StreamDescriptor
+from services.alignment import jobs
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
 from services.alignment.synchronization import recorded_streams
@@ -164,3 +166,20 @@ def test_a_sample_without_a_time_of_its_own_takes_no_other_along(store):
     numbers = np.rint((data.t_ref_ns + origin_ns - START_NS) * 1e-7)
     assert 150 not in numbers
     np.testing.assert_allclose(data.values[:, 0], 0.25 + numbers * 1e-3, atol=1e-9)
+
+
+def test_a_recording_that_is_deleted_while_it_is_aligned_leaves_no_episode(tmp_path, monkeypatch):
+    store = EpisodeStore(tmp_path / "store")
+    write_recording(store, "take")
+    build = jobs.build_episode
+
+    def build_and_delete(*args, **options):
+        built = build(*args, **options)
+        store.delete("take", kind="recording", for_good=True)
+        return built
+
+    monkeypatch.setattr(jobs, "build_episode", build_and_delete)
+    with pytest.raises(NotFoundError, match="deleted while it was aligned"):
+        align_recording(store, "take", OPTIONS)
+    assert store.list() == []
+    assert list((store.root / ".staging").glob("*")) == []
