@@ -64,7 +64,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
             content_router(store, settings),
             playback_router(store, settings),
             trash_router(store, max_page=settings.max_page),
-            deletions_router(deletions, enrolments.is_enrolled),
+            deletions_router(deletions),
             enrolment_router(enrolments),
         ],
         lifespan=lifespan,

@@ -13,7 +13,7 @@ import structlog
 from fastapi import APIRouter, Depends
 
 from dextouch.episodes.care import DeletionRecords, TakeFacts, take_start
-from dextouch.errors import AccessDeniedError, ConflictError, DexTouchError
+from dextouch.errors import ConflictError, DexTouchError
 from dextouch.schemas import (
     OPERATOR_DELETED,
     TAKE_DELETED,
@@ -29,6 +29,7 @@ from dextouch.schemas import (
     SpooledTake,
 )
 from dextouch.serving import JSON, KIB, JsonBody, RequireScope, takes
+from services.episode_store.senders import Writer
 
 logger = structlog.get_logger(__name__)
 
@@ -65,14 +66,8 @@ def refuse_deleted(records: DeletionRecords, attributes: RecordingAttributes) ->
     )
 
 
-def deletions_router(records: DeletionRecords, is_station: Callable[[str], bool]) -> APIRouter:
-    """Create the routes below /v1/deletions.
-
-    Args:
-        records: of the store.
-        is_station: whether a name of a key is that of an enrolled station, which may ask about its
-            own takes only.
-    """
+def deletions_router(records: DeletionRecords) -> APIRouter:
+    """Create the routes below /v1/deletions."""
     router = APIRouter(prefix="/v1/deletions", tags=["deletions"])
 
     @router.get("", dependencies=[MAY_DELETE])
@@ -87,9 +82,9 @@ def deletions_router(records: DeletionRecords, is_station: Callable[[str], bool]
 
     @router.post("/check", dependencies=[MAY_WRITE])
     @takes({JSON: MAX_CHECK_BYTES})
-    def check(wanted: Checked, by: Annotated[str, MAY_WRITE]) -> CheckedTakes:
+    def check(wanted: Checked, sender: Writer) -> CheckedTakes:
         """Which of these takes were deleted, and which operators."""
-        _check_own(wanted.station, by)
+        sender.check_station(wanted.station)
         # Before the takes, so that a deletion in between is found by the next check.
         revision = records.revision
         found = ((take, _deletion_of(records, wanted.station, take)) for take in wanted.takes)
@@ -107,24 +102,16 @@ def deletions_router(records: DeletionRecords, is_station: Callable[[str], bool]
     @takes({JSON: MAX_CHECK_BYTES})
     def confirm(
         removed: Annotated[ConfirmRemoval, Depends(JsonBody(ConfirmRemoval))],
-        by: Annotated[str, MAY_WRITE],
+        sender: Writer,
     ) -> DeletionsRevision:
         """Note that a station holds none of the deleted takes, except those that it names."""
-        _check_own(removed.station, by)
+        sender.check_station(removed.station)
         held: defaultdict[str, list[str]] = defaultdict(list)
         for one in removed.held:
             held[one.deletion].append(one.recording_id)
         records.confirm(removed.station, revision=removed.revision, held=held)
         logger.info("removal_confirmed", station=removed.station, num_held=len(removed.held))
         return DeletionsRevision(revision=removed.revision)
-
-    def _check_own(station: str, by: str) -> None:
-        if is_station(by) and by != station:
-            raise AccessDeniedError(
-                f"deletions: the key of station {by!r} asks about takes of station {station!r}; "
-                "expected its own",
-                reason="foreign_station",
-            )
 
     return router
 

@@ -106,10 +106,6 @@ class Enrolments:
         shown.sort(key=lambda one: one.requested_at, reverse=True)
         return StationEnrolments(enrolments=tuple(shown), needs_key=self._access.has_keys)
 
-    def is_enrolled(self, name: str) -> bool:
-        """Whether a key's name is that of an enrolled station."""
-        return any(one.station == name and one.state == "enrolled" for one in self._kept)
-
     def issue(self, station: str, *, by: str) -> EnrolmentToken:
         """Issue a token for a station, in place of an earlier unused one.
 

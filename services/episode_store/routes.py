@@ -1,7 +1,6 @@
 """HTTP routes of the store: uploads by stations, and lists of recordings and episodes."""
 
 import time
-from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
 from functools import partial
 from typing import Annotated
@@ -34,7 +33,6 @@ from dextouch.serving import (
     JSON,
     KIB,
     OCTETS,
-    AccessControl,
     JsonBody,
     RequireScope,
     takes,
@@ -51,7 +49,7 @@ from services.episode_store.hours import HoursField, HoursFilter
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
 from services.episode_store.reviewing import review_items
-from services.episode_store.senders import ANYONE, Sender
+from services.episode_store.senders import Reader, Writer
 
 Attributes = Annotated[RecordingAttributes, Depends(JsonBody(RecordingAttributes))]
 Finish = Annotated[FinishRecording, Depends(JsonBody(FinishRecording))]
@@ -61,23 +59,6 @@ MAY_WRITE = Depends(RequireScope("store_write"))
 MAY_EXPIRE = Depends(RequireScope("store_expire"))
 # Room for the calibration and descriptors of a station, or the ledger of a take.
 MAX_ATTRIBUTES_BYTES = 256 * KIB
-
-
-def _sender(scope: str) -> Callable[[Request], Awaitable[Sender]]:
-    """Dependency that tells who sends a request that needs a scope."""
-
-    async def sender(request: Request) -> Sender:
-        access: AccessControl = request.app.state.access
-        if not access.has_keys:
-            return ANYONE
-        grant = access.granted(request.headers.get("authorization"), scope)
-        return Sender(name=grant.name, station=grant.station)
-
-    return sender
-
-
-Writer = Annotated[Sender, Depends(_sender("store_write"))]
-Reader = Annotated[Sender, Depends(_sender("store_read"))]
 
 
 def uploads_router(

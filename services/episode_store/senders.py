@@ -1,13 +1,16 @@
 """Who may go on with an upload: the key that began it, or a key that is bound to its station."""
 
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
+from fastapi import Depends, Request
 from pydantic import ValidationError
 
 from dextouch.episodes import disk_errors
 from dextouch.errors import AccessDeniedError, StorageError
 from dextouch.frozen_model import FrozenModel
+from dextouch.serving import AccessControl
 
 # In the folder of an upload; without it, the upload was begun without keys or by a release that
 # did not keep the name.
@@ -24,12 +27,12 @@ class Sender(FrozenModel):
     station: str | None = None
 
     def check_station(self, station: str) -> None:
-        """Raise AccessDeniedError unless the key may upload for this station."""
+        """Raise AccessDeniedError unless the key may upload and ask for this station."""
         if self.station not in {None, station}:
             raise AccessDeniedError(
-                f"key {self.name!r} uploads for station {self.station!r} only, got a recording of "
-                f"station {station!r}; name the station {self.station!r} in its settings, or enrol "
-                f"it as {station!r}",
+                f"key {self.name!r} is of station {self.station!r} only, got takes of station "
+                f"{station!r}; name the station {self.station!r} in its settings, or enrol it as "
+                f"{station!r}",
                 reason="other_station",
                 station=station,
             )
@@ -62,6 +65,23 @@ class Sender(FrozenModel):
 
 # In a store without keys, and for callers in this process.
 ANYONE: Final = Sender()
+
+
+def _sender(scope: str) -> Callable[[Request], Awaitable[Sender]]:
+    """Dependency that tells who sends a request that needs a scope."""
+
+    async def sender(request: Request) -> Sender:
+        access: AccessControl = request.app.state.access
+        if not access.has_keys:
+            return ANYONE
+        grant = access.granted(request.headers.get("authorization"), scope)
+        return Sender(name=grant.name, station=grant.station)
+
+    return sender
+
+
+Writer = Annotated[Sender, Depends(_sender("store_write"))]
+Reader = Annotated[Sender, Depends(_sender("store_read"))]
 
 
 def owner_of(folder: Path) -> str | None:

@@ -42,7 +42,8 @@ STATUS_OF_CLASS: tuple[tuple[type[DexTouchError], int], ...] = (
 )
 STATUS_OF_REASON = {
     "missing_scope": 403,
-    "foreign_station": 403,
+    "other_key": 403,
+    "other_station": 403,
     "foreign_origin": 403,
     "unknown_token": 403,
     "used_token": 403,
@@ -99,8 +100,9 @@ def status_of(error: DexTouchError) -> int:
     """The HTTP status of an error.
 
     Two classes depend on their details: a temporary limit (`retry_after_s`) is 429, any other 413;
-    a refusal depends on its `reason`: a missing or unknown key is 401, a missing scope, a foreign
-    origin or an invalid enrolment token 403, a foreign host name 421.
+    a refusal depends on its `reason`: a missing or unknown key is 401, a missing scope, what is of
+    another key or station, a foreign origin or an invalid enrolment token 403, a foreign host name
+    421.
     """
     if isinstance(error, LimitExceededError) and "retry_after_s" in error.details:
         return 429

@@ -10,6 +10,7 @@ from pydantic import SecretStr
 from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import AccessDeniedError, ConflictError, InvalidInputError, StorageError
+from dextouch.schemas import status_of
 from dextouch.serving import AccessControl
 from dextouch.serving.keys import ApiKey
 from services.episode_store.app import create_app
@@ -91,6 +92,9 @@ def refusals(client, attributes, batch_of):
         with pytest.raises((AccessDeniedError, ConflictError)) as refused:
             request()
         found.append((type(refused.value), refused.value.details["reason"]))
+        # 401 would tell a station to look for another key.
+        is_taken = refused.value.details["reason"] == "id_taken"
+        assert status_of(refused.value) == (409 if is_taken else 403)
     return found
 
 
@@ -125,7 +129,7 @@ def test_an_upload_belongs_to_the_key_that_began_it(
 @pytest.mark.parametrize("key", ["desk_2", "bound"])
 def test_a_key_of_a_station_begins_nothing_in_another_name(serve, settings, attributes, key):
     with serve() as client:
-        with pytest.raises(AccessDeniedError, match="got a recording of station 'bench'"):
+        with pytest.raises(AccessDeniedError, match="got takes of station 'bench'"):
             client(key).create(attributes)
         assert client("cleaner").uploads().uploads == ()
         own = {"desk_2": "desk_2", "bound": "desk_9"}[key]
