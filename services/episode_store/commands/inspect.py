@@ -177,8 +177,11 @@ def verify(context: Context) -> Outcome:
     reports: list[ItemReport] = []
     with _progress_bar(context, items) as progress:
         for kind, item_id in items:
-            files = _files(context, kind, item_id)
-            reports.append(inspect_group(files, kind, progress=progress))
+            try:
+                files = _files(context, kind, item_id)
+                reports.append(inspect_group(files, kind, progress=progress))
+            except NotFoundError:
+                context.say(f"{item_id}  deleted meanwhile  {kind}")
     if not context.options.ids and root is not None:
         for what, folder in unfinished_folders(root):
             reports.append(_inspect_unfinished(what, folder))
@@ -186,7 +189,7 @@ def verify(context: Context) -> Outcome:
         _say_report(context, report)
     damaged = {r.item_id: "; ".join(f.message for f in r.findings) for r in reports if r.damaged}
     result = {
-        "verified": len(items),
+        "verified": sum(report.kind in KINDS for report in reports),
         "damaged": damaged,
         "reports": [asdict(report) for report in reports],
     }
@@ -239,7 +242,7 @@ def _progress_bar(context: Context, items: list[tuple[Kind, str]]) -> Iterator[P
             files = _files(context, kind, item_id)
             entries = open_contents(files, kind).entries
             total += sum(_shard_bytes(files, name, e.shape) for name, e in entries.items())
-        except StorageError:
+        except (StorageError, NotFoundError):
             continue
     with Bar(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("verify", total=total)

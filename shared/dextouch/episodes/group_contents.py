@@ -26,7 +26,7 @@ from dextouch.episodes.format import (
 from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.episodes.journal import log_paths, part_path, read_rows
 from dextouch.episodes.shards import ShardReader, decode_rows
-from dextouch.episodes.sources import GroupFiles, LocalFile, LocalGroup
+from dextouch.episodes.sources import GroupFiles, LocalFile, LocalGroup, OpenedGroup
 from dextouch.episodes.staged_group import read_stage
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
@@ -47,13 +47,14 @@ class GroupContents(Generic[A]):
     content_sha256: str
     what: str
     _shards: dict[str, ShardReader] = field(default_factory=dict)
+    opened: OpenedGroup | None = None
 
     def shard(self, name: str) -> ShardReader:
         """Reader of one array; its shard index is cached."""
         if name not in self._shards:
             entry, what = self.entries[name], f"{self.what}: array {name!r}"
             source = self.files.source(f"{name}/{shard_path(len(entry.shape))}")
-            self._shards[name] = ShardReader(source, entry, what=what)
+            self._shards[name] = ShardReader(source, entry, what=what, group=self.opened)
         return self._shards[name]
 
     def inspect_array(
@@ -63,7 +64,18 @@ class GroupContents(Generic[A]):
 
         Damage is the number of a storage chunk, None for the whole array, and its error. `progress`
         gets the size of every intact storage chunk, encoded, in bytes.
+
+        Raises:
+            NotFoundError: the group was deleted or replaced since it was opened.
         """
+        for number, error in self._inspect_array(name, progress):
+            if self.opened is not None:
+                self.opened.check_present(error)
+            yield number, error
+
+    def _inspect_array(
+        self, name: str, progress: Callable[[int], None]
+    ) -> Iterator[tuple[int | None, StorageError]]:
         entry, what = self.entries[name], f"{self.what}: array {name!r}"
         digest, is_whole = hashlib.sha256(), True
         try:
@@ -130,13 +142,25 @@ def read_group(files: GroupFiles, model: type[A]) -> GroupContents[A]:
 
     Raises:
         CorruptDataError: the commit record or the attributes are damaged.
+        NotFoundError: it was deleted or replaced while it was opened.
         StorageError: written by another version of the format.
     """
     kind: Kind = "episode" if issubclass(model, EpisodeAttributes) else "recording"
     what = f"{kind} {files.item_id}"
-    commit, group = files.get(COMMIT_FILE), files.get(METADATA_FILE)
+    commit = files.get(COMMIT_FILE)
     if commit is None:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} is missing")
+    opened = OpenedGroup(files, COMMIT_FILE, sha256_hex(commit), what)
+    try:
+        return _read_group(opened, commit, kind, model)
+    except StorageError as error:
+        opened.check_present(error)
+        raise
+
+
+def _read_group(opened: OpenedGroup, commit: bytes, kind: Kind, model: type[A]) -> GroupContents[A]:
+    files, what = opened.files, opened.what
+    group = files.get(METADATA_FILE)
     record, content_sha256 = decode_commit(commit, what=what)
     if group is None:
         raise CorruptDataError(f"{what}: {METADATA_FILE} is missing")
@@ -150,7 +174,9 @@ def read_group(files: GroupFiles, model: type[A]) -> GroupContents[A]:
     except MALFORMED as error:
         raise StorageError(f"{what}: attributes are invalid ({error})") from error
     _check_arrays(expected, record.arrays, what)
-    return GroupContents(files, kind, attributes, record.arrays, content_sha256, what)
+    return GroupContents(
+        files, kind, attributes, record.arrays, content_sha256, what, opened=opened
+    )
 
 
 def _check_arrays(

@@ -159,6 +159,10 @@ class ObjectGroup:
         """Contents of a small file; None if it does not exist."""
         if name in self._known:
             return self._known[name]
+        return self.get_now(name)
+
+    def get_now(self, name: str) -> bytes | None:
+        """As `get`, always from the bucket."""
         return self._bucket.get(f"{self._folder}/{name}")
 
     def source(self, name: str) -> ObjectFile:

@@ -20,8 +20,8 @@ from jaxtyping import Shaped
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import ZSTD_LEVEL, ArrayEntry, shard_path, with_rows
 from dextouch.episodes.journal import JournalWriter, part_path, read_payload, read_rows
-from dextouch.episodes.sources import ByteSource
-from dextouch.errors import CorruptDataError, InvalidInputError
+from dextouch.episodes.sources import ByteSource, OpenedGroup
+from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 
 CRC_BYTES = 4
 INDEX_ENTRY_BYTES = 16
@@ -104,10 +104,17 @@ class ShardReader:
         entry: dtype, shape and codec of the array.
         what: names the array in errors.
         index: (offset, length) of each storage chunk, for a file that has no index yet.
+        group: that the file belongs to; without it, its deletion cannot be told from damage.
     """
 
     def __init__(
-        self, source: ByteSource, entry: ArrayEntry, *, what: str, index: np.ndarray | None = None
+        self,
+        source: ByteSource,
+        entry: ArrayEntry,
+        *,
+        what: str,
+        index: np.ndarray | None = None,
+        group: OpenedGroup | None = None,
     ) -> None:
         self._source, self._entry, self._what = source, entry, what
         self._dtype, self._row_bytes = _row_layout(entry)
@@ -115,6 +122,7 @@ class ShardReader:
         self._num_rows, self._rows_each = entry.shape[0], entry.chunk_rows
         self._num_chunks = -(-entry.shape[0] // entry.chunk_rows)
         self._index = index
+        self._group = group
 
     def read(self, start: int = 0, stop: int | None = None) -> Shaped[np.ndarray, "n ..."]:
         """Rows start … stop-1; only the storage chunks that contain them are read and decoded.
@@ -122,7 +130,15 @@ class ShardReader:
         Raises:
             InvalidInputError: rows outside the array.
             CorruptDataError: a checksum mismatch, or missing bytes.
+            NotFoundError: the group was deleted or replaced since it was opened.
         """
+        try:
+            return self._read(start, stop)
+        except StorageError as error:
+            self._check_present(error)
+            raise
+
+    def _read(self, start: int, stop: int | None) -> Shaped[np.ndarray, "n ..."]:
         num_rows, rows_each = self._num_rows, self._rows_each
         stop = num_rows if stop is None else stop
         if not 0 <= start <= stop <= num_rows:
@@ -130,7 +146,7 @@ class ShardReader:
                 f"{self._what}: got rows {start} … {stop}, expected within 0 … {num_rows}"
             )
         first = start // rows_each
-        places = self.check_index()[first : -(-stop // rows_each) if stop > start else first]
+        places = self._checked_index()[first : -(-stop // rows_each) if stop > start else first]
         rows = np.empty((stop - start) * self._row_bytes, dtype=np.uint8)
         # As plain bytes, which are cheaper to copy than rows for small windows.
         wanted, skip = rows.data, start % rows_each * self._row_bytes
@@ -151,10 +167,15 @@ class ShardReader:
 
         Raises:
             CorruptDataError: a checksum does not hold, or bytes are missing.
+            NotFoundError: the group was deleted or replaced since it was opened.
         """
-        offset, length = self.check_index()[number].tolist()
         what = f"{self._what}: storage chunk {number}"
-        return _without_crc(self._source.read(offset, length), 0, length, what)
+        try:
+            offset, length = self._checked_index()[number].tolist()
+            return _without_crc(self._source.read(offset, length), 0, length, what)
+        except StorageError as error:
+            self._check_present(error)
+            raise
 
     def _payloads(self, number: int, places: list[list[int]]) -> Iterator[tuple[str, bytes]]:
         """Error label and payload of storage chunks from `number` on, by offset and length.
@@ -180,7 +201,19 @@ class ShardReader:
         Raises:
             CorruptDataError: a missing file; storage chunks that are not contiguous up to the
                 index, or too short for the rows in the commit record.
+            NotFoundError: the group was deleted or replaced since it was opened.
         """
+        try:
+            return self._checked_index()
+        except StorageError as error:
+            self._check_present(error)
+            raise
+
+    def _check_present(self, error: StorageError) -> None:
+        if self._group is not None:
+            self._group.check_present(error)
+
+    def _checked_index(self) -> np.ndarray:
         if self._index is None:
             size = self._source.size()
             if size is None:

@@ -1,15 +1,17 @@
 """File access for group readers, independent of the backend; local files are memory-mapped."""
 
+import hashlib
 import mmap
 import threading
 from collections import OrderedDict
 from collections.abc import Hashable
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from dextouch.episodes.files import disk_errors
-from dextouch.errors import CorruptDataError
+from dextouch.errors import CorruptDataError, NotFoundError, StorageError
 
 # Each mapping holds a file descriptor, and the usual limit is 1024 per process.
 MAX_MAPPED_FILES = 192
@@ -42,9 +44,46 @@ class GroupFiles(Protocol):
         """All bytes of a small file; None where there is no such file."""
         ...
 
+    def get_now(self, name: str) -> bytes | None:
+        """As `get`, but never what was read before."""
+        ...
+
     def source(self, name: str) -> ByteSource:
         """A file that is read in parts."""
         ...
+
+
+@dataclass(frozen=True)
+class OpenedGroup:
+    """The committed group that a reader has opened, to tell its deletion from damage.
+
+    Attributes:
+        files: of the group.
+        commit_name: name of its commit record.
+        commit_sha256: hash of the commit record when it was opened.
+        what: names the group in errors.
+    """
+
+    files: GroupFiles
+    commit_name: str
+    commit_sha256: str
+    what: str
+
+    def check_present(self, error: StorageError | None = None) -> None:
+        """Refuse a group that was deleted or replaced, of which `error` is the consequence.
+
+        Raises:
+            NotFoundError: its commit record is gone, or another one.
+        """
+        try:
+            commit = self.files.get_now(self.commit_name)
+        except StorageError:
+            return
+        if commit is None or hashlib.sha256(commit).hexdigest() != self.commit_sha256:
+            change = "deleted" if commit is None else "replaced by another one"
+            raise NotFoundError(
+                f"{self.what}: was {change} while it was read; list the store again"
+            ) from error
 
 
 class LruCache:
@@ -77,11 +116,12 @@ def _mapped(path: Path) -> memoryview | None:
     """The memory-mapped bytes of a file; None if it is missing."""
     try:
         status = path.stat()
+        if status.st_size == 0:
+            return memoryview(b"")
+        return memoryview(_map(str(path), status.st_ino, status.st_size, status.st_mtime_ns))
     except (FileNotFoundError, NotADirectoryError):
+        # Also if it was removed after its size was read.
         return None
-    if status.st_size == 0:
-        return memoryview(b"")
-    return memoryview(_map(str(path), status.st_ino, status.st_size, status.st_mtime_ns))
 
 
 # Evicted mappings are dropped, not closed: readers may still use them, and the last one frees them.
@@ -137,13 +177,22 @@ class LocalGroup:
         """All bytes of a small file; None where there is no such file."""
         path = self._path(name)
         with disk_errors(f"read {path}"):
-            size = path.stat().st_size if path.is_file() else None
-            if size is not None and size > MAX_METADATA_BYTES:
-                raise CorruptDataError(
-                    f"{self.item_id}: {name} holds {size} bytes, expected at most "
-                    f"{MAX_METADATA_BYTES}"
-                )
-            return None if size is None else path.read_bytes()
+            if not path.is_file():
+                return None
+            try:
+                size = path.stat().st_size
+                if size > MAX_METADATA_BYTES:
+                    raise CorruptDataError(
+                        f"{self.item_id}: {name} holds {size} bytes, expected at most "
+                        f"{MAX_METADATA_BYTES}"
+                    )
+                return path.read_bytes()
+            except FileNotFoundError:
+                return None
+
+    def get_now(self, name: str) -> bytes | None:
+        """As `get`, which remembers nothing."""
+        return self.get(name)
 
     def source(self, name: str) -> LocalFile:
         """A file that is read in parts."""

@@ -4,7 +4,8 @@ import builtins
 import re
 import shutil
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
@@ -46,6 +47,7 @@ from dextouch.episodes.trash import (
 from dextouch.episodes.writer import EpisodeWriter, write_blocks
 from dextouch.errors import (
     ConflictError,
+    CorruptDataError,
     InvalidInputError,
     NotFoundError,
     UnavailableError,
@@ -108,12 +110,23 @@ class EpisodeStore:
             CorruptDataError, StorageError: damaged, or of a newer format.
         """
         group = self._storage.group(*_check("episode", episode_id))
-        return EpisodeReader(read_group(group, EpisodeAttributes))
+        with self._deletion_told("episode", episode_id):
+            return EpisodeReader(read_group(group, EpisodeAttributes))
 
     def recording(self, recording_id: str) -> RecordingReader:
         """Open a finished recording; raises as `open`."""
         group = self._storage.group(*_check("recording", recording_id))
-        return RecordingReader(read_group(group, RecordingAttributes))
+        with self._deletion_told("recording", recording_id):
+            return RecordingReader(read_group(group, RecordingAttributes))
+
+    @contextmanager
+    def _deletion_told(self, kind: Kind, item_id: str) -> Iterator[None]:
+        """Context manager in which the damage of a group that is gone is a NotFoundError."""
+        try:
+            yield
+        except CorruptDataError:
+            self._storage.group(kind, item_id)
+            raise
 
     def files(self, item_id: str, *, kind: Kind = "episode") -> GroupFiles:
         """The raw files of a committed group, for inspection and repair.
@@ -319,8 +332,11 @@ class _LocalStorage:
 
     def group(self, kind: Kind, item_id: str) -> LocalGroup:
         if not self.exists(kind, item_id):
-            raise NotFoundError(f"{kind} {item_id!r}: not in the store {self.root}")
+            raise self._missing(kind, item_id)
         return LocalGroup(self._folder(kind, item_id))
+
+    def _missing(self, kind: Kind, item_id: str) -> NotFoundError:
+        return NotFoundError(f"{kind} {item_id!r}: not in the store {self.root}")
 
     def exists(self, kind: Kind, item_id: str) -> bool:
         with disk_errors(f"look at {kind} {item_id}"):
@@ -328,7 +344,11 @@ class _LocalStorage:
 
     def revision(self, kind: Kind, item_id: str) -> int:
         with disk_errors(f"look at {kind} {item_id}"):
-            return (self.group(kind, item_id).folder / COMMIT_FILE).stat().st_mtime_ns
+            folder = self.group(kind, item_id).folder
+            try:
+                return (folder / COMMIT_FILE).stat().st_mtime_ns
+            except FileNotFoundError as error:
+                raise self._missing(kind, item_id) from error
 
     def num_bytes(self, kind: Kind, item_id: str) -> int:
         return folder_bytes(self.group(kind, item_id).folder)
@@ -347,11 +367,15 @@ class _LocalStorage:
     def set_review(self, kind: Kind, item_id: str, content: bytes | None) -> None:
         path = self._folder(kind, item_id) / REVIEW_FILE
         with disk_errors(f"review {kind} {item_id}"):
-            if content is not None:
-                replace_file(path, content)
-            elif path.exists():
-                path.unlink()
-                sync_folder(path.parent)
+            try:
+                if content is not None:
+                    replace_file(path, content)
+                elif path.exists():
+                    path.unlink()
+                    sync_folder(path.parent)
+            except FileNotFoundError as error:
+                # Deleted meanwhile: an item without a review has no file to remove either.
+                raise self._missing(kind, item_id) from error
 
     def migrate(self, kind: Kind, item_id: str) -> bool:
         """Replace a group of an older format version atomically; its lineage names the old one."""

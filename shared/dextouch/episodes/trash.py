@@ -101,7 +101,10 @@ def restore_from_trash(root: Path, kind: TrashKind, item_id: str) -> TrashEntry:
                 f"{kind} {item_id!r} exists; delete it first, then restore the older one"
             )
         target.parent.mkdir(parents=True, exist_ok=True)
-        entry.folder.rename(target)
+        try:
+            entry.folder.rename(target)
+        except FileNotFoundError as error:
+            raise NotFoundError(f"{kind} {item_id!r}: was purged from the trash") from error
         sync_folder(target.parent)
     return entry
 

@@ -31,7 +31,7 @@ from dextouch.episodes.spool_log import body_at, find_records, open_log
 from dextouch.episodes.spool_seal import RECORDING_FILE
 from dextouch.episodes.staged_group import STAGE_FILE, STAGING, read_stage
 from dextouch.episodes.trash import HOMES
-from dextouch.errors import StorageError
+from dextouch.errors import NotFoundError, StorageError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 from dextouch.system_files import is_system_file
 
@@ -78,10 +78,16 @@ def open_contents(files: GroupFiles, kind: Kind) -> Group:
 def inspect_group(
     files: GroupFiles, kind: Kind, *, progress: Progress = lambda _: None
 ) -> ItemReport:
-    """Read a committed group completely and list all damage."""
+    """Read a committed group completely and list all damage.
+
+    Raises:
+        NotFoundError: there is no such group, or it was deleted meanwhile.
+    """
     try:
         contents = open_contents(files, kind)
     except StorageError as error:
+        if isinstance(files, LocalGroup) and not os.path.lexists(files.folder):
+            raise NotFoundError(f"{kind} {files.item_id!r}: was deleted") from error
         return ItemReport(kind, files.item_id, findings=(Finding(error.message),))
     sizes: list[int] = []
 
@@ -101,6 +107,8 @@ def inspect_group(
             Finding(f"{contents.what}: {path} belongs to no array; move it away", foreign=True)
             for path in _foreign_paths(files.folder, contents.entries)
         ]
+    if findings and contents.opened is not None:
+        contents.opened.check_present()
     return ItemReport(kind, files.item_id, len(contents.entries), sum(sizes), tuple(findings))
 
 
