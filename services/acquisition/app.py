@@ -140,7 +140,9 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
                 app.state.registry.unregister(collector)
 
     async def missing() -> Sequence[str]:
-        return [s.driver.name for s in station.supervisors if not s.connected.is_set()]
+        spool = station.recorder.spool_folder.problem(writing=True)
+        silent = [s.driver.name for s in station.supervisors if not s.connected.is_set()]
+        return silent if spool is None else [spool, *silent]
 
     app = create_service_app(
         name="acquisition",

@@ -25,6 +25,7 @@ from dextouch.schemas import (
     TakeCheck,
     TakePrompt,
 )
+from dextouch.serving import ServedFolder
 from dextouch.tracing import current_trace_id
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver
@@ -103,6 +104,7 @@ class Recorder:
         options: TakeOptions | None = None,
     ) -> None:
         self.spool_root = spool_root
+        self.spool_folder = ServedFolder(spool_root, "spool")
         self._station = station
         self._drivers = {driver.name: driver for driver in drivers}
         self._clock = clock
@@ -250,8 +252,8 @@ class Recorder:
 
     def _record(self, recording_id: str | None) -> None:
         attributes = self._attributes(recording_id)
-        with disk_errors(f"make the spool folder {self.spool_root}"):
-            self.spool_root.mkdir(parents=True, exist_ok=True)
+        self.spool_folder.open()
+        self.spool_folder.check(writing=True)
         check_free_space(self.spool_root, self._options.safety)
         spool = SpoolWriter(self.spool_root / attributes.recording_id, attributes)
         count, health = self._options.device_events, self._options.health

@@ -60,7 +60,7 @@ class SessionCount:
         self.now = session
         try:
             with disk_errors(f"write {self._path.name}"):
-                self._path.parent.mkdir(parents=True, exist_ok=True)
+                # In a spool that is gone this fails: only a take may create it.
                 replace_file(self._path, session.model_dump_json().encode())
         except StorageError as error:
             logger.warning("fail_session_count", error=error.message)

@@ -9,7 +9,16 @@ from fastapi import APIRouter, Depends, FastAPI, Query, Response, status
 
 from dextouch.episodes import EpisodeStore
 from dextouch.schemas import error_from_problem
-from dextouch.serving import JSON, KIB, JsonBody, RequireScope, create_service_app, serve, takes
+from dextouch.serving import (
+    JSON,
+    KIB,
+    JsonBody,
+    RequireScope,
+    ServedFolder,
+    create_service_app,
+    serve,
+    takes,
+)
 from services.alignment.job_runner import JobRunner
 from services.alignment.new_recordings import NewRecordings
 from services.alignment.schemas import (
@@ -60,7 +69,9 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
             await jobs.close()
 
     async def readiness() -> Sequence[str]:
-        return [] if jobs.is_warm else ["solver"]
+        waiting = [] if jobs.is_warm else ["solver"]
+        problem = jobs.queue.problem
+        return waiting if problem is None else [f"jobs: {problem}", *waiting]
 
     app = create_service_app(
         name="alignment",
@@ -68,6 +79,10 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
         routers=[alignments_router(jobs), calibration_router(runs)],
         lifespan=lifespan,
         readiness=readiness,
+        folders=[
+            ServedFolder(store.root, "store folder"),
+            ServedFolder(jobs.jobs_folder, "folder of alignment jobs"),
+        ],
     )
     app.state.registry.register(jobs.metrics)
     return app

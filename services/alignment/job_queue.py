@@ -45,7 +45,8 @@ ON CONFLICT (alignment_id) DO UPDATE SET crc32c = excluded.crc32c, job = exclude
 """
 DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 MOVE_AWAY = (
-    "episodes are not affected: move the file away and ask for the alignments that are missing"
+    f"episodes are not affected: move the file away, with {DATABASE_FILE}-wal if there is one, and "
+    "ask for the alignments that are missing"
 )
 RETRY_AFTER_S = 5
 
@@ -59,11 +60,15 @@ class JobQueue:
     Args:
         max_open: jobs that may wait or run.
         max_kept: jobs that are remembered; the oldest ended ones are forgotten first.
+
+    Attributes:
+        problem: why the jobs could not be opened; they are neither listed nor accepted then.
     """
 
     def __init__(self, *, max_open: int, max_kept: int) -> None:
         self.lock = asyncio.Lock()
         self.max_open, self._max_kept = max_open, max_kept
+        self.problem: str | None = None
         self._jobs: dict[str, AlignmentJob] = {}
         self._database: JobDatabase | None = None
 
@@ -73,9 +78,14 @@ class JobQueue:
         Raises:
             ConflictError: another service uses the folder.
             CorruptDataError: the jobs on disk are damaged.
+            StorageError: they cannot be read or written.
         """
-        self._database = await asyncio.to_thread(JobDatabase, folder)
-        self._jobs = await asyncio.to_thread(self._database.load)
+        try:
+            self._database, self._jobs = await asyncio.to_thread(_open_jobs, folder)
+        except (ConflictError, StorageError) as error:
+            self.problem = error.message
+            raise
+        self.problem = None
         return [job for job in self._jobs.values() if job.state == "running"]
 
     def close(self) -> None:
@@ -90,6 +100,7 @@ class JobQueue:
         Raises:
             NotFoundError: never submitted, or ended long ago.
         """
+        self._require_open()
         if alignment_id not in self._jobs:
             raise NotFoundError(
                 f"alignment {alignment_id!r}: not known here; POST /v1/alignments starts one"
@@ -111,6 +122,7 @@ class JobQueue:
         Raises:
             NotFoundError: there is no job `after`.
         """
+        self._require_open()
         jobs = [
             job
             for job in self._jobs.values()
@@ -193,10 +205,24 @@ class JobQueue:
         if self.is_current(job):
             self._jobs[job.alignment_id] = self._jobs[job.alignment_id].with_progress(progress)
 
+    def _require_open(self) -> None:
+        if self.problem is not None:
+            raise UnavailableError(f"alignments: the service runs without its jobs: {self.problem}")
+
     async def _commit(self, removed: Sequence[str], saved: Sequence[AlignmentJob]) -> None:
+        self._require_open()
         if self._database is None:
             raise UnavailableError("alignments: the service has not started or is stopping")
         await asyncio.to_thread(self._database.commit, removed, saved)
+
+
+def _open_jobs(folder: Path) -> tuple["JobDatabase", dict[str, AlignmentJob]]:
+    database = JobDatabase(folder)
+    with ExitStack() as opened:
+        opened.callback(database.close)
+        jobs = database.load()
+        opened.pop_all()
+    return database, jobs
 
 
 class JobDatabase:
@@ -217,11 +243,19 @@ class JobDatabase:
         self._path, self._guard = folder / DATABASE_FILE, threading.Lock()
         with disk_errors(f"open the jobs in {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
+            self._check_emptied()
         with ExitStack() as opened, self._errors("open"):
             self._connection = sqlite3.connect(self._path, check_same_thread=False, timeout=0)
             opened.callback(self._connection.close)
             self._prepare(self._connection.execute)
             opened.pop_all()
+
+    def _check_emptied(self) -> None:
+        """Refuse a file that was cut to nothing beside its log, which SQLite would delete."""
+        log = self._path.with_name(f"{DATABASE_FILE}-wal")
+        is_empty = self._path.is_file() and not self._path.stat().st_size
+        if is_empty and log.is_file() and log.stat().st_size:
+            raise CorruptDataError(f"{self._path}: damaged (it is empty); {MOVE_AWAY}")
 
     def load(self) -> dict[str, AlignmentJob]:
         """Jobs by id, in the order in which they were submitted.
@@ -235,7 +269,8 @@ class JobDatabase:
         jobs = {}
         for place, crc32c, body in rows:
             where = f"{self._path}, job {place}"
-            if google_crc32c.value(body) != crc32c:
+            # A table of others may hold anything, such as nothing at all.
+            if not isinstance(body, bytes) or google_crc32c.value(body) != crc32c:
                 raise CorruptDataError(f"{where}: does not match its checksum; {MOVE_AWAY}")
             try:
                 job = AlignmentJob.model_validate_json(body)
@@ -281,7 +316,7 @@ class JobDatabase:
         elif version != SCHEMA_VERSION:
             raise CorruptDataError(
                 f"{self._path}: got schema version {version}, expected {SCHEMA_VERSION}; use the "
-                "version of DexTouch that wrote it, or move the file away"
+                f"version of DexTouch that wrote it, or: {MOVE_AWAY}"
             )
         (found,) = execute("PRAGMA quick_check(1)").fetchone()
         if found != "ok":

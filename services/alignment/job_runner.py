@@ -31,11 +31,12 @@ class JobRunner:
     """The alignments of one store; asking again for the same one gives the same job.
 
     Runs between `start` and `close`. All methods belong to one event loop. `queue` holds the jobs,
-    `metrics` shows them.
+    which are kept in `jobs_folder`; `metrics` shows them.
     """
 
     def __init__(self, store: EpisodeStore, settings: AlignmentSettings) -> None:
         self._store, self._settings = store, settings
+        self.jobs_folder = settings.jobs_folder or Path(store.root) / JOBS_FOLDER
         max_open = settings.num_workers + settings.max_waiting
         self.queue = JobQueue(max_open=max_open, max_kept=settings.max_kept)
         self.metrics = AlignmentMetrics(self.queue)
@@ -52,18 +53,42 @@ class JobRunner:
     async def start(self) -> None:
         """Load the jobs on disk and start working on them.
 
-        Raises:
-            ConflictError: another service uses them.
-            CorruptDataError: they are damaged.
+        While they cannot be opened the service runs without them: `queue.problem` says why, and
+        they are tried again every few seconds.
         """
-        folder = self._settings.jobs_folder or Path(self._store.root) / JOBS_FOLDER
-        async with self.queue.lock:
-            for job in await self.queue.open(folder):
+        is_open = await self._open_queue()
+        await self._sweep()
+        work = [self._warm_up(), *(self._work(worker) for worker in self._workers)]
+        if not is_open:
+            work.append(self._open_later())
+        self._tasks = [asyncio.create_task(one) for one in work]
+
+    async def _open_queue(self) -> bool:
+        """Load the jobs on disk, and put those back that were running; whether that was possible.
+
+        The same failure is logged only once.
+        """
+        before = self.queue.problem
+        async with self._changed:
+            try:
+                running = await self.queue.open(self.jobs_folder)
+            except (ConflictError, StorageError) as error:
+                if error.message != before:
+                    logger.error("jobs_not_opened", reason=error.message)  # noqa: TRY400
+                return False
+            for job in running:
                 resumed = job.crashed(max_attempts=self._settings.max_attempts)
                 await self.queue.save_if_possible(resumed)
-        await asyncio.to_thread(self._store.sweep)
-        work = [self._warm_up(), *(self._work(worker) for worker in self._workers)]
-        self._tasks = [asyncio.create_task(one) for one in work]
+            self._changed.notify_all()
+        if before is not None:
+            logger.info("jobs_opened", folder=str(self.jobs_folder))
+        return True
+
+    async def _open_later(self) -> None:
+        is_open = False
+        while not is_open:
+            await asyncio.sleep(RETRY_AFTER_S)
+            is_open = await self._open_queue()
 
     async def close(self) -> None:
         """Stop at once; unfinished jobs continue when a service starts again."""
@@ -201,8 +226,7 @@ class JobRunner:
         except DexTouchError as error:
             ended = job.ended("failed", error=error)
             if isinstance(error, UnavailableError):
-                # Remove what the process was writing beside the store's episodes.
-                await asyncio.to_thread(self._store.sweep)
+                await self._sweep()
         except Exception:
             # The job's supervisor: one broken recording must not end the service.
             logger.exception("alignment_crashed", recording_id=job.recording_id)
@@ -217,6 +241,13 @@ class JobRunner:
             await self.queue.save_if_possible(ended)
             self.metrics.count(ended)
             self._changed.notify_all()
+
+    async def _sweep(self) -> None:
+        """Remove what processes that died were writing beside the store's episodes."""
+        try:
+            await asyncio.to_thread(self._store.sweep)
+        except StorageError as error:
+            logger.warning("sweep_failed", reason=error.message)
 
     def _stop_workers(self) -> None:
         for worker in self._workers:

@@ -10,7 +10,7 @@ from fastapi import FastAPI
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.care import DeletionRecords
 from dextouch.errors import StorageError
-from dextouch.serving import create_service_app, serve
+from dextouch.serving import ServedFolder, create_service_app, serve
 from services.episode_store.catalog import Catalog
 from services.episode_store.deletions import DeletionWatch, deletions_router
 from services.episode_store.enrolment import Enrolments
@@ -68,6 +68,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
             enrolment_router(enrolments),
         ],
         lifespan=lifespan,
+        folders=[ServedFolder(store.root, "store folder")],
     )
     enrolments.connect(app.state.access)
     metrics.register(app.state.registry, limits, catalog.num_items())
@@ -84,7 +85,12 @@ def _recover(store: EpisodeStore) -> None:
     except StorageError as error:
         # The service still serves everything else; `dextouch store repair` reports details.
         logger.error("recovery_failed", error=error.message)  # noqa: TRY400
-    removed = store.sweep()
+    try:
+        removed = store.sweep()
+    except StorageError as error:
+        # Such as a read-only folder, which can still be read.
+        logger.warning("sweep_failed", reason=error.message)
+        return
     if removed:
         logger.info("unfinished_writes_removed", count=removed)
 

@@ -152,6 +152,22 @@ class Ingest:
                 return RecordingStatus(recording_id=recording_id, state="finished")
             return _status(self._upload(recording_id, sender))
 
+    def is_stored(self, recording_id: str, stream: str, number: int) -> bool:
+        """Whether a batch was acknowledged before; answering it again needs no space."""
+        with self._working_on(recording_id):
+            if not self._path(recording_id).exists():
+                return self.is_finished(recording_id)
+            return number < self._upload(recording_id).num_batches(stream)
+
+    def is_begun(self, recording_id: str) -> bool:
+        """Whether an upload was begun or finished before; beginning it again needs no space."""
+        check_id(recording_id, kind="recording id")
+        return self._path(recording_id).exists() or self.is_finished(recording_id)
+
+    def is_finished(self, recording_id: str) -> bool:
+        """Whether a recording is finished, which it can be told again without any space."""
+        return self._store.exists(recording_id, kind="recording")
+
     def put_batch(
         self,
         recording_id: str,
@@ -317,8 +333,11 @@ class Ingest:
     def _opened(self, recording_id: str) -> SpoolWriter:
         with self._guard:
             if recording_id in self._open:
-                self._open.move_to_end(recording_id)
-                return self._open[recording_id]
+                if self._path(recording_id).exists():
+                    self._open.move_to_end(recording_id)
+                    return self._open[recording_id]
+                # Removed by someone else: what is appended to it now would be lost.
+                self._open.pop(recording_id).abandon()
         if self._store.exists(recording_id, kind="recording"):
             raise ConflictError(f"recording {recording_id!r} is finished and cannot be changed")
         path = self._path(recording_id)

@@ -1,7 +1,8 @@
 """HTTP routes of the store: uploads by stations, and lists of recordings and episodes."""
 
 import time
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import anyio
 import anyio.to_thread
 from fastapi import APIRouter, Depends, Path, Query, Request
 
+from dextouch.errors import StorageFullError
 from dextouch.schemas import (
     BatchReceipt,
     CatalogHours,
@@ -72,7 +74,8 @@ def uploads_router(
     def create(attributes: Attributes, sender: Writer) -> RecordingStatus:
         """Begin an upload, or return the status of an existing one."""
         sender.check_station(attributes.station)
-        with metrics.counting_refusals():
+        is_begun = partial(ingest.is_begun, attributes.recording_id)
+        with metrics.counting_refusals(), _unless(is_begun):
             limits.check_new(attributes.station)
         status = ingest.create(attributes, sender)
         if status.state == "open":
@@ -100,7 +103,11 @@ def uploads_router(
             # A refused body is not read.
             with metrics.counting_refusals():
                 admitted.enter_context(admission.admitted(num_bytes))
-                limits.check_batch(recording_id, num_bytes)
+                await _check_new(
+                    partial(limits.check_batch, recording_id, num_bytes),
+                    partial(ingest.is_stored, recording_id, stream, number),
+                    admission.threads,
+                )
             started = time.perf_counter()
             data = await request.body()
             receipt = await anyio.to_thread.run_sync(
@@ -119,7 +126,7 @@ def uploads_router(
     def finish(recording_id: str, body: Finish, sender: Writer) -> RecordingStatus:
         """Commit a complete upload."""
         started = time.perf_counter()
-        with metrics.counting_refusals():
+        with metrics.counting_refusals(), _unless(partial(ingest.is_finished, recording_id)):
             limits.check_finish(recording_id)
         status = ingest.finish(recording_id, body, sender)
         limits.end(recording_id)
@@ -142,6 +149,33 @@ def uploads_router(
         return _expire(ingest, limits, wanted.idle_s)
 
     return router
+
+
+def _raise_unless(is_known: Callable[[], bool], error: StorageFullError) -> None:
+    """Refuse for lack of space, unless the request repeats what was acknowledged before.
+
+    A station that missed the acknowledgement must get it on a full disk too.
+    """
+    if not is_known():
+        raise error
+
+
+@contextmanager
+def _unless(is_known: Callable[[], bool]) -> Iterator[None]:
+    try:
+        yield
+    except StorageFullError as error:
+        _raise_unless(is_known, error)
+
+
+async def _check_new(
+    check: Callable[[], None], is_known: Callable[[], bool], limiter: anyio.CapacityLimiter
+) -> None:
+    """As `_unless`, with the search for what is known in a thread."""
+    try:
+        check()
+    except StorageFullError as error:
+        await anyio.to_thread.run_sync(_raise_unless, is_known, error, limiter=limiter)
 
 
 def _expire(ingest: Ingest, limits: StorageLimits, idle_s: float) -> UploadList:

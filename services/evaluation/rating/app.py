@@ -12,7 +12,7 @@ from pydantic import Field
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError
 from dextouch.frozen_model import FrozenModel
-from dextouch.serving import RequireScope, create_service_app, serve
+from dextouch.serving import RequireScope, ServedFolder, create_service_app, serve
 from services.evaluation.rating.marks import Judgement, Mark, MarkLog, RaterName
 from services.evaluation.rating.rated_rollouts import RolloutPictures, rated_rollouts
 from services.evaluation.rating.rating_queue import RatingQueue
@@ -94,7 +94,11 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     given = Counter("dextouch_rating_marks", text, registry=None)
     pictures = RolloutPictures(store)
     routers = [page_router(), rating_router(queue, marks, rubrics, pictures, on_mark=given.inc)]
-    app = create_service_app(name="rating", settings=settings, routers=routers)
+    folders = [
+        ServedFolder(store.root, "store folder", is_written=False),
+        ServedFolder(settings.marks.parent, "folder of marks"),
+    ]
+    app = create_service_app(name="rating", settings=settings, routers=routers, folders=folders)
     app.state.registry.register(given)
     text = "Rollouts that the service shows to raters."
     to_rate = Gauge("dextouch_rating_rollouts", text, registry=app.state.registry)

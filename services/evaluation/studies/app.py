@@ -11,6 +11,7 @@ from dextouch.data_folder import data_folder
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import (
     RequireScope,
+    ServedFolder,
     ServiceSettings,
     create_service_app,
     serve,
@@ -77,7 +78,8 @@ class StudyRolloutList(FrozenModel):
 def create_app(settings: StudyServiceSettings) -> FastAPI:
     """Create the application."""
     routers = [study_router(StudyFolders(settings.studies))]
-    return create_service_app(name="studies", settings=settings, routers=routers)
+    folder = ServedFolder(settings.studies, "folder of studies", is_written=False)
+    return create_service_app(name="studies", settings=settings, routers=routers, folders=[folder])
 
 
 def study_router(folders: StudyFolders) -> APIRouter:

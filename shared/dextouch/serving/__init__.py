@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from dextouch.serving.keys import secret_digest as secret_digest
     from dextouch.serving.logs import configure_logging as configure_logging
     from dextouch.serving.masking import masked as masked
+    from dextouch.serving.served_folder import ServedFolder as ServedFolder
     from dextouch.serving.settings import MAX_WEBSOCKET_BYTES as MAX_WEBSOCKET_BYTES
     from dextouch.serving.settings import ServiceSettings as ServiceSettings
     from dextouch.serving.settings import load_settings as load_settings

@@ -11,7 +11,7 @@ from functools import partial
 from http import HTTPStatus
 
 import structlog
-from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
@@ -38,6 +38,7 @@ from dextouch.serving.documentation import document_service
 from dextouch.serving.guard import Admits, BodyRules, GuardMiddleware, SitePolicy
 from dextouch.serving.keys import AccessControl
 from dextouch.serving.masking import hide_secrets, masked
+from dextouch.serving.served_folder import ServedFolder
 from dextouch.serving.settings import ServiceSettings
 from dextouch.serving.spans import SPANS
 
@@ -51,7 +52,7 @@ Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
 ReadinessCheck = Callable[[], Awaitable[Sequence[str]]]
 
 
-def create_service_app(
+def create_service_app(  # noqa: PLR0913 - all by name
     *,
     name: str,
     settings: ServiceSettings,
@@ -59,6 +60,7 @@ def create_service_app(
     lifespan: Lifespan | None = None,
     readiness: ReadinessCheck | None = None,
     admits: Admits | None = None,
+    folders: Sequence[ServedFolder] = (),
 ) -> FastAPI:
     """Create the application of one service.
 
@@ -69,6 +71,7 @@ def create_service_app(
         lifespan: context of the application (pools, workers).
         readiness: called by /readyz; returns the names of what is missing.
         admits: accepts requests without a key, such as those of signed-in browsers.
+        folders: that all routes need; the service is not ready without them.
 
     Returns:
         The application; `app.state.registry` accepts further metrics, `app.state.refusal_page`
@@ -81,7 +84,7 @@ def create_service_app(
         version=__version__,
         docs_url=None,
         redoc_url=None,
-        lifespan=_started(lifespan),
+        lifespan=_started(lifespan, folders),
         # Services have metrics and logs of their own.
         telemetry={"tracing": False, "metrics": False, "logs": False},
     )
@@ -106,20 +109,37 @@ def create_service_app(
     )
     app.add_middleware(RequestMiddleware, registry=app.state.registry)
     _add_error_handlers(app)
-    app.include_router(_health_router(name, readiness))
+    app.include_router(_health_router(name, _with_folders(readiness, folders)))
     for router in routers:
-        app.include_router(router)
+        app.include_router(router, dependencies=[Depends(folder.required) for folder in folders])
     app.openapi = partial(  # type: ignore[method-assign]
         document_service, app, routers, needs_key=app.state.access.has_keys
     )
     return app
 
 
-def _started(lifespan: Lifespan | None) -> Lifespan:
+def _with_folders(
+    readiness: ReadinessCheck | None, folders: Sequence[ServedFolder]
+) -> ReadinessCheck:
+    async def check() -> Sequence[str]:
+        problems = [folder.problem(writing=True) for folder in folders]
+        waiting = [] if readiness is None else await readiness()
+        return [*(problem for problem in problems if problem is not None), *waiting]
+
+    return check
+
+
+def _started(lifespan: Lifespan | None, folders: Sequence[ServedFolder]) -> Lifespan:
     """Mark the application as running during its lifespan."""
 
     @asynccontextmanager
     async def around(app: FastAPI) -> AsyncIterator[None]:
+        for folder in folders:
+            try:
+                folder.open()
+            except UnavailableError as error:
+                # It serves what does not need the folder, such as why it is not ready.
+                logger.error("folder_unusable", reason=error.message)  # noqa: TRY400
         async with nullcontext() if lifespan is None else lifespan(app):
             app.state.running = True
             yield

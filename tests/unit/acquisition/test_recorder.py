@@ -1,13 +1,14 @@
 import errno
 import gc
 import os
+import shutil
 import weakref
 
 import numpy as np
 import pytest
 
 from dextouch.episodes.spool import SpoolReader
-from dextouch.errors import ConflictError
+from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
@@ -245,3 +246,18 @@ def test_a_damaged_count_starts_anew(recorder, clock, tmp_path):
     (tmp_path / "session.json").write_text("{")
     again = Recorder(station="test", spool_root=tmp_path, drivers=(), clock=clock, calibration={})
     assert counts(again) == ({}, None)
+
+
+def test_a_spool_that_is_gone_takes_no_take_and_is_not_created_anew(recorder, clock):
+    recorder.arm(PROMPT)
+    recorder.record()
+    recorder.discard()
+    shutil.rmtree(recorder.spool_root)
+    recorder.arm(PROMPT)
+    with pytest.raises(UnavailableError, match=f"spool {recorder.spool_root}: is gone"):
+        recorder.record()
+    assert recorder.status().state == "armed"
+    assert not recorder.spool_root.exists()
+    recorder.spool_root.mkdir()
+    with pytest.raises(UnavailableError, match="is another folder than at the start"):
+        recorder.record()

@@ -1,13 +1,16 @@
 """Alignments over HTTP: started once, told, listed, cancelled, refused with a reason."""
 
 import asyncio
+import shutil
+import sqlite3
 import threading
+from contextlib import AsyncExitStack, closing
 
 import pytest
 from httpx import ASGITransport, AsyncClient
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import ConflictError, UnavailableError
+from dextouch.errors import UnavailableError
 from services.alignment import job_runner
 from services.alignment.app import create_app
 from services.alignment.jobs import align_recording
@@ -283,10 +286,87 @@ async def test_a_worker_that_starts_while_the_service_stops_is_stopped(serve, wo
         await poll(client, started.json()["alignment_id"], lambda job: job["state"] == "running")
 
 
-async def test_two_services_do_not_share_jobs(serve):
-    async with serve():
-        with pytest.raises(ConflictError, match="another alignment service"):
-            await serve().__aenter__()
+async def test_two_services_do_not_share_jobs(serve, monkeypatch):
+    monkeypatch.setattr(job_runner, "RETRY_AFTER_S", 0.01)
+    async with AsyncExitStack() as stack:
+        first = await stack.enter_async_context(serve())
+        async with serve() as second:
+            refused = await second.post("/v1/alignments", json={"recording_id": "take"})
+            assert refused.status_code == 503
+            assert "another alignment service" in refused.json()["detail"]
+            assert (await first.get("/v1/alignments")).json()["num_matching"] == 0
+            await first.post("/v1/alignments?wait=true", json={"recording_id": "take"})
+            ready = await second.get("/readyz")
+            assert ready.status_code == 503
+            assert "another alignment service" in ready.json()["waiting_for"][0]
+            await stack.aclose()
+            # The jobs of the first one, once it has released them.
+            for _ in range(2000):
+                if (listed := await second.get("/v1/alignments")).status_code == 200:
+                    break
+                await asyncio.sleep(0.005)
+            assert [job["state"] for job in listed.json()["alignments"]] == ["done"]
+
+
+def of_another_program(path):
+    path.unlink()
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("PRAGMA journal_mode = WAL")
+        database.execute("CREATE TABLE jobs (position, crc32c, job)")
+        database.execute("INSERT INTO jobs VALUES (1, 2, NULL)")
+        database.execute("PRAGMA user_version = 1")
+        database.commit()
+
+
+DAMAGES = {
+    "garbage": lambda path: path.write_bytes(b"no database" * 1000),
+    "cut": lambda path: path.write_bytes(path.read_bytes()[:5000]),
+    "cut to a part of its header": lambda path: path.write_bytes(path.read_bytes()[:50]),
+    "emptied beside its log": lambda path: (
+        path.write_bytes(b""),
+        path.with_name("jobs.sqlite3-wal").write_bytes(b"log"),
+    ),
+    "of a later version": lambda path: path.write_bytes(
+        path.read_bytes()[:60] + (9).to_bytes(4, "big") + path.read_bytes()[64:]
+    ),
+    "of another program": of_another_program,
+    "a folder": lambda path: (path.unlink(), path.mkdir()),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+async def test_damaged_jobs_are_told_left_alone_and_tried_again(
+    serve, store, damage, monkeypatch, capsys
+):
+    monkeypatch.setattr(job_runner, "RETRY_AFTER_S", 0.01)
+    async with serve() as client:
+        await client.post("/v1/alignments?wait=true", json={"recording_id": "take"})
+    path = store.root / ".alignments/jobs.sqlite3"
+    damage(path)
+    before = path.read_bytes() if path.is_file() else None
+    async with serve(align_new=True) as client:
+        ready = await client.get("/readyz")
+        assert ready.status_code == 503
+        told = ready.json()["waiting_for"][0]
+        assert str(path) in told
+        assert "move the file away" in told or path.is_dir()
+        for refused in (
+            await client.post("/v1/alignments", json={"recording_id": "take"}),
+            await client.get("/v1/alignments"),
+            await client.get("/v1/alignments/take-0"),
+        ):
+            assert refused.status_code == 503
+            assert str(path) in refused.json()["detail"]
+        assert (await client.get("/healthz")).status_code == 200
+        assert (path.read_bytes() if path.is_file() else None) == before
+        for file in path.parent.glob("jobs.sqlite3*"):
+            file.rename(store.root / file.name)
+        for _ in range(2000):
+            if (listed := await client.get("/v1/alignments")).status_code == 200:
+                break
+            await asyncio.sleep(0.005)
+        assert listed.status_code == 200
+        assert (await client.get("/readyz")).json()["ready"]
 
 
 async def test_ready_once_a_worker_is(serve):
@@ -298,3 +378,20 @@ async def test_ready_once_a_worker_is(serve):
             assert answer.json()["waiting_for"] == ["solver"]
             await asyncio.sleep(0.005)
         assert answer.json()["ready"]
+
+
+@pytest.mark.parametrize("gone", ["store", "jobs"])
+async def test_a_folder_that_is_gone_is_told_and_not_created_anew(serve, store, tmp_path, gone):
+    folder = {"store": store.root, "jobs": tmp_path / "jobs"}[gone]
+    async with serve(jobs_folder=str(tmp_path / "jobs")) as client:
+        assert (await client.get("/v1/alignments")).status_code == 200
+        shutil.rmtree(folder)
+        for answer in (
+            await client.get("/v1/alignments"),
+            await client.post("/v1/alignments", json={"recording_id": "take"}),
+        ):
+            assert answer.status_code == 503
+            assert f"{folder}: is gone" in answer.json()["detail"]
+        ready = (await client.get("/readyz")).json()
+        assert f"{folder}: is gone" in ready["waiting_for"][0]
+    assert not folder.exists()

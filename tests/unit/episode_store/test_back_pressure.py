@@ -145,7 +145,8 @@ def test_a_full_disk_refuses_uploads_and_reads_go_on(start, attributes, batch_of
     with pytest.raises(StorageFullError, match="free space") as caught:
         client.send_batch("take-1", glove, batch_of(20, 20), number=1)
     assert caught.value.details["retry_after_s"] == 30
-    status, headers, _ = asyncio.run(post(client._http._transport.app, PATH, 500, unread))
+    new = PATH.removesuffix("0") + "1"
+    status, headers, _ = asyncio.run(post(client._http._transport.app, new, 500, unread))
     assert (status, headers["retry-after"]) == (507, "30")
     with pytest.raises(StorageFullError):
         client.create(attributes.model_copy(update={"recording_id": "take-2"}))

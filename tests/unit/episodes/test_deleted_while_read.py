@@ -3,6 +3,7 @@
 import os
 import pickle
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +85,7 @@ def outcomes(made, root, use, change):
         item_id = made.attributes.episode_id
         folder = store.root / "episodes" / item_id
         with pytest.MonkeyPatch.context() as patch:
-            at_call = ChangedAtCall(patch, folder, number, lambda s=store: change(s, item_id))
+            at_call = ChangedAtCall(patch, folder, number, partial(change, store, item_id))
             try:
                 yield use(store, item_id)
             except NotFoundError as error:

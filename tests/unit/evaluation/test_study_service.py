@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import shutil
 
 import httpx
 import pytest
@@ -45,6 +46,18 @@ async def read(root, path):
         answer = await opened.get(path)
     assert answer.status_code == 200, answer.text
     return answer.json()
+
+
+async def test_studies_that_are_gone_are_told(root):
+    app = create_app(StudyServiceSettings(studies=root))
+    transport = httpx.ASGITransport(app)
+    async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as opened:
+        assert (await opened.get("/v1/studies")).status_code == 200
+        shutil.rmtree(root)
+        answer = await opened.get("/v1/studies")
+    assert answer.status_code == 503
+    assert f"folder of studies {root}: is gone" in answer.json()["detail"]
+    assert not root.exists()
 
 
 async def test_rates_and_intervals_are_those_of_the_rows(root):
