@@ -11,6 +11,7 @@ from dextouch import __version__
 from dextouch.command_line import messages_aside
 from dextouch.errors import DexTouchError, UnknownNameError
 from services.cli.doctor import missing_package
+from services.cli.standard_streams import StandardStreams
 
 
 class Command(NamedTuple):
@@ -202,9 +203,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Returns:
-        Its exit status; 2 for an unknown command, 3 for a refusal with its reason on stderr.
+        Its exit status; 1 if standard output cannot be written, 2 for an unknown command, 3 for a
+        refusal with its reason on stderr, 141 if nobody reads the output any more (`| head`).
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    streams = StandardStreams()
+    try:
+        try:
+            return _run(words, lambda: streams.failure is not None)
+        finally:
+            streams.flush()
+    except (OSError, DexTouchError):
+        failure = streams.failure
+        if failure is None:
+            raise
+    return streams.status_after(failure, " ".join(words[:1]))
+
+
+def _run(words: list[str], has_failed: Callable[[], bool]) -> int:
     if not words or words[0] in {"-h", "--help", "help"}:
         shown = {name: command.does for name, command in COMMANDS.items() if " " not in name}
         print(USAGE.format(rows="\n".join(f"  {name:<19}{does}" for name, does in shown.items())))
@@ -229,6 +245,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if refusal is None:
             raise
     except DexTouchError as error:
+        if isinstance(error.__cause__, OSError) and has_failed():
+            raise  # Output that failed while a file was read.
         refusal = error
     except KeyboardInterrupt:
         print(f"dextouch {name}: interrupted", file=sys.stderr)

@@ -13,7 +13,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from dextouch.errors import ConflictError, UnavailableError
-from dextouch.serving import ServiceSettings, server_options
+from dextouch.serving import ServiceSettings, bound_socket, server_options
 
 BACKLOG = 128
 START_TIMEOUT_S = 60.0
@@ -61,21 +61,19 @@ def bind(name: str, *, host: str, port: int) -> Place:
     """Bind a port; 0 selects a free one.
 
     Raises:
-        ConflictError: the port is in use, or the host is not local.
+        ConflictError: the port is in use.
+        InvalidInputError: the host is not local, or the port needs rights.
     """
-    # The protocol is explicit so that asyncio sets TCP_NODELAY; otherwise every response takes 40
-    # ms.
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    flag = f"--{name.replace('_', '-')}-port"
+    advice = f"choose another port with {flag}, or 0 for any free one"
+    listener = bound_socket(name, host, port, advice=advice)
     try:
-        listener.bind((host, port))
         # At once: until the socket listens, others could bind the same port.
         listener.listen(BACKLOG)
     except OSError as error:
         listener.close()
         raise ConflictError(
-            f"{name}: cannot listen on {host}:{port} ({error.strerror}); "
-            f"choose another port with --{name.replace('_', '-')}-port, or 0 for any free one"
+            f"{name}: cannot listen on {host}:{port} ({error.strerror}); {advice}"
         ) from error
     return Place(name, listener)
 
@@ -109,6 +107,10 @@ async def serve_all(
         task.cancel()
     for place, _ in placed:
         place.socket.close()
+    for place, app in placed:
+        told = getattr(app.state, "start_error", None)
+        if told is not None:
+            raise UnavailableError(f"{place.name} did not start: {told.message}") from told
     failures = [error for task in tasks.values() if (error := task.exception()) is not None]
     if failures or (ended and not stop.is_set()):
         raise UnavailableError(

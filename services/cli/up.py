@@ -16,8 +16,10 @@ from dextouch.command_line import write_result
 from dextouch.data_folder import data_folder
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.serving import CommandSettings, configure_logging, explained, load_settings
+from services.cli.data_lock import held_data_folder
 from services.cli.doctor import missing_package
 from services.cli.servers import Place, bind, serve_all, stop_on_signals
+from services.cli.standard_streams import discard_output
 
 if TYPE_CHECKING:
     from services.acquisition.settings import AcquisitionSettings
@@ -99,6 +101,7 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
         stop_on_signals(stop)
     builders = _wanted(settings)
     with ExitStack() as held:
+        lock = held.enter_context(held_data_folder(settings.data))
         # Explicit ports first, so that no default takes one of them.
         given = settings.model_fields_set
         bound = {}
@@ -106,6 +109,7 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
             bound[name] = _bind(name, settings)
             held.callback(bound[name].socket.close)
         urls = {name: bound[name].url for name in builders}
+        lock.tell(urls["dashboard"])
         placed = [(bound[name], _build(name, settings, urls)) for name in builders]
         await serve_all(placed, stop=stop, on_ready=partial(_announce, settings, urls))
     return 0
@@ -145,10 +149,14 @@ def _wanted(settings: UpSettings) -> Mapping[str, Builder]:
 
 
 def _announce(settings: UpSettings, urls: Mapping[str, str]) -> None:
-    for name, url in urls.items():
-        print(f"{name:<14}{url}")
-    print(f"data          {settings.data.resolve()}")
-    print(f"\nOpen {urls['dashboard']} · stop with Ctrl-C", flush=True)
+    try:
+        for name, url in urls.items():
+            print(f"{name:<14}{url}")
+        print(f"data          {settings.data.resolve()}")
+        print(f"\nOpen {urls['dashboard']} · stop with Ctrl-C", flush=True)
+    except OSError:
+        # Nobody reads it, which is no reason to end the services.
+        discard_output()
     write_result(settings.json_path, dict(urls))
 
 

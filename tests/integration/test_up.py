@@ -2,14 +2,26 @@
 
 import asyncio
 import json
+import os
+import subprocess
+import sys
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import httpx
 import pytest
 
-from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.errors import (
+    ConflictError,
+    InvalidInputError,
+    StorageError,
+    UnavailableError,
+    UnknownNameError,
+)
+from dextouch.serving import ServiceSettings, create_service_app
 from services.alignment.retargeting import hand_retargeter
 from services.cli import up
+from services.cli.data_lock import held_data_folder
 from services.cli.servers import bind
 
 # Of a machine that is busy with other things; the solver may be compiled first.
@@ -200,3 +212,70 @@ def test_a_wrong_variable_is_named(tmp_path, monkeypatch):
 def test_a_station_without_devices_is_refused(tmp_path):
     with pytest.raises(InvalidInputError, match="--no-mock and no devices, expected them in DEXT"):
         up._station(up.UpSettings(data=tmp_path, mock=False))
+
+
+def other_up(folder, seconds=120):
+    """Another `up` on the same folder, as a user starts it."""
+    command = [sys.executable, "-m", "services.cli.main", "up", "--data", str(folder)]
+    ports = [f"--{name.replace('_', '-')}-port=0" for name in up.BUILDERS]
+    return subprocess.run(
+        [*command, *ports], capture_output=True, text=True, timeout=seconds, check=False
+    )
+
+
+async def test_a_second_up_on_a_data_folder_says_who_has_it(tmp_path):
+    with held_data_folder(tmp_path) as lock:
+        lock.tell("http://127.0.0.1:8080")
+        done = await asyncio.to_thread(other_up, tmp_path)
+    assert (done.returncode, done.stdout) == (3, "")
+    (line,) = done.stderr.splitlines()
+    assert f"{tmp_path} is in use by another `dextouch up`" in line
+    assert f"process {os.getpid()}, dashboard at http://127.0.0.1:8080" in line
+    assert "--data" in line
+    # Released, as it is when the process ends.
+    with held_data_folder(tmp_path):
+        pass
+
+
+def few(tmp_path, **changed):
+    ports = {f"{name}_port": 0 for name in up.BUILDERS}
+    without = ("twin", "world_model", "studies")
+    given = {"data": tmp_path / "data", "json": tmp_path / "urls.json", "without": without}
+    return up.UpSettings(**ports | given | changed)
+
+
+async def test_up_holds_its_data_folder_and_goes_on_without_damaged_jobs(solver, tmp_path):
+    jobs = tmp_path / "data/store/.alignments/jobs.sqlite3"
+    jobs.parent.mkdir(parents=True)
+    jobs.write_bytes(b"no database" * 1000)
+    stop = asyncio.Event()
+    running = asyncio.create_task(up.run(few(tmp_path), stop))
+    urls = await asyncio.wait_for(written(tmp_path / "urls.json", running), START_LIMIT_S)
+    with pytest.raises(ConflictError, match=f"process {os.getpid()}, .*{urls['dashboard']}"):
+        await up.run(few(tmp_path), asyncio.Event())
+    async with httpx.AsyncClient(trust_env=False, timeout=60) as client:
+        assert (await client.get(f"{urls['episode_store']}/readyz")).status_code == 200
+        ready = await client.get(f"{urls['alignment']}/readyz")
+        assert ready.status_code == 503
+        assert str(jobs) in ready.json()["waiting_for"][0]
+        system = (await client.get(f"{urls['dashboard']}/v1/system")).text
+        assert "jobs.sqlite3" in system
+    assert jobs.read_bytes() == b"no database" * 1000
+    stop.set()
+    assert await running == 0
+
+
+async def test_a_service_that_refuses_to_start_is_named_with_its_reason(tmp_path, monkeypatch):
+    @asynccontextmanager
+    async def refuse(_):
+        raise StorageError("alignment jobs: damaged")
+        yield
+
+    def refusing(settings, urls):
+        return create_service_app(
+            name="alignment", settings=ServiceSettings(), routers=[], lifespan=refuse
+        )
+
+    monkeypatch.setattr(up, "BUILDERS", {**up.BUILDERS, "alignment": refusing})
+    with pytest.raises(UnavailableError, match="alignment did not start: alignment jobs: damaged"):
+        await up.run(few(tmp_path), asyncio.Event())

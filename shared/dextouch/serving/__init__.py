@@ -32,11 +32,13 @@ if TYPE_CHECKING:
     from dextouch.serving.keys import RequireScope as RequireScope
     from dextouch.serving.keys import not_signed_in as not_signed_in
     from dextouch.serving.keys import secret_digest as secret_digest
+    from dextouch.serving.listening import bound_socket as bound_socket
     from dextouch.serving.logs import configure_logging as configure_logging
     from dextouch.serving.masking import masked as masked
     from dextouch.serving.served_folder import ServedFolder as ServedFolder
     from dextouch.serving.settings import MAX_WEBSOCKET_BYTES as MAX_WEBSOCKET_BYTES
     from dextouch.serving.settings import ServiceSettings as ServiceSettings
+    from dextouch.serving.settings import check_address as check_address
     from dextouch.serving.settings import load_settings as load_settings
     from dextouch.serving.settings import run as run
     from dextouch.serving.settings import serve as serve

@@ -4,8 +4,8 @@ import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import (
     AbstractAsyncContextManager,
+    AsyncExitStack,
     asynccontextmanager,
-    nullcontext,
 )
 from functools import partial
 from http import HTTPStatus
@@ -96,6 +96,8 @@ def create_service_app(  # noqa: PLR0913 - all by name
     about.info({"service": name, "version": __version__})
     app.state.shortcut = None
     app.state.running = False
+    # Why the application could not start.
+    app.state.start_error = None
     # The last one added is outermost, so that refusals of the guard have request ids and are
     # counted, and the shortcut gets no request that the guard refuses.
     app.add_middleware(ShortcutMiddleware, refuse=_refusal)
@@ -140,7 +142,13 @@ def _started(lifespan: Lifespan | None, folders: Sequence[ServedFolder]) -> Life
             except UnavailableError as error:
                 # It serves what does not need the folder, such as why it is not ready.
                 logger.error("folder_unusable", reason=error.message)  # noqa: TRY400
-        async with nullcontext() if lifespan is None else lifespan(app):
+        async with AsyncExitStack() as opened:
+            try:
+                if lifespan is not None:
+                    await opened.enter_async_context(lifespan(app))
+            except DexTouchError as error:
+                app.state.start_error = error
+                raise
             app.state.running = True
             yield
             app.state.running = False

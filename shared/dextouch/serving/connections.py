@@ -316,7 +316,7 @@ class RequestMiddleware:
             await self._count_websocket(scope, receive, send)
             return
         if scope["type"] != "http":
-            await self._app(scope, receive, send)
+            await self._app(scope, receive, partial(_send_without_trace, scope, send))
             return
         started = time.perf_counter()
         request_id = _request_id(scope)
@@ -376,6 +376,13 @@ class RequestMiddleware:
         self._histogram(method, route).observe(duration_s)
         for part, spent_s in timings_s.items():
             self._part_histogram(route, part).observe(spent_s)
+
+
+async def _send_without_trace(scope: Scope, send: Send, message: Message) -> None:
+    """Send a message of the lifespan; a refusal to start is told by its owner, in one line."""
+    if message["type"] == "lifespan.startup.failed" and scope["app"].state.start_error is not None:
+        message = {**message, "message": ""}
+    await send(message)
 
 
 def _request_id(scope: Scope) -> str:

@@ -24,6 +24,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.serving.configuration_file import CommandSettings, explained, section_of
 from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
 from dextouch.serving.keys import ApiKey
+from dextouch.serving.listening import bound_socket
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.spans import configure_spans
 
@@ -191,6 +192,19 @@ def _placeholder(kind: str, flag: str) -> str:
     return word if kind in {"str", "SecretStr"} else _PLACEHOLDERS.get(kind, kind)
 
 
+def check_address(service: str, settings: ServiceSettings) -> None:
+    """Check that a service can listen, before it opens anything.
+
+    Raises:
+        ConflictError: another program uses the port.
+        InvalidInputError: the host is not of this machine, or the port needs rights.
+    """
+    variable = f"{settings.model_config.get('env_prefix', '')}PORT"
+    advice = f"choose another with --port (or {variable}), 0 for any free one"
+    # uvicorn makes its own sockets, of every address of the host's name.
+    bound_socket(service, settings.host, settings.port, advice=advice).close()
+
+
 def run(
     app: FastAPI,
     settings: ServiceSettings,
@@ -205,6 +219,9 @@ def run(
         settings: its host, port and grace.
         drain: called at SIGTERM, so that the application refuses new work.
         drain_s: time from then until its port is closed; at once without `drain`.
+
+    Raises:
+        DexTouchError: the application could not start.
     """
     import uvicorn
     from uvicorn.config import STARTUP_FAILURE
@@ -223,6 +240,9 @@ def run(
     with suppress(KeyboardInterrupt):
         server.run()
     if not server.started:
+        told = getattr(app.state, "start_error", None)
+        if told is not None:
+            raise told
         sys.exit(STARTUP_FAILURE)
 
 
@@ -267,8 +287,10 @@ def serve(
 
     Raises:
         InvalidInputError: invalid settings.
+        ConflictError: another program uses the port.
     """
     settings = load_settings(kind, list(arguments))
+    check_address(service, settings)
     configure_logging(service=service, log_format=settings.log_format, level=settings.log_level)
     configure_spans(service)
     run(create_app(settings), settings)

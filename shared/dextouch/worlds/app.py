@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from dextouch.serving import (
     ServiceSettings,
+    check_address,
     configure_logging,
     configure_spans,
     create_service_app,
@@ -122,6 +123,7 @@ def serve_worlds(
         name: of the service.
         reopen: see create_world_app; picklable, too.
     """
+    check_address(name, settings)
     configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
     create_app = partial(create_serving_app, open_worlds, settings, name, reopen)
     if settings.workers == 1:
