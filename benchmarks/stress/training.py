@@ -11,10 +11,9 @@ import torch
 from benchmarks.stress.cells import Check, StageCells
 from benchmarks.stress.worlds import twin_start
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
-from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.configuration import NetworkConfig, Precision
 from services.world_model.network.flow_matching import MIN_TIME, training_times
 from services.world_model.network.inputs import build_inputs
-from services.world_model.network.model import Precision
 from services.world_model.settings import OptimizerSettings, TrainSettings, WindowSettings
 from services.world_model.training.dataset import EpisodeArrays, WindowBatch, WindowSampler
 from services.world_model.training.objective import LossOptions, losses

@@ -70,8 +70,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         InvalidInputError: no round or seed, or a model that knows none of the twin's tasks.
     """
-    from services.world_model.checkpoints import paper_form_checkpoint, read_checkpoint
+    from services.world_model.checkpoints import read_checkpoint
     from services.world_model.network.model import Sampling
+    from services.world_model.shipped_checkpoints import paper_form_checkpoint
     from services.world_model.world import ModelWorld
 
     del folder

@@ -10,8 +10,7 @@ from benchmarks.report import ResultTable
 from benchmarks.world_model.rollouts import RolloutError
 
 if TYPE_CHECKING:
-    from services.world_model.network.model import Precision
-    from services.world_model.network.solvers import Sampler
+    from services.world_model.network.configuration import Precision, Sampler
 
 COPY_FIRST: Final = "copy-first"
 MAX_CHUNK_MS: Final = 50.0

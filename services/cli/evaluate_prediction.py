@@ -45,7 +45,7 @@ examples:
 def main(arguments: Sequence[str]) -> int:
     """Run `dextouch evaluate prediction`."""
     options = _parser().parse_args(list(arguments))
-    from services.world_model.checkpoints import default_checkpoint
+    from services.world_model.shipped_checkpoints import default_checkpoint
     from services.world_model.world import open_world
 
     metrics = all_metrics(options.weights)

@@ -23,7 +23,7 @@ from services.cli.servers import served
 from services.cli.training_data import comma_separated, in_processes
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.generation.demonstrations import imagine_episode
-from services.world_model.checkpoints import default_checkpoint
+from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
 

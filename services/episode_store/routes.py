@@ -74,8 +74,10 @@ def uploads_router(
     def create(attributes: Attributes, sender: Writer) -> RecordingStatus:
         """Begin an upload, or return the status of an existing one."""
         sender.check_station(attributes.station)
-        is_begun = partial(ingest.is_begun, attributes.recording_id)
-        with metrics.counting_refusals(), _unless(is_begun):
+        with (
+            metrics.counting_refusals(),
+            _unless(partial(ingest.is_begun, attributes.recording_id)),
+        ):
             limits.check_new(attributes.station)
         status = ingest.create(attributes, sender)
         if status.state == "open":

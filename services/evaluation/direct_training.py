@@ -11,12 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from pydantic import Field
 from torch import nn
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
-from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import transform_from_pose
 from services.evaluation.calibration import Calibration, expected_calibration_error, fit_calibration
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
@@ -37,39 +35,10 @@ from services.evaluation.object_features import MAX_OBJECTS
 from services.evaluation.optimization import optimized
 from services.evaluation.statistics import area_under_roc
 from services.evaluation.success_probe_figures import MIN_OUTCOMES
-from services.networks.training_settings import (
-    Batch,
-    Brightness,
-    CpuBudget,
-    ImageNoise,
-    LearningRate,
-    Seed,
-    WeightDecay,
-)
+from services.evaluation.training_settings import DirectSettings
 
 _UNIT_M = 0.05
 _CHECK_EVERY = 100
-
-
-class DirectSettings(FrozenModel):
-    """Training settings of a direct judge; the finder gets `finder_share` of the time."""
-
-    seed: Seed = 0
-    max_cpu_s: CpuBudget = 600.0
-    finder_share: float = Field(
-        default=0.6, gt=0, lt=1, description="share of the time for the object finder"
-    )
-    num_finder_steps: int = Field(default=6000, ge=1, description="largest number of finder steps")
-    num_judge_steps: int = Field(default=6000, ge=1, description="largest number of judge steps")
-    batch_size: Batch = Field(default=64, ge=2)
-    learning_rate: LearningRate = 2e-3
-    weight_decay: WeightDecay = 2e-2
-    bfloat16: bool = Field(default=False, description="convolve in bfloat16: twice as fast on AMX")
-    image_noise: ImageNoise = 0.01
-    brightness: Brightness = 0.03
-    development_share: float = Field(
-        default=0.1, gt=0, lt=1, description="share of seeds to calibrate on"
-    )
 
 
 @dataclass(frozen=True)

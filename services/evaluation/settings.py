@@ -10,9 +10,7 @@ from pydantic import Field, field_validator, model_validator
 from dextouch.command_line import JSON_HELP
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import CommandSettings, service_config
-from services.evaluation.direct_training import DirectSettings
-from services.evaluation.policies.cloning_training import CloningSettings
-from services.evaluation.success_probe_training import ProbeSettings
+from services.evaluation.training_settings import CloningSettings, DirectSettings, ProbeSettings
 from services.networks.training_settings import Splits, Stores, Tasks
 
 PRETRAINED = Path(__file__).parent / "pretrained"

@@ -8,10 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from pydantic import Field
 from torch.nn import functional
 
-from dextouch.frozen_model import FrozenModel
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
 from services.evaluation.demonstrations import instructions_of, split_by_seed
 from services.evaluation.endings import EndingEpisode, endings_hash, milestones_of
@@ -31,77 +29,7 @@ from services.evaluation.success_probe_figures import (
     held_out_figures,
     milestones_that_can_be_told,
 )
-from services.networks.training_settings import (
-    Batch,
-    Brightness,
-    CpuBudget,
-    ImageNoise,
-    LearningRate,
-    NumSteps,
-    Seed,
-    WeightDecay,
-)
-
-
-class ProbeSettings(FrozenModel):
-    """Training settings of a success probe."""
-
-    seed: Seed = 0
-    # For each task.
-    num_training_steps: NumSteps = 2000
-    max_cpu_s: CpuBudget = 200.0
-    batch_size: Batch = Field(default=48, ge=2)
-    learning_rate: LearningRate = 1.5e-3
-    weight_decay: WeightDecay = 5e-2
-    image_noise: ImageNoise = 0.02
-    brightness: Brightness = 0.05
-    # At 64 pixels, one pixel is about 10 mm on the table, the scale that decides success.
-    shift_px: int = Field(default=1, ge=0, description="largest shift of training images")
-    # Shares of true endings with both inputs that lose their poses, or their image: real endings
-    # come without poses, and with poses the network would ignore the image.
-    true_without_poses: float = Field(
-        default=0.85,
-        ge=0,
-        le=1,
-        description="share of true endings with object poses dropped",
-    )
-    true_without_images: float = Field(
-        default=0.1,
-        ge=0,
-        le=1,
-        description="share of true endings with images dropped",
-    )
-    # The same for imagined endings: worlds always predict poses, but render images on request.
-    imagined_without_poses: float = Field(
-        default=0.3,
-        ge=0,
-        le=1,
-        description="share of imagined endings with object poses dropped",
-    )
-    imagined_without_images: float = Field(
-        default=0.3,
-        ge=0,
-        le=1,
-        description="share of imagined endings with images dropped",
-    )
-    pose_noise: float = Field(
-        default=0.03,
-        ge=0,
-        description="noise on object poses, in standard deviations of each feature",
-    )
-    imagined_share: float = Field(
-        default=0.4, gt=0, lt=1, description="weight of imagined endings relative to true ones"
-    )
-    milestone_weight: float = Field(
-        default=0.3, ge=0, description="weight of the milestones in the loss"
-    )
-    development_share: float = Field(
-        default=0.15, gt=0, lt=1, description="share of seeds to calibrate on"
-    )
-    held_out_share: float = Field(default=0.2, gt=0, lt=1, description="share of held-out seeds")
-    risk: float = Field(
-        default=0.05, gt=0, lt=1, description="allowed share of errors among decided endings"
-    )
+from services.evaluation.training_settings import ProbeSettings
 
 
 @dataclass(frozen=True)

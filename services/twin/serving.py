@@ -8,7 +8,6 @@ from pydantic import Field
 from dextouch.serving import load_settings, service_config
 from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, serve_worlds
 from services.twin.settings import TwinSettings
-from services.twin.world import TwinWorld
 
 
 class TwinServiceSettings(WorldServiceSettings):
@@ -25,6 +24,9 @@ class TwinServiceSettings(WorldServiceSettings):
 
 def twin_worlds(scene: TwinSettings) -> dict[str, World[Any]]:
     """The twin, and the baseline that every imagined world must beat."""
+    # The settings can be shown without MuJoCo.
+    from services.twin.world import TwinWorld
+
     twin = TwinWorld(scene)
     baseline = CopyFirstWorld.beside(twin.description)
     return {"twin": twin, baseline.description.name: baseline}

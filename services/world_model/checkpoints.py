@@ -1,4 +1,4 @@
-"""Checkpoints of the joint flow-matching model, and the default checkpoint of the package."""
+"""Checkpoints of the joint flow-matching model."""
 
 import sys
 from dataclasses import dataclass
@@ -30,8 +30,6 @@ METADATA_KEY = "dextouch_world_model"
 # Statistics missing from files of older releases; the network's defaults are used instead.
 LATER_STATISTICS = ("tokenizer.peak_kpa",)
 _TEXT: Final = "text_features."
-PRETRAINED = Path(__file__).parent / "pretrained"
-STATE_MODEL, PAPER_FORM = "state.safetensors", "tiny.safetensors"
 
 
 class TrainingSet(FrozenModel):
@@ -149,14 +147,3 @@ def _largest(path: Path) -> int:
 def list_checkpoints(folder: Path) -> dict[Path, str]:
     """Every checkpoint file of a folder with its digest."""
     return {path: digest_of(path) for path in sorted(folder.glob("*.safetensors"))}
-
-
-def default_checkpoint() -> Path:
-    """Default checkpoint of the package: the state model if it is installed."""
-    state = PRETRAINED / STATE_MODEL
-    return state if state.is_file() else paper_form_checkpoint()
-
-
-def paper_form_checkpoint() -> Path:
-    """Checkpoint of the joint flow-matching model that ships with the package."""
-    return PRETRAINED / PAPER_FORM

@@ -4,7 +4,7 @@ from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
 from services.networks.training_settings import Device
-from services.world_model.network.model import Precision
+from services.world_model.network.configuration import Precision
 from services.world_model.wan.configuration import WanFiles
 
 

@@ -30,14 +30,11 @@ from services.networks.training_settings import (
     WarmupSteps,
     WeightDecay,
 )
-from services.world_model.checkpoints import PRETRAINED, default_checkpoint
-from services.world_model.network.configuration import NetworkConfig
-from services.world_model.network.model import Precision
-from services.world_model.network.solvers import Sampler
+from services.world_model.network.configuration import NetworkConfig, Precision, Sampler
 from services.world_model.placement import Placement
 from services.world_model.presets import PRESETS, PresetSource
-from services.world_model.rendering.configuration import RendererConfig
-from services.world_model.rendering.training import RendererTraining
+from services.world_model.rendering.configuration import RendererConfig, RendererTraining
+from services.world_model.shipped_checkpoints import PRETRAINED, default_checkpoint
 from services.world_model.wan.configuration import WanFiles
 
 

@@ -30,12 +30,13 @@ from dextouch.schemas import (
 from dextouch.streams import pack, unpack
 from dextouch.worlds import StartedRollout, SteppedRollout
 from services.networks.memory import on_device
-from services.world_model.checkpoints import Checkpoint, default_checkpoint, read_checkpoint
+from services.world_model.checkpoints import Checkpoint, read_checkpoint
+from services.world_model.network.configuration import Precision, Sampler
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
-from services.world_model.network.model import Precision, Prediction, Sampling, stack_noise
-from services.world_model.network.solvers import Sampler
+from services.world_model.network.model import Prediction, Sampling, stack_noise
 from services.world_model.network.visual_codec import to_uint8, to_unit
 from services.world_model.placement import Placement
+from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.starts import CAMERA, observed_start
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.state_world import StateWorld

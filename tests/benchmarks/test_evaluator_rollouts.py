@@ -33,7 +33,7 @@ from services.evaluation.policies.colour_servo import ColourServo
 from services.evaluation.settings import DEFAULT_PROBE
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
-from services.world_model.checkpoints import PRETRAINED
+from services.world_model.shipped_checkpoints import PRETRAINED
 
 TINY = PRETRAINED / "tiny.safetensors"
 

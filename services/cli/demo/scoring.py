@@ -18,7 +18,7 @@ from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_probe import SuccessProbe
 from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name
 from services.twin.tasks import get_task
-from services.world_model.checkpoints import default_checkpoint
+from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.world import open_world
 
 MODEL = "world_model"

@@ -32,7 +32,7 @@ from services.evaluation.studies.results import StudyHeader, StudyResults, cells
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_probe import SuccessProbe
 from services.twin.scripted_actions import scripted_actions
-from services.world_model.checkpoints import default_checkpoint
+from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 
 _CHILD = "services.cli.study.world_process"

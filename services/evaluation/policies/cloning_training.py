@@ -5,10 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from pydantic import Field
 
 from dextouch.errors import InvalidInputError
-from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
 from services.evaluation.demonstrations import instructions_of, split_by_seed
@@ -33,16 +31,7 @@ from services.evaluation.policies.cloning_network import (
     CloningBatch,
     CloningNetwork,
 )
-from services.networks.training_settings import (
-    Batch,
-    Brightness,
-    CpuBudget,
-    ImageNoise,
-    LearningRate,
-    NumSteps,
-    Seed,
-    WeightDecay,
-)
+from services.evaluation.training_settings import CloningSettings
 
 # Batch size of the held-out evaluation.
 _TESTED_AT_ONCE = 128
@@ -51,21 +40,6 @@ MOMENTS_AN_EPISODE = 3
 MIN_VARIANCE = 1e-9
 # Large weights stored as float16 to keep files below a megabyte.
 _KEPT_AS_HALF = ("codec.basis", "head.0.weight", "head.2.weight")
-
-
-class CloningSettings(FrozenModel):
-    """Training settings of behaviour cloning."""
-
-    seed: Seed = 0
-    num_training_steps: NumSteps = 3000
-    max_cpu_s: CpuBudget = 240.0
-    batch_size: Batch = 72
-    learning_rate: LearningRate = 1.5e-3
-    weight_decay: WeightDecay = 1e-3
-    image_noise: ImageNoise = 0.02
-    brightness: Brightness = 0.06
-    pose_noise: float = Field(default=0.2, ge=0, description="pose noise, relative to the spread")
-    held_out_share: float = Field(default=0.12, gt=0, lt=1, description="share of held-out seeds")
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,14 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from dextouch.frozen_model import FrozenModel
-from services.world_model.network.solvers import Sampler
 from services.world_model.wan.configuration import (
     LATENT_CHANNELS,
     SPATIAL_FACTOR,
     WanConfig,
 )
 
+Sampler = Literal["euler", "unipc"]
+Precision = Literal["float32", "bfloat16"]
 TokenizerName = Literal["principal_axes", "split_hands", "grid"]
 
 

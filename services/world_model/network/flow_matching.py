@@ -13,7 +13,8 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError
-from services.world_model.network.solvers import SOLVERS, Sampler
+from services.world_model.network.configuration import Sampler
+from services.world_model.network.solvers import SOLVERS
 
 # Lower bound of training times: velocities divide by them.
 MIN_TIME = 1e-3

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float32, UInt8
@@ -18,10 +18,14 @@ from services.world_model.network.conditioning import (
     Constants,
     TactileCondition,
 )
-from services.world_model.network.configuration import NetworkConfig, num_latents
+from services.world_model.network.configuration import (
+    NetworkConfig,
+    Precision,
+    Sampler,
+    num_latents,
+)
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.joint_attention import JointLayer, Stream, clean_mask
-from services.world_model.network.solvers import Sampler
 from services.world_model.network.tactile_expert import TactileExpert
 from services.world_model.network.tokenizer_choice import build_tokenizer
 from services.world_model.network.video_side import video_side
@@ -30,7 +34,6 @@ from services.world_model.network.wan_video import WanVideoCondition
 from services.world_model.wan.configuration import FLOAT32_PARTS
 from services.world_model.wan.text import TextFeatures
 
-Precision = Literal["float32", "bfloat16"]
 _EXACT_PARTS = (
     "codec.", "tokenizer.", "normalizer.", "video_condition.", "tactile_condition.",
     "video_residual_std", "tactile_residual_std",

@@ -6,12 +6,13 @@ t' = 0 are exact.
 """
 
 import math
-from typing import Literal, Protocol
+from typing import Protocol
 
 from jaxtyping import Float32
 from torch import Tensor
 
-Sampler = Literal["euler", "unipc"]
+from services.world_model.network.configuration import Sampler
+
 # UniPC's half log-odds of data are infinite at t = 1; the same bound as in diffusers.
 _MAX_TIME = 1.0 - 1e-6
 

@@ -5,7 +5,6 @@ beyond `FAR_M`, or never, move as if they came from infinity.
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -14,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dextouch.geometry import invert
+from services.world_model.rendering.configuration import Interpolation
 
 FAR_M = 20.0
 # A camera nearer to the plane than this sees it edge-on.
@@ -21,7 +21,6 @@ MIN_HEIGHT_M = 1e-3
 # Positions farther outside than this many image sides all sample the border.
 _MAX_SIDES = 4.0
 _MIN_DEPTH = 1e-9
-Interpolation = Literal["bilinear", "bicubic"]
 
 
 def pixel_centres(height_px: int, width_px: int) -> Float64[np.ndarray, "pixels 2"]:

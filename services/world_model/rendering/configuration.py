@@ -1,9 +1,22 @@
 """Configuration of the renderer's network; stored with its weights."""
 
+from typing import Literal
+
 from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
-from services.world_model.rendering.camera_motion import Interpolation
+from services.networks.training_settings import (
+    AverageDecay,
+    Batch,
+    CpuBudget,
+    LearningRate,
+    MaxGradientNorm,
+    MaxSteps,
+    WarmupSteps,
+    WeightDecay,
+)
+
+Interpolation = Literal["bilinear", "bicubic"]
 
 
 class RendererConfig(FrozenModel):
@@ -31,3 +44,31 @@ class RendererConfig(FrozenModel):
     def pixel_multiple(self) -> int:
         """Sides of images must be multiples of this."""
         return 2 ** len(self.widths)
+
+
+class RendererTraining(FrozenModel):
+    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
+
+    cpu_budget_s: CpuBudget = 540.0
+    max_steps: MaxSteps = None
+    batch: Batch = 24
+    learning_rate: LearningRate = 2e-3
+    warmup_steps: WarmupSteps = 50
+    weight_decay: WeightDecay = 0.01
+    ema_decay: AverageDecay = 0.995
+    max_gradient_norm: MaxGradientNorm = 1.0
+    gradient_weight: float = Field(default=0.5, ge=0, description="image gradient loss")
+    sharpness_weight: float = Field(
+        default=0.3, ge=0, description="weight of the edge strength loss (7 px windows)"
+    )
+    late_start_fraction: float = Field(
+        default=0.5, ge=0, le=1, description="share of pairs with a random start image"
+    )
+    shaken_fraction: float = Field(
+        default=0.5, ge=0, le=1, description="share of pairs with pose noise"
+    )
+    shake_m: float = Field(default=0.003, ge=0, description="position noise per axis")
+    shake_rad: float = Field(default=0.05, ge=0, description="rotation noise per axis")
+    uses_bfloat16: bool = Field(
+        default=True, description="convolve in bfloat16 where that is faster"
+    )

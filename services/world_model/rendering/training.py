@@ -8,12 +8,10 @@ from functools import partial
 import numpy as np
 import torch
 from jaxtyping import Float32
-from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
-from dextouch.frozen_model import FrozenModel
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from services.networks.optimizer import (
     Budget,
@@ -22,19 +20,9 @@ from services.networks.optimizer import (
     half_cosine,
     update_average,
 )
-from services.networks.training_settings import (
-    AverageDecay,
-    Batch,
-    CpuBudget,
-    LearningRate,
-    MaxGradientNorm,
-    MaxSteps,
-    WarmupSteps,
-    WeightDecay,
-)
 from services.world_model.rendering.box_raster import object_transforms
 from services.world_model.rendering.clips import SceneClip, gather
-from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.configuration import RendererConfig, RendererTraining
 from services.world_model.rendering.inputs import DrawingInputs, drawing_inputs
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.precision import has_fast_bfloat16
@@ -43,34 +31,6 @@ from services.world_model.rendering.scene_states import SceneStates
 LOG_EVERY_STEPS = 50
 MIN_LEARNING_RATE_SHARE = 0.01
 _EDGE_WINDOW_PX = 7
-
-
-class RendererTraining(FrozenModel):
-    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
-
-    cpu_budget_s: CpuBudget = 540.0
-    max_steps: MaxSteps = None
-    batch: Batch = 24
-    learning_rate: LearningRate = 2e-3
-    warmup_steps: WarmupSteps = 50
-    weight_decay: WeightDecay = 0.01
-    ema_decay: AverageDecay = 0.995
-    max_gradient_norm: MaxGradientNorm = 1.0
-    gradient_weight: float = Field(default=0.5, ge=0, description="image gradient loss")
-    sharpness_weight: float = Field(
-        default=0.3, ge=0, description="weight of the edge strength loss (7 px windows)"
-    )
-    late_start_fraction: float = Field(
-        default=0.5, ge=0, le=1, description="share of pairs with a random start image"
-    )
-    shaken_fraction: float = Field(
-        default=0.5, ge=0, le=1, description="share of pairs with pose noise"
-    )
-    shake_m: float = Field(default=0.003, ge=0, description="position noise per axis")
-    shake_rad: float = Field(default=0.05, ge=0, description="rotation noise per axis")
-    uses_bfloat16: bool = Field(
-        default=True, description="convolve in bfloat16 where that is faster"
-    )
 
 
 @dataclass(frozen=True)

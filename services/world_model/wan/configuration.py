@@ -1,12 +1,14 @@
 """Shape of the Wan2.2 networks of the full-size model; the defaults are Wan2.2-TI2V-5B."""
 
 from pathlib import Path
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
-import torch
 from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
+
+if TYPE_CHECKING:
+    import torch
 
 # Fixed by the published autoencoder: it maps 1 + 4k images to 1 + k latents at a sixteenth of the
 # resolution, and the transformer takes two by two of them as one token.
@@ -30,7 +32,6 @@ LATENT_STD: Final = (
 )  # fmt: skip
 # Parts of the transformer that stay in float32 whatever the precision of the others.
 FLOAT32_PARTS: Final = ("time_embedder", "scale_shift_table", "norm1", "norm2", "norm3")
-_DTYPES: Final = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
 class WanFiles(FrozenModel):
@@ -70,9 +71,12 @@ class WanConfig(FrozenModel):
     )
 
     @property
-    def dtype(self) -> torch.dtype:
+    def dtype(self) -> "torch.dtype":
         """Kind of number of the weights."""
-        return _DTYPES[self.precision]
+        # Settings can be read and shown without torch.
+        import torch
+
+        return torch.float32 if self.precision == "float32" else torch.bfloat16
 
     def transformer_sizes(
         self, *, num_layers: int, num_heads: int, head_width: int
@@ -115,6 +119,8 @@ class WanConfig(FrozenModel):
         }
 
 
-def dtype_of(name: str, dtype: torch.dtype) -> torch.dtype:
+def dtype_of(name: str, dtype: "torch.dtype") -> "torch.dtype":
     """Kind of number of one tensor of the transformer."""
+    import torch
+
     return torch.float32 if any(part in name for part in FLOAT32_PARTS) else dtype
