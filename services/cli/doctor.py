@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from dextouch.command_line import CommandParser, add_json, write_result
-from dextouch.errors import DexTouchError, UnavailableError
+from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
 from services.cli.machine import Finding, Machine
 
 # Import names; if several extras provide a package, the most relevant one has it.
@@ -41,6 +41,7 @@ _DISTRIBUTIONS = {
     "usb": "pyusb",
     "cv2": "opencv-contrib-python-headless",
     "mujoco": "mujoco-core",
+    "rerun": "rerun-sdk",
 }
 _PURPOSES = {
     "zstandard": "episodes",
@@ -54,6 +55,15 @@ _PURPOSES = {
     "mujoco": "the physics twin",
     "torch": "world model and policies",
     "gymnasium": "the Gymnasium bridge",
+}
+# Without these everything else works.
+_OPTIONAL = {
+    "rerun": "shows the .rrd files of the player's command: rerun FILE.rrd",
+    "pyarrow": "LeRobot datasets",
+    "mcap": "MCAP files",
+    "numcodecs": "UMI files",
+    "obstore": "stores in a bucket, s3://…",
+    "diffusers": "the full-size world model",
 }
 
 
@@ -88,15 +98,39 @@ def examine() -> list[Finding]:
         findings.append(_package(package, purpose))
     free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
     redis = shutil.which("redis-server") or "no: rollouts are kept in memory"
-    full = "yes" if importlib.util.find_spec("diffusers") else f"no: {install_hint('diffusers')}"
     libusb = ctypes.util.find_library("usb-1.0") or "no: trackers by link usb need it"
     findings += [
         Finding("free disk", f"{free_gb:.1f} GB", ok=free_gb > 2, do="free at least 2 GB"),
         Finding("redis-server (optional)", redis),
         Finding("libusb (optional)", libusb),
-        Finding("diffusers (optional, the full-size world model)", full),
+        *(_optional(package, purpose) for package, purpose in _OPTIONAL.items()),
     ]
-    return [*findings, *_outdated(), *Machine().examine()]
+    ports, problems = _ports_of_up()
+    return [*findings, *_outdated(), *problems, *Machine(ports=ports).examine()]
+
+
+def _ports_of_up() -> tuple[dict[str, int], list[Finding]]:
+    """Ports of `dextouch up` as its settings have them, and what is wrong with the settings."""
+    what = "settings of dextouch up"
+    try:
+        # It needs the extra `serve`.
+        from services.cli.up import ports_of_up
+
+        return ports_of_up(), []
+    except ModuleNotFoundError as error:
+        refusal = missing_package(error)
+        if refusal is None:
+            raise
+        return {}, [Finding("ports of dextouch up", "unknown: it cannot run", required=False)]
+    except InvalidInputError as error:
+        return {}, [Finding(what, error.message, ok=False, do="correct them", required=False)]
+
+
+def _optional(name: str, purpose: str) -> Finding:
+    """A package that only one purpose needs; it is in order to do without."""
+    what = f"{name} (optional, {purpose})"
+    found = _package(name, purpose)
+    return Finding(what, found.found if found.ok else f"no: {found.do}")
 
 
 def _package(name: str, purpose: str) -> Finding:

@@ -1,6 +1,7 @@
 """Commands `dextouch export` and `dextouch import` for formats of other tools."""
 
 import argparse
+import math
 import shutil
 import sys
 import uuid
@@ -239,12 +240,26 @@ def export_main(argv: Sequence[str]) -> int:
     quality = "mcap: encode rgb8 images as JPEG (default: lossless)"
     add("--jpeg-quality", type=int, metavar="1…100", help=quality)
     rate = "lerobot: frames per second (default: model rate)"
-    add("--fps", type=int, metavar="N", help=rate)
+    add("--fps", type=_whole_fps, metavar="N", help=rate)
     name = "lerobot: name of the data set (%(default)s)"
     add("--repo-id", default="dextouch/export", metavar="USER/NAME", help=name)
     options = parser.parse_args(list(argv))
     write_result(options.json, _export(options))
     return 0
+
+
+def _whole_fps(text: str) -> int:
+    """Frames per second of a LeRobot dataset, whose format counts whole ones."""
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        rate_hz = math.nan
+    if not math.isfinite(rate_hz) or rate_hz != round(rate_hz):
+        near = f"; {round(rate_hz)} is the nearest" if math.isfinite(rate_hz) else ""
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected a whole number, since LeRobot counts whole frames{near}"
+        )
+    return round(rate_hz)
 
 
 def import_main(argv: Sequence[str]) -> int:

@@ -14,15 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-# Of `dextouch up`, in the order of its settings.
-PORTS: Final = {
-    "dashboard": 8080,
-    "episode-store": 8081,
-    "alignment": 8082,
-    "acquisition": 8083,
-    "twin": 8084,
-    "world-model": 8085,
-}
 DEVICE_KINDS: Final = {
     "serial devices": ("ttyACM*", "ttyUSB*"),
     "HID devices": ("hidraw*",),
@@ -95,6 +86,7 @@ class Machine:
         is_free: whether a port is free.
         output_of: what a program prints, None where it fails.
         rules: the udev rules that give access to devices.
+        ports: that `dextouch up` listens on, by service.
     """
 
     root: Path = Path("/")
@@ -102,6 +94,7 @@ class Machine:
     is_free: Callable[[int], bool] = is_free
     output_of: Callable[[Sequence[str]], str | None] = output_of
     rules: Path = field(default_factory=find_rules)
+    ports: Mapping[str, int] = field(default_factory=dict)
 
     def examine(self) -> list[Finding]:
         """All checks, without changing anything."""
@@ -178,14 +171,17 @@ class Machine:
         return Finding(what, found, ok=False, do=do, required=False)
 
     def _ports(self) -> list[Finding]:
-        """Whether `dextouch up` can listen where it does by default."""
-        taken = {name: port for name, port in PORTS.items() if not self.is_free(port)}
+        """Whether `dextouch up` can listen where its settings say."""
+        # 0 stands for any free one.
+        ports = {name: port for name, port in self.ports.items() if port}
+        taken = {name: port for name, port in ports.items() if not self.is_free(port)}
         what = "ports of dextouch up"
+        if not ports:
+            return []
         if not taken:
-            ports = list(PORTS.values())
-            return [Finding(what, f"{ports[0]} to {ports[-1]} are free")]
+            return [Finding(what, f"{', '.join(map(str, ports.values()))} are free")]
         found = "in use: " + ", ".join(f"{port} ({name})" for name, port in taken.items())
-        other = " ".join(f"--{name}-port 0" for name in taken)
+        other = " ".join(f"--{name.replace('_', '-')}-port 0" for name in taken)
         return [Finding(what, found, ok=False, do=f"dextouch up {other}", required=False)]
 
     def _memory(self) -> list[Finding]:

@@ -87,6 +87,22 @@ class UpSettings(CommandSettings):
         return str(self.data / "store")
 
 
+def ports_of_up() -> dict[str, int]:
+    """Port of each service that `dextouch up` starts, from the environment and dextouch.toml.
+
+    Raises:
+        InvalidInputError: invalid settings.
+    """
+    settings = load_settings(UpSettings, [])
+    wanted = _wanted(settings)
+    fields = (name for name in UpSettings.model_fields if name.endswith("_port"))
+    return {
+        name: getattr(settings, field)
+        for field in fields
+        if (name := field.removesuffix("_port")) in wanted
+    }
+
+
 def main(argv: Sequence[str]) -> int:
     """Serve until SIGINT or SIGTERM."""
     settings = load_settings(UpSettings, list(argv))

@@ -205,7 +205,9 @@ def test_each_service_reads_its_own_variables_too(tmp_path, monkeypatch):
 
 def test_a_wrong_variable_is_named(tmp_path, monkeypatch):
     monkeypatch.setenv("DEXTOUCH_ALIGNMENT_PORT", "far")
-    with pytest.raises(InvalidInputError, match="settings of alignment: port: Input should be a"):
+    with pytest.raises(
+        InvalidInputError, match="settings of alignment: port: got 'far', expected a whole"
+    ):
         up._build("alignment", up.UpSettings(data=tmp_path), {})
 
 

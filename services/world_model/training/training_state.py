@@ -17,6 +17,7 @@ from torch import Tensor
 
 from dextouch.errors import ConflictError, CorruptDataError
 from dextouch.frozen_model import FrozenModel
+from dextouch.schemas import first_problems
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.settings import TrainSettings
 
@@ -100,7 +101,9 @@ def checked_facts(text: str, identity: Mapping[str, JsonValue], where: str) -> R
     try:
         facts = RunFacts.model_validate_json(text)
     except ValidationError as error:
-        raise CorruptDataError(f"{where}: unreadable ({error}); remove it to start over") from error
+        raise CorruptDataError(
+            f"{where}: unreadable ({first_problems(error)}); remove it to start over"
+        ) from error
     expected = json.loads(json.dumps(dict(identity)))
     # Settings that are newer than the state have their defaults.
     saved = {**TrainSettings(episodes="").model_dump(mode="json"), **facts.identity}

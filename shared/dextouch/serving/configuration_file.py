@@ -23,7 +23,7 @@ from pydantic_settings import (
 )
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import first_problems
+from dextouch.serving.setting_problems import told_problems
 
 VARIABLE: Final = "DEXTOUCH_CONFIG"
 FILE_NAME: Final = "dextouch.toml"
@@ -158,7 +158,7 @@ def _parts(text: str) -> list[str]:
 
 def explained(error: ValidationError, section: str) -> str:
     """Problems of settings in one line, with the lines of the configuration file they come from."""
-    text = first_problems(error)
+    text = told_problems(error)
     path = configuration_path()
     if path is None:
         return text

@@ -8,7 +8,13 @@ import pytest
 
 from dextouch.bridges.lerobot import ExportOptions, ImportOptions, export_lerobot, import_lerobot
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import ConflictError, InvalidInputError, NonFiniteError, UnknownNameError
+from dextouch.errors import (
+    ConflictError,
+    CorruptDataError,
+    InvalidInputError,
+    NonFiniteError,
+    UnknownNameError,
+)
 from dextouch.hands.actions import poses_from_actions
 from tests.unit.bridges.lerobot_edits import (
     DATA,
@@ -275,3 +281,26 @@ def test_nan_is_refused_and_nothing_of_the_episode_stays(store, other, folder):
     with pytest.raises(NonFiniteError, match="NaN"):
         import_lerobot(folder, other)
     assert other.list() == ["stand-bottle-0003"]
+
+
+def test_a_rate_that_is_no_whole_number_is_kept(store, other, folder):
+    foreign(store, folder)
+    # As 29.97 is to 30, the rate of broadcast video.
+    edit_json(folder, INFO, lambda info: info.update(fps=14.985))
+    mapping = {"camera_head": "observation.images.top"}
+    options = ImportOptions(mapping=mapping, K_head=K_HEAD, images="rgb8")
+    for episode_id in import_lerobot(folder, other, options=options):
+        episode = other.open(episode_id)
+        assert episode.attributes.model_rate_hz == 14.985
+        steps_ns = np.diff(episode.stamps_ns("action"))
+        np.testing.assert_allclose(steps_ns, 1e9 / 14.985, atol=1)
+
+
+def test_a_rate_that_is_no_number_is_told_without_a_text_of_a_library(store, other, folder):
+    foreign(store, folder)
+    edit_json(folder, INFO, lambda info: info.update(fps="fast"))
+    with pytest.raises(CorruptDataError) as caught:
+        import_lerobot(folder, other)
+    assert "fps: Input should be a valid number" in caught.value.message
+    assert "\n" not in caught.value.message
+    assert "pydantic" not in caught.value.message

@@ -101,7 +101,7 @@ def test_a_preset_is_named_by_the_file_and_yields_to_it(write):
     ("text", "message"),
     [
         ("[dashboard]\nport = 1\nporrt = 2\n", r"porrt.*dextouch\.toml:3 \[dashboard\] porrt"),
-        ("[dashboard]\nport = 'x'\n", r"port.*integer.*dextouch\.toml:2 \[dashboard\] port"),
+        ("[dashboard]\nport = 'x'\n", r"port.*whole number.*dextouch\.toml:2 \[dashboard\] port"),
         (FILE.replace("scopes", "scope"), r"dextouch\.toml:10 \[dashboard\] api_keys\.0\.scope"),
         ("[dashboard]\nport = \n", r"dextouch\.toml: cannot be read as TOML: .*line 2"),
         ("port = 3\n[dashboard]\n", r"dextouch\.toml:1: port stands outside of a section"),

@@ -10,16 +10,19 @@ import pytest
 from services.cli.configuration import SECTIONS
 
 # Of the extras other than `serve`, which reads settings.
-ABSENT = (
-    "torch safetensors mujoco scipy numba cv2 serial hid usb zarr av obstore PIL mcap pyarrow "
-    "diffusers transformers rerun gymnasium"
-).split()
+ABSENT = frozenset(
+    {
+        *("torch", "safetensors", "diffusers", "transformers", "PIL"),
+        *("mujoco", "gymnasium", "scipy", "numba", "cv2", "serial", "hid", "usb"),
+        *("zarr", "av", "obstore", "mcap", "pyarrow", "rerun"),
+    }
+)
 DRIVER = f"""
 import importlib.abc, sys
 
 class Absent(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {ABSENT}:
+        if name.partition(".")[0] in {set(ABSENT)}:
             raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 
 sys.meta_path.insert(0, Absent())

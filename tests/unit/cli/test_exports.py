@@ -147,6 +147,9 @@ def test_lerobot_replaces_only_what_is_a_data_set(store, dextouch, tmp_path):
     assert status == main.EXIT_REFUSED
     assert "--force" in err
     assert dextouch(*words, "--fps", "0", "--force")[0] == main.EXIT_REFUSED
+    with pytest.raises(SystemExit) as usage:
+        dextouch(*words, "--fps", "29.97", "--force")
+    assert usage.value.code == main.EXIT_USAGE
     assert (folder / "meta" / "info.json").is_file()
     assert dextouch(*words, "--force")[0] == 0
     assert names(tmp_path) == ["data", "store"]

@@ -10,6 +10,8 @@ from services.cli import doctor
 from services.cli.machine import Finding, Machine, is_free
 
 MEMINFO = "MemTotal:       16384000 kB\nMemFree:          200000 kB\nMemAvailable:    8192000 kB\n"
+# A service with port 0 takes any free one.
+PORTS = {"dashboard": 8080, "episode_store": 8081, "acquisition": 8083, "twin": 0}
 ACCESS = (
     "sudo install -m 644 /opt/60-dextouch.rules /etc/udev/rules.d/ && "
     "sudo udevadm control --reload && sudo udevadm trigger"
@@ -37,7 +39,7 @@ def tree(tmp_path):
 def findings(tmp_path):
     """What is found in the tree, by name."""
 
-    def examine(*, closed=(), taken=(), answers=None):
+    def examine(*, closed=(), taken=(), answers=None, ports=PORTS):
         answers = {"timedatectl": "yes\n"} if answers is None else answers
         machine = Machine(
             root=tmp_path,
@@ -45,6 +47,7 @@ def findings(tmp_path):
             is_free=lambda port: port not in taken,
             output_of=lambda command: answers.get(command[0]),
             rules=Path("/opt/60-dextouch.rules"),
+            ports=ports,
         )
         return {finding.what: finding for finding in machine.examine()}
 
@@ -60,7 +63,7 @@ def test_a_machine_in_order(tree, findings):
     assert found["cameras"].found == "none"
     assert found["wall clock"].found == "synchronized"
     assert found["free memory"].found == "8.4 of 16.8 GB"
-    assert found["ports of dextouch up"].found == "8080 to 8085 are free"
+    assert found["ports of dextouch up"].found == "8080, 8081, 8083 are free"
     assert found["GPU (optional)"].found == "none: models run on the processor"
 
 
@@ -109,9 +112,51 @@ def test_the_wall_clock(findings, answers, text):
 
 
 def test_ports_in_use(findings):
-    ports = findings(taken={8080, 8083})["ports of dextouch up"]
-    assert (ports.found, ports.ok) == ("in use: 8080 (dashboard), 8083 (acquisition)", False)
-    assert ports.do == "dextouch up --dashboard-port 0 --acquisition-port 0"
+    ports = findings(taken={8080, 8081})["ports of dextouch up"]
+    assert (ports.found, ports.ok) == ("in use: 8080 (dashboard), 8081 (episode_store)", False)
+    assert ports.do == "dextouch up --dashboard-port 0 --episode-store-port 0"
+
+
+@pytest.fixture
+def doctors_ports(tmp_path, monkeypatch):
+    """What the doctor says of ports, of which those of the settings are in use."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(doctor, "Machine", lambda ports: Machine(root=tmp_path, ports=ports))
+    return lambda: {one.what: one for one in doctor.examine()}
+
+
+def test_the_ports_are_those_of_the_settings_of_up(doctors_ports, tmp_path, monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as first, socket.create_server(("", 0)) as second:
+        ports = [server.getsockname()[1] for server in (first, second)]
+        (tmp_path / "dextouch.toml").write_text(f"[up]\nstudies_port = {ports[0]}\n")
+        monkeypatch.setenv("DEXTOUCH_UP_TWIN_PORT", str(ports[1]))
+        found = doctors_ports()["ports of dextouch up"]
+        assert f"{ports[0]} (studies)" in found.found
+        assert f"{ports[1]} (twin)" in found.found
+        assert "--studies-port 0" in found.do
+        monkeypatch.setenv("DEXTOUCH_UP_WITHOUT", '["twin", "studies"]')
+        left = doctors_ports()["ports of dextouch up"].found
+        assert "studies" not in left
+        assert "twin" not in left
+
+
+def test_settings_of_up_that_are_wrong_are_a_finding(doctors_ports, monkeypatch):
+    monkeypatch.setenv("DEXTOUCH_UP_TWIN_PORT", "far")
+    found = doctors_ports()["settings of dextouch up"]
+    assert not found.ok
+    assert "twin_port: got 'far', expected a whole number" in found.found
+
+
+def test_what_only_one_purpose_needs_is_listed_with_it(doctors_ports):
+    named = [what for what in doctors_ports() if "optional" in what]
+    for package, purpose in {
+        "rerun": "rerun FILE.rrd",
+        "pyarrow": "LeRobot",
+        "mcap": "MCAP",
+        "numcodecs": "UMI",
+        "obstore": "bucket",
+    }.items():
+        assert [what for what in named if what.startswith(f"{package} ") and purpose in what]
 
 
 def test_a_port_that_someone_listens_on_is_not_free():

@@ -159,3 +159,47 @@ def test_the_garbage_collector_leaves_out_what_a_service_starts_with(monkeypatch
     with pytest.raises(SystemExit, match="3"):  # it did not start
         run(app, ServiceSettings())
     assert frozen[0] > before
+
+
+@pytest.mark.parametrize(
+    ("flag", "value", "told"),
+    [
+        ("--port", "29.97", "port: got '29.97', expected a whole number"),
+        ("--port", "99999", "port: got '99999', expected at most 65535"),
+        ("--port", "-1", "port: got '-1', expected at least 0"),
+        ("--rate-hz", "fast", "rate_hz: got 'fast', expected a number"),
+        ("--client-timeout-s", "0", "client_timeout_s: got '0', expected more than 0.0"),
+        ("--log-level", "loud", "log_level: got 'loud', expected 'debug', 'info', 'warning' or"),
+    ],
+)
+def test_a_wrong_value_is_told_with_what_is_expected(flag, value, told):
+    with pytest.raises(InvalidInputError) as caught:
+        load_settings(ProbeSettings, [f"{flag}={value}"])
+    assert told in caught.value.message
+    assert "Input should" not in caught.value.message
+
+
+def test_rates_that_are_no_whole_numbers_are_accepted():
+    assert load_settings(ProbeSettings, ["--rate-hz", "29.97"]).rate_hz == 29.97
+
+
+def test_wrong_values_of_the_environment_and_the_file_are_told_alike(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dextouch.toml").write_text('[probe]\nport = 1.5\ncolour = "red"\n')
+    with pytest.raises(InvalidInputError) as caught:
+        load_settings(ProbeSettings, [])
+    assert "port: got 1.5, expected a whole number" in caught.value.message
+    assert "colour: there is no such setting" in caught.value.message
+    assert "dextouch.toml:2 [probe] port" in caught.value.message
+    monkeypatch.setenv("DEXTOUCH_PROBE_PORT", "many")
+    with pytest.raises(InvalidInputError, match="port: got 'many', expected a whole number"):
+        load_settings(ProbeSettings, [])
+
+
+def test_a_wrong_value_that_may_be_secret_is_not_repeated(monkeypatch):
+    keys = '[{"name": "a", "key": "short-one", "scopes": 7}, {"name": "b", "key": 1234567890123}]'
+    monkeypatch.setenv("DEXTOUCH_PROBE_API_KEYS", keys)
+    with pytest.raises(InvalidInputError) as caught:
+        load_settings(ProbeSettings, [])
+    assert "short-one" not in caught.value.message
+    assert "1234567890123" not in caught.value.message

@@ -26,7 +26,14 @@ from dextouch.bridges.model_grid import (
 from dextouch.episodes import EpisodeStore, disk_errors
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
-from dextouch.schemas import Domain, EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
+from dextouch.schemas import (
+    Domain,
+    EpisodeAttributes,
+    LineageEntry,
+    Matrix,
+    StoredAnchor,
+    first_problems,
+)
 from dextouch.tactile.layout import NUM_TAXELS
 
 HEAD = "camera_head"
@@ -102,7 +109,7 @@ def import_lerobot(
             attributes = EpisodeAttributes.model_validate(changes)
         except ValidationError as error:
             raise InvalidInputError(
-                f"import from LeRobot: the options make no episode ({error})"
+                f"import from LeRobot: the options make no episode ({first_problems(error)})"
             ) from error
         if store.exists(attributes.episode_id):
             raise ConflictError(

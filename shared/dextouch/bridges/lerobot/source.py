@@ -59,7 +59,8 @@ class DatasetInfo(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     codebase_version: str = Field(max_length=32)
-    fps: int = Field(ge=1, le=1000)
+    # A whole number for LeRobot itself; others write the rate of their cameras, such as 29.97.
+    fps: float = Field(ge=1, le=1000)
     features: dict[str, FeatureInfo] = Field(max_length=10_000)
     total_episodes: int = Field(ge=0, le=MAX_EPISODES)
     data_path: str = Field(max_length=512)
@@ -133,8 +134,8 @@ class LeRobotFolder:
             sidecar = layout.Sidecar.model_validate_json(data)
         except ValidationError as error:
             raise CorruptDataError(
-                f"{path}: is not a description of an episode ({error}); remove it to import the "
-                "frames as a dataset of other origin"
+                f"{path}: is not a description of an episode ({first_problems(error)}); remove "
+                "it to import the frames as a dataset of other origin"
             ) from error
         if sidecar.episode_index != entry.index:
             raise CorruptDataError(

@@ -125,7 +125,7 @@ class VideoSpan:
     path: Path
     from_s: float
     count: int
-    fps: int
+    fps: int | float
     shape: tuple[int, ...]
 
 

@@ -25,7 +25,7 @@ from dextouch.bridges.mcap.records import records
 from dextouch.episodes import EpisodeReader, EpisodeStore, EpisodeWriter, Kind, WriteOptions
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.images import encode_jpeg
-from dextouch.schemas import EpisodeAttributes, RecordingAttributes, json_ready
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes, first_problems, json_ready
 from dextouch.streams import ENCODED_UNITS, StreamDescriptor, encoded_values
 
 PROFILE: Final = "dextouch"
@@ -268,7 +268,9 @@ def _about(path: Path) -> tuple[Attributes, dict[str, int]]:
     try:
         return model.model_validate_json(text), counts
     except ValidationError as error:
-        raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} is invalid ({error})") from error
+        raise CorruptDataError(
+            f"{path}: {ATTRIBUTES_FILE} is invalid ({first_problems(error)})"
+        ) from error
 
 
 def _count(path: Path, text: str) -> int:

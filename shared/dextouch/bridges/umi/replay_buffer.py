@@ -26,7 +26,7 @@ from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import pose_from_transform
 from dextouch.geometry.rotations import vector_from_rotation
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
-from dextouch.schemas import EpisodeAttributes, LineageEntry, json_ready
+from dextouch.schemas import EpisodeAttributes, LineageEntry, first_problems, json_ready
 
 MAX_EPISODES: Final = 1_000_000
 MAX_STEPS: Final = 100_000
@@ -223,7 +223,7 @@ def _meta(archive: ZarrZipReader, path: Path) -> _Meta:
         meta = _Meta.model_validate(plain)
     except ValidationError as error:
         raise CorruptDataError(
-            f"{path}: attributes in meta/.zattrs are invalid ({error})"
+            f"{path}: attributes in meta/.zattrs are invalid ({first_problems(error)})"
         ) from error
     if not set(meta.cameras) <= set(MODEL_CAMERAS) or len(set(meta.cameras)) != len(meta.cameras):
         raise CorruptDataError(f"{path}: got cameras {meta.cameras}, expected of {MODEL_CAMERAS}")

@@ -33,6 +33,7 @@ from dextouch.errors import (
     StorageError,
 )
 from dextouch.frozen_model import FrozenModel
+from dextouch.schemas import first_problems
 
 ZSTD_LEVEL: Final = 1
 # Rows of a storage chunk of numbers.
@@ -224,7 +225,9 @@ class ZarrZipReader:
             try:
                 metadata = ArrayMetadata.model_validate_json(self._bytes(key, MAX_METADATA_BYTES))
             except ValidationError as error:
-                raise CorruptDataError(f"{self._path}: {key} is invalid ({error})") from error
+                raise CorruptDataError(
+                    f"{self._path}: {key} is invalid ({first_problems(error)})"
+                ) from error
             self._check(name, metadata)
             self._arrays[name] = metadata
         return self._arrays[name]
