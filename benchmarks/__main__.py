@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from dextouch.command_line import messages_aside
 from dextouch.errors import DexTouchError
-from services.cli.doctor import missing_package
+from services.cli.extras import missing_package
 from services.cli.main import EXIT_REFUSED
 
 EXIT_INTERRUPTED = 130

@@ -1,4 +1,4 @@
-"""Command `dextouch doctor`: checks this machine, and names the extra of a missing package."""
+"""Command `dextouch doctor`: checks what this machine can do and what is missing."""
 
 import ctypes.util
 import importlib.metadata
@@ -12,27 +12,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from dextouch.command_line import CommandParser, add_json, write_result
-from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
+from dextouch.errors import InvalidInputError
+from services.cli.extras import install_hint, missing_package
 from services.cli.machine import Finding, Machine
-
-# Import names; if several extras provide a package, the most relevant one has it.
-_PACKAGES = {
-    "store": "zarr zstandard google_crc32c av",
-    "station": "serial fastcrc hid usb cv2",
-    "serve": "fastapi uvicorn httptools rich redis httpx pydantic_settings structlog "
-    "prometheus_client jinja2 websockets shtab",
-    "align": "scipy numba",
-    "model": "torch safetensors PIL",
-    "full": "diffusers transformers",
-    "twin": "mujoco",
-    "gym": "gymnasium",
-    "export": "pyarrow mcap foxglove_schemas_protobuf numcodecs",
-    "rerun": "rerun",
-    "s3": "obstore",
-}
-_NOT_IN_ALL = ("full", "rerun")
-EXTRA_OF = {package: extra for extra, names in _PACKAGES.items() for package in names.split()}
-
 
 # Distributions that are named otherwise than what they provide.
 _DISTRIBUTIONS = {
@@ -65,25 +47,6 @@ _OPTIONAL = {
     "obstore": "stores in a bucket, s3://…",
     "diffusers": "the full-size world model",
 }
-
-
-def install_hint(package: str) -> str:
-    """The command that installs a package through its extra."""
-    return f"pip install 'dextouch-wm[{EXTRA_OF[package]}]'"
-
-
-def missing_package(error: ModuleNotFoundError, otherwise: str = "") -> DexTouchError | None:
-    """Error for a missing package, with an alternative; None if no extra provides it."""
-    package = (error.name or "").partition(".")[0]
-    if package not in EXTRA_OF:
-        return None
-    hint = install_hint(package)
-    if EXTRA_OF[package] not in _NOT_IN_ALL:
-        hint += ", or 'dextouch-wm[all]' for everything"
-    return UnavailableError(
-        f"the package {package!r} is not installed; {hint}{otherwise}. "
-        "`dextouch doctor` lists what is missing"
-    )
 
 
 def examine() -> list[Finding]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from dextouch import __version__
 from dextouch.command_line import messages_aside
 from dextouch.errors import DexTouchError, UnknownNameError
-from services.cli.doctor import missing_package
+from services.cli.extras import missing_package
 from services.cli.standard_streams import StandardStreams
 
 

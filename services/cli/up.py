@@ -17,7 +17,7 @@ from dextouch.data_folder import data_folder
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.serving import CommandSettings, configure_logging, explained, load_settings
 from services.cli.data_lock import held_data_folder
-from services.cli.doctor import missing_package
+from services.cli.extras import missing_package
 from services.cli.servers import Place, bind, serve_all, stop_on_signals
 from services.cli.standard_streams import discard_output
 

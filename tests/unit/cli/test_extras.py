@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from services.cli.doctor import EXTRA_OF, missing_package
+from services.cli.extras import EXTRA_OF, missing_package
 
 ROOT = Path(__file__).parents[3]
 # Runs every line of standard input as a command, in an environment without some packages.

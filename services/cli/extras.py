@@ -1,0 +1,40 @@
+"""Extras of the package: which of them brings a package that is not installed."""
+
+from dextouch.errors import DexTouchError, UnavailableError
+
+# Import names; if several extras provide a package, the most relevant one has it.
+_PACKAGES = {
+    "store": "zarr zstandard google_crc32c av",
+    "station": "serial fastcrc hid usb cv2",
+    "serve": "fastapi uvicorn httptools rich redis httpx pydantic_settings structlog "
+    "prometheus_client jinja2 websockets shtab",
+    "align": "scipy numba",
+    "model": "torch safetensors PIL",
+    "full": "diffusers transformers",
+    "twin": "mujoco",
+    "gym": "gymnasium",
+    "export": "pyarrow mcap foxglove_schemas_protobuf numcodecs",
+    "rerun": "rerun",
+    "s3": "obstore",
+}
+_NOT_IN_ALL = ("full", "rerun")
+EXTRA_OF = {package: extra for extra, names in _PACKAGES.items() for package in names.split()}
+
+
+def install_hint(package: str) -> str:
+    """The command that installs a package through its extra."""
+    return f"pip install 'dextouch-wm[{EXTRA_OF[package]}]'"
+
+
+def missing_package(error: ModuleNotFoundError, otherwise: str = "") -> DexTouchError | None:
+    """Error for a missing package, with an alternative; None if no extra provides it."""
+    package = (error.name or "").partition(".")[0]
+    if package not in EXTRA_OF:
+        return None
+    hint = install_hint(package)
+    if EXTRA_OF[package] not in _NOT_IN_ALL:
+        hint += ", or 'dextouch-wm[all]' for everything"
+    return UnavailableError(
+        f"the package {package!r} is not installed; {hint}{otherwise}. "
+        "`dextouch doctor` lists what is missing"
+    )
