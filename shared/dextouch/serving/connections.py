@@ -27,6 +27,7 @@ from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
 from dextouch.schemas import PROBLEM_MEDIA_TYPE, problem_from_error
 from dextouch.serving.guard import Refuse
 from dextouch.serving.masking import masked
+from dextouch.serving.refusals import RefusalLog, caller_of
 from dextouch.serving.spans import traced
 
 logger = structlog.get_logger(__name__)
@@ -35,6 +36,8 @@ logger = structlog.get_logger(__name__)
 MIN_BYTES_PER_S = 16 * 2**10
 # Of a request, beside its body.
 MAX_HEADER_BYTES = 2**16
+# Bytes of a header's line beside its name and value: ": " and the end of the line.
+NUM_SEPARATORS = 4
 # Clients that are told at the same time that there is no place; further ones are just closed.
 MAX_REFUSED = 64
 MAX_CHECK_PERIOD_S = 1.0
@@ -56,7 +59,7 @@ def limited_protocols(*, max_connections: int, client_timeout_s: float) -> dict[
     ones get status 503. A client may take `client_timeout_s` in all to send a request and to read
     the response; only time at less than 16 KiB/s counts.
     """
-    limits = _Limits(max_connections, client_timeout_s)
+    limits = _Limits(max_connections, client_timeout_s, RefusalLog(lambda _: None))
     return {
         "http": partial(_LimitedHttp, limits=limits),
         "ws": partial(_LimitedWebSocket, limits=limits),
@@ -69,6 +72,7 @@ class _Limits:
 
     max_connections: int
     client_timeout_s: float
+    refusals: RefusalLog
     idle: dict["_LimitedHttp", None] = field(default_factory=dict)
 
     @property
@@ -141,7 +145,7 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
         self._is_receiving = True
         self._has_begun = False
         self._is_refused = False
-        self._header_bytes = 0
+        self._received_bytes = self._header_bytes = 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
@@ -170,30 +174,68 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
             return
         if self.timeout_keep_alive_task is not None:
             # Even if it is no request, such as an empty line.
-            self._is_receiving, self._has_begun, self._header_bytes = True, False, 0
-        self._header_bytes += len(data)
+            self._is_receiving, self._has_begun, self._received_bytes = True, False, 0
+        self._received_bytes += len(data)
         self._moved_bytes += len(data)
         super().data_received(data)
-        if self._is_receiving and self._header_bytes > MAX_HEADER_BYTES:
-            text = f"got {self._header_bytes} bytes of headers, expected at most {MAX_HEADER_BYTES}"
+        # The parser keeps a header to itself until its end.
+        if self._is_receiving:
+            self._check_headers(self._received_bytes)
+
+    def _check_headers(self, num_bytes: int) -> bool:
+        """Whether a request may go on; if it has too many bytes beside its body, it is refused."""
+        if num_bytes > MAX_HEADER_BYTES and not self._is_refused:
+            text = f"got {num_bytes} bytes of headers, expected at most {MAX_HEADER_BYTES}"
             self._refuse(431, InvalidInputError(text))
+        return not self._is_refused
+
+    # The parser calls these for all that it has got, also after a refusal.
 
     def on_message_begin(self) -> None:
+        if self._is_refused:
+            return
         super().on_message_begin()
-        self._is_receiving, self._has_begun, self._header_bytes = True, True, 0
+        self._is_receiving, self._has_begun = True, True
+        self._received_bytes = self._header_bytes = 0
+
+    def on_url(self, url: bytes) -> None:
+        self._header_bytes += len(url)
+        if self._check_headers(self._header_bytes):
+            super().on_url(url)
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        self._header_bytes += len(name) + len(value) + NUM_SEPARATORS
+        if self._check_headers(self._header_bytes):
+            super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
+        if self._is_refused:
+            return
         self._limits.idle.pop(self, None)
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
+        if self._is_refused:
+            return
         super().on_body(body)
         # The bytes around the pieces of a body may be as many as the body.
-        self._header_bytes = max(0, self._header_bytes - 2 * len(body))
+        self._received_bytes = max(0, self._received_bytes - 2 * len(body))
 
     def on_message_complete(self) -> None:
+        if self._is_refused:
+            return
         super().on_message_complete()
         self._is_receiving = False
+
+    def handle_websocket_upgrade(self) -> None:
+        if not self._is_refused:
+            super().handle_websocket_upgrade()
+
+    def send_400_response(self, msg: str) -> None:
+        if self._is_refused:
+            return
+        self._note_refusal(400, "no valid HTTP")
+        super().send_400_response(msg)
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
@@ -227,16 +269,21 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
         is_working = self.cycle is not None and not self.cycle.response_complete
         if self.pipeline or (is_working and not self._has_headers()):
             # The client would take this for the answer to its earlier request.
+            self._is_refused = True
             self.transport.abort()
             return
         if is_working:
             self.cycle.disconnected = True
             self.cycle.message_event.set()
         self._limits.idle.pop(self, None)
+        self._note_refusal(status, error.message)
         self._is_refused = self._is_receiving = True
         self._left_s = 1.5 * self._limits.check_period_s
         self.transport.write(_answer(status, error))
         self.transport.write_eof()
+
+    def _note_refusal(self, status: int, reason: str) -> None:
+        self._limits.refusals.note_caller(caller_of({"client": self.client}), status, reason)
 
 
 def _answer(status: int, error: DexTouchError) -> bytes:

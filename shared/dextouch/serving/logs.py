@@ -58,7 +58,7 @@ def configure_logging(
     root.setLevel(level.upper())
     for name, least in QUIET.items():
         logging.getLogger(name).setLevel(max(level.upper(), least, key=logging.getLevelName))
-    logging.getLogger("uvicorn.error").addFilter(_is_no_websocket_url)
+    logging.getLogger("uvicorn.error").addFilter(_is_wanted)
     structlog.contextvars.bind_contextvars(service=service)
 
 
@@ -67,6 +67,11 @@ def _mask(_: WrappedLogger, __: str, line: EventDict | str) -> str:
     return masked(str(line))
 
 
-def _is_no_websocket_url(record: logging.LogRecord) -> bool:
-    """False for uvicorn's lines about WebSockets, which hold the query, and so maybe a key."""
-    return '"WebSocket %s"' not in str(record.msg)
+def _is_wanted(record: logging.LogRecord) -> bool:
+    """False for some of uvicorn's lines.
+
+    Those about WebSockets hold the query, and so maybe a key; bytes that are no request are noted
+    as `request_refused`, with the client and limited in number.
+    """
+    text = str(record.msg)
+    return '"WebSocket %s"' not in text and text != "Invalid HTTP request received."

@@ -12,6 +12,7 @@ import httpx
 import pytest
 import uvicorn
 from fastapi import APIRouter, Request, Response, WebSocket, WebSocketDisconnect
+from structlog.testing import capture_logs
 
 from dextouch.serving import AS_SET, OCTETS, ServiceSettings, create_service_app, server_options
 from dextouch.serving.connections import MAX_REFUSED
@@ -212,6 +213,64 @@ def test_endless_headers_are_refused(served, first):
             received += data
         assert parts(received)[0] == 431
     served.until_none_is_left()
+
+
+def status_of(served, request):
+    """Status of a request that is sent at once, as a client of a fast network does."""
+    with served.connect() as opened, suppress(ConnectionError):
+        opened.sendall(request)
+        received = b""
+        while not received.partition(b"\r\n\r\n")[2]:
+            data = opened.recv(2**16)
+            if not data:
+                break
+            received += data
+    return int(received.split(b" ")[1])
+
+
+def padded(first, num_bytes, name=b"X-A: "):
+    """A request of which the target and headers have this many bytes, with their separators."""
+    line, _, headers = first.partition(b"\r\n")
+    used = len(line.split(b" ")[1]) + len(headers) + len(name) + 2
+    return first + name + b"b" * (num_bytes - used) + b"\r\n\r\n"
+
+
+@pytest.mark.parametrize("first", [GET, UPGRADE, POST + b"Content-Length: 3\r\n"])
+@pytest.mark.parametrize("num_bytes", [2**16 + 1, 100_000, 200_000])
+def test_headers_over_the_limit_are_refused_however_they_arrive(first, num_bytes):
+    with Served(client_timeout_s=PATIENCE_S).running() as served:
+        body = b"abc" if first.startswith(b"POST") else b""
+        assert status_of(served, padded(first, num_bytes) + body) == 431
+        served.until_none_is_left()
+
+
+def test_headers_of_the_limit_are_accepted():
+    with Served(client_timeout_s=PATIENCE_S).running() as served:
+        assert status_of(served, padded(GET, 2**16)) == 200
+
+
+def test_many_headers_and_a_long_target_count_together():
+    many = GET + b"".join(b"X-%d: %s\r\n" % (number, b"c" * 90) for number in range(700))
+    target = GET.replace(b"/healthz", b"/healthz?" + b"q" * 2**16) + b"\r\n"
+    with Served(client_timeout_s=PATIENCE_S).running() as served:
+        assert status_of(served, many + b"\r\n") == 431
+        assert status_of(served, target) == 431
+        # Of the request in front of it, the client gets the answer.
+        assert status_of(served, GET + b"\r\n") == 200
+
+
+def test_trailers_count_as_headers(served):
+    chunked = POST + b"Transfer-Encoding: chunked\r\n\r\n1\r\na\r\n0\r\n"
+    assert status_of(served, chunked + b"X-A: " + b"d" * 2**17 + b"\r\n\r\n") == 431
+
+
+def test_what_is_no_http_leaves_one_line_with_its_client(served):
+    with capture_logs() as logs:
+        for _ in range(15):
+            assert status_of(served, b"\x16\x03\x01 hello\r\n\r\n") == 400
+        assert status_of(served, padded(GET, 2**17)) == 431
+    noted = [one for one in logs if one["event"] == "request_refused"]
+    assert [(one["client"], one["status"]) for one in noted] == [("127.0.0.1", 400)] * 10
 
 
 @pytest.mark.parametrize("asked", ["large", "flow"])
