@@ -173,11 +173,18 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
         wanted = _own_path(fields.get("wanted", ["/"])[0])
         try:
             token = sessions.sign_in(fields.get("key", [""])[0])
-        except AccessDeniedError as error:
-            return page("sign_in.html", 401, reason=error.message, wanted=wanted)
+        except AccessDeniedError as refused:
+            error = _counted(request, refused)
+            too_many = error is not refused
+            status = 429 if too_many else 401
+            request.app.state.refusals.note(request, status, str(error.details["reason"]))
+            answer = page("sign_in.html", status, reason=error.message, wanted=wanted)
+            if too_many:
+                answer.headers["retry-after"] = str(error.details["retry_after_s"])
+            return answer
         request.state.person = sessions.person_of(token)
-        answer = RedirectResponse(wanted, 303)
-        answer.set_cookie(
+        entered = RedirectResponse(wanted, 303)
+        entered.set_cookie(
             COOKIE,
             token,
             max_age=int(sessions.lifetime_s),
@@ -185,7 +192,7 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
             samesite="strict",
             secure=request.url.scheme == "https",
         )
-        return answer
+        return entered
 
     @router.post("/sign_out")
     @takes({FORM: KIB}, needs_key=False)
@@ -196,6 +203,16 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
         return answer
 
     return router
+
+
+def _counted(request: Request, error: AccessDeniedError) -> AccessDeniedError:
+    """The refusal of a sign-in: that of many wrong keys in place of that of one."""
+    if error.details["reason"] == "unknown_key":
+        try:
+            request.app.state.wrong_keys.count(request)
+        except AccessDeniedError as too_many:
+            return too_many
+    return error
 
 
 def _shown(

@@ -8,6 +8,7 @@ import httpx
 import pytest
 
 from dextouch.serving.keys import ApiKey
+from dextouch.serving.refusals import WrongKeys
 from services.cli.up import BUILDERS
 from services.dashboard.upstream import Upstream
 from tests.contracts.service_apps import APPS, all_routes, client_of, open_websocket
@@ -212,6 +213,12 @@ def keyed(request, tmp_path):
     return request.param, APPS[request.param](tmp_path, api_keys=KEYS)
 
 
+@pytest.fixture
+def unlimited(monkeypatch):
+    """Wrong keys are refused one by one, however many; tests/unit/serving tests their limit."""
+    monkeypatch.setattr(WrongKeys, "count", lambda *_, **__: None)
+
+
 def test_every_service_has_a_table():
     assert set(APPS) == set(TABLE) | {"dashboard"}
     assert set(BUILDERS) - set(APPS) == {"twin", "world_model"}
@@ -247,7 +254,7 @@ async def test_only_the_key_with_the_scope_is_let_in(keyed):
 
 
 @pytest.mark.parametrize("presented", NO_KEYS)
-async def test_without_a_key_nobody_is_let_in(keyed, presented):
+async def test_without_a_key_nobody_is_let_in(unlimited, keyed, presented):
     service, app = keyed
     async with client_of(app) as client:
         for operation, needed in TABLE[service].items():
@@ -334,7 +341,7 @@ async def test_only_operators_sign_in(page, scope):
         assert ("set-cookie" in answer.headers) is (scope == "operate")
 
 
-async def test_the_dashboard_and_what_it_forwards_need_a_session(page, upstreams):
+async def test_the_dashboard_and_what_it_forwards_need_a_session(unlimited, page, upstreams):
     routes, _ = kinds_of(page)
     assert "WEBSOCKET /v1/live" in routes
     assert "POST /v1/episode_store/trash" in routes

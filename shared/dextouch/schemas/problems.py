@@ -49,6 +49,7 @@ STATUS_OF_REASON = {
     "used_token": 403,
     "expired_token": 403,
     "foreign_host": 421,
+    "too_many_wrong_keys": 429,
 }
 CLASS_OF_STATUS: dict[int, type[DexTouchError]] = {
     **dict.fromkeys((400, 405, 406, 415, 422), InvalidInputError),
@@ -102,7 +103,7 @@ def status_of(error: DexTouchError) -> int:
     Two classes depend on their details: a temporary limit (`retry_after_s`) is 429, any other 413;
     a refusal depends on its `reason`: a missing or unknown key is 401, a missing scope, what is of
     another key or station, a foreign origin or an invalid enrolment token 403, a foreign host name
-    421.
+    421, one of many wrong keys 429.
     """
     if isinstance(error, LimitExceededError) and "retry_after_s" in error.details:
         return 429

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from dextouch.serving.listening import bound_socket as bound_socket
     from dextouch.serving.logs import configure_logging as configure_logging
     from dextouch.serving.masking import masked as masked
+    from dextouch.serving.refusals import WrongKeys as WrongKeys
     from dextouch.serving.served_folder import ServedFolder as ServedFolder
     from dextouch.serving.settings import MAX_WEBSOCKET_BYTES as MAX_WEBSOCKET_BYTES
     from dextouch.serving.settings import ServiceSettings as ServiceSettings

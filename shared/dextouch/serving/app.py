@@ -21,6 +21,7 @@ from prometheus_client import (
     generate_latest,
 )
 from starlette.exceptions import HTTPException
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from dextouch import __version__
 from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
@@ -38,6 +39,7 @@ from dextouch.serving.documentation import document_service
 from dextouch.serving.guard import Admits, BodyRules, GuardMiddleware, SitePolicy
 from dextouch.serving.keys import AccessControl
 from dextouch.serving.masking import hide_secrets, masked
+from dextouch.serving.refusals import REFUSED, RefusalLog, WrongKeys
 from dextouch.serving.served_folder import ServedFolder
 from dextouch.serving.settings import ServiceSettings
 from dextouch.serving.spans import SPANS
@@ -90,6 +92,8 @@ def create_service_app(  # noqa: PLR0913 - all by name
     )
     app.state.settings = settings
     app.state.access = AccessControl(settings.api_keys)
+    app.state.wrong_keys = WrongKeys()
+    app.state.refusals = RefusalLog(app.state.access.name_of)
     app.state.registry = CollectorRegistry()
     ProcessCollector(registry=app.state.registry)
     about = Info("dextouch_build", "Name and version of the service.", registry=app.state.registry)
@@ -107,9 +111,13 @@ def create_service_app(  # noqa: PLR0913 - all by name
         site=SitePolicy(settings.allowed_hosts, settings.allowed_origins),
         bodies=BodyRules(routers, max_body_bytes=settings.max_body_bytes),
         refuse=_refusal,
+        wrong_keys=app.state.wrong_keys,
+        refusals=app.state.refusals,
         admits=admits,
     )
     app.add_middleware(RequestMiddleware, registry=app.state.registry)
+    if settings.trusted_proxies:
+        app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(settings.trusted_proxies))
     _add_error_handlers(app)
     app.include_router(_health_router(name, _with_folders(readiness, folders)))
     for router in routers:
@@ -229,6 +237,9 @@ def _refusal(request: Request, error: DexTouchError | HTTPException) -> Response
 
 
 def _page_or_problem(request: Request, error: DexTouchError, status: int) -> Response:
+    if status in REFUSED:
+        reason = error.details.get("reason", type(error).__name__)
+        request.app.state.refusals.note(request, status, str(reason))
     page = getattr(request.app.state, "refusal_page", None)
     if page is not None and "text/html" in request.headers.get("accept", ""):
         shown: Response = page(masked(error.message), status)

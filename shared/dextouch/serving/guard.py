@@ -11,23 +11,23 @@ from contextlib import suppress
 from dataclasses import dataclass
 from email.message import Message
 from functools import cached_property, lru_cache
+from http import HTTPStatus
 from typing import TypeVar
 
-import structlog
 from fastapi import APIRouter
 from fastapi.routing import APIRoute
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection, Request
-from starlette.responses import Response
+from starlette.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.types import Message as AsgiMessage
 
 from dextouch.errors import AccessDeniedError, DexTouchError
+from dextouch.schemas import status_of
 from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
-from dextouch.serving.keys import AccessControl, no_key, not_signed_in
-
-logger = structlog.get_logger(__name__)
+from dextouch.serving.keys import AccessControl, no_key, not_signed_in, presents_key
+from dextouch.serving.refusals import RefusalLog, WrongKeys
 
 HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9_.-]+))(?::\d{1,5})?")
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -255,6 +255,8 @@ class GuardMiddleware:
     site: SitePolicy
     bodies: BodyRules
     refuse: Refuse
+    wrong_keys: WrongKeys
+    refusals: RefusalLog
     admits: Admits | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -272,11 +274,23 @@ class GuardMiddleware:
             try:
                 self._check_sender(HTTPConnection(scope), needs_key=True, is_unsafe=True)
             except AccessDeniedError as error:
-                logger.warning("websocket_refused", path=scope["path"], error=error.message)
-                reason = error.message.encode()[:MAX_REASON_BYTES].decode(errors="ignore")
-                await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": reason})
+                await self._refuse_websocket(error, scope, receive, send)
                 return
         await self.app(scope, receive, send)
+
+    async def _refuse_websocket(
+        self, error: AccessDeniedError, scope: Scope, receive: Receive, send: Send
+    ) -> None:
+        status = status_of(error)
+        self.refusals.note(HTTPConnection(scope), status, str(error.details["reason"]))
+        can_answer = "websocket.http.response" in scope.get("extensions", {})
+        if status == HTTPStatus.TOO_MANY_REQUESTS and can_answer:
+            # A WebSocket that is closed before it is accepted is answered with 403.
+            waits = {"retry-after": str(error.details["retry_after_s"])}
+            await PlainTextResponse(error.message, status, waits)(scope, receive, send)
+            return
+        reason = error.message.encode()[:MAX_REASON_BYTES].decode(errors="ignore")
+        await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": reason})
 
     def _check_sender(
         self, connection: HTTPConnection, *, needs_key: bool, is_unsafe: bool
@@ -286,6 +300,8 @@ class GuardMiddleware:
             # A foreign page cannot know a key, so host and origin do not matter with one.
             if connection.scope["path"] in PROBES or self.access.find(authorization) is not None:
                 return
+            if presents_key(authorization):
+                self.wrong_keys.count(connection)
             signed_in = self.admits is not None and self.admits(connection)
             if is_unsafe and needs_key and not signed_in:
                 raise no_key(authorization) if self.admits is None else not_signed_in()

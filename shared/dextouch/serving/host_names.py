@@ -35,6 +35,19 @@ def canonical_origin(text: str) -> str:
     return f"{scheme}://{host}" if is_default else f"{scheme}://{host}:{int(port)}"
 
 
+def canonical_network(text: str) -> str:
+    """An address or a network in its short form; a network ends with the length of its prefix."""
+    try:
+        if "/" in text:
+            return str(ipaddress.ip_network(text))
+        return str(ipaddress.ip_address(text))
+    except ValueError as error:
+        raise ValueError(
+            f"got {text!r} ({error}), expected an address such as 10.0.0.7, or a network such as "
+            "10.0.0.0/24"
+        ) from None
+
+
 def is_loopback(host: str) -> bool:
     """Whether only this machine can reach a socket bound to `host`."""
     with suppress(ValueError):

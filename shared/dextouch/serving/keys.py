@@ -5,12 +5,13 @@ import hmac
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pydantic import Field, SecretStr
-from starlette.requests import Request
+from pydantic import Field, SecretStr, field_validator
+from starlette.requests import HTTPConnection, Request
 
 from dextouch.errors import AccessDeniedError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import KEY_NAME_PATTERN
+from dextouch.serving.key_strength import check_strength
 
 
 class Grant(FrozenModel):
@@ -34,9 +35,15 @@ class Grant(FrozenModel):
 
 
 class ApiKey(Grant):
-    """A key of the settings."""
+    """A key of the settings; weak ones are refused."""
 
-    key: SecretStr = Field(min_length=16)
+    key: SecretStr
+
+    @field_validator("key")
+    @classmethod
+    def _is_strong(cls, key: SecretStr) -> SecretStr:
+        check_strength(key.get_secret_value())
+        return key
 
 
 def not_signed_in() -> AccessDeniedError:
@@ -46,7 +53,7 @@ def not_signed_in() -> AccessDeniedError:
 
 def no_key(authorization: str | None) -> AccessDeniedError:
     """Error for a request with an unknown key, or with none."""
-    if _token(authorization) is not None:
+    if presents_key(authorization):
         return AccessDeniedError("unknown key", reason="unknown_key")
     return AccessDeniedError(
         "no key: expected the header 'Authorization: Bearer KEY'", reason="missing_key"
@@ -85,6 +92,11 @@ class AccessControl:
         matches = [grant for digest, grant in known if hmac.compare_digest(digest, presented)]
         return matches[0] if matches else None
 
+    def name_of(self, connection: HTTPConnection) -> str | None:
+        """Name of the key of a request, if it has a valid one."""
+        grant = self.find(connection.headers.get("authorization"))
+        return None if grant is None else grant.name
+
     def granted(self, authorization: str | None, scope: str) -> Grant:
         """Check a key and its scope, and return what the key allows.
 
@@ -119,6 +131,11 @@ class RequireScope:
 def secret_digest(text: str) -> bytes:
     """By which keys and tokens are compared and kept."""
     return hashlib.sha256(text.encode()).digest()
+
+
+def presents_key(authorization: str | None) -> bool:
+    """Whether a request has a key, valid or not."""
+    return _token(authorization) is not None
 
 
 def _token(authorization: str | None) -> str | None:

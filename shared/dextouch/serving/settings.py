@@ -22,7 +22,12 @@ from pydantic_settings import (
 from dextouch.command_line import CommandParser
 from dextouch.errors import InvalidInputError
 from dextouch.serving.configuration_file import CommandSettings, explained, section_of
-from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
+from dextouch.serving.host_names import (
+    canonical_host,
+    canonical_network,
+    canonical_origin,
+    is_loopback,
+)
 from dextouch.serving.keys import ApiKey
 from dextouch.serving.listening import bound_socket
 from dextouch.serving.logs import configure_logging
@@ -40,6 +45,7 @@ _LIST = re.compile(r"tuple\[(.+),\.\.\.\]")
 
 HostName = Annotated[str, AfterValidator(canonical_host)]
 Origin = Annotated[str, AfterValidator(canonical_origin)]
+Network = Annotated[str, AfterValidator(canonical_network)]
 SettingsT = TypeVar("SettingsT", bound=BaseSettings)
 
 
@@ -76,6 +82,11 @@ class ServiceSettings(CommandSettings):
     allowed_origins: tuple[Origin, ...] = Field(
         default=(),
         description="origins of the service behind a TLS proxy, such as https://lab.example",
+    )
+    trusted_proxies: tuple[Network, ...] = Field(
+        default=(),
+        description="addresses or networks of proxies, such as 10.0.0.7 or 10.0.0.0/24, whose "
+        "X-Forwarded-For and X-Forwarded-Proto say who the client is and whether it uses TLS",
     )
     log_format: Literal["auto", "json", "console"] = Field(
         default="auto", description="auto: console at a terminal, JSON otherwise"
@@ -261,6 +272,7 @@ def server_options(settings: ServiceSettings, *, grace_s: int) -> dict[str, Any]
         "log_config": None,
         "access_log": False,
         "server_header": False,
+        # The application reads them if it has trusted_proxies.
         "proxy_headers": False,
         "timeout_keep_alive": KEEP_ALIVE_S,
         "ws_max_size": MAX_WEBSOCKET_BYTES,

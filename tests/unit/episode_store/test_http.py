@@ -157,17 +157,17 @@ def test_a_recording_comes_back_through_the_client(start, attributes, batch_of):
 
 def test_keys_and_scopes(start, store, attributes):
     keys = (
-        ApiKey(name="station", key=SecretStr("s" * 20), scopes=("store_write",)),
-        ApiKey(name="trainer", key=SecretStr("t" * 20), scopes=("store_read",)),
+        ApiKey(name="station", key=SecretStr("key-of-some-station"), scopes=("store_write",)),
+        ApiKey(name="trainer", key=SecretStr("key-of-some-trainer"), scopes=("store_read",)),
     )
     station = start(api_keys=keys)
     with pytest.raises(AccessDeniedError, match="no key"):
         station.create(attributes)
-    station._http.headers["authorization"] = "Bearer " + "s" * 20
+    station._http.headers["authorization"] = "Bearer key-of-some-station"
     assert station.create(attributes).state == "open"
     with pytest.raises(AccessDeniedError, match="store_read"):
         station.episodes()
-    station._http.headers["authorization"] = "Bearer " + "t" * 20
+    station._http.headers["authorization"] = "Bearer key-of-some-trainer"
     assert station.episodes().num_matching == 0
     with pytest.raises(AccessDeniedError, match="store_write"):
         station.create(attributes)

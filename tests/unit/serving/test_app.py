@@ -180,7 +180,7 @@ def test_the_document_has_what_routes_declare():
 
 @pytest.mark.parametrize("has_keys", [True, False])
 def test_the_document_names_the_key_that_a_route_needs(has_keys):
-    key = ApiKey(name="policy", key=SecretStr("g" * 20), scopes=("rollout",))
+    key = ApiKey(name="policy", key=SecretStr("good-key-for-policies"), scopes=("rollout",))
     app = make_app(settings=ServiceSettings(api_keys=(key,) if has_keys else ()))
     scheme = app.openapi()["components"]["securitySchemes"]["api_key"]
     assert (scheme["type"], scheme["scheme"]) == ("http", "bearer")
@@ -260,7 +260,7 @@ async def test_request_id_is_kept_when_sane_and_timing_is_told():
 
 
 async def test_keys_open_only_what_their_scopes_name():
-    good, weak = "g" * 20, "w" * 20
+    good, weak = "good-key-for-policies", "weak-key-for-ratings"
     settings = ServiceSettings(
         host="0.0.0.0",  # noqa: S104 - that keys are demanded there is what is tested
         api_keys=(

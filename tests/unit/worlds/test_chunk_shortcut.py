@@ -200,12 +200,12 @@ async def test_requests_are_counted_under_the_route(served):
 
 async def test_keys_and_senders_are_checked_as_ever():
     keys = [
-        ApiKey(name=scope, key=SecretStr(scope * 20), scopes=(scope,))
+        ApiKey(name=scope, key=SecretStr(f"key-of-some-{scope}"), scopes=(scope,))
         for scope in ("rollout", "rate")
     ]
     app = create_world_app({"sum": SumWorld()}, WorldServiceSettings(api_keys=tuple(keys)))
     transport = ASGITransport(app)
-    mine, other = ({"authorization": f"Bearer {name * 20}"} for name in ("rollout", "rate"))
+    mine, other = ({"authorization": f"Bearer key-of-some-{name}"} for name in ("rollout", "rate"))
     async with AsyncClient(transport=transport, base_url="http://localhost") as client:
         client.headers.update(mine)
         path = f"/v1/rollouts/{await begin(client)}/chunks"

@@ -210,7 +210,7 @@ async def test_get_fork_delete(client):
 
 
 async def test_a_key_needs_the_scope_rollout():
-    key = "k" * 20
+    key = "a-key-of-some-length"
     app = make_app(api_keys=(ApiKey(name="rater", key=SecretStr(key), scopes=("rate",)),))
     async with client_of(app) as client:
         assert problem_of(await client.get("/v1/worlds")).status == 401
