@@ -5,7 +5,6 @@ end). Without it, everything is made in a temporary folder.
 """
 
 import os
-import secrets
 import signal
 import time
 
@@ -16,8 +15,8 @@ from tests.browser.conftest import chromium, open_page, open_pages  # noqa: F401
 from tests.containers import images
 from tests.containers.composed import Composed
 from tests.containers.disks import Disk
-from tests.containers.engine import engine_in, missing
-from tests.system.compose_processes import wait_for
+from tests.containers.engine import ROOT, engine_in, missing
+from tests.system.compose_processes import keys_of, wait_for
 
 ARRIVAL_TIMEOUT_S = 300.0
 _FIGURES = []
@@ -60,15 +59,21 @@ def built(engine, note):
 
 
 @pytest.fixture(scope="session")
-def key():
-    """The key of `.env`."""
-    return secrets.token_hex(32)
+def keys():
+    """The keys of `.env`."""
+    return keys_of(ROOT / "docker-compose.yml")
 
 
 @pytest.fixture(scope="session")
-def composed(engine, built, key, note):
+def key(keys):
+    """The administrator's key."""
+    return keys["DEXTOUCH_KEY"]
+
+
+@pytest.fixture(scope="session")
+def composed(engine, built, keys, note):
     """All lasting services of the compose file, healthy."""
-    composed = Composed(engine, {"DEXTOUCH_KEY": key})
+    composed = Composed(engine, dict(keys))
     try:
         composed.up_all()
         for name, time_s in composed.started_s.items():

@@ -48,9 +48,9 @@ def nodes():
         shutil.rmtree(folder)
 
 
-def test_the_station_may_open_its_kinds_of_devices_only(engine, built, key, nodes):
+def test_the_station_may_open_its_kinds_of_devices_only(engine, built, keys, nodes):
     variables = {
-        "DEXTOUCH_KEY": key,
+        **keys,
         "DEXTOUCH_HIDRAW_MAJOR": str(HIDRAW),
         "DEXTOUCH_DEVICE_GROUP": str(GROUP),
     }

@@ -2,6 +2,7 @@
 
 import os
 import re
+import secrets
 import signal
 import socket
 import subprocess
@@ -41,6 +42,12 @@ def interpolate(value, variables):
         raise KeyError(f"{name}: {text or 'not set'}")
 
     return VARIABLE.sub(fill, value)
+
+
+def keys_of(path):
+    """A new key for each variable that a compose file needs."""
+    needed = {name for name, kind, _ in VARIABLE.findall(path.read_text()) if kind == "?"}
+    return {name: secrets.token_hex(32) for name in needed}
 
 
 def start_order(services):

@@ -9,10 +9,11 @@ import pytest
 from dextouch.clients import RolloutClient
 from dextouch.hands.actions import ACTION_DIM
 from tests.programs import needed_program
-from tests.system.compose_processes import ComposeProcesses, record_take, wait_for
+from tests.system.compose_processes import ComposeProcesses, keys_of, record_take, wait_for
 
 ROOT = Path(__file__).parents[2]
-KEY = "0123456789abcdef-of-the-system-test"
+KEYS = keys_of(ROOT / "docker-compose.yml")
+KEY = KEYS["DEXTOUCH_KEY"]
 TAKE_S = 4.0
 UPLOAD_TIMEOUT_S = 30.0
 ALIGNMENT_TIMEOUT_S = 300.0
@@ -33,7 +34,7 @@ def composed(tmp_path_factory):
     processes = ComposeProcesses(
         ROOT / "docker-compose.yml",
         tmp_path_factory.mktemp("compose"),
-        {"DEXTOUCH_KEY": KEY},
+        KEYS,
         WITHOUT + OTHERWISE_TESTED,
     )
     try:
@@ -139,6 +140,27 @@ def test_keys_are_asked_for(composed):
         answer = httpx.get(composed.running[service].url + path, trust_env=False)
         assert answer.status_code == 401, service
         assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_the_key_of_a_service_opens_only_what_it_needs(composed):
+    """As a station, or who reads its environment: no other service, and nothing of the store."""
+    for variable, service, path, status in (
+        ("DEXTOUCH_STATION_KEY", "episode_store", "/v1/recordings", 403),
+        ("DEXTOUCH_STATION_KEY", "episode_store", "/v1/enrolments", 403),
+        ("DEXTOUCH_STATION_KEY", "alignment", "/v1/alignments", 401),
+        ("DEXTOUCH_STATION_KEY", "acquisition", "/v1/recorder", 401),
+        ("DEXTOUCH_EVALUATION_KEY", "twin", "/v1/worlds", 200),
+        ("DEXTOUCH_EVALUATION_KEY", "twin", "/v1/watch", 403),
+        ("DEXTOUCH_EVALUATION_KEY", "episode_store", "/v1/recordings", 401),
+        ("DEXTOUCH_DASHBOARD_KEY", "episode_store", "/v1/recordings", 200),
+    ):
+        headers = {"authorization": f"Bearer {KEYS[variable]}"}
+        url = composed.running[service].url + path
+        answer = httpx.get(url, headers=headers, trust_env=False)
+        assert answer.status_code == status, (variable, service, path)
+    with httpx.Client(base_url=composed.running["dashboard"].url, trust_env=False) as browser:
+        for variable in KEYS.keys() - {"DEXTOUCH_KEY"}:
+            assert browser.post("/sign_in", data={"key": KEYS[variable]}).status_code == 401
 
 
 # Last: it ends the services.

@@ -1,8 +1,10 @@
 """Deployment files against what they must be: valid, without privileges, and true to the code."""
 
 import importlib
+import json
 import re
 import shutil
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -10,10 +12,12 @@ from pathlib import Path
 import pytest
 import yaml
 
+from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.take import STALL_NS
 from services.cli.main import COMMANDS, find_command
 from tests.containers import engine
 from tests.containers.engine import PACKAGES
+from tests.system.compose_processes import VARIABLE, keys_of
 
 ROOT = Path(__file__).parents[3]
 COMPOSE = ROOT / "docker-compose.yml"
@@ -134,6 +138,77 @@ def test_what_training_writes_can_be_served():
     assert mounted("world_model")[folder] == mounted("training")[folder]
     passed = SERVICES["world_model"]["environment"]["DEXTOUCH_WORLD_MODEL_CHECKPOINT"]
     assert passed == "${DEXTOUCH_WORLD_MODEL_CHECKPOINT:-}"
+
+
+WORLD = {
+    "administrator": {"rollout", "watch"},
+    "dashboard": {"rollout", "watch"},
+    "evaluation": {"rollout"},
+}
+# What each key may do in each service, and the containers that have it to use.
+SCOPES_OF_KEYS = {
+    "episode_store": {
+        "administrator": {"store_read", "store_write", "store_expire", "store_delete", "enrol"},
+        "dashboard": {"store_read", "store_delete", "enrol"},
+        "station": {"store_write"},
+    },
+    "alignment": {"administrator": {"align"}, "dashboard": {"align"}},
+    "acquisition": {"administrator": {"station"}, "dashboard": {"station"}},
+    "twin": WORLD,
+    "world_model": WORLD,
+    "studies": {"administrator": {"study_read"}, "dashboard": {"study_read"}},
+    "dashboard": {"administrator": {"operate", "enrol"}},
+}
+USERS = {
+    "DEXTOUCH_KEY": set(),
+    "DEXTOUCH_STATION_KEY": {"acquisition"},
+    "DEXTOUCH_DASHBOARD_KEY": {"dashboard"},
+    "DEXTOUCH_EVALUATION_KEY": {"evaluation"},
+    "DEXTOUCH_GRAFANA_PASSWORD": {"grafana"},
+}
+
+
+def test_every_service_has_a_key_of_its_own_with_the_scopes_that_it_needs():
+    names = {}
+    for service, expected in SCOPES_OF_KEYS.items():
+        keys = json.loads(SERVICES[service]["environment"][f"DEXTOUCH_{service.upper()}_API_KEYS"])
+        assert {key["name"]: set(key["scopes"]) for key in keys} == expected, service
+        for key in keys:
+            names.setdefault(key["name"], set()).add(VARIABLE.fullmatch(key["key"])[1])
+    # A name is always that of the same key, and no two names share one.
+    assert all(len(variables) == 1 for variables in names.values())
+    assert len(set.union(*names.values())) == len(names)
+    for variable, users in USERS.items():
+        using = {
+            service
+            for service, given in SERVICES.items()
+            for name, value in given.get("environment", {}).items()
+            if not name.endswith("_API_KEYS") and f"${{{variable}:?" in str(value)
+        }
+        assert using == users, variable
+    # A station records under the name of its key.
+    assert AcquisitionSettings.model_fields["station"].default in SCOPES_OF_KEYS["episode_store"]
+
+
+def test_one_command_makes_all_keys(tmp_path):
+    (tmp_path / ".env").write_text("DEXTOUCH_KEY=one-that-was-there-before\n")
+    command = ["sh", str(ROOT / "deploy/make_keys.sh")]
+    for _ in range(2):
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=True, text=True)
+    assert "one-that-was-there-before" in done.stdout
+    lines = (tmp_path / ".env").read_text().splitlines()
+    made = dict(line.split("=") for line in lines)
+    assert made.keys() == keys_of(COMPOSE).keys()
+    assert len(lines) == len(made)
+    assert made.pop("DEXTOUCH_KEY") == "one-that-was-there-before"
+    assert len(set(made.values())) == len(made)
+    for key in made.values():
+        assert re.fullmatch("[0-9a-f]{64}", key)
+
+
+def test_a_new_file_of_keys_is_for_its_owner_only(tmp_path):
+    subprocess.run(["sh", str(ROOT / "deploy/make_keys.sh")], cwd=tmp_path, check=True)
+    assert stat.S_IMODE((tmp_path / ".env").stat().st_mode) == 0o600
 
 
 def test_rollouts_outlast_a_restart_of_redis():
