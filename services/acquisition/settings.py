@@ -6,6 +6,7 @@ from typing import Literal
 from pydantic import Field, SecretStr, model_validator
 
 from dextouch.data_folder import default_enrolment, default_spool
+from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import ServiceSettings, service_config
 from services.acquisition.devices.kinds import ChosenDevice
@@ -41,7 +42,7 @@ class AcquisitionSettings(ServiceSettings, SpoolSafety, Retention):
 
     model_config = service_config("acquisition", "dextouch station serve")
 
-    station: str = Field(
+    station: FreeText = Field(
         default="station",
         min_length=1,
         max_length=128,

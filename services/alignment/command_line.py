@@ -17,6 +17,7 @@ from rich.progress import TaskID
 from dextouch.command_line import CommandParser, ProgressLines, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, disk_errors
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
+from dextouch.free_text import printable
 from dextouch.hands.hand_files import load_hand
 from dextouch.schemas import json_ready
 from dextouch.serving import load_settings
@@ -142,10 +143,10 @@ def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
         )
         for _, result in chain(refused, outcomes):
             if isinstance(result, DexTouchError):
-                print(f"dextouch align: {result.message}", file=sys.stderr)
+                print(f"dextouch align: {printable(result.message)}", file=sys.stderr)
                 num_failed += 1
             else:
-                console.print(report_line(result), markup=False)
+                console.print(printable(report_line(result)), markup=False)
                 reports.append(json_ready(result))
     if not reports and not num_failed:
         console.print("nothing to do: every recording has its episode")

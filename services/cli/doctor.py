@@ -13,6 +13,7 @@ from pathlib import Path
 
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.errors import InvalidInputError
+from dextouch.free_text import printable
 from services.cli.extras import install_hint, missing_package
 from services.cli.machine import Finding, Machine
 
@@ -146,6 +147,6 @@ def main(argv: Sequence[str]) -> int:
     for finding in findings:
         mark = "ok     " if finding.ok else "MISSING" if finding.required else "advice "
         hint = f"  → {finding.do}" if not finding.ok and finding.do else ""
-        print(f"{mark}  {finding.what:<{width}}  {finding.found}{hint}")
+        print(f"{mark}  {finding.what:<{width}}  {printable(finding.found)}{printable(hint)}")
     write_result(arguments.json, [asdict(finding) for finding in findings])
     return 0 if all(finding.ok or not finding.required for finding in findings) else 1

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from dextouch import __version__
 from dextouch.command_line import messages_aside
 from dextouch.errors import DexTouchError, UnknownNameError
+from dextouch.free_text import printable
 from services.cli.extras import missing_package
 from services.cli.standard_streams import StandardStreams
 
@@ -231,7 +232,7 @@ def _run(words: list[str], has_failed: Callable[[], bool]) -> int:
     try:
         name, _ = find_command(words)
     except UnknownNameError as error:
-        print(f"dextouch: {error.message}; see dextouch --help", file=sys.stderr)
+        print(f"dextouch: {printable(error.message)}; see dextouch --help", file=sys.stderr)
         return EXIT_USAGE
     try:
         if os.environ.get("DEXTOUCH_CONFIG") or Path("dextouch.toml").is_file():
@@ -251,7 +252,7 @@ def _run(words: list[str], has_failed: Callable[[], bool]) -> int:
     except KeyboardInterrupt:
         print(f"dextouch {name}: interrupted", file=sys.stderr)
         return 130
-    print(f"dextouch {name}: {refusal.message}", file=sys.stderr)
+    print(f"dextouch {name}: {printable(refusal.message, lines=True)}", file=sys.stderr)
     return EXIT_REFUSED
 
 

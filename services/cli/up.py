@@ -15,6 +15,7 @@ from pydantic_settings import SettingsConfigDict
 from dextouch.command_line import write_result
 from dextouch.data_folder import data_folder
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.free_text import FreeText
 from dextouch.serving import CommandSettings, configure_logging, explained, load_settings
 from services.cli.data_lock import held_data_folder
 from services.cli.extras import missing_package
@@ -55,7 +56,7 @@ class UpSettings(CommandSettings):
         default_factory=data_folder,
         description="folder of store and spool (DEXTOUCH_DATA, else data)",
     )
-    station: str = Field(
+    station: FreeText = Field(
         default="mock station", min_length=1, max_length=64, description="name of the station"
     )
     mock: bool = Field(default=True, description="simulate the station's devices")

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from pydantic import Field, FiniteFloat, SecretStr
 
+from dextouch.free_text import FreeText
 from dextouch.serving import ServiceSettings, service_config
 
 
@@ -19,7 +20,7 @@ class DashboardSettings(ServiceSettings):
 
     model_config = service_config("dashboard", "dextouch dashboard")
 
-    station: str = Field(
+    station: FreeText = Field(
         default="station", min_length=1, max_length=64, description="name of the station"
     )
     task_file: Path | None = Field(
@@ -36,7 +37,7 @@ class DashboardSettings(ServiceSettings):
     acquisition_url: str | None = Field(
         default=None, description="URL of the station; services without a URL are not shown"
     )
-    stations: dict[str, str] = Field(
+    stations: dict[FreeText, str] = Field(
         default={},
         max_length=64,
         description='URLs of further stations by name: {"desk_2": "http://…"}; /fleet shows all',

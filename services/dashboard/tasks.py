@@ -7,6 +7,7 @@ from typing import Annotated, Final
 from pydantic import Field, ValidationError
 
 from dextouch.errors import InvalidInputError
+from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
 
@@ -17,8 +18,8 @@ DEFAULT_TASKS: Final = Path(__file__).with_name("tasks.toml")
 class TaskChoice(FrozenModel):
     """A task of the list; `goal` and `reset_s` are used in place of those of the settings."""
 
-    name: str = Field(min_length=1, max_length=128)
-    instructions: tuple[Annotated[str, Field(min_length=1, max_length=2000)], ...] = Field(
+    name: FreeText = Field(min_length=1, max_length=128)
+    instructions: tuple[Annotated[FreeText, Field(min_length=1, max_length=2000)], ...] = Field(
         min_length=1
     )
     goal: int | None = Field(default=None, ge=0, le=1_000_000)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import TRASH_KINDS, EpisodeStore
+from dextouch.free_text import printable
 from dextouch.serving import configure_logging, load_settings
 from services.episode_store.commands import delete, inspect, repair
 from services.episode_store.commands.context import Context, Outcome, seconds_of
@@ -21,9 +22,13 @@ def main(argv: Sequence[str]) -> int:
     # Items that the catalog leaves out are reported on stderr.
     configure_logging(service="episode_store", log_format="auto", level="warning")
     url = options.store or load_settings(EpisodeStoreSettings, []).store_url
-    result, status = _COMMANDS[options.command](Context(EpisodeStore(url), url, options, print))
+    result, status = _COMMANDS[options.command](Context(EpisodeStore(url), url, options, _say))
     write_result(options.json, result)
     return status
+
+
+def _say(line: str) -> None:
+    print(printable(line))
 
 
 _COMMANDS: dict[str, Callable[[Context], Outcome]] = {

@@ -23,7 +23,7 @@ from dextouch.schemas import (
     HoursByField,
     ItemKind,
     Lineage,
-    RecordingAttributes,
+    NewRecording,
     RecordingList,
     RecordingStatus,
     ReviewedItems,
@@ -53,7 +53,7 @@ from services.episode_store.intake import Admission, StorageLimits, UploadMetric
 from services.episode_store.reviewing import review_items
 from services.episode_store.senders import Reader, Writer
 
-Attributes = Annotated[RecordingAttributes, Depends(JsonBody(RecordingAttributes))]
+Attributes = Annotated[NewRecording, Depends(JsonBody(NewRecording))]
 Finish = Annotated[FinishRecording, Depends(JsonBody(FinishRecording))]
 MAY_READ = Depends(RequireScope("store_read"))
 MAY_DELETE = Depends(RequireScope("store_delete"))

@@ -11,6 +11,7 @@ from dextouch.clients import Policy, RolloutClient
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.free_text import printable
 from dextouch.serving import load_settings
 from services.evaluation.checkpoints import Checkpoint, save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
@@ -225,6 +226,7 @@ def print_failures(report: Mapping[str, Any], results: Path) -> None:
             file=sys.stderr,
         )
     for row in rows:
-        print(f"  {row.policy} in {row.world}, {row.count} x: {row.message}", file=sys.stderr)
+        failed = f"{row.policy} in {row.world}, {row.count} x: {row.message}"
+        print(f"  {printable(failed)}", file=sys.stderr)
         if row.traceback:
-            print(indent(row.traceback, "    "), file=sys.stderr)
+            print(indent(printable(row.traceback, lines=True), "    "), file=sys.stderr)

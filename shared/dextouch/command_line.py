@@ -14,6 +14,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
+from dextouch.free_text import printable
+
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
@@ -143,7 +145,8 @@ def write_json_text(path: Path | None, text: str) -> None:
     if path is None:
         return
     if path == STANDARD_OUTPUT:
-        print(text, file=_result_stream.get() or sys.stdout, flush=True)
+        # Other escapes of JSON: what reads it gets the same text.
+        print(printable(text, lines=True), file=_result_stream.get() or sys.stdout, flush=True)
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text + "\n", encoding="utf-8")

@@ -4,6 +4,7 @@ from typing import Literal
 
 from pydantic import AwareDatetime, Field
 
+from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 
 ItemState = Literal["good", "due", "missing", "optional"]
@@ -16,13 +17,13 @@ class RunRequest(FrozenModel):
 
     kind: Literal["camera", "glove"]
     subject: Literal["head", "wrist_left", "wrist_right", "left", "right"]
-    board: str = Field(default="", max_length=64)
+    board: FreeText = Field(default="", max_length=64)
 
 
 class Answer(FrozenModel):
     """What the operator answers to the question of a run."""
 
-    text: str = Field(max_length=200)
+    text: FreeText = Field(max_length=200)
 
 
 class CalibrationItem(FrozenModel):

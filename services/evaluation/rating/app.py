@@ -11,6 +11,7 @@ from pydantic import Field
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError
+from dextouch.free_text import FreeLines
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import RequireScope, ServedFolder, create_service_app, serve
 from services.evaluation.rating.marks import Judgement, Mark, MarkLog, RaterName
@@ -61,6 +62,7 @@ class GivenMark(Judgement):
     """Body of a mark."""
 
     rollout: str = Field(pattern=r"^[0-9a-f]{20}$")
+    comment: FreeLines = Field(default="", max_length=2000)
 
 
 class GivenNumber(FrozenModel):

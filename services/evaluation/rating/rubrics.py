@@ -8,6 +8,7 @@ from typing import Final
 from pydantic import Field, ValidationError, model_validator
 
 from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 
 BUNDLED: Final = Path(__file__).with_name("rubrics.toml")
@@ -24,7 +25,7 @@ class Criterion(FrozenModel):
 
     name: str = Field(pattern=_NAME)
     points: float = Field(gt=0, le=100, allow_inf_nan=False)
-    description: str = Field(min_length=1, max_length=500)
+    description: FreeText = Field(min_length=1, max_length=500)
     requires: tuple[str, ...] = ()
     latched: bool = True
     milestone: str | None = None

@@ -12,6 +12,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
+from dextouch.free_text import printable
 from services.evaluation.reporting.drawings import (
     action_charts,
     clock_chart,
@@ -45,12 +46,18 @@ def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path
     unfinished.replace(path)
 
 
+def _visible(value: object) -> object:
+    """Texts from elsewhere with their unusual characters escaped; drawings and numbers as given."""
+    return printable(value, lines=True) if type(value) is str else value
+
+
 def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
     """Render the page as text."""
     environment = Environment(
         loader=PackageLoader("services.evaluation.reporting"),
         autoescape=select_autoescape(["j2"], default=True),
         undefined=StrictUndefined,
+        finalize=_visible,
         trim_blocks=True,
         lstrip_blocks=True,
     )

@@ -100,6 +100,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.recordings import ExpireUploads as ExpireUploads
     from dextouch.schemas.recordings import FinishRecording as FinishRecording
     from dextouch.schemas.recordings import LedgerEntry as LedgerEntry
+    from dextouch.schemas.recordings import NewRecording as NewRecording
     from dextouch.schemas.recordings import RecordingAttributes as RecordingAttributes
     from dextouch.schemas.recordings import RecordingList as RecordingList
     from dextouch.schemas.recordings import RecordingStatus as RecordingStatus

@@ -5,6 +5,7 @@ from typing import Literal
 
 from pydantic import AwareDatetime, Field
 
+from dextouch.free_text import FreeLines, FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.episodes import Domain, Origin, StoreId
 
@@ -102,8 +103,8 @@ class ReviewItems(FrozenModel):
 
     items: tuple[StoredItem, ...] = Field(min_length=1, max_length=MAX_MOVED)
     verdict: Verdict | None
-    reason: str = Field(default="", max_length=500)
-    reviewer: str | None = Field(default=None, max_length=128)
+    reason: FreeLines = Field(default="", max_length=500)
+    reviewer: FreeText | None = Field(default=None, max_length=128)
 
 
 class ReviewedItems(FrozenModel):

@@ -3,8 +3,9 @@
 from operator import not_
 from typing import Annotated, Literal
 
-from pydantic import AwareDatetime, Field, FiniteFloat
+from pydantic import AwareDatetime, Field, FiniteFloat, model_validator
 
+from dextouch.free_text import check_texts
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.episodes import (
     FORMAT_VERSION,
@@ -73,6 +74,15 @@ class RecordingAttributes(FrozenModel):
         return self.model_copy(update={"ledger": (*self.ledger, *marks), "recovered": True})
 
 
+class NewRecording(RecordingAttributes):
+    """Attributes with which an upload begins; texts of earlier recordings are not checked again."""
+
+    @model_validator(mode="after")
+    def _is_visible(self) -> "NewRecording":
+        check_texts(self)
+        return self
+
+
 class StreamContent(FrozenModel):
     """What a recording has of one stream: number of samples, and a digest of them.
 
@@ -116,6 +126,11 @@ class FinishRecording(FrozenModel):
     content: dict[str, StreamContent] = Field(default={})
     success: bool | None = None
     ledger: Annotated[tuple[LedgerEntry, ...], Field(fail_fast=True)] = ()
+
+    @model_validator(mode="after")
+    def _is_visible(self) -> "FinishRecording":
+        check_texts(self)
+        return self
 
 
 class RecordingSummary(FrozenModel):

@@ -4,6 +4,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
+from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 
 ActionKind = Literal["measured", "commanded"]
@@ -44,10 +45,10 @@ class WorldList(FrozenModel):
 class StartRequest(FrozenModel):
     """The fields of POST /v1/rollouts; an observation to start from is sent as arrays."""
 
-    world: str
-    task: str
+    world: FreeText
+    task: FreeText
     seed: int = Field(ge=0, le=MAX_SEED)
-    instruction: str = Field(max_length=1000)
+    instruction: FreeText = Field(max_length=1000)
     action_kind: ActionKind = "commanded"
 
 

@@ -5,6 +5,7 @@ from typing import Literal
 
 from pydantic import AwareDatetime, Field, FiniteFloat
 
+from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.episodes import Domain, StoreId
 
@@ -20,10 +21,10 @@ CauseCode = Literal["host", "hub", "network", "bridge", "gone", "clock", "device
 class TakePrompt(FrozenModel):
     """What is going to be recorded; given before the start."""
 
-    task: str = Field(min_length=1, max_length=128)
-    instruction: str = Field(min_length=1, max_length=2000)
+    task: FreeText = Field(min_length=1, max_length=128)
+    instruction: FreeText = Field(min_length=1, max_length=2000)
     domain: Domain = "human"
-    operator: str | None = Field(default=None, max_length=128)
+    operator: FreeText | None = Field(default=None, max_length=128)
     consent: bool = False
 
 

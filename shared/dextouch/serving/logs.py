@@ -7,6 +7,7 @@ from typing import Final, Literal
 import structlog
 from structlog.typing import EventDict, Processor, WrappedLogger
 
+from dextouch.free_text import printable
 from dextouch.serving.masking import masked
 
 # Libraries that log headers, in which keys are sent, or every request.
@@ -33,9 +34,11 @@ def configure_logging(
     last: list[Processor] = (
         # Plain tracebacks: rich ones print local variables, which may contain keys.
         [
+            structlog.processors.format_exc_info,
+            _escape,
             structlog.dev.ConsoleRenderer(
                 colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback
-            )
+            ),
         ]
         if console
         else [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
@@ -60,6 +63,15 @@ def configure_logging(
         logging.getLogger(name).setLevel(max(level.upper(), least, key=logging.getLevelName))
     logging.getLogger("uvicorn.error").addFilter(_is_wanted)
     structlog.contextvars.bind_contextvars(service=service)
+
+
+def _escape(_: WrappedLogger, __: str, event: EventDict) -> EventDict:
+    """For the console: no text forges a line or changes the terminal. JSON has its own escapes."""
+    # A traceback and the stack are texts of several lines.
+    return {
+        name: printable(one, lines=name in {"exception", "stack"}) if isinstance(one, str) else one
+        for name, one in event.items()
+    }
 
 
 def _mask(_: WrappedLogger, __: str, line: EventDict | str) -> str:
