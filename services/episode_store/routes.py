@@ -71,8 +71,9 @@ def uploads_router(
 
     @router.post("/recordings", status_code=201, tags=["recordings"], dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def create(attributes: Attributes, sender: Writer) -> RecordingStatus:
+    def create(given: Attributes, sender: Writer) -> RecordingStatus:
         """Begin an upload, or return the status of an existing one."""
+        attributes = given.attributes()
         sender.check_station(attributes.station)
         with (
             metrics.counting_refusals(),
@@ -98,9 +99,7 @@ def uploads_router(
         sender: Writer,
     ) -> BatchReceipt:
         """Store batch n of a stream (wire format v2 or v1), exactly once even if repeated."""
-        announced = request.headers.get("content-length", "")
-        # A body of unknown length may be as large as the largest batch.
-        num_bytes = int(announced) if announced.isdecimal() else MAX_BATCH_BYTES
+        num_bytes = _announced_bytes(request)
         with ExitStack() as admitted:
             # A refused body is not read.
             with metrics.counting_refusals():
@@ -178,6 +177,12 @@ async def _check_new(
         check()
     except StorageFullError as error:
         await anyio.to_thread.run_sync(_raise_unless, is_known, error, limiter=limiter)
+
+
+def _announced_bytes(request: Request) -> int:
+    announced = request.headers.get("content-length", "")
+    # A body of unknown length may be as large as the largest batch.
+    return int(announced) if announced.isdecimal() else MAX_BATCH_BYTES
 
 
 def _expire(ingest: Ingest, limits: StorageLimits, idle_s: float) -> UploadList:

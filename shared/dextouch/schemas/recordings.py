@@ -82,6 +82,10 @@ class NewRecording(RecordingAttributes):
         check_texts(self)
         return self
 
+    def attributes(self) -> RecordingAttributes:
+        """As they are stored, and compared with those that are."""
+        return RecordingAttributes.model_construct(**dict(self))
+
 
 class StreamContent(FrozenModel):
     """What a recording has of one stream: number of samples, and a digest of them.

@@ -93,7 +93,7 @@ def create_service_app(  # noqa: PLR0913 - all by name
     app.state.settings = settings
     app.state.access = AccessControl(settings.api_keys)
     app.state.wrong_keys = WrongKeys()
-    app.state.refusals = RefusalLog(app.state.access.name_of)
+    app.state.refusals = RefusalLog(app.state.access)
     app.state.registry = CollectorRegistry()
     ProcessCollector(registry=app.state.registry)
     about = Info("dextouch_build", "Name and version of the service.", registry=app.state.registry)

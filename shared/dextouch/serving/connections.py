@@ -59,7 +59,7 @@ def limited_protocols(*, max_connections: int, client_timeout_s: float) -> dict[
     ones get status 503. A client may take `client_timeout_s` in all to send a request and to read
     the response; only time at less than 16 KiB/s counts.
     """
-    limits = _Limits(max_connections, client_timeout_s, RefusalLog(lambda _: None))
+    limits = _Limits(max_connections, client_timeout_s, RefusalLog())
     return {
         "http": partial(_LimitedHttp, limits=limits),
         "ws": partial(_LimitedWebSocket, limits=limits),

@@ -26,7 +26,7 @@ from starlette.types import Message as AsgiMessage
 from dextouch.errors import AccessDeniedError, DexTouchError
 from dextouch.schemas import status_of
 from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
-from dextouch.serving.keys import AccessControl, no_key, not_signed_in, presents_key
+from dextouch.serving.keys import AccessControl, no_key, not_signed_in, presented_key
 from dextouch.serving.refusals import RefusalLog, WrongKeys
 
 HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9_.-]+))(?::\d{1,5})?")
@@ -300,7 +300,7 @@ class GuardMiddleware:
             # A foreign page cannot know a key, so host and origin do not matter with one.
             if connection.scope["path"] in PROBES or self.access.find(authorization) is not None:
                 return
-            if presents_key(authorization):
+            if presented_key(authorization) is not None:
                 self.wrong_keys.count(connection)
             signed_in = self.admits is not None and self.admits(connection)
             if is_unsafe and needs_key and not signed_in:

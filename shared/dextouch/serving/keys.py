@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pydantic import Field, SecretStr, field_validator
-from starlette.requests import HTTPConnection, Request
+from starlette.requests import Request
 
 from dextouch.errors import AccessDeniedError
 from dextouch.frozen_model import FrozenModel
@@ -53,7 +53,7 @@ def not_signed_in() -> AccessDeniedError:
 
 def no_key(authorization: str | None) -> AccessDeniedError:
     """Error for a request with an unknown key, or with none."""
-    if presents_key(authorization):
+    if presented_key(authorization) is not None:
         return AccessDeniedError("unknown key", reason="unknown_key")
     return AccessDeniedError(
         "no key: expected the header 'Authorization: Bearer KEY'", reason="missing_key"
@@ -86,16 +86,11 @@ class AccessControl:
 
     def find(self, authorization: str | None) -> Grant | None:
         """What the key in the header allows, if it is a valid one."""
-        presented = secret_digest(_token(authorization) or "")
+        presented = secret_digest(presented_key(authorization) or "")
         # Every key is compared, to avoid a timing side channel.
         known = (*self._keys, *self._enrolled)
         matches = [grant for digest, grant in known if hmac.compare_digest(digest, presented)]
         return matches[0] if matches else None
-
-    def name_of(self, connection: HTTPConnection) -> str | None:
-        """Name of the key of a request, if it has a valid one."""
-        grant = self.find(connection.headers.get("authorization"))
-        return None if grant is None else grant.name
 
     def granted(self, authorization: str | None, scope: str) -> Grant:
         """Check a key and its scope, and return what the key allows.
@@ -133,12 +128,8 @@ def secret_digest(text: str) -> bytes:
     return hashlib.sha256(text.encode()).digest()
 
 
-def presents_key(authorization: str | None) -> bool:
-    """Whether a request has a key, valid or not."""
-    return _token(authorization) is not None
-
-
-def _token(authorization: str | None) -> str | None:
+def presented_key(authorization: str | None) -> str | None:
+    """The key in the header, valid or not; None without one."""
     kind, _, token = (authorization or "").partition(" ")
     # Api-Key is what clients of openpi send.
     return token.strip() or None if kind.lower() in {"bearer", "api-key"} else None

@@ -16,6 +16,8 @@ from starlette.requests import HTTPConnection
 from starlette.types import Scope
 
 from dextouch.errors import AccessDeniedError
+from dextouch.serving.keys import AccessControl, presented_key
+from dextouch.serving.masking import MASK
 
 logger = structlog.get_logger(__name__)
 
@@ -24,6 +26,9 @@ PERIOD_S: Final = 60.0
 MAX_PER_ADDRESS: Final = 10
 # All addresses together: many more stations and people than have a wrong key at the same time.
 MAX_OVERALL: Final = 100
+# Lines of the log a minute about one kind of refusal of an address. Of all kinds these are fewer
+# than MAX_OVERALL, at which a day of refusals takes some 40 MB.
+MAX_LINES: Final = 5
 # Some 100 bytes each; of more, those that were silent for the longest time are forgotten.
 MAX_ADDRESSES: Final = 4096
 # A provider gives a customer at least this much of IPv6, so that one caller has all of it.
@@ -56,9 +61,12 @@ class RateLimit:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
         self._of_all = (float(overall), clock_s())
 
-    def wait_s(self, address: str) -> float:
-        """Count an event; the time until the next one is within the limits, 0 if this one is."""
-        name = _owner(address)
+    def wait_s(self, address: str, kind: str = "") -> float:
+        """Count an event; the time until the next one is within the limits, 0 if this one is.
+
+        Events of different kinds have buckets of their own.
+        """
+        name = f"{_owner(address)} {kind}"
         with self._lock:
             now_s = self._clock_s()
             before = self._buckets.get(name, (float(self._per_address), now_s))
@@ -126,14 +134,12 @@ class WrongKeys:
 class RefusalLog:
     """One line for each refusal, of which a flood leaves only some, with the number of the others.
 
-    `name` finds the name of the key in a request.
+    `access` knows the names of keys.
     """
 
-    def __init__(
-        self, name: Callable[[HTTPConnection], str | None], limit: RateLimit | None = None
-    ) -> None:
-        self._name = name
-        self._limit = RateLimit() if limit is None else limit
+    def __init__(self, access: AccessControl | None = None, limit: RateLimit | None = None) -> None:
+        self._access = access
+        self._limit = RateLimit(MAX_LINES) if limit is None else limit
         self._num_not_logged = 0
 
     def note(self, connection: HTTPConnection, status: int, reason: str) -> None:
@@ -144,23 +150,28 @@ class RefusalLog:
             status: of the response.
             reason: a word, or a sentence without anything secret.
         """
-        scope = connection.scope
+        scope, path = connection.scope, connection.scope["path"]
         is_request = scope["type"] == "http"
+        authorization = connection.headers.get("authorization")
+        grant = None if self._access is None else self._access.find(authorization)
+        if key := presented_key(authorization):
+            # A client may send its key in the wrong place as well.
+            path = path.replace(key, MASK)
         self.note_caller(
             caller_of(scope),
             status,
             reason,
             event=REQUEST if is_request else "websocket_refused",
             method=scope["method"] if is_request else None,
-            path=scope["path"][:MAX_SHOWN_PATH],
-            key=self._name(connection),
+            path=path[:MAX_SHOWN_PATH],
+            key=None if grant is None else grant.name,
         )
 
     def note_caller(
         self, caller: str, status: int, reason: str, *, event: str = REQUEST, **more: str | None
     ) -> None:
         """Log a refusal of which there may be no request."""
-        if self._limit.wait_s(caller):
+        if self._limit.wait_s(caller, f"{event} {status}"):
             self._num_not_logged += 1
             return
         given: dict[str, object] = {name: one for name, one in more.items() if one is not None}

@@ -7,7 +7,7 @@ from structlog.testing import capture_logs
 
 from dextouch.serving import RequireScope, ServiceSettings, create_service_app
 from dextouch.serving.keys import ApiKey
-from dextouch.serving.refusals import MAX_ADDRESSES, RateLimit, RefusalLog, WrongKeys
+from dextouch.serving.refusals import MAX_ADDRESSES, MAX_LINES, RateLimit, RefusalLog, WrongKeys
 from services.dashboard.app import create_app
 from services.dashboard.settings import DashboardSettings
 from tests.contracts.service_apps import open_websocket
@@ -38,7 +38,7 @@ def probe_app(clock, **settings):
     made = ServiceSettings.model_validate({"api_keys": KEYS} | settings)
     app = create_service_app(name="probe", settings=made, routers=[router])
     app.state.wrong_keys._limit = RateLimit(clock_s=clock)
-    app.state.refusals._limit = RateLimit(clock_s=clock)
+    app.state.refusals._limit = RateLimit(MAX_LINES, clock_s=clock)
     return app
 
 
@@ -149,6 +149,15 @@ async def test_a_refused_caller_leaves_one_line(clock):
     assert "wrong-key" not in str(logs)
 
 
+async def test_a_key_that_is_also_in_the_path_is_not_logged(clock):
+    app = probe_app(clock)
+    async with from_("10.0.0.9", app) as client:
+        with capture_logs() as logs:
+            given = {"authorization": "Bearer wrong-key-of-some-length"}
+            await client.post("/v1/wrong-key-of-some-length", headers=given)
+    assert [one["path"] for one in logs] == ["/v1/***"]
+
+
 async def test_the_line_names_the_key_that_lacks_a_scope(clock):
     reader = ApiKey(name="reader", key="another-key-of-length", scopes=("store_read",))
     app = probe_app(clock, api_keys=(reader,))
@@ -172,16 +181,18 @@ async def test_a_flood_is_counted_rather_than_logged(clock):
     app = probe_app(clock)
     with capture_logs() as logs:
         await guess(app, "10.0.0.9", 500)
-        assert len(logs) == 10
-        # Another caller is not hidden by it.
+        assert [one["status"] for one in logs] == [401] * 5 + [429] * 5
+        # Neither another caller nor another kind is hidden by it.
         await guess(app, "10.0.0.10", 1)
-        clock.now_s += 6.1
+        clock.now_s += 12.1
         await guess(app, "10.0.0.9", 1)
-    assert [one.get("num_not_logged") for one in logs[10:]] == [490, None]
+    assert len(logs) == 12
+    # 502 refusals in all.
+    assert sum(one.get("num_not_logged", 0) for one in logs) == 502 - 12
 
 
 def test_many_callers_leave_a_bounded_number_of_lines(clock):
-    log = RefusalLog(lambda _: None, RateLimit(clock_s=clock))
+    log = RefusalLog(limit=RateLimit(clock_s=clock))
     with capture_logs() as logs:
         for number in range(5000):
             log.note_caller(f"10.1.{number >> 8}.{number & 255}", 401, "unknown_key")
