@@ -68,8 +68,8 @@ def test_every_step_of_an_upload_is_refused_after_the_deletion(store, settings, 
 
 
 def test_a_deletion_during_the_commit_leaves_no_recording(store, settings, take, delete):
-    def commit(spool, attributes):
-        counts = commit_spool(store, spool, attributes)
+    def commit(spool, attributes, content):
+        counts = commit_spool(store, spool, attributes, content)
         # What the deletion finds is too late: it is committed after the search.
         (store.root / "recordings" / "take-1").rename(store.root / "hidden")
         delete()

@@ -239,9 +239,9 @@ def test_a_commit_in_conflict_is_a_success_only_if_the_recording_is_there(
 ):
     """It is there if the commit process of a service before completed it meanwhile."""
 
-    def commit(path, finished):
+    def commit(path, finished, content):
         if is_there:
-            commit_spool(store, path, finished)
+            commit_spool(store, path, finished, content)
         raise ConflictError("recording 'take-1': exists already")
 
     ingest = Ingest(store, settings, commit=commit)
