@@ -305,7 +305,7 @@ def fields_of(document, operation):
 # Requests that the guard or the key refuses, and the statuses that it may give.
 REFUSED = [
     ({}, b"", {401}),
-    ({"authorization": "Bearer nonsense"}, b"", {401}),
+    ({"authorization": "Bearer nonsense"}, b"", {401, 429}),
     ({"authorization": f"Bearer {OTHER_KEY}"}, b"", {403, 401}),
     (AUTHORIZED | {"content-type": "text/plain"}, b"{}", {415}),
     (AUTHORIZED | {"content-type": JSON}, b" " * 2**25, {413, 415}),

@@ -26,8 +26,8 @@ PROBLEM_CONTENT = {PROBLEM_MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas
 
 # The server, the guard and the error handlers can give these on any route (413 and 415 also where a
 # GET has a body), and on those that change something.
-OF_ANY = frozenset({408, 413, 415, 421, 431, 500, 503})
-OF_CHANGES = frozenset({403, 404, 409, 422, 429, 507})
+OF_ANY = frozenset({408, 413, 415, 421, 429, 431, 500, 503})
+OF_CHANGES = frozenset({403, 404, 409, 422, 507})
 
 
 def document_service(

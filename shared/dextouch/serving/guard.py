@@ -300,9 +300,9 @@ class GuardMiddleware:
             # A foreign page cannot know a key, so host and origin do not matter with one.
             if connection.scope["path"] in PROBES or self.access.find(authorization) is not None:
                 return
-            if presented_key(authorization) is not None:
-                self.wrong_keys.count(connection)
             signed_in = self.admits is not None and self.admits(connection)
+            if not signed_in and presented_key(authorization) is not None:
+                self.wrong_keys.count(connection)
             if is_unsafe and needs_key and not signed_in:
                 raise no_key(authorization) if self.admits is None else not_signed_in()
             if self.admits is None:

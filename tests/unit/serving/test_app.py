@@ -162,7 +162,7 @@ def test_the_document_has_what_routes_declare():
     _, plain = operation_of(make_app(), "/fail/{index}", "get")
     problems = {status: kind for status, kind in plain.items() if int(status) >= 400}
     assert problems == dict.fromkeys(
-        ("404", "408", "413", "415", "421", "422", "431", "500", "503"), PROBLEM
+        ("404", "408", "413", "415", "421", "422", "429", "431", "500", "503"), PROBLEM
     )
     raw, answers = operation_of(make_app(), "/raw", "post")
     assert set(raw["requestBody"]["content"]) == {JSON, OCTETS}

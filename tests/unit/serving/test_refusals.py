@@ -137,6 +137,15 @@ async def test_sign_ins_are_slowed_and_a_valid_key_is_not():
         assert (await sign_in(KEY)).status_code == 303
 
 
+async def test_a_browser_that_is_signed_in_is_not_refused_for_the_key_of_another_proxy():
+    app = create_app(DashboardSettings(api_keys=KEYS), {})
+    async with from_("10.0.0.9", app) as client:
+        assert (await client.post("/sign_in", data={"key": KEY})).status_code == 303
+        other = {"authorization": "Bearer of-a-proxy-that-knows-people"}
+        found = [(await client.get("/v1/overview", headers=other)).status_code for _ in range(20)]
+    assert found == [200] * 20
+
+
 async def test_a_refused_caller_leaves_one_line(clock):
     app = probe_app(clock)
     with capture_logs() as logs:
