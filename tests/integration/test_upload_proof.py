@@ -11,6 +11,7 @@ from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.schemas import RecordingAttributes
 from dextouch.serving.keys import ApiKey
 from dextouch.streams import SampleBatch, StreamDescriptor
+from services.acquisition.retention import Retention
 from services.acquisition.uploader import UPLOADED_FILE, Uploader, second_id
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings
@@ -30,6 +31,7 @@ TAKE = RecordingAttributes(
     trace_id="a" * 32,
 )
 NUM_SAMPLES = 400
+RANDOM_TEXT = "Xk3vQ9wLr7ZpT2mB"
 
 
 def samples(start, stop, *, offset=0.0):
@@ -57,12 +59,12 @@ def settings(tmp_path):
 def client_of(settings):
     """A client with the key of this name, of a store with the keys `old` and `new`."""
     keys = tuple(
-        ApiKey(name=n, key=SecretStr(f"{n}-0123456789abc"), scopes=("store_write",))
+        ApiKey(name=n, key=SecretStr(f"{n}-{RANDOM_TEXT}"), scopes=("store_write",))
         for n in ("old", "new")
     )
     transport = InProcess(create_app(settings.model_copy(update={"api_keys": keys})))
     clients = {
-        name: kind("http://localhost", f"{key}-0123456789abc", transport=transport)
+        name: kind("http://localhost", f"{key}-{RANDOM_TEXT}", transport=transport)
         for name, key, kind in (
             ("old", "old", EpisodeStoreClient),
             ("new", "new", EpisodeStoreClient),
@@ -94,8 +96,18 @@ def send(client, *, force, wrist, finish=True):
         client.finish("take-1", counts)
 
 
+class SweptUploader(Uploader):
+    """Removes what was uploaded at once, as the thread of an uploader does after each look."""
+
+    def upload_all(self):
+        done = super().upload_all()
+        self.retention.sweep()
+        return done
+
+
 def uploader_of(spool, client):
-    return Uploader(spool.parent, client, period_s=1.0, keep_uploaded=False)
+    limits = Retention(keep_uploaded_days=0)
+    return SweptUploader(spool.parent, client, period_s=1.0, retention=limits)
 
 
 WHOLE = {"force": samples(0, NUM_SAMPLES), "wrist": samples(0, 50)}

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from http import HTTPStatus
 from typing import Any
 
@@ -59,7 +59,7 @@ def limited_protocols(*, max_connections: int, client_timeout_s: float) -> dict[
     ones get status 503. A client may take `client_timeout_s` in all to send a request and to read
     the response; only time at less than 16 KiB/s counts.
     """
-    limits = _Limits(max_connections, client_timeout_s, RefusalLog())
+    limits = _Limits(max_connections, client_timeout_s)
     return {
         "http": partial(_LimitedHttp, limits=limits),
         "ws": partial(_LimitedWebSocket, limits=limits),
@@ -72,8 +72,13 @@ class _Limits:
 
     max_connections: int
     client_timeout_s: float
-    refusals: RefusalLog
     idle: dict["_LimitedHttp", None] = field(default_factory=dict)
+
+    # Made in the process that needs it: with several workers the limits are sent to each.
+    @cached_property
+    def refusals(self) -> RefusalLog:
+        """The lines about refused callers."""
+        return RefusalLog()
 
     @property
     def check_period_s(self) -> float:

@@ -6,6 +6,8 @@ mounted over it later.
 """
 
 import os
+import weakref
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -64,6 +66,10 @@ class ServedFolder:
         identity = found.st_dev, found.st_ino
         if self._identity is None:
             self._identity = identity
+            # Held until the end: the number of a removed folder could become that of a new one.
+            with suppress(PermissionError):
+                held = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+                weakref.finalize(self, os.close, held)
         if identity != self._identity:
             return (
                 f"{where}: is another folder than at the start; put the first one back or mount "

@@ -12,6 +12,7 @@ from dextouch.errors import CorruptDataError
 from dextouch.images import encode_jpeg
 from dextouch.schemas import LedgerEntry, RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values
+from services.acquisition.retention import Retention
 from services.acquisition.uploader import Uploader, recover_spool
 from tests.unit.acquisition.test_uploader import FakeStore
 
@@ -181,7 +182,7 @@ def test_a_closed_take_that_lost_its_tail_is_neither_sent_nor_removed(tmp_path):
     make(tmp_path, closed=True)
     half_a_log(tmp_path / "take-1")
     store = FakeStore()
-    uploader = Uploader(tmp_path, store, period_s=1.0, keep_uploaded=False)
+    uploader = Uploader(tmp_path, store, period_s=1.0, retention=Retention(keep_uploaded_days=0))
     assert recover_spool(tmp_path) == []
     assert uploader.upload_all() == []
     assert store.batches == {}
