@@ -13,7 +13,12 @@ import structlog
 from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import disk_errors
 from dextouch.episodes.spool import SpoolReader
-from dextouch.errors import DexTouchError, NotFoundError, StorageError
+from dextouch.errors import (
+    AccessDeniedError,
+    DexTouchError,
+    NotFoundError,
+    StorageError,
+)
 from dextouch.schemas import (
     MAX_CHECKED_TAKES,
     CheckTakes,
@@ -93,19 +98,42 @@ class DeletedTakes:
         self._remove(path, "refused by the store as deleted")
 
     def _work_off(self, store: EpisodeStoreClient, removed: list[str]) -> bool:
-        """Remove all deleted takes; whether none of them is left."""
+        """Remove all deleted takes; whether none of them is left to try again."""
         takes: defaultdict[str, list[SpooledTake]] = defaultdict(list, {self._station: []})
         for station, take in self._spooled():
             takes[station].append(take)
-        num_held = 0
+        confirmed, unknown = [], []
         for station, spooled in takes.items():
-            held, revision = self._remove_of(store, station, spooled, removed)
-            num_held += len(held)
-            confirmed = ConfirmRemoval(
-                station=station, revision=revision, held=tuple(held[:MAX_CHECKED_TAKES])
+            try:
+                held, revision = self._remove_of(store, station, spooled, removed)
+            except AccessDeniedError:
+                # Recorded under an earlier name, of which this key may not ask.
+                unknown += [take.recording_id for take in spooled]
+                continue
+            gone = {*removed, *(one.recording_id for one in held)}
+            unknown += [
+                take.recording_id
+                for take in spooled
+                if take.is_damaged and take.recording_id not in gone
+            ]
+            confirmed.append(
+                ConfirmRemoval(
+                    station=station, revision=revision, held=tuple(held[:MAX_CHECKED_TAKES])
+                )
             )
-            store.confirm_removal(confirmed)
-        return num_held == 0
+        if unknown:
+            # A take of a deleted operator may be among them: then nothing is confirmed, and the
+            # store goes on to list this station as outstanding.
+            logger.warning(
+                "unknown_takes",
+                recording_ids=sorted(unknown),
+                advice="damaged, or of another station name, so that the store cannot say whether "
+                "they were deleted: restore, send or remove them, then start the station again",
+            )
+            return True
+        for one in confirmed:
+            store.confirm_removal(one)
+        return not any(one.held for one in confirmed)
 
     def _remove_of(
         self,

@@ -6,15 +6,18 @@ A take that the store has not acknowledged is never removed here.
 import shutil
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 import structlog
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from dextouch.episodes import disk_errors, folder_bytes
+from dextouch.episodes.spool import LOG_FILE
 from dextouch.errors import StorageError
 from dextouch.frozen_model import FrozenModel
+from dextouch.schemas import RecordingStatus
 
 logger = structlog.get_logger(__name__)
 
@@ -84,7 +87,7 @@ class SpoolRetention:
         """Bytes of the takes in the spool by state of their upload; a running one waits, too."""
         num_bytes = {"waiting": 0, "uploaded": 0, "refused": 0}
         for path in spooled_takes(self._spool_root):
-            if (path / UPLOADED_FILE).exists():
+            if acknowledgement(path) is not None:
                 num_bytes["uploaded"] += self._size(path)
             else:
                 state = "refused" if (path / REFUSED_FILE).exists() else "waiting"
@@ -95,10 +98,9 @@ class SpoolRetention:
         """Acknowledged takes with the time of that."""
         found = []
         for path in spooled_takes(self._spool_root):
-            try:
-                found.append(((path / UPLOADED_FILE).stat().st_mtime, path))
-            except FileNotFoundError:
-                continue
+            if acknowledgement(path) is not None:
+                with suppress(FileNotFoundError):  # removed meanwhile
+                    found.append(((path / UPLOADED_FILE).stat().st_mtime, path))
         return found
 
     def _size(self, path: Path) -> int:
@@ -107,9 +109,22 @@ class SpoolRetention:
         return self._sizes[path.name]
 
 
+def acknowledgement(path: Path) -> RecordingStatus | None:
+    """What the store answered when it had all of a take; None where it has not, as far as known.
+
+    A note that is damaged or says otherwise does not count: the take is sent again.
+    """
+    try:
+        note = RecordingStatus.model_validate_json((path / UPLOADED_FILE).read_bytes())
+    except (ValidationError, FileNotFoundError):
+        return None
+    return note if note.state == "finished" else None
+
+
 def spooled_takes(spool_root: Path) -> list[Path]:
-    """Folders of the takes in a spool, by name."""
-    return sorted(path.parent for path in spool_root.glob(f"*/{RECORDING_FILE}"))
+    """Folders of the takes in a spool, by name; also those of which only the log is left."""
+    found = (spool_root.glob(f"*/{name}") for name in (RECORDING_FILE, LOG_FILE))
+    return sorted({path.parent for paths in found for path in paths})
 
 
 def remove_take(path: Path) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import structlog
-from pydantic import ValidationError
 from structlog.contextvars import bound_contextvars
 
 from dextouch.clients import EpisodeStoreClient
@@ -41,6 +40,7 @@ from services.acquisition.retention import (
     UPLOADED_FILE,
     Retention,
     SpoolRetention,
+    acknowledgement,
     remove_take,
     sweep_safely,
 )
@@ -123,7 +123,7 @@ class Uploader:
     def counts(self) -> dict[str, int]:
         """Takes of the spool that wait, are uploaded, or were refused; a running one waits too."""
         paths = _spools(self._spool_root)
-        uploaded = sum((path / UPLOADED_FILE).exists() for path in paths)
+        uploaded = sum(acknowledgement(path) is not None for path in paths)
         refused = sum((path / REFUSED_FILE).exists() for path in paths)
         waiting = len(paths) - uploaded - refused
         return {"waiting": waiting, "uploaded": uploaded, "refused": refused}
@@ -182,7 +182,7 @@ class Uploader:
         done = []
         self._retry_after_s = 0.0
         for path in _spools(self._spool_root):
-            if (path / UPLOADED_FILE).exists() or (path / REFUSED_FILE).exists():
+            if acknowledgement(path) is not None or (path / REFUSED_FILE).exists():
                 continue
             if self._stopping.is_set():
                 break
@@ -204,16 +204,16 @@ class Uploader:
     def _status(self, path: Path, damage: str | None) -> UploadStatus:
         last_error, _ = self._failures.get(path.name, (None, 0))
         error = damage or last_error
-        uploaded, stored_as, reason = (path / UPLOADED_FILE).exists(), None, _refusal(path)
-        if uploaded:
-            stored_as = _stored_as(path)
+        note, stored_as, reason = acknowledgement(path), None, _refusal(path)
+        if note is not None:
+            stored_as = note.recording_id
         elif reason is not None:
             error = f"the store refuses it: {reason}; it stays here until it is sent again"
         elif self._store is None and error is None:
             error = NO_STORE
         return UploadStatus(
             recording_id=path.name,
-            uploaded=uploaded,
+            uploaded=note is not None,
             stored_as=stored_as,
             refused=reason is not None,
             error=error,
@@ -270,6 +270,8 @@ class Uploader:
             return self._upload(path, spool, self._store)
 
     def _upload(self, path: Path, spool: SpoolReader, store: EpisodeStoreClient) -> bool:
+        # A log that has changed is found before the store hears of the take.
+        spool.scan()
         status = _begin(store, spool.attributes)
         recording_id = status.recording_id
         num_batches, content = {}, {}
@@ -346,9 +348,9 @@ def ids_in_store(path: Path, about: RecordingAttributes | None) -> tuple[str, ..
 
     `about` is None of a damaged take.
     """
-    stored_as = _stored_as(path)
-    if stored_as is not None:
-        return (stored_as,)
+    note = acknowledgement(path)
+    if note is not None:
+        return (note.recording_id,)
     return (path.name,) if about is None else (about.recording_id, second_id(about))
 
 
@@ -441,13 +443,4 @@ def _text(path: Path) -> str | None:
     try:
         return path.read_text(encoding="utf-8", errors="replace")
     except FileNotFoundError:
-        return None
-
-
-def _stored_as(path: Path) -> str | None:
-    """The id that a take has in the store; None where the note of its upload is damaged or gone."""
-    try:
-        note = (path / UPLOADED_FILE).read_bytes()
-        return RecordingStatus.model_validate_json(note).recording_id
-    except (ValidationError, FileNotFoundError):
         return None

@@ -341,4 +341,4 @@ class JobDatabase:
                 raise StorageFullError(told) from error
             if code in DAMAGED:
                 raise CorruptDataError(f"{what}: damaged ({error}); {MOVE_AWAY}") from error
-            raise StorageError(f"{what}: {error}") from error
+            raise StorageError(f"{what}: {error}; {MOVE_AWAY}") from error

@@ -62,11 +62,12 @@ def test_mount_is_as_near_as_promised_and_its_sigma_honest(with_corners, capsys)
     with capsys.disabled():
         sys.stdout.write(
             f"\nhand-eye, corners {with_corners}: {median[0]:.3f} deg, bound 0.06 (Park "
-            f"{median_park[0]:.3f}) | {median[1]:.2f} mm, bound 0.8 (Park {median_park[1]:.2f}) | "
-            f"NEES {np.mean(normalised):.2f}, bounds 0.5 and 2"
+            f"{median_park[0]:.3f}) | {median[1]:.2f} mm, bounds 0.8 and 0.85 "
+            f"(Park {median_park[1]:.2f}) | NEES {np.mean(normalised):.2f}, bounds 0.5 and 2"
         )
     assert median[0] <= 0.06
-    assert median[1] <= 0.8
+    # Without corners the size of the board is known less well.
+    assert median[1] <= (0.8 if with_corners else 0.85)
     assert (median <= median_park).all()
     assert 0.5 <= np.mean(normalised) <= 2
     # A sigma is the length of three axes' sigmas: the mean square of error by sigma is one, of 20
@@ -205,7 +206,7 @@ def test_an_inverted_side_is_named():
             assert refusal.value.details["inverted"] == name
 
 
-@pytest.mark.parametrize("scale", [0.95, 0.985, 1.015, 1.02, 1.05, 25.0 / 28.0, 1e-3, 1e3])
+@pytest.mark.parametrize("scale", [0.95, 0.975, 1.025, 1.05, 25.0 / 28.0, 1e-3, 1e3])
 @pytest.mark.parametrize("with_corners", [True, False])
 def test_a_board_of_another_size_than_was_entered_is_named(scale, with_corners):
     """The board is `scale` as large as entered: a scaled page, a wrong number, millimetres."""
@@ -226,11 +227,11 @@ def test_a_board_of_another_size_than_was_entered_is_named(scale, with_corners):
 
 
 def test_the_uncertain_size_of_a_board_is_part_of_sigma():
-    """A print within the ruler's error: the mount is as far off as its sigma says."""
+    """A print near what a ruler says: the mount is as far off as its sigma says."""
     ratios = []
     for seed in range(NUM_SEEDS):
         scene = make_scene(seed)
-        scale = 1.0 + 2e-3 * np.random.default_rng(seed).normal()
+        scale = 1.0 + 5e-3 * np.random.default_rng(seed).normal()
         board = scene.Ts_camera_board.copy()
         board[:, :3, 3] /= scale
         result = solve_hand_eye(scene.Ts_world_tracker, board)

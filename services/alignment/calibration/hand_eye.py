@@ -60,8 +60,8 @@ class HandEyeNoise(TrackerNoise):
 
     That of the tracker and the pixels holds for a Vive tracker and a sharp board. `board_*` are of
     a board's pose that a solver found, in the camera's axes; they count only where no corners are
-    given. `board_scale` is how well the size of the print is known, as a share: by a ruler half a
-    millimetre of 25 cm.
+    given. `board_scale` is how well the size of the print is known, as a share: by a
+    ruler a millimetre of 20 cm.
     """
 
     pixel_px: float = 0.3
@@ -69,7 +69,7 @@ class HandEyeNoise(TrackerNoise):
     board_roll_rad: float = 5e-4
     board_sideways_m: float = 1.5e-4
     board_depth_m: float = 4e-4
-    board_scale: float = 2e-3
+    board_scale: float = 5e-3
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ NUM_FINGERS = 5
 # Proximal phalanx of an index finger: that of the mean hand (39.7 mm) at the sizes that are
 # accepted (0.55 … 1.5, SIZE_RANGE of hand_checks), and a tenth for fingers of other proportions and
 # the tracker's noise. Outside, the unit is wrong: the nearest is inches, a factor of 39.
-INDEX_PROXIMAL_RANGE_M = (0.0195, 0.0655)
+INDEX_PROXIMAL_RANGE_M = (0.0190, 0.0668)
 BONE_RANGE_M = (0.003, 0.150)
 _INDEX_FINGER = CHAINS.index("index")
 NUM_COLUMNS = 9
@@ -151,7 +151,7 @@ def calibrated_profile(
 
 
 def check_bone_unit(index_proximal_m: float, *, where: str) -> None:
-    """Refuse an index finger's proximal bone that is not 19.5–65.5 mm long.
+    """Refuse an index finger's proximal bone that is not 19.0–66.8 mm long.
 
     Raises:
         InvalidInputError: most likely millimetres, or nodes in another order.

@@ -94,7 +94,10 @@ def calibrate_mount(options: argparse.Namespace) -> dict[str, object]:
     name = f"T_tracker_{TRACKERS[options.camera]}_camera_{options.camera}"
     sigma = (result.sigma_rotation_rad, result.sigma_translation_m)
     known = write_pose(options.to, name, X, sigma, facts)
-    print(f"{known}; the board scatters by {rms_mm:.1f} mm RMS")
+    print(
+        f"{known}; the board scatters by {rms_mm:.1f} mm RMS, and is {result.board_scale:.4f} ± "
+        f"{result.sigma_board_scale:.4f} times as large as entered"
+    )
     return facts
 
 

@@ -31,6 +31,7 @@ from dextouch.episodes.spool_seal import (
     Seal,
     decode_attributes,
     encode_attributes,
+    has_checksum,
     read_recording_file,
     read_seal,
 )
@@ -83,6 +84,8 @@ class SpoolReader:
         self._rows: dict[str, np.ndarray] = {}
         if self._seal is not None:
             self._check_seal(self._seal, text)
+        elif self.closed and has_checksum(text):
+            raise self._changed(f"{CLOSED_FILE!r} is empty")
 
     def num_samples(self, stream_name: str) -> int:
         """Number of samples of a stream when the log was scanned.
@@ -167,6 +170,8 @@ class SpoolReader:
             got = _num_samples(rows, list(self.streams))
             if got != self._seal.num_samples:
                 raise self._changed(f"samples {got}, expected {self._seal.num_samples}")
+            if sha256_hex(rows.tobytes()) != self._seal.records_sha256:
+                raise self._changed("its log has other records")
 
     def _check_seal(self, seal: Seal, text: bytes) -> None:
         with disk_errors(f"open {self._where}"):
@@ -276,7 +281,7 @@ class SpoolWriter:
         self._lock = lock
         self.torn_bytes, self.lost_samples = 0, dict[str, int]()
         try:
-            self._log = SpoolLogWriter(path, end=self._resume())
+            self._log = SpoolLogWriter(path, self._resume())
         except BaseException:
             os.close(self._lock)
             raise
@@ -399,6 +404,7 @@ class SpoolWriter:
         seal = Seal(
             num_samples={name: s.num_samples for name, s in self._streams.items()},
             log_bytes=self._log.end,
+            records_sha256=self._log.records_sha256,
             recording_sha256=sha256_hex(read_recording_file(self.path)),
         )
         with disk_errors(f"close spool {self.path.name}"):
@@ -432,8 +438,8 @@ class SpoolWriter:
             raise UnknownNameError("stream", name, list(self._streams))
         return self._streams[name]
 
-    def _resume(self) -> int:
-        """Count the samples of the log; returns where it goes on."""
+    def _resume(self) -> LogRecords:
+        """Count the samples of the log; returns the records after which it goes on."""
         reader = SpoolReader(self.path)
         records = trusted_records(self.path, reader.scan())
         self.torn_bytes = max(0, records.num_bytes - records.end)
@@ -448,7 +454,7 @@ class SpoolWriter:
             if len(rows):
                 last = read_batch(self.path, self.attributes.streams[stream.number], rows[-1:])
                 stream.last_t_host_ns = int(last.t_host_ns[-1])
-        return records.end
+        return records
 
 
 def _create(path: Path, attributes: RecordingAttributes, notes: Mapping[str, bytes]) -> None:

@@ -6,6 +6,7 @@ tail differs from damage in that no valid header follows it. Records of format 1
 columns, are read, and followed by those of today.
 """
 
+import hashlib
 import os
 import struct
 from collections.abc import Iterator
@@ -260,14 +261,16 @@ def _header_at(data: LogBytes, place: int) -> tuple[int, ...] | None:
 class SpoolLogWriter:
     """Appends records to a spool's log; each append is one write.
 
-    `end` is the offset to continue at, where the file is truncated.
+    It continues after `records`, where the file is truncated.
 
     Raises:
         StorageError: the file cannot be opened.
     """
 
-    def __init__(self, folder: Path, *, end: int) -> None:
-        self._what, self._end = f"log of spool {folder.name!r}", end
+    def __init__(self, folder: Path, records: LogRecords) -> None:
+        self._what, self._end = f"log of spool {folder.name!r}", records.end
+        # Of the rows of all records, and of those before the last one, for `undo`.
+        self._rows = self._rows_before = hashlib.sha256(records.rows.tobytes())
         self._file = -1
         with disk_errors(f"open {self._what}"):
             self._file = os.open(folder / LOG_FILE, os.O_RDWR)
@@ -294,6 +297,9 @@ class SpoolLogWriter:
             self._cut(place)
             raise
         self._end = place + HEADER_BYTES + length
+        self._rows_before = self._rows.copy()
+        row = (place, first_sample, stream, batch.num_samples, length, batch.body_crc32c)
+        self._rows.update(_ROW.pack(*row, _LAYOUTS[b"DXTS"]))
         return place
 
     @property
@@ -301,11 +307,16 @@ class SpoolLogWriter:
         """Length of the log in bytes."""
         return self._end
 
+    @property
+    def records_sha256(self) -> str:
+        """The sha256 of the rows of all records (`RECORD_ROW`), which hold their checksums."""
+        return self._rows.hexdigest()
+
     def undo(self, place: int) -> None:
         """Remove the last record, at the given offset."""
         with disk_errors(f"cut {self._what}"):
             self._cut(place)
-        self._end = place
+        self._end, self._rows = place, self._rows_before
 
     def sync(self) -> None:
         """Sync all appended records to disk."""

@@ -169,7 +169,18 @@ def load_settings(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
         problems = explained(error, section_of(cls))
         raise InvalidInputError(f"settings of {cls.__name__}: {problems}") from error
     except SettingsError as error:
-        raise InvalidInputError(f"settings of {cls.__name__}: {error}; is it JSON?") from error
+        raise InvalidInputError(
+            f"settings of {cls.__name__}: {_malformed(cls, error)}; expected JSON, such as "
+            '["A", "B"] for a list'
+        ) from error
+
+
+def _malformed(cls: type[BaseSettings], error: SettingsError) -> str:
+    """What is no JSON: the environment variable of the field that an error names."""
+    found = re.search(r'field "([^"]+)" from source "EnvSettingsSource"', str(error))
+    if found is None:
+        return str(error)
+    return f"variable {cls.model_config.get('env_prefix', '')}{found[1].upper()} is no JSON"
 
 
 def _add_argument(

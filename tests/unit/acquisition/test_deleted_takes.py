@@ -7,7 +7,12 @@ import pytest
 
 from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes.spool import SpoolWriter
-from dextouch.errors import ConflictError, NotFoundError, UnavailableError
+from dextouch.errors import (
+    AccessDeniedError,
+    ConflictError,
+    NotFoundError,
+    UnavailableError,
+)
 from dextouch.schemas import (
     CheckedTakes,
     FoundDeletion,
@@ -176,3 +181,32 @@ def test_the_session_forgets_an_operator(tmp_path):
     count.forget("gone")
     assert [one.operator for one in SessionCount(tmp_path).now.saved] == ["other", None]
     assert "gone" not in (tmp_path / "session.json").read_text()
+
+
+def test_nothing_is_confirmed_while_a_take_cannot_be_asked_about(tmp_path, deleted):
+    spool(tmp_path, "a")
+    spool(tmp_path, "damaged", operator="gone")
+    path = tmp_path / "damaged" / "recording.json"
+    path.write_bytes(path.read_bytes().replace(b"gone", b"gome"))
+    spool(tmp_path, "log-alone", operator="gone")
+    (tmp_path / "log-alone" / "recording.json").unlink()
+    store = Store()
+    # What can be found goes all the same.
+    assert deleted.remove(store) == ["a"]
+    assert store.confirmed == []
+
+
+def test_nothing_is_confirmed_while_takes_of_an_earlier_name_are_there(tmp_path, forgotten):
+    spool(tmp_path, "a")
+
+    class Bound(Store):
+        def check_takes(self, spooled):
+            if spooled.station != "new":
+                raise AccessDeniedError("of another station", reason="other_station")
+            return super().check_takes(spooled)
+
+    names = OperatorNames(lambda: (), forgotten.append)
+    renamed = DeletedTakes(tmp_path, "new", stored_as=ids_in_store, operators=names)
+    store = Bound()
+    assert renamed.remove(store) == []
+    assert store.confirmed == []

@@ -13,6 +13,7 @@ from services.acquisition.retention import Retention, SpoolRetention, spooled_ta
 DAY_S = 86_400
 NOW_S = 1_000 * DAY_S
 MEGABYTE = 10**6
+NOTE = b'{"recording_id": "take", "state": "finished"}'
 
 
 def take(root, name, *, age_days=None, num_bytes=MEGABYTE):
@@ -20,10 +21,11 @@ def take(root, name, *, age_days=None, num_bytes=MEGABYTE):
     path = root / name
     path.mkdir(parents=True)
     (path / "recording.json").write_bytes(b"{}")
-    # With "{}" and "{}" of the acknowledgement, exactly the size.
-    (path / "batches.log").write_bytes(bytes(num_bytes - (2 if age_days is None else 4)))
+    # With "{}" and the acknowledgement, exactly the size.
+    others = 2 if age_days is None else 2 + len(NOTE)
+    (path / "batches.log").write_bytes(bytes(num_bytes - others))
     if age_days is not None:
-        (path / "uploaded.json").write_bytes(b"{}")
+        (path / "uploaded.json").write_bytes(NOTE)
         at_s = NOW_S - age_days * DAY_S
         os.utime(path / "uploaded.json", (at_s, at_s))
 
@@ -42,6 +44,16 @@ def test_a_take_stays_for_a_week_after_the_acknowledgement(tmp_path):
     assert swept(tmp_path) == ["old"]
     assert left(tmp_path) == ["waiting", "young"]
     assert swept(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "note", [b"", bytes(200), b"{}", b'{"recording_id": "take", "state": "open"}', NOTE[:-3]]
+)
+def test_a_note_that_says_nothing_of_an_acknowledgement_is_none(tmp_path, note):
+    take(tmp_path, "take", age_days=100)
+    (tmp_path / "take" / "uploaded.json").write_bytes(note)
+    assert swept(tmp_path, keep_uploaded_days=0, keep_uploaded_gb=0) == []
+    assert left(tmp_path) == ["take"]
 
 
 def test_what_the_store_never_acknowledged_stays_whatever_the_limits(tmp_path):

@@ -39,9 +39,9 @@ NUM_FORCE, NUM_IMAGES = 40, 12
 IMAGES = [encode_jpeg(np.full((8, 8, 3), 20 * k, np.uint8)) for k in range(NUM_IMAGES)]
 
 
-def force(first, count=1):
+def force(first, count=1, *, offset_n=0.0):
     k = np.arange(first, first + count)
-    return SampleBatch(k * 10, k * 9, k, (k[:, None] * np.arange(6)).astype("f4"))
+    return SampleBatch(k * 10, k * 9, k, (k[:, None] * np.arange(6) + offset_n).astype("f4"))
 
 
 def image(first, count=1):
@@ -52,10 +52,10 @@ def image(first, count=1):
 EXPECTED = {"force": force(0, NUM_FORCE), "camera": image(0, NUM_IMAGES)}
 
 
-def make(root, *, closed):
+def make(root, *, closed, offset_n=0.0):
     writer = SpoolWriter(root / "take-1", TAKE, sync=False)
     for k in range(NUM_FORCE):
-        writer.append_record(writer.encode("force", force(k)))
+        writer.append_record(writer.encode("force", force(k, offset_n=offset_n)))
         if k < NUM_IMAGES:
             writer.append("camera", image(k))
     if closed:
@@ -261,3 +261,33 @@ def test_a_take_without_a_whole_record_stays(tmp_path):
         assert recover_spool(tmp_path / name) == []
         assert len(file.read_bytes()) == size
         assert "take-1" in Uploader(tmp_path / name, None, period_s=1.0).status()[0].error
+
+
+def test_a_log_of_another_take_is_not_sent(tmp_path):
+    """Takes of one length have logs of one length, whose records differ."""
+    make(tmp_path / "a", closed=True)
+    make(tmp_path / "b", closed=True, offset_n=0.5)
+    log, other = (tmp_path / name / "take-1" / "batches.log" for name in ("a", "b"))
+    assert log.stat().st_size == other.stat().st_size
+    shutil.copy(other, log)
+    store = FakeStore()
+    uploader = Uploader(tmp_path / "a", store, period_s=1.0)
+    assert uploader.upload_all() == []
+    assert store.batches == {}
+    assert "its log has other records" in uploader.status()[0].error
+
+
+def test_an_empty_seal_of_a_spool_of_today_is_damage(tmp_path):
+    make(tmp_path, closed=True)
+    (tmp_path / "take-1" / "closed").write_bytes(b"")
+    with pytest.raises(CorruptDataError, match="'closed' is empty"):
+        SpoolReader(tmp_path / "take-1")
+
+
+def test_a_log_alone_is_reported(tmp_path):
+    make(tmp_path, closed=True)
+    (tmp_path / "take-1" / "recording.json").unlink()
+    uploader = Uploader(tmp_path, FakeStore(), period_s=1.0)
+    assert uploader.upload_all() == []
+    (status,) = uploader.status()
+    assert "recording.json is missing" in status.error

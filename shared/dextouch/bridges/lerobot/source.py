@@ -1,5 +1,6 @@
 """Reader of LeRobotDataset v3 folders of any origin, with validated metadata."""
 
+import codecs
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -193,7 +194,8 @@ def _small_file(path: Path, max_bytes: int) -> bytes | None:
             return None
         if path.stat().st_size > max_bytes:
             raise CorruptDataError(f"{path}: is larger than {max_bytes} bytes")
-        return path.read_bytes()
+        # Editors of Windows begin text with a byte-order mark.
+        return path.read_bytes().removeprefix(codecs.BOM_UTF8)
 
 
 def _read_info(folder: Path) -> DatasetInfo:
