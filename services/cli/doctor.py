@@ -28,6 +28,7 @@ _DISTRIBUTIONS = {
 }
 _PURPOSES = {
     "zstandard": "episodes",
+    "av": "video of cameras",
     "serial": "gloves over serial",
     "hid": "trackers over HID",
     "usb": "trackers over USB",

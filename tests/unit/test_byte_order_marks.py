@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from dextouch.bridges.lerobot import source
 from dextouch.serving import configuration_file
 from services.acquisition.devices import load_calibration
 from services.alignment.station_calibration import record
@@ -54,3 +55,9 @@ def test_configuration(write, monkeypatch):
     monkeypatch.setenv(configuration_file.VARIABLE, str(path))
     assert DashboardSettings().port == 8123
     assert configuration_file.line_of(path, ["dashboard", "port"]) == 2
+
+
+def test_sidecars_of_datasets(tmp_path):
+    path = tmp_path / "meta.json"
+    path.write_bytes(codecs.BOM_UTF8 + b"{}")
+    assert source._small_file(path, 1024) == b"{}"

@@ -43,6 +43,12 @@ def test_an_empty_variable_counts_as_not_set(monkeypatch):
     assert load_settings(UpSettings, []).station == "mock station"
 
 
+def test_a_variable_that_is_no_json_is_named(monkeypatch):
+    monkeypatch.setenv("DEXTOUCH_PROBE_ALLOWED_HOSTS", "lab.example")
+    with pytest.raises(InvalidInputError, match="variable DEXTOUCH_PROBE_ALLOWED_HOSTS is no JSON"):
+        load_settings(ProbeSettings, [])
+
+
 def test_unknown_flags_are_refused(capsys):
     with pytest.raises(SystemExit) as caught:
         load_settings(ProbeSettings, ["--colour", "red"])
