@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError
 from dextouch.geometry import invert, transform
-from services.alignment.calibration.hand_eye import HandEyeResult, solve_hand_eye
+from services.alignment.calibration.hand_eye import HandEyeNoise, HandEyeResult, solve_hand_eye
 from services.alignment.calibration.motion import park
 
 if TYPE_CHECKING:
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 OURS = "ours"
 OURS_POSES = "ours, poses only"
+# As its rivals, which rely on the size of the board that was entered.
+OURS_SIZE_KNOWN = "ours, size known"
 PARK = "park"
 
 
@@ -46,15 +48,15 @@ class Method(ABC):
 class Ours(Method):
     """Our weighted bundle adjustment, with the corners or with the board's poses alone."""
 
-    def __init__(self, name: str, *, with_corners: bool) -> None:
+    def __init__(self, name: str, *, with_corners: bool, noise: HandEyeNoise | None = None) -> None:
         self.name = name
-        self._with_corners = with_corners
+        self._with_corners, self._noise = with_corners, noise
 
     def solve(self, scene: "Scene") -> Answer:
         """By `solve_hand_eye`."""
         views = scene.views if self._with_corners else None
         result: HandEyeResult = solve_hand_eye(
-            scene.Ts_world_tracker, scene.Ts_camera_board, views=views
+            scene.Ts_world_tracker, scene.Ts_camera_board, views=views, noise=self._noise
         )
         return Answer(result.T_tracker_camera, result.covariance)
 
@@ -120,6 +122,7 @@ class OpenCvRobotWorld(Method):
 METHODS: tuple[Method, ...] = (
     Ours(OURS, with_corners=True),
     Ours(OURS_POSES, with_corners=False),
+    Ours(OURS_SIZE_KNOWN, with_corners=True, noise=HandEyeNoise(board_scale=1e-6)),
     OurPark(),
     *(OpenCvHandEye(name) for name in ("tsai", PARK, "horaud", "andreff", "daniilidis")),
     *(OpenCvRobotWorld(name) for name in ("shah", "li")),

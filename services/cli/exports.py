@@ -139,19 +139,26 @@ def _note_damaged(reader: Reader, damaged: DamagedImages) -> None:
             shown = ", ".join(map(str, lost[:MAX_NAMED])) + ", …" * (len(lost) > MAX_NAMED)
             print(
                 f"{reader.item_id}: {name}: {len(lost)} of {reader.num_samples(name)} images "
-                "cannot be decoded and are left out; where a step needs one, the nearest other "
-                f"image stands (images {shown})",
+                "cannot be decoded and are left out; where a data set needs one for a step, the "
+                f"nearest other stands (images {shown})",
                 file=sys.stderr,
             )
 
 
 def _episodes(
-    store: EpisodeStore, ids: Iterable[str], damaged: DamagedImages
+    store: EpisodeStore, ids: Iterable[str], damaged: DamagedImages, left_out: list[str]
 ) -> Iterator[EpisodeReader]:
+    """Episodes of one data set, without those of which a camera has no image that is whole."""
     for item_id in ids:
         episode = store.open(item_id)
         _note_damaged(episode, damaged)
-        yield episode
+        lost = damaged.get(item_id, {})
+        blind = [name for name, images in lost.items() if len(images) == episode.num_samples(name)]
+        if blind:
+            left_out.append(item_id)
+            print(f"{item_id}: left out: no image of {', '.join(blind)} is whole", file=sys.stderr)
+        else:
+            yield episode
 
 
 def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
@@ -170,9 +177,10 @@ def _export(options: argparse.Namespace) -> Report:
     damaged: DamagedImages = {}
     report["damaged_images"] = damaged
     if form in _JOINT:
-        num_steps = _export_all(_episodes(store, shown, damaged), options)
-        print(f"{to}  {len(ids)} episodes  {num_steps} steps")
-        return report | {"path": str(to), "num_steps": num_steps}
+        left_out: list[str] = []
+        num_steps = _export_all(_episodes(store, shown, damaged, left_out), options)
+        print(f"{to}  {len(ids) - len(left_out)} episodes  {num_steps} steps")
+        return report | {"path": str(to), "num_steps": num_steps, "left_out": left_out}
     # One file for one id, a folder of files otherwise.
     paths = {item_id: to / f"{item_id}.{form}" for item_id in ids}
     if to.suffix == f".{form}":

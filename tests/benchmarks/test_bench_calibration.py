@@ -17,7 +17,7 @@ from benchmarks.calibration.acceptance import requirements
 from benchmarks.calibration.cameras import CameraResult
 from benchmarks.calibration.compare import MethodResult, not_worse_share, score
 from benchmarks.calibration.refusals import SceneResult, scene_makers
-from benchmarks.calibration.rivals import METHODS, OURS, OURS_POSES, PARK
+from benchmarks.calibration.rivals import METHODS, OURS, OURS_POSES, OURS_SIZE_KNOWN, PARK
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
 from benchmarks.simulated.board_scenes import Motion, board_points, make_scene
@@ -144,7 +144,9 @@ def test_requirements_say_what_failed():
         SceneResult("healthy", is_healthy=True, **counts(50, 1, 0)),
         SceneResult("no turns", is_healthy=False, **counts(4, 4, 3)),
     ]
-    found = requirements({OURS: good, OURS_POSES: bad, PARK: rival}, [camera], refusals)
+    known = result(OURS_SIZE_KNOWN, [0.05], [0.5], sigma=0.05)
+    results = {OURS: good, OURS_POSES: bad, OURS_SIZE_KNOWN: known, PARK: rival}
+    found = requirements(results, [camera], refusals)
     assert [r.verdict() for r in found] == [
         *("pass", "pass", "pass", "pass", "pass"),
         *("FAIL", "FAIL", "pass", "pass", "pass"),

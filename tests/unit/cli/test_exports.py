@@ -186,7 +186,21 @@ def test_damaged_images_are_left_out_and_named(store, dextouch, tmp_path, form, 
     np.testing.assert_array_equal(again.stamps_ns("camera_head"), stamps[kept])
 
 
-def write_damaged(store, unit, damaged):
+@pytest.mark.parametrize("form", ["lerobot", "umi"])
+def test_an_episode_without_a_whole_image_does_not_stop_a_data_set(store, dextouch, tmp_path, form):
+    write_damaged(store, "jpeg", damaged=(5,))
+    write_damaged(store, "jpeg", damaged=range(21), episode_id="blind")
+    report = tmp_path / "report.json"
+    to = tmp_path / {"lerobot": "set", "umi": "set.zarr.zip"}[form]
+    words = ("export", "--format", form, "take", "blind", "--to", to, "--json", report)
+    status, out, err = dextouch(*words)
+    assert status == 0, err
+    assert "blind: left out: no image of camera_head is whole" in err
+    assert "1 episodes" in out
+    assert json.loads(report.read_text())["left_out"] == ["blind"]
+
+
+def write_damaged(store, unit, damaged, *, episode_id="take"):
     """An episode of 21 images, one a step, of which some are cut."""
     made = make_episode(num_steps=21)
     made.set_unit(unit, "camera_head")
@@ -198,7 +212,7 @@ def write_damaged(store, unit, damaged):
         encoded[index] = encoded[index][: len(encoded[index]) * 6 // 10]
     made.values["camera_head"] = encoded_values(encoded)
     made.stamps_ns["camera_head"] = made.stamps_ns["action"].copy()
-    made.write(store, episode_id="take")
+    made.write(store, episode_id=episode_id)
 
 
 def test_rerun_files_are_written(store, dextouch, tmp_path):
