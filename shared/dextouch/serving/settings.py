@@ -180,7 +180,8 @@ def _malformed(cls: type[BaseSettings], error: SettingsError) -> str:
     found = re.search(r'field "([^"]+)" from source "EnvSettingsSource"', str(error))
     if found is None:
         return str(error)
-    return f"variable {cls.model_config.get('env_prefix', '')}{found[1].upper()} is no JSON"
+    variable = cls.model_config.get("env_prefix", "") + found[1].upper()
+    return f"{found[1]}: variable {variable} is no JSON"
 
 
 def _add_argument(

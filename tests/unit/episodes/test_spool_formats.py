@@ -115,10 +115,13 @@ def test_checksums_and_the_seal_are_as_documented(path):
     assert json.loads(whole) == json.loads(plain) | {"sha256": hashlib.sha256(plain).hexdigest()}
     assert RecordingAttributes.model_validate_json(plain) == ATTRIBUTES
     # The log's first bytes, a header of 40, and seven samples of three stamps and 360 values.
+    body = (path / "batches.log").read_bytes()[8 + 40 :]
+    row = struct.pack("<QQIIIII", 8, 0, 0, 7, len(body), google_crc32c.value(body), 0)
     assert json.loads((path / "closed").read_text()) == {
         "format_version": 1,
         "num_samples": {"glove_left": 7, "camera_head": 0},
         "log_bytes": 8 + 40 + 7 * (3 * 8 + 360 * 2),
+        "records_sha256": hashlib.sha256(row).hexdigest(),
         "recording_sha256": hashlib.sha256(whole).hexdigest(),
     }
 
