@@ -1,5 +1,6 @@
 """Takes that an exception, a Ctrl-C or a full disk breaks off: what was appended is kept."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -281,6 +282,7 @@ def test_ctrl_c_while_a_log_is_closed_is_no_error_of_the_disk(store, monkeypatch
     writer = store.writer(kind="recording", attributes=take(FORCE))
     record(writer, 0, 17)
     names = {name: getattr(os, name) for name in dir(os)}
+    locked = os.fstat(writer._lock)
     with monkeypatch.context() as patch:
         fake = SimpleNamespace(**names | {"close": interrupted})
         patch.setattr("dextouch.episodes.journal.os", fake)
@@ -289,8 +291,9 @@ def test_ctrl_c_while_a_log_is_closed_is_no_error_of_the_disk(store, monkeypatch
     assert kept_numbers(store) == list(range(17))
     # The lock is free.
     assert stages(store) == []
-    with pytest.raises(OSError, match="Bad file descriptor"):
-        os.fstat(writer._lock)
+    # Its number may be that of another file by now.
+    with contextlib.suppress(OSError):
+        assert not os.path.samestat(os.fstat(writer._lock), locked)
 
 
 def test_what_is_known_at_the_end_is_kept_too(store):
