@@ -19,7 +19,12 @@ from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
 from services.episode_store.playback import playback_router
 from services.episode_store.reading import content_router
-from services.episode_store.routes import catalog_router, reviews_router, uploads_router
+from services.episode_store.routes import (
+    catalog_router,
+    idle_uploads_router,
+    reviews_router,
+    uploads_router,
+)
 from services.episode_store.settings import EpisodeStoreSettings
 from services.episode_store.trash import trash_router
 
@@ -59,6 +64,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         settings=settings,
         routers=[
             uploads_router(ingest, limits, admission, metrics),
+            idle_uploads_router(ingest, limits),
             catalog_router(catalog, max_page=settings.max_page),
             reviews_router(catalog),
             content_router(store, settings),

@@ -66,7 +66,7 @@ MAX_ATTRIBUTES_BYTES = 256 * KIB
 def uploads_router(
     ingest: Ingest, limits: StorageLimits, admission: Admission, metrics: UploadMetrics
 ) -> APIRouter:
-    """Create the routes of uploads: /v1/recordings while they come, and /v1/uploads."""
+    """Create the routes by which stations upload recordings, below /v1/recordings."""
     router = APIRouter(prefix="/v1")
 
     @router.post("/recordings", status_code=201, tags=["recordings"], dependencies=[MAY_WRITE])
@@ -138,6 +138,13 @@ def uploads_router(
     def status(recording_id: str, sender: Reader) -> RecordingStatus:
         """Status of an upload, for those who may continue it, or of a finished recording."""
         return ingest.status(recording_id, sender)
+
+    return router
+
+
+def idle_uploads_router(ingest: Ingest, limits: StorageLimits) -> APIRouter:
+    """Create the routes of unfinished uploads, below /v1/uploads."""
+    router = APIRouter(prefix="/v1")
 
     @router.get("/uploads", tags=["uploads"], dependencies=[MAY_READ])
     def listing(idle_s: Annotated[float, Query(ge=0)] = 0.0) -> UploadList:
