@@ -1,10 +1,12 @@
 """Under tests, and only there, every annotated array shape is checked at run time."""
 
 import gc
+import logging
 import os
 from pathlib import Path
 
 import pytest
+import structlog
 from hypothesis import settings
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -38,6 +40,23 @@ def pytest_collection_finish() -> None:
     """All modules stay from here on, so that the garbage collector need not visit them again."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(autouse=True)
+def _logging_is_put_back():
+    """Commands and services configure logging for their process, which tests share."""
+    from dextouch.serving.logs import QUIET  # not before the checks of shapes are installed
+
+    root = logging.getLogger()
+    loggers = [root, *(logging.getLogger(name) for name in (*QUIET, "uvicorn.error"))]
+    before = [(one, list(one.handlers), list(one.filters), one.level) for one in loggers]
+    yield
+    for one, handlers, filters, level in before:
+        one.handlers[:], one.filters[:] = handlers, filters
+        one.setLevel(level)
+    if structlog.is_configured():
+        structlog.reset_defaults()
+        structlog.contextvars.clear_contextvars()
 
 
 def _shown_names() -> set[str]:

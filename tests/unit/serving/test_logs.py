@@ -11,18 +11,12 @@ from dextouch.serving import configure_logging
 
 @pytest.fixture
 def lines(capsys):
-    """What is written to stderr, as lines; logging is put back afterwards."""
-    root = logging.getLogger()
-    handlers, level = list(root.handlers), root.level
+    """What is written to stderr, as lines."""
 
     def written() -> list[str]:
         return capsys.readouterr().err.splitlines()
 
-    yield written
-    root.handlers[:] = handlers
-    root.setLevel(level)
-    structlog.reset_defaults()
-    structlog.contextvars.clear_contextvars()
+    return written
 
 
 def test_events_and_foreign_records_are_json_lines(lines):
