@@ -9,6 +9,7 @@ from playwright.sync_api import expect
 
 from dextouch import __version__
 from dextouch.episodes import EpisodeStore
+from dextouch.schemas import RecordingStatus
 from services.acquisition.app import create_app as create_station
 from services.acquisition.settings import AcquisitionSettings
 from services.alignment import job_runner
@@ -117,11 +118,13 @@ def test_services_jobs_and_audit(page, serve_dashboard, urls, folder, worker):
 @pytest.mark.slow
 def test_spools_show_what_they_hold_and_for_how_long(page, serve, serve_dashboard, tmp_path):
     spool = tmp_path / "spool"
-    for name, extra in (("a", ()), ("b", ("uploaded.json",)), ("c", ("uploaded.json",))):
+    for name in "abc":
         (spool / name).mkdir(parents=True)
-        for file in ("recording.json", *extra):
-            (spool / name / file).write_bytes(b"{}")
+        (spool / name / "recording.json").write_bytes(b"{}")
         (spool / name / "batches.log").write_bytes(bytes(10**6))
+        if name != "a":
+            note = RecordingStatus(recording_id=name, state="finished")
+            (spool / name / "uploaded.json").write_text(note.model_dump_json())
     settings = AcquisitionSettings(
         mock=True, spool=spool, keep_uploaded_days=3, keep_uploaded_gb=200, upload_period_s=3600
     )
