@@ -49,6 +49,7 @@ from services.twin.world import TwinWorld
 CAMERAS = ("camera_head",)
 DEFAULT_MIX = "evaluator"
 MAX_LABEL = 32
+_VARIED_DRAW: Final = 103
 # How a take becomes an episode: written as it is, or by devices, drivers, recorder and alignment.
 TakePath = Literal["direct", "devices"]
 TAKE_PATHS: Final[tuple[TakePath, ...]] = get_args(TakePath)
@@ -61,9 +62,10 @@ Result = TypeVar("Result")
 class Scope:
     """Tasks, domains, images and streams to record.
 
-    Images are recorded at the grid steps (15 Hz) that are multiples of `image_every`, and at the
-    last three. Without a `path` robots are written directly and humans by devices: the actions of a
-    human take that is written directly are the joint angles of a human hand.
+    In a share `varied` of the scenes, colours, light and head camera are drawn anew. Images are
+    recorded at the grid steps (15 Hz) that are multiples of `image_every`, and at the last three.
+    Without a `path` robots are written directly and humans by devices: the actions of a human take
+    that is written directly are the joint angles of a human hand.
     """
 
     tasks: tuple[str, ...] = EVALUATED
@@ -71,6 +73,7 @@ class Scope:
     image_every: int = 1
     streams: StreamChoice = "training"
     path: TakePath | None = None
+    varied: float = 0.0
 
     def path_of(self, domain: Domain) -> TakePath:
         """The path of the takes of a domain."""
@@ -256,8 +259,9 @@ def make_training_data(
         for task in scope.tasks:
             made = TakeOptions() if policy is not None else options_of(task, seed, mix)
             options = replace(
-                made, images=CAMERAS, image_every=scope.image_every, streams=scope.streams
-            )
+                made, images=CAMERAS, image_every=scope.image_every, streams=scope.streams,
+                varied=bool(np.random.default_rng([seed, _VARIED_DRAW]).random() < scope.varied),
+            )  # fmt: skip
             orders += [
                 Order(task, domain, seed, options, store, policy, scope.path_of(domain))
                 for domain in scope.domains
@@ -350,6 +354,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--policy-arguments", type=_keywords, default={}, help=arguments)
     images = "images of every N-th step (%(default)s)"
     add("--images", type=int, default=1, metavar="N", help=images)
+    looks = "share of scenes with other colours, light and head camera (%(default)s)"
+    add("--varied", type=float, default=0.0, metavar="SHARE", help=looks)
     add("--streams", choices=STREAM_CHOICES, default="training", help="(%(default)s)")
     add("--jobs", type=int, help="processes (default: one per core)")
     add_json(parser)
@@ -362,7 +368,8 @@ def main(argv: Sequence[str]) -> int:
     seeds = range(arguments.first, arguments.first + max(0, arguments.count))
     mix = MIXES[arguments.mix].changed(miss=arguments.miss_fraction, still=arguments.still_fraction)
     tasks = named_tasks(arguments.tasks)
-    scope = Scope(tasks, arguments.domains, arguments.images, arguments.streams, arguments.path)
+    scope = Scope(tasks, arguments.domains, arguments.images, arguments.streams, arguments.path,
+                  arguments.varied)  # fmt: skip
     log_warnings()
     policy = arguments.policy and PolicyChoice.parse(arguments.policy, arguments.policy_arguments)
     counts = make_training_data(

@@ -1,6 +1,6 @@
 """Camera rendering by ray casting, deterministic and without GPU or OpenGL.
 
-Flat object colours with Lambert shading by one fixed light, and a chequered table that makes motion
+Flat object colours with Lambert shading by one light, and a chequered table that makes motion
 visible. Equal states give equal bytes.
 """
 
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from dextouch.geometry import pinhole_matrix, transform, transform_from_pose
+from services.twin.appearance import Appearance
 from services.twin.scene import Scene
 from services.twin.simulation import Simulation
 
@@ -21,11 +22,7 @@ FOVY_RAD: Final = {
     "camera_wrist_left": math.radians(80.0),
     "camera_wrist_right": math.radians(80.0),
 }
-_TO_LIGHT: Final = np.array([0.30, -0.40, 0.85]) / np.linalg.norm([0.30, -0.40, 0.85])
-_AMBIENT: Final = 0.35
-BACKGROUND: Final = np.array([0.16, 0.17, 0.20])
 _CHECKER_M: Final = 0.08
-_CHECKER_DEPTH: Final = 0.14
 _FAR_M: Final = 4.0
 # Geoms of group 4 (the sensing skin) are invisible.
 _VISIBLE_GROUPS: Final = np.array([1, 1, 1, 1, 0, 0], dtype=np.uint8)
@@ -57,7 +54,8 @@ class CameraRig:
     def __init__(self, scene: Scene, *, height_px: int, width_px: int) -> None:
         self._model = scene.model
         self.shape_px = (height_px, width_px)
-        self._colours = np.array(scene.model.geom_rgba[:, :3], dtype=np.float64)
+        own_colours = np.array(scene.model.geom_rgba[:, :3], dtype=np.float64)
+        self.own_appearance = self.appearance = Appearance.of(own_colours)
         self._table = scene.model.geom("table").id
         self.mounts = [_wrist_mount(hand.palm_sign) for hand in scene.hands]
         self.K = {
@@ -129,13 +127,14 @@ class CameraRig:
 
     def _shaded(self, eye_m: np.ndarray, rays_world: np.ndarray) -> UInt8[np.ndarray, "rays 3"]:
         hit = self._geom_ids >= 0
-        light = self._normals.reshape(-1, 3) @ _TO_LIGHT
-        brightness = _AMBIENT + (1 - _AMBIENT) * np.clip(light, 0.0, 1.0)
+        look = self.appearance
+        light = self._normals.reshape(-1, 3) @ look.to_light
+        brightness = look.ambient + (1 - look.ambient) * np.clip(light, 0.0, 1.0)
         on_table = self._geom_ids == self._table
         points = eye_m[:2] + rays_world[on_table, :2] * self._distances[on_table, None]
         cells = np.floor(points / _CHECKER_M).sum(axis=1) % 2
-        brightness[on_table] *= 1 - _CHECKER_DEPTH * cells
+        brightness[on_table] *= 1 - look.checker_depth * cells
         rgb = np.where(
-            hit[:, None], self._colours[self._geom_ids] * brightness[:, None], BACKGROUND
+            hit[:, None], look.colours[self._geom_ids] * brightness[:, None], look.background
         )
         return (np.clip(rgb, 0.0, 1.0) * 255).round().astype(np.uint8)

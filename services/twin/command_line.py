@@ -16,6 +16,7 @@ from dextouch.errors import InvalidInputError
 from services.twin.cameras import CAMERAS
 from services.twin.episodes import record, write_episode
 from services.twin.hands import DOMAINS, Domain
+from services.twin.mistakes import KINDS, Mistake
 from services.twin.motions import MOTION_KINDS, Motion
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
@@ -111,6 +112,17 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument(
         "--actions-of", type=int, metavar="SEED", help="play the actions of another seed instead"
     )
+    make.add_argument(
+        "--mistake",
+        action="append",
+        type=Mistake.parse,
+        default=[],
+        metavar="KIND=STRENGTH",
+        help=f"change the script's commands, strength 0 … 1; repeat for more: {', '.join(KINDS)}",
+    )
+    make.add_argument(
+        "--varied", action="store_true", help="vary colours, light and head camera by seed"
+    )
     make.add_argument("--cameras", nargs="*", default=list(CAMERAS), choices=CAMERAS, help="(all)")
     make.add_argument(
         "--image-every",
@@ -151,6 +163,8 @@ def _orders(arguments: argparse.Namespace) -> list[TakeOrder]:
             arguments.actions_of,
             arguments.image_every,
             arguments.streams,
+            tuple(arguments.mistake),
+            arguments.varied,
         )
         orders.append(TakeOrder(arguments.task, arguments.domain, seed, options, arguments.store))
     return orders

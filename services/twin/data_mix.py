@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from dextouch.errors import InvalidInputError
+from services.twin.mistakes import TRAINING, Mistake
 from services.twin.motions import MOTION_KINDS, Motion, MotionKind
 from services.twin.take_options import TakeOptions
 
@@ -27,6 +28,11 @@ _AT_ONCE: Final = 0.7
 # Seeds of one purpose (training, development, evaluation) form blocks of this size.
 _SEED_BLOCK: Final = 10_000
 _SUM_TOLERANCE: Final = 1e-9
+# Shares of takes with one, two, three and four mistakes, and of those with a noisy script.
+_COUNTS: Final = (0.45, 0.30, 0.15, 0.10)
+_NOISY: Final = 0.4
+# Largest strength of a single mistake, where a task succeeds about half of the time.
+STRENGTHS: Final = {"stand_bottle": 0.7}
 _HOLD: Final = TakeOptions(frozen_from_step=0)
 
 
@@ -38,7 +44,8 @@ class Mix:
     deviation, or with the levels `LADDER_M` cycled over the seeds (`ladder`). The other kinds have
     the noise of a script: `miss` has displaced objects; `frozen` stops midway and `hold` never
     starts; `retreat`, `push`, `slip` and `wander` are motions of `services.twin.motions`;
-    `other_scene` plays the actions of another seed.
+    `other_scene` plays the actions of another seed; `mistaken` has one to four of the mistakes
+    `services.twin.mistakes.TRAINING`, half of them in a script that is also noisy.
     """
 
     exact: float = 0.0
@@ -54,6 +61,7 @@ class Mix:
     slip: float = 0.0
     other_scene: float = 0.0
     wander: float = 0.0
+    mistaken: float = 0.0
 
     def __post_init__(self) -> None:
         shares = asdict(self)
@@ -92,8 +100,8 @@ class Mix:
 SCRIPTS: Final = ("exact", "fine", "medium", "coarse", "ladder")
 MIXES: Final[dict[str, Mix]] = {
     "evaluator": Mix(
-        exact=0.12, fine=0.25, coarse=0.16, ladder=0.10, miss=0.10, frozen=0.05, hold=0.04,
-        retreat=0.04, push=0.05, slip=0.04, other_scene=0.03, wander=0.02,
+        exact=0.05, fine=0.08, coarse=0.05, ladder=0.04, miss=0.04, frozen=0.02, hold=0.02,
+        retreat=0.02, push=0.02, slip=0.02, other_scene=0.02, wander=0.01, mistaken=0.61,
     ),
     "demonstrations": Mix(exact=0.28, medium=0.52, miss=0.20),
     "ladder": Mix(ladder=1.0),
@@ -123,7 +131,19 @@ def options_of(task: str, seed: int, mix: Mix) -> TakeOptions:
         return TakeOptions(noise_m, actions_of_seed=_another_seed(seed, draw))
     if kind in SCRIPTS:
         return TakeOptions(noise_m)
+    if kind == "mistaken":
+        noise_m = _noise_m("fine", seed, draw) if draw.random() < _NOISY else 0.0
+        return TakeOptions(noise_m, mistakes=mistakes_of(task, draw))
     return _with_motion(kind, noise_m, draw)
+
+
+def mistakes_of(task: str, draw: np.random.Generator) -> tuple[Mistake, ...]:
+    """One to four mistakes of the training kinds, weaker where a task forgives less."""
+    count = 1 + int(draw.choice(len(_COUNTS), p=_COUNTS))
+    kinds = draw.choice(list(TRAINING), size=count, replace=False)
+    largest = STRENGTHS.get(task, 1.0) / count**0.5
+    strengths = np.round(draw.uniform(0, largest, size=count), 3)
+    return tuple(Mistake(str(kind), float(s)) for kind, s in zip(kinds, strengths, strict=True))
 
 
 def _with_motion(kind: str, noise_m: float, draw: np.random.Generator) -> TakeOptions:

@@ -19,6 +19,9 @@ NUM_GRID_STEPS: Final = 81
 # Head motion of a person watching their hands: centimetres and degrees.
 _SWAY_M: Final = np.array([0.030, 0.025, 0.020])
 _SWAY_RAD: Final = np.array([0.050, 0.050, 0.028])
+# Spread of the head's home from take to take, where it varies.
+_HOME_M: Final = 0.030
+_HOME_RAD: Final = 0.040
 # Range of the duration of each part of a take, relative to the nominal one.
 _TEMPO: Final = (0.85, 1.15)
 # An offset of a centimetre comes with a small rotation error.
@@ -80,6 +83,16 @@ def head_sway(generator: np.random.Generator) -> Float64[np.ndarray, "81 4 4"]:
     return HEAD_HOME @ transform(
         rotation_from_vector(waves[:, 3:] * _SWAY_RAD), waves[:, :3] * _SWAY_M
     )
+
+
+def at_another_home(
+    head: Float64[np.ndarray, "81 4 4"], generator: np.random.Generator
+) -> Float64[np.ndarray, "81 4 4"]:
+    """A head motion about another home: a person of another size, a camera mounted again."""
+    turn = rotation_from_vector(generator.normal(scale=_HOME_RAD, size=3))
+    moved_head = head @ transform(turn, np.zeros(3))
+    moved_head[:, :3, 3] += generator.normal(scale=_HOME_M, size=3)
+    return moved_head
 
 
 def at_own_tempo(waypoints: Sequence[Waypoint], generator: np.random.Generator) -> list[Waypoint]:

@@ -13,6 +13,7 @@ from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.events import EventTimes
+from services.twin.mistakes import with_mistakes
 from services.twin.motions import MotionScene, with_motion
 from services.twin.recorder import GridLog, Recorder, TruthStream, action_stream
 from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID
@@ -58,7 +59,8 @@ def record(
         options: options of the take; they determine the commands unless `played` is given.
         played: actions from another source.
     """
-    plan = stage.plan(seed, noise_m=options.noise_m, miss=options.miss)
+    plan = stage.plan(seed, noise_m=options.noise_m, miss=options.miss, varied=options.varied)
+    stage.dress(seed, varied=options.varied)
     anchor = stage.start(plan)
     # Commands are converted to 67-D and back, so that the take exactly follows its
     # `action_commanded`.
@@ -100,9 +102,11 @@ def _commanded(
         Ts = transform_from_pose(pose_from_transform(np.stack(other.anchor(0).as_tuple())))
         return actions_from_poses(other, AnchorPoses(*Ts))
     commands = plan.commands
+    scene = MotionScene(stage.domain, plan.object_poses)
+    if options.mistakes:
+        commands = with_mistakes(commands, options.mistakes, scene, seed)
     if options.motion is not None:
         draw = np.random.default_rng([seed, _MOTION])
-        scene = MotionScene(stage.domain, plan.object_poses)
         commands = with_motion(commands, options.motion, scene, draw)
     actions = actions_from_poses(commands, anchor)
     if options.frozen_from_step is not None:

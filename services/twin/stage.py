@@ -10,7 +10,13 @@ from dextouch.errors import InvalidInputError
 from dextouch.geometry import transform_from_pose
 from dextouch.hands.actions import AnchorPoses, HandTrajectory
 from services.twin.cameras import CameraRig
-from services.twin.demonstrators import WaypointNoise, at_own_tempo, follow, head_sway
+from services.twin.demonstrators import (
+    WaypointNoise,
+    at_another_home,
+    at_own_tempo,
+    follow,
+    head_sway,
+)
 from services.twin.hands import Domain
 from services.twin.scene import compile_scene
 from services.twin.settings import TwinSettings
@@ -22,7 +28,7 @@ MAX_NOISE_M: Final = 0.2
 _ASIDE_M: Final = 0.13
 _SHELF_Y_M: Final = -3.0
 # Independent random streams for each purpose, so that noise does not affect the placement.
-_PLACEMENT, _NOISE, _SWAY, _MISS, _HABIT, _TEMPO = range(6)
+_PLACEMENT, _NOISE, _SWAY, _MISS, _HABIT, _TEMPO, _HOME, _LOOK = range(8)
 
 
 @dataclass(frozen=True)
@@ -56,13 +62,16 @@ class Stage:
             scene, height_px=settings.image_height_px, width_px=settings.image_width_px
         )
 
-    def plan(self, seed: int, *, noise_m: float = 0.0, miss: bool = False) -> Plan:
+    def plan(
+        self, seed: int, *, noise_m: float = 0.0, miss: bool = False, varied: bool = False
+    ) -> Plan:
         """Plan the take of a seed.
 
         Args:
             seed: 0 or more; determines placement, variations of the motion, and noise.
             noise_m: standard deviation of the demonstrator's error at each location, 0 … 0.2 m.
             miss: whether the objects are moved away, unknown to the demonstrator.
+            varied: whether the head camera's home differs from take to take.
         """
         if seed < 0 or not 0.0 <= noise_m <= MAX_NOISE_M:
             raise InvalidInputError(
@@ -78,7 +87,10 @@ class Stage:
             noise=(WaypointNoise.draw(errors, noise_m), WaypointNoise.draw(errors, noise_m)),
         )
         waypoints = at_own_tempo(waypoints, np.random.default_rng([seed, _TEMPO]))
-        commands = follow(waypoints, head_sway(np.random.default_rng([seed, _SWAY])))
+        head = head_sway(np.random.default_rng([seed, _SWAY]))
+        if varied:
+            head = at_another_home(head, np.random.default_rng([seed, _HOME]))
+        commands = follow(waypoints, head)
         if miss:
             placed = _displaced(placed, np.random.default_rng([seed, _MISS]))
         return Plan(placed, commands)
@@ -89,6 +101,14 @@ class Stage:
             command_row(plan.commands, 0), plan.object_poses, settle_s=self._settings.settle_s
         )
         return self.anchor()
+
+    def dress(self, seed: int, *, varied: bool) -> None:
+        """Give a take its appearance: that of the task, or one drawn from the seed."""
+        look, scene = self.rig.own_appearance, self.simulation.scene
+        if varied:
+            draw = np.random.default_rng([seed, _LOOK])
+            look = look.varied(draw, scene.geom_object, scene.table_geom)
+        self.rig.appearance = look
 
     def anchor(self) -> AnchorPoses:
         """Measured poses of wrists and head camera now."""

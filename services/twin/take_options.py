@@ -12,6 +12,7 @@ from dextouch.hands.actions import ACTION_DIM, check_actions
 from services.twin.cameras import CAMERAS
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.hands import Domain
+from services.twin.mistakes import Mistake
 from services.twin.motions import Motion
 
 StreamChoice = Literal["all", "training"]
@@ -26,11 +27,11 @@ class TakeOptions:
     motion stays, `images` are the cameras to record. At most one of three modifies the commands:
     `frozen_from_step` (0 … 80) freezes them from that step on (0: from the start), `motion`
     replaces the script, and `actions_of_seed` plays the demonstration of another seed, relative to
-    this take's start.
+    this take's start. `mistakes` change the commands of the script, in their order.
 
-    Cameras record at 30 Hz, or at grid steps that are multiples of `image_every` and the last
-    three. With `training`, only touch, images, actions, and object poses at grid steps are
-    recorded.
+    With `varied`, colours, light and the home of the head camera differ from take to take. Cameras
+    record at 30 Hz, or at grid steps that are multiples of `image_every` and the last three. With
+    `training`, only touch, images, actions, and object poses at grid steps are recorded.
     """
 
     noise_m: float = 0.0
@@ -41,6 +42,8 @@ class TakeOptions:
     actions_of_seed: int | None = None
     image_every: int | None = None
     streams: StreamChoice = "all"
+    mistakes: tuple[Mistake, ...] = ()
+    varied: bool = False
 
     def __post_init__(self) -> None:
         frozen = self.frozen_from_step
@@ -54,6 +57,11 @@ class TakeOptions:
             raise InvalidInputError(
                 f"twin: got frozen_from_step {frozen}, motion {self.motion} and actions_of_seed "
                 f"{self.actions_of_seed}, expected at most one of them"
+            )
+        if self.mistakes and any(change is not None for change in changes):
+            raise InvalidInputError(
+                f"twin: got mistakes {', '.join(map(str, self.mistakes))} of a script that is "
+                f"replaced ({changes}), expected one or the other"
             )
         every = self.image_every
         if every is not None and not 1 <= every < NUM_GRID_STEPS:
@@ -79,6 +87,10 @@ class TakeOptions:
             words += ["--image-every", str(self.image_every)]
         if self.streams != "all":
             words += ["--streams", self.streams]
+        for mistake in self.mistakes:
+            words += ["--mistake", str(mistake)]
+        if self.varied:
+            words.append("--varied")
         return words
 
     def figures(self) -> dict[str, float]:
@@ -90,6 +102,7 @@ class TakeOptions:
             figures[f"{self.motion.kind}_from_step"] = float(self.motion.from_step)
         if self.actions_of_seed is not None:
             figures["actions_of_seed"] = float(self.actions_of_seed)
+        figures |= {f"mistake_{one.kind}": one.strength for one in self.mistakes}
         return figures
 
 
@@ -141,6 +154,9 @@ def episode_id(
         parts.append(f"{options.motion.kind}{options.motion.from_step}")
     if options.actions_of_seed is not None:
         parts.append(f"of{options.actions_of_seed:06d}")
+    parts += [f"{one.kind}{round(1000 * one.strength)}" for one in options.mistakes]
+    if options.varied:
+        parts.append("varied")
     if played is not None:
         parts.append(f"by_{played}")
     if options.image_every is not None:

@@ -10,7 +10,8 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ClockFitError, InvalidInputError, UnknownNameError
 from services.cli import training_data
 from services.cli.training_data import PolicyChoice, Scope, make_training_data
-from services.twin.data_mix import MIXES, Mix, options_of
+from services.twin.data_mix import MIXES, STRENGTHS, Mix, options_of
+from services.twin.mistakes import TRAINING
 
 
 def drawn(mix, seeds=2000, task="stand_bottle"):
@@ -20,6 +21,8 @@ def drawn(mix, seeds=2000, task="stand_bottle"):
 def kind_of(options):
     if options.miss:
         return "miss"
+    if options.mistakes:
+        return "mistaken"
     if options.motion is not None:
         return options.motion.kind
     if options.actions_of_seed is not None:
@@ -40,8 +43,8 @@ def test_the_evaluators_mix_has_what_decides():
     options = drawn(MIXES["evaluator"])
     shares = {kind: count / 2000 for kind, count in Counter(map(kind_of, options)).items()}
     expected = {
-        "script": 0.63, "miss": 0.10, "frozen": 0.05, "hold": 0.04, "retreat": 0.04,
-        "push": 0.05, "slip": 0.04, "other_scene": 0.03, "wander": 0.02,
+        "script": 0.22, "miss": 0.04, "frozen": 0.02, "hold": 0.02, "retreat": 0.02,
+        "push": 0.02, "slip": 0.02, "other_scene": 0.02, "wander": 0.01, "mistaken": 0.61,
     }  # fmt: skip
     assert set(shares) == set(expected)
     for kind, share in expected.items():
@@ -49,10 +52,13 @@ def test_the_evaluators_mix_has_what_decides():
         assert abs(shares[kind] - share) < 3 * (share * (1 - share) / 2000) ** 0.5, kind
     scripts_m = np.array([o.noise_m for o in options if kind_of(o) == "script"])
     assert 0.15 < (scripts_m == 0).mean() < 0.27
-    assert 0.45 < ((scripts_m > 0) & (scripts_m <= 0.012)).mean() < 0.65
+    assert 0.40 < ((scripts_m > 0) & (scripts_m <= 0.012)).mean() < 0.65
     assert 0.035 < scripts_m.max() <= 0.040
     steps = [o.motion.from_step for o in options if kind_of(o) == "slip"]
     assert 18 <= min(steps) < max(steps) <= 50
+    mistakes = [m for o in options for m in o.mistakes]
+    assert {m.kind for m in mistakes} == set(TRAINING)
+    assert max(m.strength for m in mistakes) <= STRENGTHS["stand_bottle"]
     assert all(o.actions_of_seed < 10_000 for o in options if kind_of(o) == "other_scene")
 
 
