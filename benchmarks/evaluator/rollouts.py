@@ -123,10 +123,19 @@ class PolicyRollout:
         if path.is_file():
             kept = read_arrays(path)
             poses, doubted = kept.pop("object_poses", None), str(kept.pop("doubted"))
-            return ImaginedRollout(**kept, object_poses=poses, doubted=doubted or None)
+            own = kept.pop("success_probability", None)
+            return ImaginedRollout(
+                **kept,
+                object_poses=poses,
+                doubted=doubted or None,
+                success_probability=None if own is None else float(own),
+            )
         imagined = play_in_imagination(world, self._first, self._actor, self._for_policy)
         arrays = {n: a for n, a in vars(imagined).items() if isinstance(a, np.ndarray)}
-        write_arrays(path, arrays | {"doubted": np.array(imagined.doubted or "")})
+        arrays["doubted"] = np.array(imagined.doubted or "")
+        if imagined.success_probability is not None:
+            arrays["success_probability"] = np.array(imagined.success_probability)
+        write_arrays(path, arrays)
         return imagined
 
     def _path(self, kind: str, *digests: str) -> Path:
@@ -164,6 +173,7 @@ class PolicyRollout:
             imagined.object_poses,
             imagined=True,
             doubted=imagined.doubted,
+            success_probability=imagined.success_probability,
         )
 
     def _context_row(self, member: Member) -> Row:

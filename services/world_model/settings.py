@@ -212,7 +212,7 @@ class AdaptSettings(RunSettings):
 class ReaderSettings(FrozenModel):
     """Training of start readers."""
 
-    num_steps: NumSteps = 4000
+    num_steps: NumSteps = 10000
     batch: Batch = 32
     learning_rate: LearningRate = 2e-3
     ema_decay: AverageDecay = 0.995
@@ -235,7 +235,7 @@ class CoreLossWeights(FrozenModel):
 class CoreSettings(FrozenModel):
     """Training of recurrent cores."""
 
-    num_steps: NumSteps = 6500
+    num_steps: NumSteps = 5000
     batch: Batch = 64
     learning_rate: LearningRate = 2e-3
     weight_decay: WeightDecay = 0.05
@@ -248,13 +248,10 @@ class CoreSettings(FrozenModel):
         default=0.04, ge=0, le=1, description="share of examples with the hands held still"
     )
     pose_noise_m: float = Field(
-        default=0.0025, ge=0, description="noise on ground-truth start poses"
+        default=0.012, ge=0, description="largest noise on ground-truth start poses"
     )
     weights: CoreLossWeights = Field(
         default=CoreLossWeights(), description="weights of the training targets"
-    )
-    bfloat16: bool | None = Field(
-        default=None, description="train in bfloat16; default: if that is faster here"
     )
 
 

@@ -29,6 +29,7 @@ from dextouch.schemas import (
     WorldDescription,
 )
 from dextouch.worlds import StartedRollout, SteppedRollout
+from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT
 from services.world_model.dynamics.hand_motion import hand_motion
 from services.world_model.dynamics.memory import (
@@ -37,7 +38,6 @@ from services.world_model.dynamics.memory import (
 )
 from services.world_model.dynamics.model import (
     PRESENCE_THRESHOLD,
-    Commands,
     ImaginedSteps,
     mean_start,
     pad_means_kpa,
@@ -298,11 +298,14 @@ class StateWorld:
         elif distance > bounds.latent_distance:
             times = distance / bounds.latent_distance
             reason = f"hands are {times:.1f} times as far from training as allowed"
+        success = steps.success[:, index, -1]
         return Doubt(
             disagreement=disagreement_m,
             distance=distance,
             outside=reason is not None,
             reason=reason,
+            success_probability=float(success.logit(1e-6).mean().sigmoid()),
+            success_spread=float(success.max() - success.min()),
         )
 
     def _poses(self, objects: ObjectPoses, task: str) -> Float32[np.ndarray, "n objects 7"]:

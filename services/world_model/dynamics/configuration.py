@@ -25,7 +25,6 @@ class DynamicsConfig(FrozenModel):
     reader_channels: int = Field(default=32, ge=8, le=256)
     reader_keypoints: int = Field(default=40, ge=4, le=256)
     width: int = Field(default=192, ge=8, le=1024)
-    num_layers: int = Field(default=2, ge=1, le=8)
     touch_channels: int = Field(default=96, ge=4, le=320)
 
     @model_validator(mode="after")

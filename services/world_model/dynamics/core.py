@@ -1,32 +1,46 @@
 """Recurrent core: predicts object motion and touch from commanded hand motion.
 
-A gated recurrent network (Cho et al. 2014) at 3.75 Hz. Its hidden state is the only memory that a
-rollout carries from one action chunk to the next, and it is bounded by construction (every unit
-stays within −1 … 1).
+A gated recurrent network (Cho et al. 2014) at 3.75 Hz that knows no tasks. Its inputs are the
+distances of hand points to the surface of every object at its predicted pose (`features`), so that
+predictions feed back; objects are described by their size and whether they move at all. An object
+moves with the left hand, with the right hand, or by itself, as three gates say.
+
+Hidden units stay within −1 … 1 by construction, and predicted positions within reach, so that what
+a rollout carries from one chunk to the next is bounded.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor, nn
+from torch.nn import functional
 
 from dextouch.tactile.layout import NUM_TAXELS
+from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import (
     MAX_OBJECTS,
     STEPS_PER_LATENT,
     DynamicsConfig,
 )
-from services.world_model.dynamics.features import NUM_FEATURES, compressed
-from services.world_model.dynamics.objects import ObjectPoses
+from services.world_model.dynamics.features import SLOT_SIZE, compressed, slot_features
+from services.world_model.dynamics.hand_motion import NUM_POINTS
+from services.world_model.dynamics.objects import MAX_DISTANCE_M, ObjectPoses, rotations
 
 NUM_PADS = 12
 # The contact of a hand's taxels is modelled as a mixture of this many patterns.
 NUM_PATTERNS = 48
-# Displacements from the start are predicted in this unit.
+# Predicted motion of an object by itself in one latent step, per unit of output.
 MOVE_M = 0.05
-MAX_DEVIATION = 5.0
-_OBJECT_SIZE = MAX_OBJECTS * 10
+_TURN = 0.3
+_SIDES = 2
+_SLOT_WIDTH, _HAND_WIDTH = 64, 96
+# Of an object: size (6), movability, presence, uncertainty, height, and way from the start (3).
+_ABOUT_SIZE = 6 + 1 + 1 + 1 + 1 + 3
+# Joints, wrist axes, heights of the points at two looks, wrist velocity (twice scaled), side.
+_OWN_SIZE = 20 + 6 + 2 * NUM_POINTS + 2 * 3 + 1
+# At first, objects move with no hand.
+_BY_ITSELF = 2.0
 
 
 @dataclass(frozen=True)
@@ -34,14 +48,42 @@ class SceneStart:
     """Inputs of the core at the first step, besides the commands.
 
     `touch` holds the latents of both hands, `pads_kpa` the mean pressures of the twelve pads (thumb
-    … little, palm; left, right); `commanded` is 1 for commanded actions and 0 for measured ones.
+    … little, palm; left, right); `sd_m` is how uncertain each object's position is, on each axis of
+    the table; `commanded` is 1 for commanded actions and 0 for measured ones.
+    `task` selects the objects' boxes.
     """
 
     objects: ObjectPoses
+    sd_m: Float32[Tensor, "batch objects"]
     touch: Float32[Tensor, "batch 2 channels"]
     pads_kpa: Float32[Tensor, "batch 12"]
     task: Int64[Tensor, " batch"]
     commanded: Float32[Tensor, " batch"]
+
+
+@dataclass(frozen=True)
+class CoreState:
+    """What a core carries from one latent step to the next, per entry.
+
+    The hidden units, the objects' predicted poses (`axes` orthonormal), and the wrists' last
+    position and axes.
+    """
+
+    hidden: Float32[Tensor, "batch width"]
+    position_m: Float32[Tensor, "batch objects 3"]
+    axes: Float32[Tensor, "batch objects 2 3"]
+    wrist_m: Float32[Tensor, "batch 2 3"]
+    wrist_axes: Float32[Tensor, "batch 2 6"]
+
+    def where(self, chosen: Bool[Tensor, " batch"], other: "CoreState") -> "CoreState":
+        """This state where chosen, another one elsewhere."""
+
+        def either(name: str) -> Tensor:
+            mine: Tensor = getattr(self, name)
+            shape = (-1, *[1] * (mine.ndim - 1))
+            return torch.where(chosen.view(shape), mine, getattr(other, name))
+
+        return CoreState(**{one.name: either(one.name) for one in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -50,8 +92,7 @@ class SceneFuture:
 
     `touch`, `pattern` (mapped by `RecurrentCore.taxels` to contact log odds of each taxel) and
     `contact` (contact log odds of each pad) cover the four steps that end at the latent; `success`
-    holds the log odds that the task is done at it. `contact` and `success` are training targets
-    only.
+    holds the log odds that the task is done at the end, as seen at the latent.
     """
 
     objects: ObjectPoses
@@ -62,104 +103,230 @@ class SceneFuture:
 
 
 class RecurrentCore(nn.Module):
-    """Predicts object poses and touch from command features and a start.
+    """Predicts object poses and touch from commands and a start.
 
     Args:
         config: configuration of the dynamics model.
     """
 
-    feature_mean: Tensor
-    feature_std: Tensor
+    boxes_m: Tensor
+    movable: Tensor
+    lowest: Tensor
+    highest: Tensor
 
     def __init__(self, config: DynamicsConfig) -> None:
         super().__init__()
         self.config = config
         width, channels = config.width, config.touch_channels
-        self.register_buffer("feature_mean", torch.zeros(len(config.tasks), NUM_FEATURES))
-        self.register_buffer("feature_std", torch.ones(len(config.tasks), NUM_FEATURES))
-        static = _OBJECT_SIZE + NUM_PADS + len(config.tasks) + 1
-        self.enter = nn.Sequential(
-            nn.Linear(NUM_FEATURES + static, width),
-            nn.LayerNorm(width),
-            nn.GELU(),
-            nn.Linear(width, width),
-            nn.GELU(),
+        # Not weights: what the objects of each task are.
+        tasks = len(config.tasks)
+        self.register_buffer("boxes_m", torch.zeros(tasks, MAX_OBJECTS, 6))
+        self.register_buffer("movable", torch.zeros(tasks, MAX_OBJECTS))
+        self.register_buffer("lowest", torch.full((_OWN_SIZE,), -10.0))
+        self.register_buffer("highest", torch.full((_OWN_SIZE,), 10.0))
+        self.slot = nn.Sequential(
+            nn.Linear(SLOT_SIZE + _ABOUT_SIZE, 128), nn.GELU(),
+            nn.Linear(128, _SLOT_WIDTH), nn.GELU(),
+        )  # fmt: skip
+        self.hand = nn.Sequential(nn.Linear(_SLOT_WIDTH + _OWN_SIZE, _HAND_WIDTH), nn.GELU())
+        self.mix = nn.Sequential(
+            nn.Linear(_SIDES * _HAND_WIDTH + 1, width), nn.LayerNorm(width), nn.GELU()
         )
         self.begin = nn.Sequential(
-            nn.Linear(static + 2 * channels, width),
-            nn.GELU(),
-            nn.Linear(width, config.num_layers * width),
-            nn.Tanh(),
-        )
-        self.memory = nn.GRU(width, width, num_layers=config.num_layers, batch_first=True)
+            nn.Linear(NUM_PADS + _SIDES * channels + 1, width), nn.GELU(),
+            nn.Linear(width, width), nn.Tanh(),
+        )  # fmt: skip
+        self.memory = nn.GRUCell(width, width)
         self.dropout = nn.Dropout(0.1)
-        self.objects = nn.Linear(width, MAX_OBJECTS * 9)
-        self.touch = nn.Linear(width, STEPS_PER_LATENT * 2 * channels)
-        self.contact = nn.Linear(width, STEPS_PER_LATENT * NUM_PADS)
-        self.pattern = nn.Linear(width, STEPS_PER_LATENT * 2 * NUM_PATTERNS)
+        self.objects = nn.Sequential(
+            nn.Linear(width + _SIDES * _SLOT_WIDTH + _ABOUT_SIZE + 6, 128), nn.GELU()
+        )
+        self.feel = nn.Sequential(
+            nn.Linear(width + _HAND_WIDTH + 1, 160), nn.GELU(), nn.Linear(160, 160), nn.GELU()
+        )
+        self.touch = nn.Linear(160, STEPS_PER_LATENT * channels)
+        self.contact = nn.Linear(160, STEPS_PER_LATENT * (NUM_PADS // _SIDES))
+        self.pattern = nn.Linear(160, STEPS_PER_LATENT * NUM_PATTERNS)
         self.taxels = nn.Linear(NUM_PATTERNS, NUM_TAXELS)
-        self.success = nn.Sequential(nn.Linear(width, 64), nn.GELU(), nn.Linear(64, 1))
+        self.success = nn.Sequential(
+            nn.Linear(width + MAX_OBJECTS * (_ABOUT_SIZE + 6 + 3 + 3), 128), nn.GELU(),
+            nn.Dropout(0.2), nn.Linear(128, 1),
+        )  # fmt: skip
+        self.motion = nn.Linear(128, 3 + 3 + 6)
+        nn.init.zeros_(self.motion.weight)
+        with torch.no_grad():
+            self.motion.bias.copy_(torch.tensor([0.0, 0.0, _BY_ITSELF, *[0.0] * 9]))
 
-    def first_state(self, start: SceneStart) -> Float32[Tensor, "layers batch width"]:
-        """The hidden state before the first step."""
-        static = torch.cat([self._static(start), start.touch.flatten(1)], dim=1)
-        state = self.begin(static).unflatten(1, (self.config.num_layers, self.config.width))
-        return state.transpose(0, 1).contiguous()
-
-    def forward(
-        self,
-        features: Float32[Tensor, "batch latents features"],
-        start: SceneStart,
-        state: Float32[Tensor, "layers batch width"],
-    ) -> tuple[SceneFuture, Float32[Tensor, "layers batch width"]]:
-        """Predictions for every latent, and the hidden state after the last one.
+    @torch.no_grad()
+    def distance(
+        self, commands: Commands, before_m: Float32[Tensor, "batch 2 3"]
+    ) -> Float32[Tensor, "batch latents"]:
+        """Mean excess of the hands' own features over their range in training; 0 inside it.
 
         Args:
-            features: from `command_features`, relative to the objects of `start`.
+            commands: of the next latents.
+            before_m: the wrists' positions before them.
+        """
+        wrist_m = torch.cat([before_m[:, None], commands.points_m[:, :, -1, :, 0]], dim=1)
+        own = own_features(commands, wrist_m)
+        beyond = (own - self.highest).clamp_min(0.0) + (self.lowest - own).clamp_min(0.0)
+        return beyond.mean((2, 3))
+
+    def first_state(self, start: SceneStart, standing: Commands) -> CoreState:
+        """The state before the first step, with the measured hands as one latent step."""
+        known = [
+            compressed(start.pads_kpa * 1e-2),
+            start.touch.flatten(1),
+            start.commanded[:, None],
+        ]
+        return CoreState(
+            self.begin(torch.cat(known, dim=1)),
+            start.objects.position_m,
+            rotations(start.objects.axes)[..., [2, 0]].transpose(-1, -2),
+            standing.points_m[:, -1, -1, :, 0],
+            standing.axes[:, -1],
+        )
+
+    def forward(
+        self, commands: Commands, start: SceneStart, state: CoreState
+    ) -> tuple[SceneFuture, CoreState]:
+        """Predictions for every latent, and the state after the last one.
+
+        Args:
+            commands: of the next latents.
             start: start of the rollout, the same for all its chunks.
             state: from `first_state` or from the previous chunk.
         """
-        scaled = self.scaled(features, start.task).clamp(-MAX_DEVIATION, MAX_DEVIATION)
-        static = self._static(start)[:, None].expand(-1, features.shape[1], -1)
-        entered = self.dropout(self.enter(torch.cat([scaled, static], dim=-1)))
-        hidden, state = self.memory(entered, state)
-        return self._decoded(hidden, start), state
+        # Slots that no entry of the batch uses need no computation.
+        counts = torch.tensor(self.config.num_objects)[start.task]
+        used = int(counts.max())
+        there = start.objects.present * (torch.arange(MAX_OBJECTS) < counts[:, None])
+        present = there[:, :used]
+        first_m = start.objects.position_m[:, :used]
+        box = self.boxes_m[start.task, :used]
+        moves = self.movable[start.task, :used] * present
+        doubt = 5.0 * compressed(start.sd_m[:, :used])
+        known = torch.cat([box * 10.0, torch.stack([moves, present, doubt], dim=-1)], dim=-1)
+        wrist_m = torch.cat([state.wrist_m[:, None], commands.points_m[:, :, -1, :, 0]], dim=1)
+        R = _rotation(torch.cat([state.wrist_axes[:, None], commands.axes], dim=1))
+        turn = R[:, 1:] @ R[:, :-1].transpose(-1, -2)
+        own = own_features(commands, wrist_m)
+        hidden = state.hidden
+        position, R_object = state.position_m[:, :used], rotations(state.axes[:, :used])
+        steps: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]] = []
+        for latent in range(len(commands)):
+            height, way = compressed(position[..., 2:]), (position - first_m) * 5.0
+            about = torch.cat([known, height, way], dim=-1)
+            seen = slot_features(commands.points_m[:, latent], position, R_object, box)
+            each = about[:, None].expand(-1, _SIDES, -1, -1)
+            slots = self.slot(torch.cat([seen, each], dim=-1)) * present[:, None, :, None]
+            hands = self.hand(torch.cat([slots.sum(2), own[:, latent]], dim=-1))
+            mixed = self.mix(torch.cat([hands.flatten(1), start.commanded[:, None]], dim=1))
+            hidden = self.memory(self.dropout(mixed), hidden)
+            near = torch.cat(
+                [
+                    hidden[:, None].expand(-1, used, -1),
+                    slots.transpose(1, 2).flatten(2),
+                    about,
+                    R_object[..., 2],
+                    R_object[..., 0],
+                ],
+                dim=-1,
+            )
+            position, R_object = _moved(
+                (position, R_object),
+                self.motion(self.objects(near)),
+                moves,
+                (wrist_m[:, latent], wrist_m[:, latent + 1], turn[:, latent]),
+            )
+            steps.append((hidden, hands, position, R_object, about))
+        stacked = [torch.stack(parts, dim=1) for parts in zip(*steps, strict=True)]
+        future = self._decoded(stacked, there)
+        objects = future.objects
+        last = CoreState(
+            hidden,
+            objects.position_m[:, -1],
+            objects.axes[:, -1],
+            wrist_m[:, -1],
+            commands.axes[:, -1],
+        )
+        return future, last
 
-    def scaled(
-        self, features: Float32[Tensor, "batch latents features"], task: Int64[Tensor, " batch"]
-    ) -> Float32[Tensor, "batch latents features"]:
-        """Features standardized with the mean and deviation of their task.
-
-        Tasks hold the hands in different regions: with statistics shared by all tasks, the
-        millimetres that decide success would be too small to learn from.
-        """
-        return (features - self.feature_mean[task][:, None]) / self.feature_std[task][:, None]
-
-    def _static(self, start: SceneStart) -> Float32[Tensor, "batch static"]:
-        objects = start.objects
-        position = objects.position_m * 5.0 * objects.present[..., None]
-        parts = [
-            position.flatten(1),
-            objects.axes.flatten(1),
-            objects.present,
-            compressed(start.pads_kpa * 1e-2),
-            nn.functional.one_hot(start.task, len(self.config.tasks)).float(),
-            start.commanded[:, None],
-        ]
-        return torch.cat(parts, dim=1)
-
-    def _decoded(
-        self, hidden: Float32[Tensor, "batch latents width"], start: SceneStart
-    ) -> SceneFuture:
-        outputs = self.objects(hidden).unflatten(-1, (MAX_OBJECTS, 3, 3))
-        position = start.objects.position_m[:, None] + MOVE_M * outputs[..., 0, :]
-        present = start.objects.present[:, None].expand(-1, hidden.shape[1], -1)
-        axes = start.objects.axes[:, None] + outputs[..., 1:, :]
-        steps = (STEPS_PER_LATENT, 2, self.config.touch_channels)
+    def _decoded(self, steps: list[Tensor], there: Float32[Tensor, "batch objects"]) -> SceneFuture:
+        hidden, hands, position, R_object, about = steps
+        axes = torch.stack([R_object[..., 2], R_object[..., 0]], dim=-2)
+        empty = MAX_OBJECTS - position.shape[2]
+        position = functional.pad(position, (0, 0, 0, empty))
+        axes = functional.pad(axes, (0, 0, 0, 0, 0, empty))
+        about = functional.pad(about, (0, 0, 0, empty))
+        side = torch.tensor([-1.0, 1.0])[:, None].expand(*hands.shape[:-1], 1)
+        each = hidden[:, :, None].expand(-1, -1, _SIDES, -1)
+        felt = self.feel(torch.cat([each, hands, side], dim=-1))
+        pads = self.contact(felt).unflatten(-1, (STEPS_PER_LATENT, NUM_PADS // _SIDES))
+        touch = self.touch(felt).unflatten(-1, (STEPS_PER_LATENT, self.config.touch_channels))
+        pattern = self.pattern(felt).unflatten(-1, (STEPS_PER_LATENT, NUM_PATTERNS))
+        present = there[:, None].expand(-1, hidden.shape[1], -1)
+        ends = _ending_features(position, axes, about, present)
         return SceneFuture(
             ObjectPoses(position, axes, present),
-            self.touch(hidden).unflatten(-1, steps),
-            self.contact(hidden).unflatten(-1, (STEPS_PER_LATENT, NUM_PADS)),
-            self.pattern(hidden).unflatten(-1, (STEPS_PER_LATENT, 2, NUM_PATTERNS)),
-            self.success(hidden)[..., 0],
+            touch.transpose(2, 3),
+            pads.transpose(2, 3).flatten(3),
+            pattern.transpose(2, 3),
+            self.success(torch.cat([hidden, ends], dim=-1))[..., 0],
         )
+
+
+def own_features(
+    commands: Commands, wrist_m: Float32[Tensor, "batch following 2 3"]
+) -> Float32[Tensor, "batch latents 2 own"]:
+    """What is known of each hand without objects."""
+    velocity = wrist_m[:, 1:] - wrist_m[:, :-1]
+    heights = compressed(commands.points_m[..., 2]).transpose(2, 3).flatten(3)
+    side = torch.tensor([-1.0, 1.0])[:, None].expand(*velocity.shape[:-1], 1)
+    parts = [commands.joints_rad, commands.axes, heights, 20 * velocity, compressed(velocity), side]
+    return torch.cat(parts, dim=-1)
+
+
+def _rotation(columns: Float32[Tensor, "*batch 6"]) -> Float32[Tensor, "*batch 3 3"]:
+    """R from its first two columns."""
+    x, y = columns[..., :3], columns[..., 3:]
+    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
+
+
+def _moved(
+    poses: tuple[Tensor, Tensor],
+    output: Float32[Tensor, "batch objects outputs"],
+    moves: Float32[Tensor, "batch objects"],
+    wrists: tuple[Tensor, Tensor, Tensor],
+) -> tuple[Tensor, Tensor]:
+    """Positions and rotations after a latent step: with the hands as the gates say, and by itself.
+
+    Rotations are blended as matrices and made orthonormal again.
+    """
+    position, R = poses
+    before_m, after_m, turn = wrists
+    share = output[..., :3].softmax(-1)[..., :2].transpose(1, 2)[..., None]
+    arm = position[:, None] - before_m[:, :, None]
+    with_hands = torch.einsum("bhij,bhsj->bhsi", turn, arm) + after_m[:, :, None]
+    step = (share * (with_hands - position[:, None])).sum(1) + MOVE_M * output[..., 3:6]
+    moved = position + moves[..., None] * step
+    turned = torch.einsum("bhij,bsjk->bhsik", turn, R)
+    change = (share[..., None] * (turned - R[:, None])).sum(1)
+    own = _TURN * output[..., 6:12]
+    z = functional.normalize(R[..., 2] + moves[..., None] * (change[..., 2] + own[..., :3]), dim=-1)
+    x = R[..., 0] + moves[..., None] * (change[..., 0] + own[..., 3:])
+    x = functional.normalize(x - z * (x * z).sum(-1, keepdim=True), dim=-1)
+    after = torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
+    return moved.clamp(-MAX_DISTANCE_M, MAX_DISTANCE_M), after
+
+
+def _ending_features(
+    position: Float32[Tensor, "batch latents objects 3"],
+    axes: Float32[Tensor, "batch latents objects 2 3"],
+    about: Float32[Tensor, "batch latents objects size"],
+    present: Float32[Tensor, "batch latents objects"],
+) -> Float32[Tensor, "batch latents features"]:
+    """Poses of all objects, and of each relative to the next one."""
+    apart = compressed(position - position.roll(1, dims=2)) * present.roll(1, dims=2)[..., None]
+    each = torch.cat([about, axes.flatten(3), compressed(position), apart], dim=-1)
+    return (each * present[..., None]).flatten(2)

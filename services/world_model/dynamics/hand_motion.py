@@ -11,19 +11,20 @@ from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, AnchorPoses, poses
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile.layout import SIDES
 
-# The wrist and five fingertips of each hand.
-NUM_POINTS: Final = 6
+# Of each hand: the wrist, five fingertips, five PIP joints, and the middle of the palm.
+NUM_POINTS: Final = 12
 
 
 @dataclass(frozen=True)
 class HandMotion:
     """Both hands over n steps in the world frame, left before right.
 
-    `points_m` are the wrist and thumb … little fingertip; `axes` the first two columns of
+    `points_m` are the wrist, thumb … little fingertip, their PIP joints, and a point halfway
+    between the wrist and the knuckles; `axes` the first two columns of
     R_world_wrist; `Ts_world_camera` the head camera's poses.
     """
 
-    points_m: Float32[np.ndarray, "n 2 6 3"]
+    points_m: Float32[np.ndarray, "n 2 12 3"]
     axes: Float32[np.ndarray, "n 2 6"]
     joints_rad: Float32[np.ndarray, "n 2 20"]
     Ts_world_camera: Float64[np.ndarray, "n 4 4"]
@@ -62,11 +63,13 @@ def hand_motion(
     poses = poses_from_actions(actions, anchor, validated=validated)
     Ts = np.stack([poses.Ts_world_wrist_left, poses.Ts_world_wrist_right], axis=1)
     joints = np.stack([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1)
-    tips = np.stack(
-        [_hand(side).fingertips_m(joints[:, index]) for index, side in enumerate(SIDES)], axis=1
+    chains = np.stack(
+        [_hand(side).chain_points_m(joints[:, index]) for index, side in enumerate(SIDES)], axis=1
     )
+    knuckles, pips, tips = chains[..., 0, :], chains[..., 1, :], chains[..., 3, :]
+    palm = 0.5 * knuckles[:, :, 1:].mean(axis=2, keepdims=True)
     R = Ts[..., :3, :3]
-    points = np.concatenate([np.zeros_like(tips[:, :, :1]), tips], axis=2)
+    points = np.concatenate([np.zeros_like(palm), tips, pips, palm], axis=2)
     points = points @ np.swapaxes(R, -1, -2) + Ts[:, :, None, :3, 3]
     axes = np.concatenate([R[..., 0], R[..., 1]], axis=-1)
     return HandMotion(

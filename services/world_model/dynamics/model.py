@@ -13,16 +13,15 @@ from torch import Tensor, nn
 
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import split_pads
+from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT, DynamicsConfig
 from services.world_model.dynamics.core import (
-    MAX_DEVIATION,
     NUM_PADS,
+    CoreState,
     RecurrentCore,
     SceneFuture,
     SceneStart,
 )
-from services.world_model.dynamics.features import LOOKS, command_features
-from services.world_model.dynamics.hand_motion import HandMotion
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import FirstStep, StartReader
 from services.world_model.dynamics.stillness import REST_LATENTS, stillness
@@ -43,56 +42,24 @@ def pad_means_kpa(tactile_kpa: Float32[np.ndarray, "*batch 2 320"]) -> np.ndarra
 
 
 @dataclass(frozen=True)
-class Commands:
-    """Motion of both hands at the sampled steps of each latent."""
-
-    points_m: Float32[Tensor, "batch latents looks 2 6 3"]
-    axes: Float32[Tensor, "batch latents 2 6"]
-    joints_rad: Float32[Tensor, "batch latents 2 20"]
-
-    def __len__(self) -> int:
-        return self.points_m.shape[1]
-
-    def __getitem__(self, latents: slice) -> "Commands":
-        """Select latent steps."""
-        return Commands(
-            self.points_m[:, latents], self.axes[:, latents], self.joints_rad[:, latents]
-        )
-
-    @classmethod
-    def of(cls, motions: list[HandMotion]) -> "Commands":
-        """Commands of a batch: for each entry, the hand motion over the next 4k steps."""
-        looks = np.arange(0, len(motions[0]), STEPS_PER_LATENT)[:, None] + np.array(LOOKS) - 1
-        ends = looks[:, -1]
-        return cls(
-            torch.from_numpy(np.stack([motion.points_m[looks] for motion in motions])),
-            torch.from_numpy(np.stack([motion.axes[ends] for motion in motions])),
-            torch.from_numpy(np.stack([motion.joints_rad[ends] for motion in motions])),
-        )
-
-    @classmethod
-    def standing(cls, motions: list[HandMotion]) -> "Commands":
-        """The single latent step, with resting hands, that starts a rollout (one step each)."""
-        return cls.of([motion[np.zeros(STEPS_PER_LATENT, dtype=np.int64)] for motion in motions])
-
-
-@dataclass(frozen=True)
 class SceneMemory:
     """State of the dynamics that a rollout carries from one chunk to the next.
 
-    `start` holds objects and touch at the first step for every member, `hidden` the hidden states
-    of the cores, `poses` the current object poses (mean over members), `disagreement_m` the
-    ensemble disagreement about them, `points_m` the hand points when they last moved, and
+    `start` holds objects and touch at the first step for every member, `states` the states of the
+    cores, `poses` the current object poses (mean over members), `disagreement_m` the
+    ensemble disagreement about them, `success` the members' probability that the task is done at
+    the end, `points_m` the hand points when they last moved, and
     `num_still` the number of latent steps since then (at least `REST_LATENTS` from the start on
     for hands that touch nothing).
     """
 
     start: tuple[SceneStart, ...]
-    hidden: Float32[Tensor, "members layers batch width"]
+    states: tuple[CoreState, ...]
     poses: ObjectPoses
     disagreement_m: Float32[Tensor, " batch"]
     tactile_kpa: Float32[Tensor, "batch 2 320"]
-    points_m: Float32[Tensor, "batch 2 6 3"]
+    success: Float32[Tensor, "members batch"]
+    points_m: Float32[Tensor, "batch 2 points 3"]
     num_still: Int64[Tensor, " batch"]
 
 
@@ -101,14 +68,16 @@ class ImaginedSteps:
     """Predictions of the ensemble for the next 4k steps and the k latent steps they form.
 
     `disagreement_m` is the largest standard deviation over members of an object's position;
-    `distance` is how far command features lie outside the range of training (0: inside); `moves`
-    marks latents in which hands move, `at_rest` those in which nothing moves any more.
+    `distance` is how far the hands' motion lies outside the range of training (0: inside);
+    `success` is the probability of every member that the task is done at the end; `moves` marks
+    latents in which hands move, `at_rest` those in which nothing moves any more.
     """
 
     poses: ObjectPoses
     tactile_kpa: Float32[Tensor, "batch steps 2 320"]
     disagreement_m: Float32[Tensor, "batch latents"]
     distance: Float32[Tensor, "batch latents"]
+    success: Float32[Tensor, "members batch latents"]
     moves: Bool[Tensor, "batch latents"]
     at_rest: Bool[Tensor, "batch latents"]
 
@@ -154,21 +123,23 @@ class DynamicsModel(nn.Module):
             standing: the measured hands, from `Commands.standing`.
             commanded: 1 if the rollout's actions are commanded, 0 if they are measured.
         """
-        starts, states = [], []
+        starts, states, success = [], [], []
         touch = self.codec.encode(tactile_kpa)
         for member in self._members():
-            objects = member.reader(first)
-            start = SceneStart(objects, touch, first.pads_kpa, first.task, commanded)
-            features = _features(standing, objects)
-            _, state = member.core(features, start, member.core.first_state(start))
+            reading = member.reader(first)
+            seen = (reading.objects, reading.sd_m)
+            start = SceneStart(*seen, touch, first.pads_kpa, first.task, commanded)
+            future, state = member.core(standing, start, member.core.first_state(start, standing))
             starts.append(start)
             states.append(state)
+            success.append(future.success[:, -1].sigmoid())
         return SceneMemory(
             start=tuple(starts),
-            hidden=torch.stack(states),
+            states=tuple(states),
             poses=_mean([start.objects for start in starts]),
             disagreement_m=_spread_m([start.objects for start in starts]),
             tactile_kpa=torch.minimum(tactile_kpa, self.codec.peak_kpa),
+            success=torch.stack(success),
             points_m=standing.points_m[:, -1, -1],
             num_still=REST_LATENTS * (tactile_kpa.amax((1, 2)) < FREE_KPA).long(),
         )
@@ -195,6 +166,7 @@ class DynamicsModel(nn.Module):
             torch.cat([part.tactile_kpa for part in parts], dim=1),
             torch.cat([part.disagreement_m for part in parts], dim=1),
             torch.cat([part.distance for part in parts], dim=1),
+            torch.cat([part.success for part in parts], dim=2),
             still.moves,
             still.at_rest,
         )
@@ -204,11 +176,10 @@ class DynamicsModel(nn.Module):
         self, memory: SceneMemory, commands: Commands, at_rest: Bool[Tensor, " batch"]
     ) -> tuple[SceneMemory, "_Run"]:
         """Advance by latent steps during which the same entries are at rest."""
-        features = [_features(commands, start.objects) for start in memory.start]
         distance = torch.stack(
             [
-                _distance(member.core.scaled(f, start.task))
-                for member, f, start in zip(self._members(), features, memory.start, strict=True)
+                member.core.distance(commands, state.wrist_m)
+                for member, state in zip(self._members(), memory.states, strict=True)
             ]
         ).mean(0)
         resting = _resting(memory, distance)
@@ -216,17 +187,18 @@ class DynamicsModel(nn.Module):
             return memory, resting
         futures, states = [], []
         for index, member in enumerate(self._members()):
-            start = memory.start[index]
-            future, state = member.core(features[index], start, memory.hidden[index])
+            before = memory.states[index]
+            future, state = member.core(commands, memory.start[index], before)
             futures.append(future)
-            states.append(state)
+            states.append(state.where(~at_rest, before))
         run = _chosen(at_rest, resting, self._imagined(memory, futures, distance))
         following = replace(
             memory,
-            hidden=torch.where(at_rest[:, None], memory.hidden, torch.stack(states)),
+            states=tuple(states),
             poses=run.poses[:, -1],
             disagreement_m=run.disagreement_m[:, -1],
             tactile_kpa=run.tactile_kpa[:, -1],
+            success=run.success[..., -1],
         )
         return following, run
 
@@ -253,6 +225,7 @@ class DynamicsModel(nn.Module):
             tactile_kpa=self.decode_touch(touch, taxels).flatten(1, 2),
             disagreement_m=_spread_m(objects),
             distance=distance,
+            success=torch.stack([future.success.sigmoid() for future in futures]),
         )
 
     def decode_touch(
@@ -276,15 +249,7 @@ class _Run:
     tactile_kpa: Float32[Tensor, "batch steps 2 320"]
     disagreement_m: Float32[Tensor, "batch latents"]
     distance: Float32[Tensor, "batch latents"]
-
-
-def _features(commands: Commands, objects: ObjectPoses) -> Float32[Tensor, "batch latents f"]:
-    return command_features(commands.points_m, commands.axes, commands.joints_rad, objects)
-
-
-def _distance(scaled: Float32[Tensor, "batch latents f"]) -> Float32[Tensor, "batch latents"]:
-    """Mean excess of scaled features over the range that the core sees unclipped."""
-    return (scaled.abs() - MAX_DEVIATION).clamp_min(0.0).mean(2)
+    success: Float32[Tensor, "members batch latents"]
 
 
 def _spread_m(poses: list[ObjectPoses]) -> Float32[Tensor, "*batch"]:
@@ -341,6 +306,7 @@ def _resting(memory: SceneMemory, distance: Float32[Tensor, "batch latents"]) ->
         held(memory.tactile_kpa, steps),
         held(memory.disagreement_m, num_latents),
         distance,
+        memory.success[..., None].expand(-1, -1, num_latents),
     )  # fmt: skip
 
 
@@ -359,4 +325,5 @@ def _chosen(at_rest: Bool[Tensor, " batch"], resting: _Run, moving: _Run) -> _Ru
         chosen(resting.tactile_kpa, moving.tactile_kpa),
         chosen(resting.disagreement_m, moving.disagreement_m),
         moving.distance,
+        torch.where(at_rest[:, None], resting.success, moving.success),
     )

@@ -6,12 +6,15 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Shaped
 from torch import Tensor
+from torch.nn import functional
 
 from dextouch.geometry import pose_from_transform, transform, transform_from_pose
 from services.world_model.dynamics.configuration import MAX_OBJECTS
 
 # Objects farther than this from the world's origin count as absent.
 MAX_DISTANCE_M = 1.0
+# Shorter axes have no direction.
+_SHORTEST = 1e-3
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,26 @@ def poses_from_objects(objects: ObjectPoses) -> Float64[np.ndarray, "*batch obje
     return pose_from_transform(transform(R, objects.position_m.double().numpy()))
 
 
+def rotations(axes: Float32[Tensor, "*batch 2 3"]) -> Float32[Tensor, "*batch 3 3"]:
+    """R_world_object nearest to predicted axes: z keeps its direction, x is made perpendicular.
+
+    As `poses_from_objects`, for networks. Axes of no length give some rotation.
+    """
+    z = _direction(axes[..., 0, :], torch.tensor([0.0, 0.0, 1.0]))
+    x = axes[..., 1, :]
+    x = x - z * (x * z).sum(-1, keepdim=True)
+    helper = torch.where(
+        z[..., :1].abs() < 0.9, torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0])
+    )
+    x = _direction(x, functional.normalize(helper - z * (helper * z).sum(-1, keepdim=True), dim=-1))
+    return torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
+
+
+def _direction(vectors: Tensor, otherwise: Tensor) -> Tensor:
+    length = vectors.norm(dim=-1, keepdim=True)
+    return torch.where(length > _SHORTEST, vectors / length.clamp_min(_SHORTEST), otherwise)
+
+
 def _unit(vectors: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > 1e-3, vectors / np.maximum(length, 1e-3), otherwise)
+    return np.where(length > _SHORTEST, vectors / np.maximum(length, _SHORTEST), otherwise)

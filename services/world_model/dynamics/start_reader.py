@@ -20,6 +20,13 @@ from services.world_model.dynamics.objects import MAX_DISTANCE_M, ObjectPoses
 TASK_WIDTH = 16
 _POINT_SIZE = 2 * NUM_POINTS * 3
 _CAMERA_SIZE = 7
+# Outputs of an object: pixel (2), height, axes (6), presence, uncertainty.
+_OUTPUTS = 11
+LEAST_SD_M = 0.001
+# Uncertainty of an output of zero.
+_USUAL_SD_M = 0.005
+# Added to the contrast of a channel, so that a blank image stays finite.
+_LEAST_CONTRAST = 0.02
 # Rays flatter than this do not meet the table within reach.
 _FLATTEST = -0.15
 
@@ -31,13 +38,27 @@ class FirstStep:
     image: UInt8[Tensor, "batch px px 3"]
     K_head: Float32[Tensor, "batch 3 3"]
     T_world_camera: Float32[Tensor, "batch 4 4"]
-    points_m: Float32[Tensor, "batch 2 6 3"]
+    points_m: Float32[Tensor, "batch 2 12 3"]
     pads_kpa: Float32[Tensor, "batch 12"]
     task: Int64[Tensor, " batch"]
 
 
+@dataclass(frozen=True)
+class Reading:
+    """Objects of one observed step, and the uncertainty of each position.
+
+    `sd_m` is the predicted standard deviation of the position on each axis of the table.
+    """
+
+    objects: ObjectPoses
+    sd_m: Float32[Tensor, "batch objects"]
+
+
 class StartReader(nn.Module):
-    """Predicts object poses and presence probabilities from the first step.
+    """Predicts object poses, their uncertainty and presence probabilities from the first step.
+
+    Channels of the image are standardized, so that exposure, gain and the colour of the light
+    have no effect.
 
     Args:
         config: configuration of the dynamics model.
@@ -64,13 +85,12 @@ class StartReader(nn.Module):
         known = 3 * points + TASK_WIDTH + _POINT_SIZE + NUM_PADS + _CAMERA_SIZE
         self.head = nn.Sequential(
             nn.Linear(known, 192), nn.GELU(), nn.Linear(192, 192), nn.GELU(),
-            nn.Linear(192, MAX_OBJECTS * 10),
+            nn.Linear(192, MAX_OBJECTS * _OUTPUTS),
         )  # fmt: skip
 
-    def forward(self, first: FirstStep) -> ObjectPoses:
+    def forward(self, first: FirstStep) -> Reading:
         """Objects of every entry; `present` holds probabilities, 0 in slots unused by the task."""
-        image = first.image.permute(0, 3, 1, 2).float() / 255 - 0.5
-        return self.read(image, first)
+        return self.read(first.image.permute(0, 3, 1, 2).float() / 255, first)
 
     def read(
         self,
@@ -78,18 +98,23 @@ class StartReader(nn.Module):
         first: FirstStep,
         *,
         bfloat16: bool = False,
-    ) -> ObjectPoses:
-        """`forward` for an image in −0.5 … 0.5 instead of bytes; optionally in bfloat16."""
+    ) -> Reading:
+        """`forward` for an image in 0 … 1 instead of bytes; optionally in bfloat16."""
+        contrast = image.std((2, 3), keepdim=True) + _LEAST_CONTRAST
+        plain = (image - image.mean((2, 3), keepdim=True)) / contrast
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bfloat16):
-            maps = self.eye(image)
-        outputs = self.head(self._known(maps.float(), first)).unflatten(1, (MAX_OBJECTS, 10))
+            maps = self.eye(plain)
+        outputs = self.head(self._known(maps.float(), first))
+        outputs = outputs.unflatten(1, (MAX_OBJECTS, _OUTPUTS))
         pixel = (outputs[..., :2] * 0.5 + 0.5) * self.config.image_px
         height_m = self.height_mean[first.task] + 0.05 * outputs[..., 2]
         counts = torch.tensor(self.config.num_objects)[first.task]
         used = torch.arange(MAX_OBJECTS) < counts[:, None]
         present = outputs[..., 9].sigmoid() * used
         position = ray_at_height(pixel, height_m, first.K_head, first.T_world_camera)
-        return ObjectPoses(position, outputs[..., 3:9].unflatten(-1, (2, 3)), present)
+        objects = ObjectPoses(position, outputs[..., 3:9].unflatten(-1, (2, 3)), present)
+        sd_m = (_USUAL_SD_M * outputs[..., 10].clamp(-4.0, 4.0).exp()).clamp_min(LEAST_SD_M)
+        return Reading(objects, sd_m)
 
     def _known(
         self, maps: Float32[Tensor, "batch points rows columns"], first: FirstStep

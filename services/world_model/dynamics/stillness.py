@@ -25,7 +25,7 @@ class Stillness:
     since then, both after the last latent step.
     """
 
-    points_m: Float32[Tensor, "batch 2 6 3"]
+    points_m: Float32[Tensor, "batch 2 points 3"]
     num_still: Int64[Tensor, " batch"]
     moves: Bool[Tensor, "batch latents"]
     at_rest: Bool[Tensor, "batch latents"]
@@ -40,9 +40,9 @@ class Stillness:
 
 
 def stillness(
-    points_m: Float32[Tensor, "batch 2 6 3"],
+    points_m: Float32[Tensor, "batch 2 points 3"],
     num_still: Int64[Tensor, " batch"],
-    commanded_m: Float32[Tensor, "batch latents looks 2 6 3"],
+    commanded_m: Float32[Tensor, "batch latents looks 2 points 3"],
 ) -> Stillness:
     """Track hands that have stood at `points_m` for `num_still` latent steps.
 

@@ -10,21 +10,21 @@ from torch import Tensor
 from torch.nn import functional
 
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
+from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT, DynamicsConfig
-from services.world_model.dynamics.core import RecurrentCore, SceneFuture, SceneStart
-from services.world_model.dynamics.features import command_features
-from services.world_model.dynamics.model import Commands
+from services.world_model.dynamics.core import RecurrentCore, SceneStart, own_features
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.touch_codec import TouchCodec
-from services.world_model.rendering.precision import uses_bfloat16
 from services.world_model.settings import CoreSettings
 from services.world_model.training.averaging import OnStep, train_averaged
 from services.world_model.training.scene_table import SceneTable
 
 _UNIT_M = 0.05
-_FIT_EPISODES = 400
-# Added to the deviation of features, some of which hardly vary within a task.
-_LEAST_DEVIATION = 0.05
+_FIT_EPISODES = 1000
+# Assumed of readers where no label says it.
+_READER_SD_M = 0.004
+# Weight of the outcome as predicted at every latent step, relative to that at the last.
+_EARLY_SUCCESS = 0.2
 # Factor by which hands are held still more often at later starts, where fewer scenes allow it.
 _LATER_HELD = 2.5
 # Objects that moved less than this in the previous latent step count as settled.
@@ -36,11 +36,11 @@ _TAXEL_SHARE = 4
 
 @dataclass(frozen=True)
 class CoreData:
-    """Training data of cores: episodes, touch latents and the readers' outputs.
+    """Training data of cores: episodes, touch latents and a reader's outputs.
 
-    `readings` are a reader's objects by start step, for the episodes that the reader was trained
-    on. Since its errors are smaller there than on new scenes, the core is trained equally often on
-    ground-truth poses with noise of `pose_noise_m`.
+    Cores start from true poses with noise, and know its size, as they know that of a reader's error
+    in a rollout. `readings` are a reader's objects by start step, for episodes without labels;
+    empty where all have them.
     """
 
     table: SceneTable
@@ -78,7 +78,7 @@ def train_core(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         core = RecurrentCore(config)
-        fit_features(core, data.table)
+        describe(core, data.table)
 
         def loss() -> Tensor:
             return core_loss(core, data, _draw(data, settings, generator, rng), settings)
@@ -89,18 +89,16 @@ def train_core(
 
 
 @torch.no_grad()
-def fit_features(core: RecurrentCore, table: SceneTable) -> None:
-    """Fit mean and deviation of command features to the training episodes of each task."""
-    for task in range(len(core.config.tasks)):
-        known = torch.nonzero(table.labelled & (table.task == task))[:, 0]
-        rows = known[:: max(1, len(known) // _FIT_EPISODES)]
-        commands = table.commands(rows, 0, torch.zeros(len(rows), dtype=torch.bool))
-        objects = table.objects_at(rows, 0)
-        features = command_features(
-            commands.points_m, commands.axes, commands.joints_rad, objects
-        ).flatten(0, 1)
-        core.feature_mean[task] = features.mean(0)
-        core.feature_std[task] = features.std(0) + _LEAST_DEVIATION
+def describe(core: RecurrentCore, table: SceneTable) -> None:
+    """Tell a core the objects of every task, and the range of the hands' motion."""
+    core.boxes_m.copy_(table.boxes_m)
+    core.movable.copy_(table.movable())
+    rows = torch.arange(0, len(table), max(1, len(table) // _FIT_EPISODES))
+    commands = table.commands(rows, 0, torch.zeros(len(rows), dtype=torch.bool))
+    wrist_m = commands.points_m[:, :, -1, :, 0]
+    own = own_features(commands, torch.cat([wrist_m[:, :1], wrist_m], dim=1)).flatten(0, 2)
+    core.lowest.copy_(own.amin(0))
+    core.highest.copy_(own.amax(0))
 
 
 def start_steps(table: SceneTable) -> list[int]:
@@ -124,7 +122,7 @@ def _draw(
 ) -> _Batch:
     table = data.table
     is_first = rng.random() < settings.first_fraction
-    later = [step for step in data.readings if step > 0]
+    later = [step for step in start_steps(table) if step > 0]
     start_step = 0 if is_first or not later else _later_start(later, table.num_steps, rng)
     rows = torch.randint(len(table), (settings.batch,), generator=generator)
 
@@ -135,12 +133,13 @@ def _draw(
     commands = table.commands(rows, start_step, measured)
     held = chance(settings.held_fraction * (1 if start_step == 0 else _LATER_HELD))
     held &= _is_settled(table, rows, start_step) & table.labelled[rows]
-    objects = _start_objects(data, rows, start_step, settings, generator)
+    objects, sd_m = _start_objects(data, rows, start_step, settings, generator)
     return _Batch(
         rows=rows,
         start_step=start_step,
         start=SceneStart(
             objects,
+            sd_m,
             data.touch[rows, start_step].float(),
             table.pads_kpa[rows, start_step],
             table.task[rows],
@@ -166,20 +165,28 @@ def _start_objects(
     start_step: int,
     settings: CoreSettings,
     generator: torch.Generator,
-) -> ObjectPoses:
-    """A reader's objects or, half of the time and where known, true objects with noise."""
-    true, read = data.table.objects_at(rows, start_step), data.readings[start_step][rows]
-    size = settings.pose_noise_m * 2 * torch.rand((len(rows), 1, 1), generator=generator)
-    shift = torch.randn(true.position_m.shape, generator=generator) * size
+) -> tuple[ObjectPoses, Float32[Tensor, "batch objects"]]:
+    """True objects with noise, or a reader's where they are unknown; and their uncertainty.
+
+    The noise of each object has its own standard deviation, of up to `pose_noise_m`.
+    """
+    true = data.table.objects_at(rows, start_step)
+    sd_m = settings.pose_noise_m * torch.rand(true.present.shape, generator=generator).square()
+    shift = torch.randn(true.position_m.shape, generator=generator) * sd_m[..., None]
     shift[..., 2] *= 0.3
-    turn = torch.randn(true.axes.shape, generator=generator) * size[..., None] * 5.0
-    use_read = torch.rand((len(rows), 1), generator=generator) < 0.5
-    use_read |= ~data.table.labelled[rows, None]
-    return ObjectPoses(
-        torch.where(use_read[..., None], read.position_m, true.position_m + shift),
-        torch.where(use_read[..., None, None], read.axes, true.axes + turn),
-        torch.where(use_read, read.present, true.present),
+    turn = torch.randn(true.axes.shape, generator=generator) * sd_m[..., None, None] * 5.0
+    noisy = ObjectPoses(true.position_m + shift, true.axes + turn, true.present)
+    labelled = data.table.labelled[rows]
+    if bool(labelled.all()):
+        return noisy, sd_m
+    read = data.readings[start_step][rows]
+    known = labelled[:, None]
+    objects = ObjectPoses(
+        torch.where(known[..., None], noisy.position_m, read.position_m),
+        torch.where(known[..., None, None], noisy.axes, read.axes),
+        torch.where(known, noisy.present, read.present),
     )
+    return objects, torch.where(known, sd_m, _READER_SD_M)
 
 
 def _held_still(commands: Commands, held: Bool[Tensor, " batch"]) -> Commands:
@@ -198,14 +205,7 @@ def core_loss(
     Where hands are held still without contact, the targets are no motion and no change of touch.
     """
     commands, start = batch.commands, batch.start
-    features = command_features(
-        commands.points_m, commands.axes, commands.joints_rad, start.objects
-    )
-    with torch.autocast(
-        "cpu", dtype=torch.bfloat16, enabled=uses_bfloat16(setting=settings.bfloat16)
-    ):
-        future, _ = core(features, start, core.first_state(start))
-    future = _in_float32(future)
+    future, _ = core(commands, start, core.first_state(start, commands[:1]))
     table, rows = data.table, batch.rows
     true = _stand(table.objects_of_latents(rows, batch.start_step), batch.is_held)
     steps = table.steps_after(batch.start_step)
@@ -230,20 +230,17 @@ def core_loss(
         * functional.binary_cross_entropy_with_logits(
             core.taxels(future.pattern[few, 1:]), felt.float()
         )
-        + weights.success
-        * functional.binary_cross_entropy_with_logits(future.success[:, -1], success)
+        + weights.success * _success_error(future.success, success)
     )
 
 
-def _in_float32(future: SceneFuture) -> SceneFuture:
-    objects = future.objects
-    return SceneFuture(
-        ObjectPoses(objects.position_m.float(), objects.axes.float(), objects.present.float()),
-        future.touch.float(),
-        future.contact.float(),
-        future.pattern.float(),
-        future.success.float(),
-    )
+def _success_error(
+    log_odds: Float32[Tensor, "batch latents"], success: Float32[Tensor, " batch"]
+) -> Float32[Tensor, ""]:
+    """Cross entropy of the outcome at the last latent step and, with less weight, at all."""
+    goal = success[:, None].expand_as(log_odds)
+    each = functional.binary_cross_entropy_with_logits(log_odds, goal, reduction="none")
+    return each[:, -1].mean() + _EARLY_SUCCESS * each.mean()
 
 
 def _stand(objects: ObjectPoses, held: Bool[Tensor, " batch"]) -> ObjectPoses:

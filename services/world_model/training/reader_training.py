@@ -12,6 +12,7 @@ from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.rendering.precision import uses_bfloat16
 from services.world_model.settings import ReaderSettings
+from services.world_model.training.augmentation import as_another_camera
 from services.world_model.training.averaging import OnStep, train_averaged
 from services.world_model.training.scene_table import SceneTable
 
@@ -19,6 +20,7 @@ from services.world_model.training.scene_table import SceneTable
 _UNIT_M = 0.05
 _BATCH_OF_READING = 128
 _WEIGHT_DECAY = 1e-3
+_SD_WEIGHT = 0.02
 
 
 @dataclass(frozen=True)
@@ -91,10 +93,9 @@ def _loss(
 ) -> Float32[Tensor, ""]:
     table, rows, steps = places
     first, true = table.first_steps(rows, steps), table.objects_at(rows, steps)
-    image = first.image.permute(0, 3, 1, 2).float() / 255 - 0.5
-    brightness = torch.randn((len(rows), 1, 1, 1), generator=generator) * 0.03
-    image = image + brightness + torch.randn(image.shape, generator=generator) * 0.01
-    predicted = reader.read(image, first, bfloat16=bfloat16)
+    image, first = as_another_camera(first, generator)
+    reading = reader.read(image, first, bfloat16=bfloat16)
+    predicted = reading.objects
     there = true.present
     used = torch.arange(MAX_OBJECTS) < torch.tensor(reader.config.num_objects)[first.task][:, None]
     position = functional.smooth_l1_loss(
@@ -104,7 +105,11 @@ def _loss(
     presence = functional.binary_cross_entropy(
         predicted.present.clamp(1e-4, 1 - 1e-4), there, reduction="none"
     )
-    return ((position + axes) * there).sum() / there.sum().clamp_min(1.0) + 0.3 * (
+    # Of a Gaussian on both axes of the table; the position is not trained by it.
+    lateral_m = (predicted.position_m - true.position_m)[..., :2].detach().square().sum(-1)
+    surprise = 2 * reading.sd_m.log() + lateral_m / (2 * reading.sd_m.square())
+    each = position + axes + _SD_WEIGHT * surprise
+    return (each * there).sum() / there.sum().clamp_min(1.0) + 0.3 * (
         presence * used
     ).sum() / used.sum()
 
@@ -113,7 +118,7 @@ def _loss(
 def read_objects(reader: StartReader, table: SceneTable, step: int) -> ObjectPoses:
     """The reader's objects at one step of every episode."""
     parts: list[ObjectPoses] = [
-        reader(table.first_steps(rows, torch.full_like(rows, step)))
+        reader(table.first_steps(rows, torch.full_like(rows, step))).objects
         for rows in torch.split(torch.arange(len(table)), _BATCH_OF_READING)
     ]
     return ObjectPoses(

@@ -11,6 +11,7 @@ from torch import Tensor
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.tactile.layout import split_pads
+from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import (
     MAX_OBJECTS,
     STEPS_PER_LATENT,
@@ -19,18 +20,21 @@ from services.world_model.dynamics.configuration import (
 from services.world_model.dynamics.core import NUM_PADS
 from services.world_model.dynamics.features import LOOKS
 from services.world_model.dynamics.hand_motion import HandMotion, hand_motion
-from services.world_model.dynamics.model import Commands, pad_means_kpa
+from services.world_model.dynamics.model import pad_means_kpa
 from services.world_model.dynamics.objects import ObjectPoses, objects_from_poses
 from services.world_model.dynamics.start_reader import FirstStep
 from services.world_model.dynamics.touch_codec import FREE_KPA
 from services.world_model.training.scene_episodes import SceneEpisode
+
+# Objects that never move farther than this are fixed.
+_MOVED_M = 2e-3
 
 
 @dataclass(frozen=True)
 class HandTable:
     """Hands at every step of every episode, in the world."""
 
-    points_m: Float32[Tensor, "episodes steps 2 6 3"]
+    points_m: Float32[Tensor, "episodes steps 2 12 3"]
     axes: Float32[Tensor, "episodes steps 2 6"]
     joints_rad: Float32[Tensor, "episodes steps 2 20"]
 
@@ -50,7 +54,8 @@ class SceneTable:
 
     `images` are those of the steps `image_steps`; `in_contact` marks pads in contact; `sent` are
     commanded hands where available and measured ones elsewhere, as given by `commanded`.
-    `labelled` marks episodes whose object poses are trained on.
+    `labelled` marks episodes whose object poses are trained on; `boxes_m` are the boxes of each
+    task's objects in their frames (middle, half sizes).
     """
 
     sent: HandTable
@@ -67,6 +72,7 @@ class SceneTable:
     success: Float32[Tensor, " episodes"]
     task: Int64[Tensor, " episodes"]
     labelled: Bool[Tensor, " episodes"]
+    boxes_m: Float32[Tensor, "tasks objects 6"]
 
     def __len__(self) -> int:
         return len(self.success)
@@ -75,6 +81,16 @@ class SceneTable:
     def num_steps(self) -> int:
         """Steps of every episode, including the first one."""
         return self.tactile_kpa.shape[1]
+
+    def movable(self) -> Float32[Tensor, "tasks objects"]:
+        """1 for objects that move in some labelled episode of their task, 0 for fixed ones."""
+        position_m = self.objects.position_m
+        way_m = (position_m.amax(1) - position_m.amin(1)).norm(dim=-1)
+        moves = (way_m > _MOVED_M) & (self.objects.present.amin(1) > 0) & self.labelled[:, None]
+        found = torch.zeros(self.boxes_m.shape[:2])
+        for task in range(len(found)):
+            found[task] = moves[self.task == task].any(0).float()
+        return found
 
     def first_steps(
         self, rows: Int64[Tensor, " batch"], steps: Int64[Tensor, " batch"]
@@ -227,7 +243,18 @@ def scene_table(
         success=torch.tensor([float(episode.success) for episode in episodes]),
         task=torch.tensor([config.tasks.index(episode.task) for episode in episodes]),
         labelled=torch.tensor(list(labelled) or [True] * len(episodes)),
+        boxes_m=_boxes_m(episodes, config),
     )
+
+
+def _boxes_m(
+    episodes: Sequence[SceneEpisode], config: DynamicsConfig
+) -> Float32[Tensor, "tasks objects 6"]:
+    boxes = torch.zeros(len(config.tasks), MAX_OBJECTS, 6)
+    for episode in episodes:
+        known = torch.from_numpy(episode.object_boxes_m).float()
+        boxes[config.tasks.index(episode.task), : len(known)] = known
+    return boxes
 
 
 def _pad_peaks_kpa(tactile_kpa: np.ndarray) -> np.ndarray:

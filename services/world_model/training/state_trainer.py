@@ -22,6 +22,7 @@ from dextouch.errors import InvalidInputError
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsMember, DynamicsModel
+from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.touch_codec import TouchCodec
 from services.world_model.recorded_commands import flags_of, last_name
@@ -54,7 +55,7 @@ from services.world_model.training.scene_table import SceneTable, scene_table, v
 from services.world_model.training.state_evaluation import evaluate_dynamics
 
 # Increment when a change of training gives other weights for the same settings and data.
-READER_VERSION, CORE_VERSION, RENDERER_VERSION = 3, 4, 3
+READER_VERSION, CORE_VERSION, RENDERER_VERSION = 4, 5, 3
 # Largest number of episodes the renderer is trained on; it samples few of their images anyway.
 MAX_CLIPS = 1500
 _SEED_STRIDE = 1000
@@ -155,7 +156,8 @@ class _Work:
 
     def core_file(self, member: int) -> Path:
         """File of a member's finished core, which was trained with that member's reader."""
-        key = self._key(CORE_VERSION, "width", "reader", "core")
+        reader = () if self.settings.labelled_share == 1 else ("reader",)
+        key = self._key(CORE_VERSION, "width", *reader, "core")
         return self.parts / f"core-{key}-{member}.safetensors"
 
     @property
@@ -174,12 +176,9 @@ class _Work:
 
 
 def _with_precision(settings: StateTrainSettings) -> StateTrainSettings:
-    """Settings that name the precision: it is chosen once, and part of the keys of all parts."""
-    reader, core = (
-        part.model_copy(update={"bfloat16": uses_bfloat16(setting=part.bfloat16)})
-        for part in (settings.reader, settings.core)
-    )
-    return settings.model_copy(update={"reader": reader, "core": core})
+    """Settings that name the precision: it is chosen once, and part of the readers' keys."""
+    chosen = {"bfloat16": uses_bfloat16(setting=settings.reader.bfloat16)}
+    return settings.model_copy(update={"reader": settings.reader.model_copy(update=chosen)})
 
 
 def _episodes(settings: StateTrainSettings) -> list[SceneEpisode]:
@@ -239,10 +238,13 @@ def _prefixed(codec: TouchCodec) -> dict[str, Tensor]:
 
 def _train_parts(work: _Work) -> None:
     """Train missing parts, several in parallel."""
-    missing = [m for m in range(work.settings.num_members) if not work.core_file(m).exists()]
+    members = range(work.settings.num_members)
     spawned = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(work.settings.jobs, spawned) as pool:
-        orders = [pool.submit(_train_member, work, member) for member in missing]
+        # Cores first: they take longest.
+        orders = [pool.submit(_train_core, work, m) for m in members]
+        if work.settings.labelled_share == 1:
+            orders += [pool.submit(_train_reader, work, m) for m in members]
         if not work.renderer_file.exists():
             orders.append(pool.submit(_train_renderer, work))
         for done in as_completed(orders):
@@ -282,27 +284,45 @@ def _load(model: nn.Module, path: Path) -> float:
     return float(notes[_CPU_S])
 
 
-def _train_member(work: _Work, member: int) -> None:
+def _table(work: _Work) -> tuple[SceneTable, TouchCodec]:
+    """The training data as kept for the processes of the parts."""
     torch.set_num_threads(1)
     flat = load_file(work.parts / "table.safetensors")
     codec = TouchCodec(work.config.touch_channels)
     codec.load_state_dict(
         {k.removeprefix("codec/"): flat.pop(k) for k in list(flat) if k.startswith("codec/")}
     )
-    table = SceneTable.from_tensors(flat)
+    return SceneTable.from_tensors(flat), codec
+
+
+def _train_reader(work: _Work, member: int) -> None:
+    if work.reader_file(member).exists():
+        return
+    table, _ = _table(work)
+    started_s = time.process_time()
+    on_step = _on_step(member, "reader")
     seed = work.settings.seed * _SEED_STRIDE + member
+    trained = train_reader(table, work.config, work.settings.reader, seed=seed, on_step=on_step)
+    _keep(trained, work.reader_file(member), time.process_time() - started_s)
+
+
+def _train_core(work: _Work, member: int) -> None:
+    """Train a core; before it, the reader that it needs where episodes have no labels."""
+    if work.core_file(member).exists():
+        return
+    readings: dict[int, ObjectPoses] = {}
+    if work.settings.labelled_share < 1:
+        _train_reader(work, member)
+    table, codec = _table(work)
+    if work.settings.labelled_share < 1:
+        reader = StartReader(work.config)
+        _load(reader, work.reader_file(member))
+        reader.eval()
+        readings = {step: read_objects(reader, table, step) for step in start_steps(table)}
     started_s = time.process_time()
-    if not work.reader_file(member).exists():
-        on_step = _on_step(member, "reader")
-        trained = train_reader(table, work.config, work.settings.reader, seed=seed, on_step=on_step)
-        _keep(trained, work.reader_file(member), time.process_time() - started_s)
-    reader = StartReader(work.config)
-    _load(reader, work.reader_file(member))
-    reader.eval()
-    started_s = time.process_time()
-    readings = {step: read_objects(reader, table, step) for step in start_steps(table)}
     data = CoreData(table, touch_latents(codec, table), readings)
     on_step = _on_step(member, "core")
+    seed = work.settings.seed * _SEED_STRIDE + member
     core = train_core(data, work.config, work.settings.core, seed=seed, on_step=on_step)
     _keep(core, work.core_file(member), time.process_time() - started_s)
 

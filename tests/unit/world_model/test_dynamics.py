@@ -5,15 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
+from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore, SceneStart
-from services.world_model.dynamics.features import NUM_FEATURES, command_features, compressed
-from services.world_model.dynamics.hand_motion import hand_motion
+from services.world_model.dynamics.features import LOOKS, compressed, slot_features
+from services.world_model.dynamics.hand_motion import NUM_POINTS, hand_motion
 from services.world_model.dynamics.memory import (
     memory_arrays,
     memory_from_arrays,
@@ -21,7 +23,6 @@ from services.world_model.dynamics.memory import (
     stack_memories,
 )
 from services.world_model.dynamics.model import (
-    Commands,
     DynamicsModel,
     SceneMemory,
     mean_start,
@@ -30,6 +31,7 @@ from services.world_model.dynamics.objects import (
     ObjectPoses,
     objects_from_poses,
     poses_from_objects,
+    rotations,
 )
 from services.world_model.dynamics.start_reader import FirstStep, ray_at_height
 from services.world_model.dynamics.stillness import REST_LATENTS
@@ -99,42 +101,87 @@ def test_pixels_of_the_sky_stay_within_reach():
     assert found.abs().max() <= 1.0
 
 
-def test_features_hold_a_millimetre_near_an_object():
-    points = torch.zeros(1, 1, 2, 2, 6, 3)
-    axes, joints = torch.zeros(1, 1, 2, 6), torch.zeros(1, 1, 2, 20)
-    here = command_features(points, axes, joints, objects())
-    assert here.shape == (1, 1, NUM_FEATURES)
-    moved = points.clone()
-    moved[0, 0, 1, 1, 3, 0] = 0.001
-    change = command_features(moved, axes, joints, objects()) - here
-    # Its offset along x in world axes, and along the object's x: asinh(0.1) / 2 each.
-    changed = change[change.abs() > 1e-6]
-    assert len(changed) == 2 * MAX_OBJECTS
-    np.testing.assert_allclose(changed.abs(), np.arcsinh(0.1) / 2, rtol=1e-5)
+def random_points(*batch, seed=0, scale_m=0.1):
+    generator = torch.Generator().manual_seed(seed)
+    return scale_m * torch.randn(*batch, len(LOOKS), 2, NUM_POINTS, 3, generator=generator)
 
 
-def test_features_of_empty_slots_are_zero_and_of_moved_scenes_the_same():
-    generator = torch.Generator().manual_seed(0)
-    points = 0.1 * torch.randn(1, 3, 2, 2, 6, 3, generator=generator)
-    axes, joints = torch.zeros(1, 3, 2, 6), torch.zeros(1, 3, 2, 20)
-    none = objects(present=torch.zeros(1, MAX_OBJECTS))
-    assert command_features(points, axes, joints, none).count_nonzero() == 2 * 2 * 6 * 3
-    shift = torch.tensor([0.3, -0.2, 0.0])
-    one = command_features(points, axes, joints, objects())
-    other = command_features(
-        points + shift, axes, joints, objects(position_m=shift.expand(1, MAX_OBJECTS, 3))
+def matrix(turn):
+    return torch.tensor(turn.as_matrix(), dtype=torch.float32)
+
+
+def test_distances_to_a_box_are_those_of_another_library():
+    """Outside against a bounded minimizer, inside against the nearest face."""
+    half = np.array([0.03, 0.02, 0.05])
+    middle = np.array([0.01, -0.02, 0.03])
+    rotation = Rotation.random(random_state=3)
+    place = np.array([0.2, 0.1, 0.05])
+    points = random_points(1, seed=4, scale_m=0.04) + torch.tensor(place, dtype=torch.float32)
+    found = slot_features(
+        points,
+        torch.tensor(place, dtype=torch.float32)[None, None],
+        matrix(rotation)[None, None],
+        torch.tensor(np.concatenate([middle, half]), dtype=torch.float32)[None, None],
     )
-    torch.testing.assert_close(one, other, atol=1e-4, rtol=0)
+    each = found.reshape(2, len(LOOKS), NUM_POINTS - 1, 7)
+    distance_m = 0.01 * torch.sinh(2 * each[..., 0])
+    inside = 0
+    for hand, look, point in np.ndindex(*each.shape[:3]):
+        own = rotation.inv().apply(points[0, look, hand, point + 1].numpy() - place) - middle
+        nearest = minimize(lambda x, own=own: ((x - own) ** 2).sum(), np.zeros(3),
+            bounds=list(zip(-half, half, strict=True)))  # fmt: skip
+        expected = np.sqrt(nearest.fun)
+        if (np.abs(own) < half).all():
+            inside += 1
+            expected = -(half - np.abs(own)).min()
+        assert float(distance_m[hand, look, point]) == pytest.approx(expected, abs=2e-5)
+    assert inside >= 2
 
 
-def test_features_end_with_the_axes_and_twice_the_joint_angles():
-    """In the order and scale that trained weights expect."""
-    points = torch.zeros(1, 1, 2, 2, 6, 3)
-    axes = torch.arange(12.0).reshape(1, 1, 2, 6)
-    joints = torch.arange(40.0).reshape(1, 1, 2, 20) / 10
-    found = command_features(points, axes, joints, objects())[0, 0]
-    np.testing.assert_allclose(found[-52:-40], np.arange(12))
-    np.testing.assert_allclose(found[-40:], np.arange(40) / 5, rtol=1e-6)
+def test_features_of_a_scene_that_is_moved_and_turned_are_the_same():
+    """Those in the object's frame: the last three of each point are in the world's."""
+    rotation, shift = Rotation.from_rotvec([0.3, -0.5, 1.0]), np.array([0.3, -0.2, 0.1])
+    points = random_points(1)
+    moved = torch.tensor(rotation.apply(points.reshape(-1, 3).numpy()) + shift).float()
+    boxes = torch.tensor([0.0, 0.0, 0.01, 0.02, 0.03, 0.04]).expand(1, 2, 6)
+    unit = Rotation.identity()
+    places = torch.tensor([[[0.05, 0.0, 0.02], [-0.1, 0.1, 0.0]]])
+    here = slot_features(points, places, matrix(unit).expand(1, 2, 3, 3), boxes)
+    there = slot_features(
+        moved.reshape(points.shape),
+        torch.tensor(rotation.apply(places[0].numpy()) + shift).float()[None],
+        matrix(rotation).expand(1, 2, 3, 3),
+        boxes,
+    )
+    parts = [one.reshape(2, 2, -1, 7)[..., :4] for one in (here, there)]
+    torch.testing.assert_close(*parts, atol=1e-4, rtol=0)
+
+
+def test_features_hold_a_millimetre_near_an_object():
+    points = torch.zeros(1, len(LOOKS), 2, NUM_POINTS, 3)
+    points[..., 0] = 0.02
+    moved = points.clone()
+    moved[0, 1, 1, 3, 0] += 0.001
+    about = (torch.zeros(1, 1, 3), matrix(Rotation.identity()).expand(1, 1, 3, 3),
+             torch.tensor([0.0, 0, 0, 0.02, 0.02, 0.02]).expand(1, 1, 6))  # fmt: skip
+    change = slot_features(moved, *about) - slot_features(points, *about)
+    each = change.reshape(2, len(LOOKS), NUM_POINTS - 1, 7)[1, 1, 2]
+    # Outside the box by a millimetre: the distance to it changes most.
+    np.testing.assert_allclose(each[0], np.arcsinh(0.1) / 2, rtol=1e-4)
+    assert change.count_nonzero() == 3
+
+
+def test_rotations_are_those_of_poses():
+    generator = torch.Generator().manual_seed(0)
+    axes = torch.randn(40, 2, 3, generator=generator)
+    axes[:3, 1] = axes[:3, 0]
+    axes[3] = 0.0
+    R = rotations(axes)
+    poses = poses_from_objects(ObjectPoses(torch.zeros(40, 3), axes, torch.ones(40)))
+    expected = Rotation.from_quat(poses[:, 3:], scalar_first=True).as_matrix()
+    np.testing.assert_allclose(R[4:].numpy(), expected[4:], atol=1e-5)
+    identity = R.transpose(-1, -2) @ R
+    torch.testing.assert_close(identity, torch.eye(3).expand(40, 3, 3), atol=1e-5, rtol=0)
 
 
 def test_distances_are_compressed_as_written():
@@ -143,15 +190,15 @@ def test_distances_are_compressed_as_written():
 
 
 def test_poses_go_through_position_and_axes_and_back():
-    rotations = Rotation.random(20, random_state=1)
+    turns = Rotation.random(20, random_state=1)
     poses = np.concatenate(
-        [np.linspace(-0.3, 0.3, 60).reshape(20, 3), rotations.as_quat(scalar_first=True)], axis=1
+        [np.linspace(-0.3, 0.3, 60).reshape(20, 3), turns.as_quat(scalar_first=True)], axis=1
     )[:, None]
     slots = objects_from_poses(poses)
     assert slots.present.tolist() == [[1.0, 0.0, 0.0]] * 20
     back = poses_from_objects(slots)[:, 0]
     np.testing.assert_allclose(back[:, :3], poses[:, 0, :3], atol=1e-6)
-    turned = Rotation.from_quat(back[:, 3:], scalar_first=True) * rotations.inv()
+    turned = Rotation.from_quat(back[:, 3:], scalar_first=True) * turns.inv()
     assert turned.magnitude().max() < 1e-5
 
 
@@ -192,6 +239,7 @@ def start(batch=2, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return SceneStart(
         objects(batch, position_m=0.1 * torch.randn(batch, MAX_OBJECTS, 3, generator=generator)),
+        0.005 * torch.rand(batch, MAX_OBJECTS, generator=generator),
         torch.randn(batch, 2, CONFIG.touch_channels, generator=generator),
         torch.rand(batch, 12, generator=generator),
         torch.arange(batch) % 2,
@@ -205,36 +253,87 @@ def core():
     return RecurrentCore(CONFIG).eval()
 
 
+def random_commands(batch, latents, seed=1, scale_m=0.1):
+    """Points anywhere, wrists turned anyhow, any joint angles."""
+    generator = torch.Generator().manual_seed(seed)
+    R = Rotation.random(batch * latents * 2, random_state=seed).as_matrix()
+    columns = np.concatenate([R[..., 0], R[..., 1]], axis=-1)
+    return Commands(
+        random_points(batch, latents, seed=seed, scale_m=scale_m),
+        torch.tensor(columns, dtype=torch.float32).reshape(batch, latents, 2, 6),
+        torch.randn(batch, latents, 2, 20, generator=generator),
+    )
+
+
+def first_of(core, start, commands):
+    return core.first_state(start, commands[:1])
+
+
 @torch.no_grad()
 def test_chunks_one_after_another_are_the_whole(core):
-    features = torch.randn(2, 20, NUM_FEATURES, generator=torch.Generator().manual_seed(1))
-    whole, end = core(features, start(), core.first_state(start()))
-    state, parts = core.first_state(start()), []
-    for chunk in features.split(4, dim=1):
-        future, state = core(chunk, start(), state)
+    commands = random_commands(2, 20)
+    whole, end = core(commands, start(), first_of(core, start(), commands))
+    state, parts = first_of(core, start(), commands), []
+    for first in range(0, 20, 4):
+        future, state = core(commands[first : first + 4], start(), state)
         parts.append(future.objects.position_m)
     torch.testing.assert_close(torch.cat(parts, dim=1), whole.objects.position_m)
-    torch.testing.assert_close(state, end)
+    for one in dataclasses.fields(end):
+        torch.testing.assert_close(getattr(state, one.name), getattr(end, one.name))
 
 
 @torch.no_grad()
 def test_a_state_is_bounded_whatever_comes(core):
-    wild = 1e6 * torch.randn(2, 1000, NUM_FEATURES, generator=torch.Generator().manual_seed(1))
-    future, state = core(wild, start(), core.first_state(start()))
-    assert state.abs().max() <= 1.0
+    core.movable.fill_(1.0)
+    wild = random_commands(2, 1000, scale_m=1e6)
+    future, state = core(wild, start(), first_of(core, start(), wild))
+    assert state.hidden.abs().max() <= 1.0
+    assert state.position_m.abs().max() <= 1.0
+    assert state.axes.abs().max() <= 1.0 + 1e-5
     assert torch.isfinite(future.touch).all()
 
 
 @torch.no_grad()
 def test_one_at_a_time_is_as_a_batch(core):
-    features = torch.randn(2, 5, NUM_FEATURES, generator=torch.Generator().manual_seed(2))
-    both = start()
-    together, _ = core(features, both, core.first_state(both))
+    """The second entry has more objects than the first."""
+    commands, both = random_commands(2, 5), start()
+    together, _ = core(commands, both, first_of(core, both, commands))
     one = SceneStart(
-        both.objects[:1], both.touch[:1], both.pads_kpa[:1], both.task[:1], both.commanded[:1]
-    )
-    alone, _ = core(features[:1], one, core.first_state(one))
+        both.objects[:1], both.sd_m[:1], both.touch[:1], both.pads_kpa[:1], both.task[:1],
+        both.commanded[:1],
+    )  # fmt: skip
+    first = Commands(commands.points_m[:1], commands.axes[:1], commands.joints_rad[:1])
+    alone, _ = core(first, one, first_of(core, one, first))
     torch.testing.assert_close(alone.touch, together.touch[:1], atol=1e-5, rtol=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("hand", [0, 1])
+def test_what_a_hand_holds_moves_rigidly_with_it(core, hand):
+    """With the gate of one hand open, against scipy's composition of rigid motions."""
+    core.movable.fill_(1.0)
+    core.motion.bias.copy_(torch.tensor([0.0] * 12))
+    core.motion.bias[hand] = 50.0
+    commands, begun_at = random_commands(1, 6), start(1)
+    future, _ = core(commands, begun_at, first_of(core, begun_at, commands))
+    columns = commands.axes[0, :, hand].double().numpy()
+    x, y = columns[:, :3], columns[:, 3:]
+    wrist = Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], axis=-1))
+    wrist_m = commands.points_m[0, :, -1, hand, 0].double().numpy()
+    from_wrist = wrist[0].inv().apply(begun_at.objects.position_m[0, 0].numpy() - wrist_m[0])
+    expected = wrist.apply(from_wrist) + wrist_m
+    np.testing.assert_allclose(future.objects.position_m[0, :, 0], expected.clip(-1, 1), atol=2e-4)
+    z = wrist.apply(wrist[0].inv().apply([0, 0, 1.0]))
+    np.testing.assert_allclose(future.objects.axes[0, :, 0, 0], z, atol=1e-3)
+
+
+@torch.no_grad()
+def test_fixed_objects_stay_whatever_the_gates_say(core):
+    commands, begun_at = random_commands(2, 6), start()
+    core.motion.bias.copy_(torch.ones(12))
+    future, _ = core(commands, begun_at, first_of(core, begun_at, commands))
+    still = begun_at.objects.position_m[1, :2].expand(6, 2, 3)
+    torch.testing.assert_close(future.objects.position_m[1, :, :2], still)
 
 
 @pytest.fixture
@@ -255,7 +354,7 @@ def begun(model, tasks=(0, 1)):
         torch.tensor(pinhole_matrix(width_px=32, height_px=32, fovy_rad=0.8)).float().expand(
             batch, 3, 3),
         torch.tensor(motion.Ts_world_camera).float().expand(batch, 4, 4),
-        torch.tensor(motion.points_m).expand(batch, 2, 6, 3),
+        torch.tensor(motion.points_m).expand(batch, 2, NUM_POINTS, 3),
         torch.zeros(batch, 12),
         torch.tensor(tasks),
     )  # fmt: skip
@@ -267,6 +366,13 @@ def lifted(num_steps):
     actions = still_actions(num_steps)
     actions[:, 2] = np.linspace(0.001, 0.05, num_steps)
     return hand_motion(actions, ANCHOR)
+
+
+def same_state(one, other):
+    return all(
+        torch.equal(getattr(one, part.name), getattr(other, part.name))
+        for part in dataclasses.fields(one)
+    )
 
 
 def test_slots_a_task_has_not_are_empty(model):
@@ -303,13 +409,13 @@ def test_hands_that_stand_for_two_seconds_bring_everything_to_rest(model):
     for _ in range(REST_LATENTS // 4):
         memory, _ = model.advance(memory, still)
     rested, imagined = model.advance(memory, still)
-    torch.testing.assert_close(rested.hidden, memory.hidden, atol=0, rtol=0)
+    assert all(map(same_state, rested.states, memory.states))
     assert (imagined.tactile_kpa == memory.tactile_kpa[:, None]).all()
     for _ in range(60):
         rested, imagined = model.advance(rested, still)
     assert (imagined.tactile_kpa == memory.tactile_kpa[:, None]).all()
     moving, _ = model.advance(rested, Commands.of([lifted(16)] * 2))
-    assert (moving.hidden != rested.hidden).any()
+    assert not any(map(same_state, moving.states, rested.states))
 
 
 def test_hands_that_creep_do_not_stand_still(model):
@@ -332,9 +438,10 @@ def test_members_that_see_nothing_have_no_say_about_the_place():
     )
     memory = SceneMemory(
         start=tuple(dataclasses.replace(start(1), objects=each) for each in (seen, seen, blind)),
-        hidden=torch.zeros(3, 1, 1, 1), poses=seen, disagreement_m=torch.zeros(1),
+        states=(), poses=seen, disagreement_m=torch.zeros(1),
         tactile_kpa=torch.zeros(1, 2, 320),
-        points_m=torch.zeros(1, 2, 6, 3), num_still=torch.zeros(1, dtype=torch.int64),
+        points_m=torch.zeros(1, 2, NUM_POINTS, 3), success=torch.zeros(3, 1),
+        num_still=torch.zeros(1, dtype=torch.int64),
     )  # fmt: skip
     mean = mean_start(memory)
     torch.testing.assert_close(mean.position_m, torch.full((1, MAX_OBJECTS, 3), 0.2))
@@ -346,7 +453,7 @@ def test_rollouts_of_a_batch_share_no_memory(model):
     one = memory_of(both, 0)
     before = both.tactile_kpa.clone()
     one.tactile_kpa.add_(1.0)
-    one.hidden.add_(1.0)
+    one.states[0].hidden.add_(1.0)
     assert (both.tactile_kpa == before).all()
     assert one.tactile_kpa.untyped_storage().nbytes() == 2 * 320 * 4
 
@@ -376,14 +483,14 @@ def test_a_memory_survives_its_arrays(model):
     expected, got = model.advance(one, command)[1], model.advance(back, command)[1]
     assert (expected.tactile_kpa == got.tactile_kpa).all()
     both = stack_memories([memory_of(memory, 0), one])
-    assert (both.hidden == memory.hidden).all()
+    assert all(map(same_state, both.states, memory.states))
 
 
 @pytest.mark.parametrize("damage", ["missing", "shape", "nan", "task"])
 def test_damaged_memories_are_refused(model, damage):
     arrays = memory_arrays(memory_of(begun(model), 0))
     if damage == "missing":
-        del arrays["hidden"]
+        del arrays["state_hidden"]
     elif damage == "shape":
         arrays["axes"] = arrays["axes"][:1]
     elif damage == "nan":

@@ -14,7 +14,6 @@ from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
 from dextouch.serving import load_settings
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore
-from services.world_model.dynamics.features import command_features
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.touch_codec import TouchCodec
@@ -30,7 +29,7 @@ from services.world_model.training.core_training import (
     _draw,
     _is_settled,
     core_loss,
-    fit_features,
+    describe,
     start_steps,
     touch_latents,
     train_core,
@@ -131,9 +130,8 @@ def test_the_same_seed_gives_the_same_reader(table, config):
 def test_a_core_feels_what_it_touches_and_nothing_elsewhere(reader, table, held_out, config):
     dynamics = DynamicsModel(config)
     dynamics.codec.fit(table.tactile_kpa.float().flatten(0, 2))
-    readings = {step: read_objects(reader, table, step) for step in (0, 4)}
-    data = CoreData(table, touch_latents(dynamics.codec, table), readings)
-    settings = CoreSettings(num_steps=250, batch=16, bfloat16=False)
+    data = CoreData(table, touch_latents(dynamics.codec, table), {})
+    settings = CoreSettings(num_steps=250, batch=16)
     member = dynamics.members[0]
     member.reader = reader
     member.core = train_core(data, config, settings, seed=0)
@@ -150,14 +148,14 @@ def test_object_poses_without_labels_are_never_looked_at(config):
     episodes = [episode(seed) for seed in range(8)]
     lies = [dataclasses.replace(e, object_poses=e.object_poses + 0.07) for e in episodes]
     known = [seed < 4 for seed in range(8)]
-    settings = CoreSettings(num_steps=12, batch=8, bfloat16=False, held_fraction=0.5)
+    settings = CoreSettings(num_steps=12, batch=8, held_fraction=0.5)
     trained = []
     for few in (episodes, episodes[:4] + lies[4:], lies):
         table = scene_table(few, config, labelled=known)
         reader = train_reader(
             table, config, ReaderSettings(num_steps=5, batch=8, bfloat16=False), seed=0
         )
-        readings = {step: read_objects(reader, table, step) for step in (0, 4)}
+        readings = {step: read_objects(reader, table, step) for step in start_steps(table)}
         data = CoreData(table, touch_latents(TouchCodec(8), table), readings)
         core = train_core(data, config, settings, seed=0)
         trained.append([*reader.state_dict().values(), *core.state_dict().values()])
@@ -190,7 +188,7 @@ def test_cores_begin_anywhere_up_to_the_last_latent_step(config):
     blank = {step: read_objects(StartReader(config), table, step) for step in starts}
     data = CoreData(table, touch_latents(TouchCodec(8), table), blank)
     rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
-    settings = CoreSettings(batch=2, bfloat16=False, first_fraction=0.5)
+    settings = CoreSettings(batch=2, first_fraction=0.5)
     drawn = [_draw(data, settings, generator, rng) for _ in range(600)]
     counts = Counter(batch.start_step for batch in drawn)
     assert set(counts) == set(starts)
@@ -202,31 +200,40 @@ def test_cores_begin_anywhere_up_to_the_last_latent_step(config):
     assert torch.isfinite(core_loss(core, data, latest, settings))
 
 
-def test_each_task_has_features_in_units_of_its_own():
+def test_a_core_knows_the_boxes_of_its_tasks_and_what_moves():
     config = DynamicsConfig(tasks=("lift", "press"), num_objects=(1, 1), image_px=PX, width=32)
-    tasks = [("press", "lift")[seed % 2] for seed in range(8)]
-    episodes = [dataclasses.replace(episode(seed), task=task) for seed, task in enumerate(tasks)]
-    # Hands that stay where they are: hardly any feature changes within "lift".
-    still = [
-        dataclasses.replace(one, actions=np.repeat(one.actions[:1], len(one.actions), axis=0))
-        for one in episodes
-        if one.task == "lift"
+    episodes = [
+        dataclasses.replace(episode(seed), task=("press", "lift")[seed % 2]) for seed in range(8)
     ]
-    table = scene_table([one for one in episodes if one.task == "press"] + still, config)
+    box = np.array([[0, 0, 0.01, 0.04, 0.02, 0.03]])
+    episodes[1] = dataclasses.replace(
+        episodes[1], object_poses=episodes[1].object_poses.copy(), object_boxes_m=box
+    )
+    episodes[1].object_poses[4:, 0, 2] += 0.003
+    lifts = [one for one in episodes if one.task == "lift"]
+    episodes = [one for one in episodes if one.task == "press"] + [
+        dataclasses.replace(one, object_boxes_m=box) for one in lifts
+    ]
+    table = scene_table(episodes, config)
     core = RecurrentCore(config)
-    fit_features(core, table)
-    for task in (0, 1):
-        rows = torch.nonzero(table.task == task)[:, 0]
-        commands = table.commands(rows, 0, torch.zeros(len(rows), dtype=torch.bool))
-        features = command_features(
-            commands.points_m, commands.axes, commands.joints_rad, table.objects_at(rows, 0)
-        )
-        seen = features.numpy().reshape(-1, features.shape[-1])
-        np.testing.assert_allclose(core.feature_mean[task], seen.mean(0), atol=1e-5)
-        scaled = core.scaled(features, table.task[rows]).numpy().reshape(seen.shape)
-        wanted = (seen - seen.mean(0)) / (seen.std(0, ddof=1) + 0.05)
-        np.testing.assert_allclose(scaled, wanted, atol=1e-4)
-    assert core.feature_std[0].sum() < 0.9 * core.feature_std[1].sum()
+    describe(core, table)
+    assert core.movable.tolist() == [[1, 0, 0], [0, 0, 0]]
+    np.testing.assert_allclose(core.boxes_m[0, 0], box[0], rtol=1e-6)
+    np.testing.assert_allclose(core.boxes_m[1, 0], episodes[0].object_boxes_m[0], rtol=1e-6)
+    assert core.boxes_m[:, 1:].count_nonzero() == 0
+
+
+def test_distance_is_none_in_training_and_grows_beyond_it(config, table):
+    core = RecurrentCore(config)
+    describe(core, table)
+    commands = table.commands(torch.arange(8), 0, torch.zeros(8, dtype=torch.bool))
+    here_m = commands.points_m[:, 0, -1, :, 0]
+    assert core.distance(commands, here_m).max() == 0
+    far = dataclasses.replace(commands, joints_rad=commands.joints_rad + 1.0)
+    farther = dataclasses.replace(commands, joints_rad=commands.joints_rad + 2.0)
+    assert 0 < core.distance(far, here_m).min() < core.distance(farther, here_m).min()
+    # A jump of the wrists is a speed that no take has.
+    assert core.distance(commands, here_m + 1.0)[:, 0].min() > 0
 
 
 def test_hands_are_held_still_only_where_nothing_would_happen(config):

@@ -31,7 +31,7 @@ def with_presence(checkpoint, *odds):
             bias = reader.head[-1].bias.clone()
             reader.head[-1].weight.zero_()
             bias.zero_()
-            bias[9::10] = value
+            bias[9::11] = value
             reader.head[-1].bias.copy_(bias)
     return StateWorld(checkpoint)
 
