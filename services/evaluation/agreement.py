@@ -22,6 +22,7 @@ from services.evaluation.rate_draws import (
     MatchedScores,
     ScoreDraws,
     bootstrap_scores,
+    known_mean,
     posterior_scores,
 )
 from services.evaluation.resampling import mmrv_of_draws, pearson_of_draws
@@ -107,7 +108,7 @@ def task_agreement(
         InvalidInputError: too few policies or starts.
     """
     _check_names(policies, scores)
-    real, imagined = (rollouts.mean(axis=1) for rollouts in scores.by_rollout())
+    real, imagined = (known_mean(rollouts, axis=1) for rollouts in scores.by_rollout())
     draws = Draws(posterior_scores(scores, generator), bootstrap_scores(scores, generator))
     without = {
         name: policy.pearson(real=np.delete(real, row), imagined=np.delete(imagined, row))
@@ -138,7 +139,7 @@ def pooled_agreement(
     """
     for scores in tasks:
         _check_names(policies, scores)
-    means = [[rollouts.mean(axis=1) for rollouts in scores.by_rollout()] for scores in tasks]
+    means = [[known_mean(rollouts, axis=1) for rollouts in scores.by_rollout()] for scores in tasks]
     real, imagined = (np.array([pair[side] for pair in means]) for side in (0, 1))
     joined = Draws(
         _joined([one.posterior for one in draws]), _joined([one.bootstrap for one in draws])
@@ -261,6 +262,9 @@ def paired_differences(
 ) -> list[Difference]:
     """Differences of mean scores of all pairs of policies over matched starts.
 
+    A score that is NaN is missing: a pair is compared over the starts that both have, and left out
+    if there are none.
+
     The interval is that of Bonett and Price (2012) for paired rates, which adds one difference of
     +1 and one of −1; for graded scores in 0 … 1 the same two are added.
 
@@ -273,6 +277,9 @@ def paired_differences(
     found = []
     for first, second in itertools.combinations(rows, 2):
         paired = rollouts[first] - rollouts[second]
+        paired = paired[np.isfinite(paired)]
+        if len(paired) == 0:
+            continue
         widened = np.concatenate([paired, [1.0, -1.0]])
         centre, half = widened.mean(), z * widened.std() / math.sqrt(len(widened))
         interval = Interval(max(-1.0, float(centre - half)), min(1.0, float(centre + half)))

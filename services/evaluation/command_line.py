@@ -26,7 +26,7 @@ from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import ReportPictures, write_report
-from services.evaluation.reporting.sections import failure_rows, figure
+from services.evaluation.reporting.sections import failure_rows, figure, undecided_note
 from services.evaluation.results import ResultLog
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.settings import (
@@ -185,14 +185,15 @@ def _address(world: ServedWorld, connections: ExitStack) -> WorldAddress:
 
 
 def print_scores(report: Mapping[str, Any]) -> None:
-    """Print success rates, of how many rollouts, and agreement of a report."""
+    """Print success rates, of how many decided rollouts, and agreement of a report."""
     worlds = ["real"] if report["imagined_world"] is None else ["real", "imagined"]
     print(f"{'task':<16}{'policy':<22}" + "".join(f"{world:>16}" for world in worlds))
     for row in report["policies"]:
         rates = "".join(
-            f"{figure(row[world])} of {row[world + '_rollouts']}".rjust(16) for world in worlds
+            f"{figure(row[world])} of {_num_decided(row, world)}".rjust(16) for world in worlds
         )
-        print(f"{row['task']:<16}{row['policy']:<22}{rates}")
+        note = undecided_note(row, worlds[-1])
+        print(f"{row['task']:<16}{row['policy']:<22}{rates}{f'  {note}' if note else ''}")
     for task, rows in report["real_differences"].items() if not report["agreement"] else ():
         print(f"\n{task}: differences of success rates")
         for row in rows:
@@ -209,6 +210,10 @@ def print_scores(report: Mapping[str, Any]) -> None:
         )
         for comment in report["comments"][task]:
             print(f"  {comment}")
+
+
+def _num_decided(row: Mapping[str, Any], world: str) -> int:
+    return int(row[f"{world}_rollouts"] - row.get(f"{world}_undecided", 0))
 
 
 def _interval(figures: Mapping[str, Any], name: str) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dextouch.metrics.policy import MIN_POLICIES
+from services.evaluation.calibration import LEAST_DECIDED
 
 UNDEFINED = "undefined"
 # Smaller mean differences of success are not mentioned.
@@ -32,12 +33,17 @@ def task_comments(
         world: name of the imagined world.
     """
     both = f"both worlds (real and {world})"
+    undecided = _undecided(rows, agreement["not_comparable"], world)
     if agreement["num_starts"] == 0:
-        return [f"No start was completed in {both} by every policy: nothing to compare."]
+        if len(agreement["not_comparable"]) == len(rows):
+            return [*undecided, "No policy is left to compare."]
+        nothing = f"No start was completed in {both} by every policy: nothing to compare."
+        return [*undecided, nothing]
     undefined = []
     if isinstance(agreement["pearson"], str):
         undefined = [_why_undefined(list(agreement["rates"].values()), world)]
     return [
+        *undecided,
         _compared_starts(rows, agreement, both),
         _size_of_a_step(rows),
         _mean_error(agreement["bias"], world),
@@ -71,10 +77,30 @@ def _chance(chance: float) -> str:
     return f"Share of all pairings of the policies' rates that correlate at least as well: {share}."
 
 
+def _undecided(
+    rows: Sequence[Mapping[str, Any]], not_comparable: Sequence[str], world: str
+) -> list[str]:
+    """How many rollouts are in no rate, and which policies are not compared because of that."""
+    undecided = sum(row.get("imagined_undecided", 0) for row in rows)
+    if not undecided:
+        return []
+    sentences = [
+        f"Of {undecided} of {sum(row['imagined_rollouts'] for row in rows)} rollouts in {world} it "
+        "cannot be told whether they succeeded; they count in no rate."
+    ]
+    if not_comparable:
+        sentences.append(
+            f"Not compared, because fewer than {LEAST_DECIDED:.0%} of the rollouts in {world} were "
+            f"decided: {', '.join(map(repr, not_comparable))}."
+        )
+    return sentences
+
+
 def _compared_starts(
     rows: Sequence[Mapping[str, Any]], agreement: Mapping[str, Any], both: str
 ) -> str:
-    left_out = [repr(row["policy"]) for row in rows if row["policy"] not in agreement["rates"]]
+    named = {*agreement["rates"], *agreement["not_comparable"]}
+    left_out = [repr(row["policy"]) for row in rows if row["policy"] not in named]
     unless = f" except {', '.join(left_out)}, which completed none" if left_out else ""
     num_starts = rows[0]["real_rollouts"] + rows[0]["real_failed"]
     return (
@@ -116,7 +142,11 @@ def _widest_gaps(rows: Sequence[Mapping[str, Any]], world: str) -> list[str]:
 
     The rates are those of the report, over all completed rollouts of a policy.
     """
-    rows = [row for row in rows if UNDEFINED not in {row["real"], row["imagined"]}]
+    rows = [
+        row
+        for row in rows
+        if UNDEFINED not in {row["real"], row["imagined"]} and row["imagined_comparable"]
+    ]
     sentences = []
     for verb, sign in (("overrates", 1), ("underrates", -1)):
         low, high = ("real", "imagined") if sign > 0 else ("imagined", "real")

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -10,7 +10,7 @@ from jaxtyping import Float32, UInt8
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import Observation, is_rollout
+from dextouch.schemas import Observation, RolloutDoubt, is_rollout, rollout_doubt
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
@@ -40,7 +40,8 @@ class Ending:
     `object_poses` are T_world_object (x y z m, qw qx qy qz) of at most three objects, NaN for an
     unknown object; only imagined worlds provide them. `images` are None if they were not
     requested; images or object poses are required. `doubted` is the reason why the world itself
-    flags its prediction as uncertain.
+    flags its prediction as uncertain, and `success_probability` its own estimate of the outcome;
+    both are of the whole rollout.
     """
 
     images: UInt8[np.ndarray, "3 h w 3"] | None
@@ -49,10 +50,24 @@ class Ending:
     object_poses: Float32[np.ndarray, "3 objects 7"] | None = None
     imagined: bool = False
     doubted: str | None = None
+    success_probability: float | None = None
 
     @classmethod
-    def of(cls, observation: Observation, task: str, *, imagined: bool) -> "Ending":
+    def of(
+        cls,
+        observation: Observation,
+        task: str,
+        *,
+        imagined: bool,
+        doubt: RolloutDoubt | None = None,
+    ) -> "Ending":
         """Ending shown by the last observation of a rollout.
+
+        Args:
+            observation: the last one.
+            task: of the rollout.
+            imagined: whether a world model imagined it.
+            doubt: of the whole rollout; None if it has no observation but this one.
 
         Raises:
             InvalidInputError: fewer than three steps.
@@ -63,14 +78,22 @@ class Ending:
                 "longer chunks and request all steps of the last one"
             )
         images = observation.images.get(CAMERA)
-        poses, doubt = observation.object_poses, observation.doubt
-        return cls(
+        poses = observation.object_poses
+        ending = cls(
             None if images is None else images[-NUM_SEEN_STEPS:],
             observation.tactile_kpa[-NUM_SEEN_STEPS:],
             task,
             None if poses is None else poses[-NUM_SEEN_STEPS:],
             imagined,
-            doubt.reason if doubt is not None and doubt.outside else None,
+        )
+        return ending.with_doubt(rollout_doubt([observation]) if doubt is None else doubt)
+
+    def with_doubt(self, doubt: RolloutDoubt) -> "Ending":
+        """The ending with what the world says about the whole rollout."""
+        return replace(
+            self,
+            doubted=None if doubt.reason is None else f"at step {doubt.step}, {doubt.reason}",
+            success_probability=doubt.success_probability,
         )
 
 
@@ -155,6 +178,7 @@ def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:
     )
     steps = (episode.early_step, episode.middle_step, last - 1, last)
     endings = {step: _read_ending(reader, step) for step in steps}
+    endings[last] = endings[last].with_doubt(RolloutDoubt.from_quality(about.quality))
     return EndingEpisode(**{**vars(episode), "endings": endings})
 
 
@@ -227,6 +251,8 @@ def endings_hash(episodes: Iterable[EndingEpisode]) -> str:
         digest.update(repr(sorted((item.event_times_s or {}).items())).encode())
         for step, ending in sorted(item.endings.items()):
             digest.update(str(step).encode())
+            if (told := (ending.doubted, ending.success_probability)) != (None, None):
+                digest.update(repr(told).encode())
             for array in (ending.images, ending.tactile_kpa, ending.object_poses):
                 digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

@@ -24,16 +24,28 @@ _SHRINK_STARTS: Final = 4.0
 _BATCH: Final = 1000
 
 
+def known_mean(scores: np.ndarray, *, axis: int) -> np.ndarray:
+    """Mean of the scores that are not NaN; NaN where there are none."""
+    known = np.isfinite(scores)
+    if known.all():
+        return np.asarray(scores.mean(axis=axis))
+    count = known.sum(axis=axis)
+    total = np.where(known, scores, 0.0).sum(axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
 @dataclass(frozen=True)
 class MatchedScores:
     """Scores in 0 … 1 of one task's policies from the same starts in two worlds.
 
-    `real` and `imagined` are [policies, starts, raters]; an absent rater is NaN, and every rollout
-    has at least one. Success is a score of one rater, 0 or 1.
+    `real` and `imagined` are [policies, starts, raters]; an absent rater is NaN. Every real rollout
+    has at least one; an imagined one without any is undecided and counts in no mean, and every
+    policy has one that is not. Success is a score of one rater, 0 or 1.
 
     Raises:
         ShapeError: different policies or starts, or nothing to compare.
-        InvalidInputError: a score outside 0 … 1, or a rollout that nobody rated.
+        InvalidInputError: a score outside 0 … 1, a real rollout that nobody rated, or a policy
+            without any imagined score.
     """
 
     real: Float64[np.ndarray, "_ _ _"]
@@ -48,11 +60,17 @@ class MatchedScores:
             )
         for world, scores in (("real", self.real), ("imagined", self.imagined)):
             known = np.isfinite(scores)
-            if not known.any(axis=2).all():
-                policy, start = np.argwhere(~known.any(axis=2))[0]
+            rated = known.any(axis=2)
+            if world == "real" and not rated.all():
+                policy, start = np.argwhere(~rated)[0]
                 raise InvalidInputError(
-                    f"scores: policy {policy} from start {start} in the {world} world has no "
+                    f"scores: policy {policy} from start {start} in the real world has no "
                     "score; leave the start out in both worlds"
+                )
+            if not rated.any(axis=1).all():
+                raise InvalidInputError(
+                    f"scores: policy {np.argmin(rated.any(axis=1))} has no imagined score; leave "
+                    "the policy out in both worlds"
                 )
             if ((scores[known] < 0) | (scores[known] > 1)).any():
                 raise InvalidInputError(
@@ -68,8 +86,8 @@ class MatchedScores:
     def by_rollout(
         self,
     ) -> tuple[Float64[np.ndarray, "policies starts"], Float64[np.ndarray, "policies starts"]]:
-        """Scores of rollouts in both worlds: means over raters."""
-        return np.nanmean(self.real, axis=2), np.nanmean(self.imagined, axis=2)
+        """Scores of rollouts in both worlds: means over raters; NaN for undecided rollouts."""
+        return known_mean(self.real, axis=2), known_mean(self.imagined, axis=2)
 
 
 @dataclass(frozen=True)
@@ -107,7 +125,7 @@ def _resampled(
     means = []
     for drawn in np.array_split(starts, -(-len(starts) // _BATCH)):
         if num_raters == 1:
-            means.append(scores[rows, drawn[:, None, :], 0].mean(axis=2))
+            means.append(known_mean(scores[rows, drawn[:, None, :], 0], axis=2))
             continue
         here = present[rows, drawn[:, None, :]]
         uniform = generator.random((*here.shape, num_raters), dtype=np.float32)
@@ -118,8 +136,9 @@ def _resampled(
             rollouts = values.mean(axis=3)
         else:
             counted = np.arange(num_raters) < here[..., None]
-            rollouts = (values * counted).sum(axis=3) / here
-        means.append(rollouts.mean(axis=2))
+            total = (values * counted).sum(axis=3)
+            rollouts = np.where(here > 0, total / np.maximum(here, 1), np.nan)
+        means.append(known_mean(rollouts, axis=2))
     return np.concatenate(means)
 
 
@@ -144,7 +163,7 @@ def posterior_scores(
             "at least two of each"
         )
     rollouts = np.concatenate(scores.by_rollout())
-    observed, noise = rollouts.mean(axis=1), noise_covariance(rollouts)
+    observed, noise = known_mean(rollouts, axis=1), noise_covariance(rollouts)
     grid = _Grid.of(num_policies, observed, noise)
     counts = generator.multinomial(num_draws, grid.weight)
     drawn = np.empty((num_draws, 2 * num_policies))
@@ -167,17 +186,21 @@ def noise_covariance(
 
     Variances include two additional rollouts, one of score 0 and one of score 1 (the rule of
     Agresti and Coull 1998 for binomial rates), so that ten of ten successes are not certain.
-    Correlations are shrunk towards zero; with four starts or fewer they are zero.
+    Correlations are shrunk towards zero; with four starts or fewer they are zero. Scores that are
+    NaN are missing: variances are those of the known scores, and two series correlate by the starts
+    that both know.
     """
-    num_series, num_starts = rollouts.shape
-    mean = (rollouts.sum(axis=1) + 1) / (num_starts + 2)
-    square = ((rollouts**2).sum(axis=1) + 1) / (num_starts + 2)
+    num_series = len(rollouts)
+    known = np.isfinite(rollouts)
+    num_starts, scores = known.sum(axis=1), np.where(known, rollouts, 0.0)
+    mean = (scores.sum(axis=1) + 1) / (num_starts + 2)
+    square = ((scores**2).sum(axis=1) + 1) / (num_starts + 2)
     deviation = np.sqrt((square - mean**2) / num_starts)
-    centred = rollouts - rollouts.mean(axis=1, keepdims=True)
+    centred = np.where(known, rollouts - known_mean(rollouts, axis=1)[:, None], 0.0)
     size = np.linalg.norm(centred, axis=1)
     varies = size > 1e-9
     unit = np.where(varies[:, None], centred / np.where(varies, size, 1.0)[:, None], 0.0)
-    correlation = max(0.0, 1 - _SHRINK_STARTS / num_starts) * (unit @ unit.T)
+    correlation = max(0.0, 1 - _SHRINK_STARTS / num_starts.min()) * (unit @ unit.T)
     correlation[np.arange(num_series), np.arange(num_series)] = 1.0
     # Identical series make the matrix singular; a small diagonal term keeps it invertible.
     correlation += 1e-6 * np.eye(num_series)

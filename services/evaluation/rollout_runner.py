@@ -8,7 +8,13 @@ from jaxtyping import Float64
 
 from dextouch.clients import Policy, Rollout
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError
-from dextouch.schemas import MAX_SEED, Observation, ReturnSelector
+from dextouch.schemas import (
+    MAX_SEED,
+    Observation,
+    ReturnSelector,
+    RolloutDoubt,
+    rollout_doubt,
+)
 from dextouch.tracing import current_trace_id, in_trace
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
@@ -45,6 +51,11 @@ class PlayedRollout:
     def ending(self) -> Observation:
         """The observation of the last chunk."""
         return self.observations[-1]
+
+    @property
+    def doubt(self) -> RolloutDoubt:
+        """The world's doubt of the whole rollout."""
+        return rollout_doubt(self.observations)
 
 
 @dataclass(frozen=True)
@@ -95,7 +106,9 @@ class RolloutRunner:
         try:
             with in_trace():
                 played = self._play(start, actor, policy, world, repeat)
-            ending = Ending.of(played.ending, start.task, imagined=world != REAL)
+            ending = Ending.of(
+                played.ending, start.task, imagined=world != REAL, doubt=played.doubt
+            )
         except DexTouchError as error:
             return rollout_failure(error, start, policy, world, repeat), None
         verdict = self.probe.verdict(ending)
@@ -109,6 +122,7 @@ class RolloutRunner:
             verdict.probability,
             cannot_tell=None if played.success is not None else verdict.reason,
             repeat=repeat,
+            world_probability=verdict.world_probability,
         )
         return score, played
 

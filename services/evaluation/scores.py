@@ -17,8 +17,9 @@ from services.evaluation.agreement import (
     pooled_agreement,
     task_agreement,
 )
+from services.evaluation.calibration import LEAST_DECIDED
 from services.evaluation.comments import UNDEFINED, task_comments, undefined_by
-from services.evaluation.rate_draws import MatchedScores
+from services.evaluation.rate_draws import MatchedScores, known_mean
 from services.evaluation.statistics import wilson_interval
 
 REAL = "real"
@@ -39,9 +40,10 @@ class RolloutScore:
     """Result of one rollout.
 
     `success` is reported by the real world and decided by the probe elsewhere; `probability` is
-    always the probe's, so that the probe itself can be evaluated. `cannot_tell` is the reason why
-    the probe abstains on an imagined rollout; `success` is then the more likely outcome. `repeat`
-    numbers imagined rollouts that differ by their noise alone.
+    that of the probe's verdict, in the real world too, so that the probe itself can be evaluated.
+    `cannot_tell` is the reason why the probe abstains on an imagined rollout; `success` is then the
+    more likely outcome, which counts in no rate. `repeat` numbers imagined rollouts that differ by
+    their noise alone. `world_probability` is the world's own estimate of success, if it has one.
     """
 
     world: str
@@ -53,6 +55,7 @@ class RolloutScore:
     probability: float
     cannot_tell: str | None = None
     repeat: int = 0
+    world_probability: float | None = None
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,9 @@ Outcome = RolloutScore | RolloutFailure
 class ClosedLoopReport:
     """Every rollout of an evaluation; the first imagined world, if any, is reported.
 
-    Failed rollouts are excluded from all figures and counted separately.
+    Failed and undecided rollouts are excluded from all rates and counted separately. A policy of
+    which fewer than `LEAST_DECIDED` of the rollouts in a world are decided is not comparable there:
+    its rate is reported, but not compared.
     """
 
     scores: tuple[RolloutScore, ...]
@@ -98,10 +103,13 @@ class ClosedLoopReport:
         """Tasks, in the order of the rollouts."""
         return tuple(dict.fromkeys(rollout.task for rollout in self.rollouts))
 
-    def outcomes(self, world: str, task: str) -> Float64[np.ndarray, "policies starts"]:
+    def outcomes(
+        self, world: str, task: str, *, only_decided: bool = False
+    ) -> Float64[np.ndarray, "policies starts"]:
         """Success (1 or 0) of every policy from every start; NaN for failed rollouts.
 
-        Rollouts that were repeated count with their share of successes.
+        Rollouts that were repeated count with their share of successes. Undecided ones count with
+        the likelier outcome, or not at all if `only_decided`.
 
         Raises:
             InvalidInputError: policies have different starts.
@@ -118,7 +126,8 @@ class ClosedLoopReport:
                 f"scores of {world!r} in {task!r}: got policies with different starts, expected "
                 "the same starts for all"
             )
-        success = {key: _success_share(found) for key, found in scores.items()}
+        counted = {k: _decided(found) if only_decided else found for k, found in scores.items()}
+        success = {key: _success_share(found) for key, found in counted.items() if found}
         rows = [[success.get((p, seed), math.nan) for seed in seeds] for p in self.policies]
         return np.array(rows)
 
@@ -148,30 +157,40 @@ class ClosedLoopReport:
     def _cell(self, name: str, world: str, task: str, policy: str) -> dict[str, Any]:
         mine = [s for s in self._of(world, task) if s.policy == policy]
         num_failed = sum(f.policy == policy for f in self._failed(world, task))
-        counts = {f"{name}_rollouts": len(mine), f"{name}_failed": num_failed}
+        counts: dict[str, Any] = {f"{name}_rollouts": len(mine), f"{name}_failed": num_failed}
         if not mine:
             return {name: UNDEFINED, f"{name}_probability": UNDEFINED, **counts}
+        counts |= {
+            f"{name}_probability": float(np.mean([s.probability for s in mine])),
+            f"{name}_undecided": len(mine) - len(_decided(mine)),
+            f"{name}_comparable": self._is_comparable(world, task, policy),
+        }
         # Repeats of one start are one observation of the policy.
         starts: dict[int, list[RolloutScore]] = {}
-        for score in mine:
+        for score in _decided(mine):
             starts.setdefault(score.seed, []).append(score)
+        if not starts:
+            return {name: UNDEFINED, **counts}
         successes = sum(map(_success_share, starts.values()))
         interval = wilson_interval(successes, len(starts))
         return {
             name: successes / len(starts),
             f"{name}_interval": [interval.low, interval.high],
-            f"{name}_probability": float(np.mean([s.probability for s in mine])),
-            f"{name}_undecided": sum(s.cannot_tell is not None for s in mine),
             **counts,
         }
+
+    def _is_comparable(self, world: str, task: str, policy: str) -> bool:
+        mine = [s for s in self._of(world, task) if s.policy == policy]
+        return len(_decided(mine)) >= LEAST_DECIDED * len(mine)
 
     def agreement(self, world: str) -> dict[str, dict[str, Any]]:
         """Agreement of the policies' success rates in a world with the real ones, by task.
 
         `mmrv` counts ties (`ties="simpler"`); `mmrv_paper` does not, so it is 0 for a world that
         gives every policy the same score. `rates` are the compared success rates, over the
-        `num_starts` starts that finished in both worlds for every policy. Correlations need three
-        policies; with fewer they are "undefined (2 policies)". With two policies and
+        `num_starts` starts that finished in both worlds for every policy; the imagined ones are of
+        the decided rollouts among them, and policies in `not_comparable` are left out. Correlations
+        need three policies; with fewer they are "undefined (2 policies)". With two policies and
         two starts or more, every figure has a 95 % interval of the true scores' figure and the
         share of bootstrap draws in which it is undefined; `pearson_without` leaves one policy out,
         `pearson_chance` is the permutation p value, and `differences` compares policies in pairs.
@@ -194,12 +213,20 @@ class ClosedLoopReport:
         return by_task, _entries(pooled, len(compared[0].policies))
 
     def _agreement(self, world: str, task: str) -> tuple[dict[str, Any], "_Compared | None"]:
-        outcomes = (self.outcomes(REAL, task), self.outcomes(world, task))
-        compared, real, imagined = matched(self.policies, *outcomes)
+        vague = [p for p in self.policies if not self._is_comparable(world, task, p)]
+        kept = np.array([policy not in vague for policy in self.policies])
+        names = [policy for policy in self.policies if policy not in vague]
+        compared, real, imagined = matched(
+            names,
+            self.outcomes(REAL, task)[kept],
+            self.outcomes(world, task)[kept],
+            self.outcomes(world, task, only_decided=True)[kept],
+        )
         if real.size == 0:
             undefined = dict.fromkeys(FIGURES, UNDEFINED)
-            return undefined | {"num_policies": 0, "num_starts": 0, "rates": {}}, None
-        pair = {"real": real.mean(axis=1), "imagined": imagined.mean(axis=1)}
+            counts = {"num_policies": 0, "num_starts": 0, "rates": {}, "not_comparable": vague}
+            return undefined | counts, None
+        pair = {"real": real.mean(axis=1), "imagined": known_mean(imagined, axis=1)}
         found: dict[str, Any] = {n: defined(f(**pair), len(real)) for n, f in FIGURES.items()}
         joined = None
         if min(real.shape) >= 2:
@@ -215,6 +242,7 @@ class ClosedLoopReport:
         found |= {
             "num_policies": len(real),
             "num_starts": real.shape[1],
+            "not_comparable": vague,
             "rates": {
                 policy: {side: float(rates[row]) for side, rates in pair.items()}
                 for row, policy in enumerate(compared)
@@ -225,7 +253,7 @@ class ClosedLoopReport:
     def real_differences(self, task: str) -> list[dict[str, Any]]:
         """Differences of pairs of policies in the real world, over starts that ended for all."""
         outcomes = self.outcomes(REAL, task)
-        compared, real, _ = matched(self.policies, outcomes, outcomes)
+        compared, real, _ = matched(self.policies, outcomes, outcomes, outcomes)
         return _differences(compared, real, np.random.default_rng(_SEED)) if real.size else []
 
     def probe_accuracy(self) -> float | str:
@@ -267,25 +295,36 @@ def _differences(
     ]
 
 
+def _decided(scores: Sequence[RolloutScore]) -> list[RolloutScore]:
+    return [score for score in scores if score.cannot_tell is None]
+
+
 def _success_share(scores: Sequence[RolloutScore]) -> float:
     return sum(score.success for score in scores) / len(scores)
 
 
 def matched(
-    policies: Sequence[str], real: np.ndarray, imagined: np.ndarray
+    policies: Sequence[str], real: np.ndarray, imagined: np.ndarray, decided: np.ndarray
 ) -> tuple[
     list[str], Float64[np.ndarray, "policies starts"], Float64[np.ndarray, "policies starts"]
 ]:
     """Compared policies, and their outcomes [policies, starts] in both worlds.
 
     Excludes policies without a start that finished in both worlds, then starts that did not
-    finish in both worlds for every remaining policy.
+    finish in both worlds for every remaining policy, then policies without a decided one of these.
+
+    Args:
+        policies: names, in the order of the outcomes.
+        real: outcomes in the real world.
+        imagined: outcomes in the imagined one, undecided ones with the likelier.
+        decided: the same with NaN for undecided ones, which is what is returned.
     """
     known = np.isfinite(real) & np.isfinite(imagined)
     rows = known.any(axis=1)
     columns = known[rows].all(axis=0)
+    rows &= np.isfinite(decided[:, columns]).any(axis=1)
     compared = [policy for policy, kept in zip(policies, rows, strict=True) if kept]
-    return compared, real[rows][:, columns], imagined[rows][:, columns]
+    return compared, real[rows][:, columns], decided[rows][:, columns]
 
 
 def _entries(agreement: Agreement, num_policies: int) -> dict[str, Any]:

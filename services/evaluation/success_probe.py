@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float32, Float64
 
 from dextouch.errors import InvalidInputError
-from services.evaluation.calibration import Calibration, sigmoid
+from services.evaluation.calibration import Calibration, Combination, sigmoid
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_network
 from services.evaluation.endings import Ending
 from services.evaluation.judge_network import ProbeBatch, ProbeNetwork, ProbeShape, probe_batch
@@ -30,9 +30,10 @@ _BATCH = 256
 class Verdict:
     """Decision of the probe about one ending.
 
-    `likely_success` is the more probable outcome, also where the probe abstains; `reason` says why
-    it does. `milestones` are the probabilities that each was reached by the end, for those that the
-    probe can classify.
+    `probability` is the probe's, joined with the world's own estimate `world_probability` where an
+    imagined ending has one. `likely_success` is the more probable outcome, also where the probe
+    abstains; `reason` says why it does. `milestones` are the probabilities that each was reached by
+    the end, for those that the probe can classify.
     """
 
     probability: float
@@ -40,6 +41,7 @@ class Verdict:
     likely_success: bool
     reason: str | None = None
     milestones: Mapping[str, float] = field(default_factory=dict)
+    world_probability: float | None = None
 
 
 class SuccessProbe:
@@ -60,6 +62,10 @@ class SuccessProbe:
         self._calibrations = {
             name: Calibration.model_validate(values)
             for name, values in settings.get("calibration", {}).items()
+        }
+        self._combinations = {
+            task: Combination.model_validate(values)
+            for task, values in settings.get("combination", {}).items()
         }
         self._told: Mapping[str, Sequence[str]] = settings.get("told_milestones", {})
         self._network = ProbeNetwork(self.shape)
@@ -108,7 +114,10 @@ class SuccessProbe:
         return odds
 
     def probabilities(self, endings: Sequence[Ending]) -> Float64[np.ndarray, " n"]:
-        """Calibrated probability of success of each ending; raises as `log_odds`."""
+        """Calibrated probability of success of each ending, whatever the world estimates.
+
+        Raises as `log_odds`.
+        """
         return self._calibrated(endings, self.log_odds(endings))
 
     def _calibrated(self, endings: Sequence[Ending], odds: np.ndarray) -> Float64[np.ndarray, " n"]:
@@ -135,16 +144,8 @@ class SuccessProbe:
         return self.verdicts([ending])[0]
 
     def _verdict(self, ending: Ending, probability: float, odds: np.ndarray) -> Verdict:
-        band = self.calibration(ending.task, imagined=ending.imagined).band
+        probability, reason = self._judged(ending, probability)
         likely = probability >= self.threshold
-        reason = None
-        if ending.doubted is not None:
-            reason = f"the world flags its prediction: {ending.doubted}"
-        elif band > 0 and abs(probability - self.threshold) <= band:
-            reason = (
-                f"its probability is within {band:.2f} of {self.threshold:g}, where the probe "
-                "errs too often"
-            )
         decided: Decision = "success" if likely else "failure"
         names = self.shape.milestones.get(ending.task, ())
         reached = sigmoid(odds[1:])
@@ -154,8 +155,40 @@ class SuccessProbe:
             if name in self._told.get(ending.task, ())
         }
         return Verdict(
-            probability, decided if reason is None else "cannot tell", likely, reason, milestones
+            probability,
+            decided if reason is None else "cannot tell",
+            likely,
+            reason,
+            milestones,
+            ending.success_probability,
         )
+
+    def _judged(self, ending: Ending, probability: float) -> tuple[float, str | None]:
+        """Probability of success by all that is known, and why nothing is decided from it.
+
+        Args:
+            ending: what is judged.
+            probability: calibrated, of the probe alone.
+        """
+        band = self.calibration(ending.task, imagined=ending.imagined).band
+        contradiction = None
+        if ending.success_probability is not None:
+            joint = self._combinations.get(ending.task, Combination(band=band))
+            pair = np.array([probability]), np.array([ending.success_probability])
+            if joint.contradictory(*pair)[0]:
+                contradiction = (
+                    f"the probe expects success with probability {probability:.2f}, the world "
+                    f"itself with {ending.success_probability:.2f}"
+                )
+            probability, band = float(joint.probabilities(*pair)[0]), joint.band
+        if ending.doubted is not None:
+            return probability, f"the world flags its prediction: {ending.doubted}"
+        if contradiction is None and band > 0 and abs(probability - self.threshold) <= band:
+            return probability, (
+                f"its probability is within {band:.2f} of {self.threshold:g}, where the probe "
+                "errs too often"
+            )
+        return probability, contradiction
 
 
 def calibration_name(task: str, kind: str) -> str:

@@ -7,7 +7,14 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool
 
-from services.evaluation.calibration import Calibration, Reliability, fit_calibration, sigmoid
+from services.evaluation.calibration import (
+    Calibration,
+    Combination,
+    Reliability,
+    fit_calibration,
+    fit_combination,
+    sigmoid,
+)
 from services.evaluation.endings import Ending, EndingEpisode
 from services.evaluation.statistics import area_under_roc, balanced_accuracy
 from services.evaluation.success_probe import IMAGINED, TRUE, SuccessProbe, calibration_name
@@ -31,6 +38,33 @@ def fit_calibrations(
                 continue
             odds = probe.log_odds(endings)[:, 0]
             found[calibration_name(task, kind)] = fit_calibration(odds, success, risk=risk)
+    return found
+
+
+def fit_combinations(
+    probe: SuccessProbe, episodes: Sequence[EndingEpisode], *, risk: float, margin: float
+) -> dict[str, Combination]:
+    """Combination of a calibrated probe with the world's own estimates, of every task.
+
+    Only imagined endings count that the world estimates and does not doubt, since it is for these
+    that the probe decides.
+    """
+    found: dict[str, Combination] = {}
+    for task in probe.shape.tasks:
+        endings, success = final_endings(episodes, task, IMAGINED)
+        rows = [
+            row
+            for row, ending in enumerate(endings)
+            if ending.success_probability is not None and ending.doubted is None
+        ]
+        outcomes = success[rows]
+        if min(outcomes.sum(), (~outcomes).sum()) < MIN_OUTCOMES:
+            continue
+        mine = [endings[row] for row in rows]
+        world = np.array([ending.success_probability for ending in mine], dtype=np.float64)
+        found[task] = fit_combination(
+            probe.probabilities(mine), world, outcomes, risk=risk, margin=margin
+        )
     return found
 
 

@@ -26,6 +26,7 @@ from services.evaluation.success_probe import DECISION_THRESHOLD, KIND, SuccessP
 from services.evaluation.success_probe_data import Labelled, labelled_endings, object_scale
 from services.evaluation.success_probe_figures import (
     fit_calibrations,
+    fit_combinations,
     held_out_figures,
     milestones_that_can_be_told,
 )
@@ -156,18 +157,29 @@ def _metadata(
 
 
 def _calibrated(checkpoint: Checkpoint, sets: ProbeSets, settings: ProbeSettings) -> Checkpoint:
-    """The checkpoint with calibration and milestones from the development episodes."""
+    """The checkpoint with all that is fitted to the development episodes."""
     probe = SuccessProbe(checkpoint)
-    found = fit_calibrations(probe, sets.development, risk=settings.risk)
-    added = {
-        "calibration": {name: one.model_dump() for name, one in found.items()},
-        "told_milestones": milestones_that_can_be_told(probe, sets.development),
-    }
-    metadata = checkpoint.metadata
-    return replace(
+    calibrations = fit_calibrations(probe, sets.development, risk=settings.risk)
+    calibrated = _with_settings(
         checkpoint,
-        metadata=metadata.model_copy(update={"settings": {**metadata.settings, **added}}),
+        calibration={name: one.model_dump() for name, one in calibrations.items()},
+        told_milestones=milestones_that_can_be_told(probe, sets.development),
     )
+    combinations = fit_combinations(
+        SuccessProbe(calibrated),
+        sets.development,
+        risk=settings.imagined_risk,
+        margin=settings.contradiction_margin,
+    )
+    return _with_settings(
+        calibrated, combination={task: one.model_dump() for task, one in combinations.items()}
+    )
+
+
+def _with_settings(checkpoint: Checkpoint, **added: object) -> Checkpoint:
+    metadata = checkpoint.metadata
+    settings = {**metadata.settings, **added}
+    return replace(checkpoint, metadata=metadata.model_copy(update={"settings": settings}))
 
 
 def _measured(checkpoint: Checkpoint, sets: ProbeSets) -> Checkpoint:

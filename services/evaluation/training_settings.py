@@ -89,6 +89,18 @@ class ProbeSettings(FrozenModel):
     risk: float = Field(
         default=0.05, gt=0, lt=1, description="allowed share of errors among decided endings"
     )
+    imagined_risk: float = Field(
+        default=0.10,
+        gt=0,
+        lt=1,
+        description="the same for imagined endings of worlds that estimate success",
+    )
+    contradiction_margin: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.5,
+        description="distance from 0.5 beyond which probe and world contradict each other",
+    )
 
 
 class DirectSettings(FrozenModel):

@@ -9,7 +9,7 @@ import numpy as np
 from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeReader, EpisodeStore, write_rollout
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import LineageEntry, Observation, ReturnSelector
+from dextouch.schemas import LineageEntry, Observation, ReturnSelector, rollout_doubt
 
 CAMERA: Final = "camera_head"
 CHUNK_STEPS: Final = 16
@@ -29,7 +29,8 @@ def imagine_episode(
     The imagined episode starts from the source's first observation. Its `success` is that of the
     *source*: the real outcome of the actions, and the label for training a success probe on
     imagined endings. Its lineage names the source and the world's digest. Object poses, if the
-    world provides them, are the stream `object_poses`, from step 1 on.
+    world provides them, are the stream `object_poses`, from step 1 on; the world's doubt about the
+    whole rollout, and its own estimate of success, are quality figures (`RolloutDoubt.to_quality`).
 
     Args:
         source: a robot episode with head camera, touch and commanded actions.
@@ -73,6 +74,7 @@ def imagine_episode(
             "event_times_s": {},
             "generator_command": None,
             "streams": (),
+            "quality": attributes.quality | rollout_doubt(seen).to_quality(),
         }
     )
     write_rollout(store, imagined, seen, commanded)

@@ -267,7 +267,7 @@ def _study_pages(
             }
             cells = {"twin": Measured((float(row[REAL]),))}
             cells |= {
-                world: Measured(tuple(by_world[f"{world} {seed}"] for seed in experiments.seeds))
+                world: _defined(by_world[f"{world} {seed}"] for seed in experiments.seeds)
                 for world in ADAPTED
             }
             success.append(Row(f"{task}, {policy}", cells, {}))
@@ -277,7 +277,7 @@ def _study_pages(
     for key, name, higher in (("pearson", "Pearson", True), ("mmrv", "MMRV", False)):
         for task in DOWNSTREAM:
             cells = {
-                world: _agreed(
+                world: _defined(
                     agreement[f"{world} {seed}"][task][key] for seed in experiments.seeds
                 )
                 for world in ADAPTED
@@ -291,8 +291,8 @@ def _study_pages(
     ]
 
 
-def _agreed(by_seed: Iterable[float | str]) -> Measured:
-    """A figure of agreement by training seed; a report has the reason where it is undefined."""
+def _defined(by_seed: Iterable[float | str]) -> Measured:
+    """A figure of a report by training seed; it is the reason where it is undefined."""
     found = list(by_seed)
     values = tuple(math.nan if isinstance(one, str) else float(one) for one in found)
     reasons = [one for one in found if isinstance(one, str)]

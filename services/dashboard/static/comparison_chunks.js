@@ -38,3 +38,9 @@ export function difference(real, imagined) {
 export function doubtAt(doubts, step) {
   return doubts.find((one) => step >= one.first_step && step <= one.last_step) ?? null;
 }
+
+// Reason and step of the first doubted chunk up to a step, which makes the rest unreliable; null if none.
+export function firstDoubted(doubts, step) {
+  const first = doubts.find((one) => one.doubt?.outside && one.first_step <= step);
+  return first ? { reason: first.doubt.reason, step: first.last_step } : null;
+}

@@ -10,17 +10,21 @@ const KINDS = { twin: "physics twin", model: "imagined", baseline: "baseline", r
 
 export function stateOf(rollout) {
   if (rollout.ended) return { level: "ERROR", word: "ended" };
-  if (rollout.doubt?.outside) return { level: "WARN", word: "unreliable" };
+  if (rollout.rollout_doubt?.reason) return { level: "WARN", word: "unreliable" };
   if (rollout.idle_s > IDLE_S) return { level: "STALE", word: "waiting" };
   return { level: "OK", word: "running" };
 }
 
-// Doubt in words; `reason` is what to read beside a number that cannot be trusted.
+// Doubt of the newest chunk in words; `reason` is what to read beside a number that cannot be trusted.
+// Once a chunk was doubted, the rest of the rollout is unreliable, too.
 export function doubtOf(rollout) {
-  const { doubt, kind } = rollout;
+  const { doubt, kind, rollout_doubt: whole } = rollout;
   if (doubt) {
-    const figures = `disagreement ${doubt.disagreement.toPrecision(2)}, distance ${doubt.distance.toPrecision(2)}`;
-    return { text: doubt.outside ? `above its bound: ${figures}` : `within its bound: ${figures}`, reason: doubt.reason ?? "" };
+    const estimate = doubt.success_probability ?? null;
+    const success = estimate === null ? "" : `, success ${(100 * estimate).toFixed(0)} % by its own estimate`;
+    const figures = `disagreement ${doubt.disagreement.toPrecision(2)}, distance ${doubt.distance.toPrecision(2)}${success}`;
+    const earlier = whole?.reason ? `unreliable since step ${whole.step}: ${whole.reason}` : "";
+    return { text: doubt.outside ? `above its bound: ${figures}` : `within its bound: ${figures}`, reason: doubt.reason ?? earlier };
   }
   if (kind === "model") return { text: "not reported", reason: rollout.next_chunk === 0 ? "" : "This model has no doubt figure: nothing says how reliable these steps are." };
   return { text: "–", reason: "" };

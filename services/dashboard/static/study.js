@@ -57,7 +57,7 @@ function showFigures() {
   setText(find("study_title"), summary.title || summary.name);
   find("study_state").replaceChildren(badge(stateOf(summary)), progress(summary));
   setText(find("summary"), `${figures.num_disagreements} imagined outcomes differ from the real ones`);
-  setText(find("rate_meaning"), `${meanings.rate} Unreliable: ${meanings.unreliable}`);
+  setText(find("rate_meaning"), `${meanings.rate} Cannot tell: ${meanings.unreliable}`);
   const named = [["Pearson", "pearson"], ["Mean absolute error", "mean_absolute_error"], ["MMRV", "mmrv"], ["Bias", "bias"], ["Intervals", "interval"]];
   find("meanings").replaceChildren(...named.flatMap(([label, key]) => [element("dt", {}, label), element("dd", {}, meanings[key])]));
   showRates();
@@ -83,7 +83,7 @@ async function findPlayable(found) {
 
 function showRollouts(total) {
   const kept = new Set([...playable].filter(([, has]) => has).map(([id]) => id));
-  const heads = ["", "World", "Task", "Policy", "Seed", "Outcome", "Real outcome", "Probe", "Unreliable", "Play"];
+  const heads = ["", "World", "Task", "Policy", "Seed", "Outcome", "Real outcome", "Probe", "Cannot tell", "Play"];
   find("rollouts").tHead.replaceChildren(element("tr", {}, ...heads.map((label) =>
     element("th", { scope: "col", class: ["Seed", "Probe"].includes(label) ? "number" : null }, label))));
   find("rollouts").tBodies[0].replaceChildren(...rows.map((row) => rolloutRow(row, kept)));

@@ -46,7 +46,8 @@ export function why(text) {
 export function cautions(rate) {
   const found = [];
   const total = rate.num_finished + rate.num_failed + rate.num_missing;
-  if (rate.num_unreliable) found.push(`${rate.num_unreliable} of ${rate.num_finished} unreliable: ${rate.reasons.join("; ")}`);
+  if (rate.num_unreliable) found.push(`${rate.num_unreliable} of ${rate.num_finished} cannot tell: ${rate.reasons.join("; ")}`);
+  if (!rate.is_comparable) found.push("not comparable: too few rollouts are decided");
   if (rate.num_failed) found.push(`${rate.num_failed} of ${total} failed to run and are not counted`);
   if (rate.num_missing) found.push(`${rate.num_missing} of ${total} have no result yet`);
   return found;

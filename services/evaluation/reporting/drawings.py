@@ -126,7 +126,9 @@ def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
                 style=index,
             )
             for index, entry in enumerate(rows)
-            if is_number(entry.get("real")) and is_number(entry.get("imagined"))
+            if is_number(entry.get("real"))
+            and is_number(entry.get("imagined"))
+            and entry.get("imagined_comparable", True)
         ]
         chart = agreement_chart(points) if points else None
         figures = agreement_figures(agreement.get(task, {}))

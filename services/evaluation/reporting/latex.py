@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from services.evaluation.comments import UNDEFINED
-from services.evaluation.reporting.sections import figure, is_number
+from services.evaluation.reporting.sections import figure, is_number, undecided_note
 from services.evaluation.scores import REAL, ClosedLoopReport
 
 _ESCAPED: Final = {letter: rf"\{letter}" for letter in "#$%&_{}"} | {
@@ -20,7 +20,10 @@ _FIGURES: Final = (("pearson", "Pearson"), ("mmrv", "MMRV"), ("mmrv_paper", "MMR
 
 
 def latex_tables(report: ClosedLoopReport) -> str:
-    """Both tables; rates are followed by 95 % Wilson intervals, agreement by its own intervals."""
+    """Both tables; rates are followed by 95 % Wilson intervals, agreement by its own intervals.
+
+    Undecided rollouts are in no rate; their number follows it.
+    """
     rows = {(row["task"], row["policy"]): row for row in report.policy_rows()}
     worlds = (REAL, *report.imagined_worlds)
     lines = _head(report.tasks, "Policy", "World")
@@ -70,10 +73,13 @@ def _row(first: str, second: str, cells: Sequence[str]) -> str:
 def _rate(row: Mapping[str, Any], world: str, report: ClosedLoopReport) -> str:
     if world == REAL:
         return _with_interval(row[REAL], row.get("real_interval"))
-    if world == report.imagined_worlds[0]:
-        return _with_interval(row["imagined"], row.get("imagined_interval"))
-    other = row["other_worlds"][world]
-    return _with_interval(other["success"], other.get("success_interval"))
+    is_first = world == report.imagined_worlds[0]
+    name, cell = ("imagined", row) if is_first else ("success", row["other_worlds"][world])
+    rate, undecided = (
+        _with_interval(cell[name], cell.get(f"{name}_interval")),
+        undecided_note(cell, name),
+    )
+    return rf"{rate} {{\scriptsize {escape(undecided)}}}" if undecided else rate
 
 
 def _with_interval(value: object, interval: object) -> str:

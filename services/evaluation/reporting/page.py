@@ -29,6 +29,7 @@ from services.evaluation.reporting.sections import (
     figure,
     stage_bars,
     tiles,
+    undecided_note,
 )
 
 
@@ -77,6 +78,7 @@ def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
         policies=policy_panels(report),
         agreement=report.get("agreement", {}),
         failures=failure_rows(report),
+        undecided_note=undecided_note,
         num_rollouts=report.get("num_rollouts", 0),
         strips=strips(pictures),
         raw=json.dumps(report, indent=1, default=str, ensure_ascii=False),

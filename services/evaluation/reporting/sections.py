@@ -164,6 +164,15 @@ def figure(value: object, digits: int = 3) -> str:
     return f"{number:.{max(0, min(decimals, 4))}f}"
 
 
+def undecided_note(row: Mapping[str, Any], name: str) -> str:
+    """What to write beside a policy's rate of this name; empty if all rollouts were decided."""
+    undecided = row.get(f"{name}_undecided", 0)
+    if not undecided:
+        return ""
+    note = f"{undecided} of {row[f'{name}_rollouts']} cannot tell"
+    return note if row[f"{name}_comparable"] else f"{note}, not comparable"
+
+
 def stage_bars(stages: Sequence[Mapping[str, Any]]) -> list[Bar]:
     """Seconds of every stage."""
     longest = max((float(s["seconds"]) for s in stages), default=1.0) or 1.0

@@ -7,6 +7,7 @@ from typing import Any, Final
 from pydantic import AwareDatetime
 
 from dextouch.frozen_model import FrozenModel
+from services.evaluation.calibration import LEAST_DECIDED
 from services.evaluation.comments import UNDEFINED, VAGUE_R, undefined_by
 from services.evaluation.scores import REAL, ClosedLoopReport, RolloutFailure, RolloutScore
 from services.evaluation.studies.definition import StudyDefinition
@@ -22,7 +23,8 @@ from services.evaluation.studies.results import (
 DISAGREEMENT: Final = 0.5
 MEANINGS: Final = {
     "rate": "Share of the starts from which the policy succeeded, with its 95 % Wilson interval. "
-    "In an imagined world success is what the success probe finds more likely.",
+    "In an imagined world success is what the success probe decides from images, touch and object "
+    "poses and from the world's own estimate; rollouts that it cannot tell count in no rate.",
     "pearson": "Pearson's r: 1 if the world's success rates of the policies are a straight line "
     "over the real ones, 0 if they say nothing about them, negative if they reverse them. It needs "
     "three policies: two points always lie on a line.",
@@ -33,9 +35,9 @@ MEANINGS: Final = {
     "bias": "Mean of the world's success rates minus the real ones; above 0 it is too optimistic.",
     "interval": "Intervals contain the true policies' figure with 95 % probability; with few "
     "policies or starts they are wide.",
-    "unreliable": "The success probe abstains: its probability is too close to 0.5, or the world "
-    "doubts its own prediction. The likelier outcome is counted all the same. Most wrong outcomes "
-    "of policies that the world model was not trained on are not marked.",
+    "unreliable": "The success probe cannot tell: its probability is too close to 0.5, it and the "
+    "world's own estimate contradict each other, or the world doubted its prediction at a step. "
+    f"With fewer than {LEAST_DECIDED:.0%} of its rollouts decided a policy is not compared.",
 }
 
 
@@ -56,12 +58,14 @@ class StudySummary(FrozenModel):
 
 
 class StudyRate(FrozenModel):
-    """Success rate of a policy in a task of a world; None without finished rollouts.
+    """Success rate of a policy in a task of a world; None without decided rollouts.
 
     Attributes:
         interval: 95 % Wilson interval.
         num_missing: rollouts without a result yet.
-        num_unreliable: rollouts on which the success probe abstains, and `reasons` why.
+        num_unreliable: rollouts on which the success probe abstains, and `reasons` why; they count
+            in no rate.
+        is_comparable: whether enough of the rollouts are decided to compare the policy.
         num_disagreements: starts whose outcome differs from the real one.
     """
 
@@ -74,6 +78,7 @@ class StudyRate(FrozenModel):
     num_failed: int
     num_missing: int
     num_unreliable: int
+    is_comparable: bool = True
     reasons: tuple[str, ...] = ()
     num_disagreements: int = 0
 
@@ -222,6 +227,7 @@ def _rates(report: ClosedLoopReport, rollouts: tuple[StudyRollout, ...]) -> Iter
                 num_failed=fields[f"{name}_failed"] - missing[place],
                 num_missing=missing[place],
                 num_unreliable=fields.get(f"{name}_undecided", 0),
+                is_comparable=fields.get(f"{name}_comparable", True),
                 reasons=tuple(reasons.get(place, ())),
                 num_disagreements=sum(
                     sum(repeats) >= DISAGREEMENT * len(repeats)

@@ -81,6 +81,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.observations import decode_start as decode_start
     from dextouch.schemas.observations import encode_observation as encode_observation
     from dextouch.schemas.observations import encode_start as encode_start
+    from dextouch.schemas.observations import rollout_doubt as rollout_doubt
     from dextouch.schemas.observations import start_from as start_from
     from dextouch.schemas.observations import validate_fields as validate_fields
     from dextouch.schemas.playback import Playback as Playback
@@ -112,6 +113,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.rollouts import ActionKind as ActionKind
     from dextouch.schemas.rollouts import Doubt as Doubt
     from dextouch.schemas.rollouts import ForkRequest as ForkRequest
+    from dextouch.schemas.rollouts import RolloutDoubt as RolloutDoubt
     from dextouch.schemas.rollouts import RolloutInfo as RolloutInfo
     from dextouch.schemas.rollouts import StartRequest as StartRequest
     from dextouch.schemas.rollouts import WatchedRollout as WatchedRollout

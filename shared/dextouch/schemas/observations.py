@@ -1,6 +1,6 @@
 """Observations of rollouts, and the binary codec that server, client and store share."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Final, Literal, TypeVar
@@ -16,7 +16,7 @@ from dextouch.geometry import rigid_error
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
 from dextouch.schemas.jpeg_images import IMAGE_PREFIX, JPEG_PREFIX, decode_images, encode_images
 from dextouch.schemas.problems import first_problems
-from dextouch.schemas.rollouts import ActionKind, Doubt, RolloutInfo, StartRequest
+from dextouch.schemas.rollouts import ActionKind, Doubt, RolloutDoubt, RolloutInfo, StartRequest
 from dextouch.streams import pack, unpack
 
 # Tolerance of the norm of a unit quaternion in float32.
@@ -76,11 +76,16 @@ class Observation:
     def __len__(self) -> int:
         return len(self.tactile_kpa)
 
+    @property
+    def last_step(self) -> int:
+        """Index of the last step."""
+        return self.first_step + len(self) - 1
+
     def last(self) -> "Observation":
         """The last step only."""
         return replace(
             self,
-            first_step=self.first_step + len(self) - 1,
+            first_step=self.last_step,
             images={camera: images[-1:] for camera, images in self.images.items()},
             tactile_kpa=self.tactile_kpa[-1:],
             action_reached=self.action_reached[-1:],
@@ -98,6 +103,14 @@ class Observation:
             return shown
         wanted = {camera: rows for camera, rows in shown.images.items() if selector.wants(camera)}
         return replace(shown, images=wanted)
+
+
+def rollout_doubt(observations: Iterable[Observation]) -> RolloutDoubt:
+    """The doubt of a whole rollout, from its observations in their order."""
+    doubt = RolloutDoubt()
+    for seen in observations:
+        doubt = doubt.after(seen.doubt, last_step=seen.last_step)
+    return doubt
 
 
 @dataclass(frozen=True)

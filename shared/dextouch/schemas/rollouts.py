@@ -1,6 +1,7 @@
 """Schemas of rollouts without arrays: worlds, requests to start and fork, progress and doubt."""
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Final, Literal
 
 from pydantic import Field, model_validator
 
@@ -10,6 +11,17 @@ from dextouch.frozen_model import FrozenModel
 ActionKind = Literal["measured", "commanded"]
 WorldKind = Literal["twin", "model", "baseline", "robot"]
 MAX_SEED = 2**63 - 1
+# Quality figures of imagined episodes, and the fields of `RolloutDoubt` that they hold.
+_QUALITY: Final = {
+    "imagined_doubted_step": "step",
+    "imagined_success_probability": "success_probability",
+    "imagined_success_spread": "success_spread",
+}
+
+
+def _is_none(value: object) -> bool:
+    """For fields that are omitted where they are unknown, so that older clients can read them."""
+    return value is None
 
 
 class WorldDescription(FrozenModel):
@@ -58,10 +70,96 @@ class ForkRequest(FrozenModel):
     seed: int | None = Field(default=None, ge=0, le=MAX_SEED)
 
 
+class Doubt(FrozenModel):
+    """Uncertainty of an imagining world about its prediction.
+
+    `disagreement` and `distance` are non-negative, and comparable within one world digest only. The
+    last two fields are omitted by a world that does not estimate success.
+
+    Attributes:
+        disagreement: between several predictions of the same steps.
+        distance: of the rollout from the training distribution.
+        outside: whether the world's own bound is exceeded, so that the prediction is unreliable.
+        reason: why it is outside; None otherwise.
+        success_probability: probability that the task is done after these steps, in the world's own
+            estimate: the mean over ensemble members and possible starts.
+        success_spread: largest difference between the probabilities of two members.
+    """
+
+    disagreement: float = Field(ge=0, allow_inf_nan=False)
+    distance: float = Field(ge=0, allow_inf_nan=False)
+    outside: bool = False
+    reason: str | None = Field(default=None, min_length=1, max_length=500)
+    success_probability: float | None = Field(default=None, ge=0, le=1, exclude_if=_is_none)
+    success_spread: float | None = Field(default=None, ge=0, le=1, exclude_if=_is_none)
+
+    @model_validator(mode="after")
+    def _a_reason_if_outside(self) -> "Doubt":
+        if self.outside != (self.reason is not None):
+            raise ValueError(
+                f"got outside {self.outside} with reason {self.reason!r}, expected a reason where "
+                "outside is true and none where it is not"
+            )
+        return self
+
+
+class RolloutDoubt(FrozenModel):
+    """What the doubt of all chunks of a rollout says about its outcome.
+
+    An outcome depends on every step before it, so one doubted chunk makes the rest of the rollout
+    doubtful.
+
+    Attributes:
+        reason: of the first chunk that was outside the world's bound; None if none was.
+        step: last step of that chunk.
+        success_probability: of the newest chunk; None where the world does not estimate it.
+        success_spread: of the newest chunk.
+    """
+
+    reason: str | None = None
+    step: int | None = None
+    success_probability: float | None = None
+    success_spread: float | None = None
+
+    def after(self, doubt: Doubt | None, *, last_step: int) -> "RolloutDoubt":
+        """The doubt of the rollout after one more chunk.
+
+        Args:
+            doubt: of the chunk; None where the world reports none.
+            last_step: last step of the chunk.
+        """
+        reason, step = self.reason, self.step
+        if reason is None and doubt is not None and doubt.outside:
+            reason, step = doubt.reason, last_step
+        return RolloutDoubt(
+            reason=reason,
+            step=step,
+            success_probability=None if doubt is None else doubt.success_probability,
+            success_spread=None if doubt is None else doubt.success_spread,
+        )
+
+    def to_quality(self) -> dict[str, float]:
+        """The known numbers as quality figures of an episode; the reason's text is lost."""
+        known = {name: getattr(self, name) for name in _QUALITY.values()}
+        return {
+            figure: float(known[name])
+            for figure, name in _QUALITY.items()
+            if known[name] is not None
+        }
+
+    @staticmethod
+    def from_quality(quality: Mapping[str, float]) -> "RolloutDoubt":
+        """The doubt that `to_quality` noted; unknown where the episode has no such figures."""
+        known = {name: quality.get(figure) for figure, name in _QUALITY.items()}
+        reason = None if known["step"] is None else "the world doubted its prediction"
+        return RolloutDoubt.model_validate(known | {"reason": reason})
+
+
 class RolloutInfo(FrozenModel):
     """State of a rollout; `next_chunk` is the only chunk number accepted next.
 
-    `ended` is why its world cannot continue it, omitted while it can.
+    `ended` is why its world cannot continue it, omitted while it can; `rollout_doubt` the doubt of
+    all chunks so far, omitted while the world reports none.
     """
 
     id: str
@@ -74,34 +172,21 @@ class RolloutInfo(FrozenModel):
     next_chunk: int
     last_step: int
     ttl_s: float
-    ended: str | None = Field(default=None, exclude_if=lambda reason: reason is None)
+    ended: str | None = Field(default=None, exclude_if=_is_none)
+    rollout_doubt: RolloutDoubt | None = Field(default=None, exclude_if=_is_none)
 
-
-class Doubt(FrozenModel):
-    """Uncertainty of an imagining world about its prediction.
-
-    Both numbers are non-negative, and comparable within one world digest only.
-
-    Attributes:
-        disagreement: between several predictions of the same steps.
-        distance: of the rollout from the training distribution.
-        outside: whether the world's own bound is exceeded, so that the prediction is unreliable.
-        reason: why it is outside; None otherwise.
-    """
-
-    disagreement: float = Field(ge=0, allow_inf_nan=False)
-    distance: float = Field(ge=0, allow_inf_nan=False)
-    outside: bool = False
-    reason: str | None = Field(default=None, min_length=1, max_length=500)
-
-    @model_validator(mode="after")
-    def _a_reason_if_outside(self) -> "Doubt":
-        if self.outside != (self.reason is not None):
-            raise ValueError(
-                f"got outside {self.outside} with reason {self.reason!r}, expected a reason where "
-                "outside is true and none where it is not"
-            )
-        return self
+    def after(self, doubt: Doubt | None, num_steps: int) -> "RolloutInfo":
+        """The state after one more chunk of this doubt and number of steps."""
+        last_step, so_far = self.last_step + num_steps, self.rollout_doubt
+        if doubt is not None or so_far is not None:
+            so_far = (so_far or RolloutDoubt()).after(doubt, last_step=last_step)
+        return self.model_copy(
+            update={
+                "next_chunk": self.next_chunk + 1,
+                "last_step": last_step,
+                "rollout_doubt": so_far,
+            }
+        )
 
 
 class WatchedRollout(FrozenModel):
@@ -114,6 +199,7 @@ class WatchedRollout(FrozenModel):
         age_s: since its start.
         idle_s: since its newest chunk, or its start.
         doubt: of the newest chunk; None where the world reports none.
+        rollout_doubt: of all chunks so far; None where the world reports none.
         success: at the newest step; None where unknown.
         trace_id: of the request that began it; None if another version of DexTouch began it.
     """
@@ -133,6 +219,7 @@ class WatchedRollout(FrozenModel):
     age_s: float
     idle_s: float
     doubt: Doubt | None = None
+    rollout_doubt: RolloutDoubt | None = None
     success: bool | None = None
     trace_id: str | None = None
 

@@ -302,12 +302,7 @@ class RolloutService:
             num_steps=num_steps,
             selector=selector,
         )
-        info = before.model_copy(
-            update={
-                "next_chunk": before.next_chunk + 1,
-                "last_step": before.last_step + num_steps,
-            }
-        )
+        info = before.after(seen.doubt, num_steps)
         began_s = time.perf_counter()
         parts = await parts_of(info, seen, selector, info=outcome.stepped.info)
         payload = pack(*parts)

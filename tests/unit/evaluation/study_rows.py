@@ -8,8 +8,8 @@ from scipy import stats
 DOUBTED = "the world flags its prediction: two predictions are <b>14 mm</b> apart"
 TASKS = ("stand_bottle", "open_drawer")
 FIRST_SEED, NUM_STARTS = 500, 8
-# Outcomes from the starts in order: S success, F failure, D success that the probe doubts,
-# X failed to run, . no result yet.
+# Outcomes from the starts in order: S success, F failure, D success that the probe doubts and that
+# counts in no rate, X failed to run, . no result yet.
 ROWS = {
     "stand_bottle": {
         "careful": {"real": "SSSSSSSF", "model": "SSSSSSFF", "blurred": "SSFFSSFF"},
@@ -67,9 +67,9 @@ def write_study(folder, **options):
 
 
 def counted(task, policy, world):
-    """Successes and finished rollouts."""
-    outcomes = [letter for letter in ROWS[task][policy][world] if letter in "SDF"]
-    return sum(letter in "SD" for letter in outcomes), len(outcomes)
+    """Successes and decided rollouts."""
+    outcomes = [letter for letter in ROWS[task][policy][world] if letter in "SF"]
+    return outcomes.count("S"), len(outcomes)
 
 
 def interval(task, policy, world):
@@ -80,7 +80,10 @@ def interval(task, policy, world):
 
 
 def matched_rates(task, world):
-    """Rates of each policy in both worlds, over the starts that ended for all policies in both."""
+    """Rates of each policy in both worlds, over the starts that ended for all policies in both.
+
+    Those of a world are of the decided rollouts among them.
+    """
     policies = ROWS[task]
     starts = [
         index
@@ -91,13 +94,11 @@ def matched_rates(task, world):
             for side in ("real", world)
         )
     ]
-    return [
-        [
-            sum(policies[policy][side][i] in "SD" for i in starts) / len(starts)
-            for policy in policies
-        ]
+    letters = [
+        [[policies[policy][side][i] for i in starts] for policy in policies]
         for side in ("real", world)
     ]
+    return [[one.count("S") / (len(one) - one.count("D")) for one in side] for side in letters]
 
 
 def pearson(task, world):

@@ -5,11 +5,15 @@ import pytest
 
 from dextouch.errors import InvalidInputError
 from services.evaluation.calibration import (
+    IMAGINED_RISK,
+    LEAST_DECIDED,
     Calibration,
+    Combination,
     Reliability,
     brier,
     expected_calibration_error,
     fit_calibration,
+    fit_combination,
     sigmoid,
     undecided_band,
 )
@@ -72,6 +76,101 @@ def test_the_band_leaves_the_allowed_risk():
 
 def test_few_endings_promise_nothing():
     assert undecided_band(np.array([0.9, 0.1]), np.array([1, 0]), risk=0.05) == 0.45
+
+
+def brute_force_band(told, came, risk):
+    """The narrowest of all bands that keeps the risk, and 0.5 if none does."""
+    for band in [0.0, *sorted(abs(told - 0.5))]:
+        decided = abs(told - 0.5) > band if band else np.full(len(told), fill_value=True)
+        wrong = sum((p >= 0.5) != y for p, y in zip(told[decided], came[decided], strict=True))
+        if decided.any() and (wrong + 1) / (decided.sum() + 1) <= risk:
+            return band
+    return 0.5
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_band_is_the_narrowest_of_all_that_keep_the_risk(seed):
+    rng = np.random.default_rng(seed)
+    told = rng.random(120)
+    came = rng.random(120) < told
+    for risk in (0.02, 0.1, 0.2):
+        found = undecided_band(told, came, risk=risk, widest=0.5)
+        assert found == pytest.approx(brute_force_band(told, came, risk))
+
+
+def estimates(rng, num, *, probe_noise, world_noise):
+    """Outcomes, and probabilities of two judges who see the true log odds with noise."""
+    true = rng.normal(0.0, 3.0, num)
+    came = rng.random(num) < sigmoid(true)
+    probe, world = (sigmoid(true + rng.normal(0, n, num)) for n in (probe_noise, world_noise))
+    return probe, world, came
+
+
+def decided_of(joint, probe, world, came):
+    told = joint.probabilities(probe, world)
+    decided = (abs(told - 0.5) > joint.band) & ~joint.contradictory(probe, world)
+    wrong = ((told >= 0.5) != came)[decided].mean() if decided.any() else 0.0
+    return decided.mean(), wrong
+
+
+def test_judges_that_know_something_decide_most_and_err_within_the_risk():
+    rng = np.random.default_rng(3)
+    for noises in ((0.5, 0.5), (0.5, 3.0), (2.0, 0.5)):
+        noise = dict(zip(("probe_noise", "world_noise"), noises, strict=True))
+        joint = fit_combination(*estimates(rng, 300, **noise))
+        decided, wrong = decided_of(joint, *estimates(rng, 20_000, **noise))
+        assert decided >= LEAST_DECIDED
+        # Up to the error of a rate among some 200 development endings.
+        assert wrong <= IMAGINED_RISK + 0.03
+
+
+def test_a_judge_that_is_too_sure_gets_a_band_and_its_risk():
+    rng = np.random.default_rng(4)
+
+    def too_sure(num):
+        probe, world, came = estimates(rng, num, probe_noise=2.0, world_noise=2.0)
+        probe, world = (p**5 / (p**5 + (1 - p) ** 5) for p in (probe, world))
+        return probe, world, came
+
+    joint = fit_combination(*too_sure(400), margin=0.5)
+    probe, world, came = too_sure(20_000)
+    assert joint.band > 0
+    assert decided_of(Combination(margin=0.5), probe, world, came)[1] > IMAGINED_RISK + 0.03
+    assert decided_of(joint, probe, world, came)[1] <= IMAGINED_RISK + 0.03
+
+
+def test_of_a_world_that_knows_nothing_the_probe_is_believed_and_of_two_nobody():
+    rng = np.random.default_rng(5)
+    probe, _, came = estimates(rng, 2000, probe_noise=0.5, world_noise=0.5)
+    joint = fit_combination(probe, rng.random(2000), came, margin=0.5)
+    assert joint.world_weight < 0.1 * joint.probe_weight
+    assert decided_of(joint, probe, rng.random(2000), came)[0] >= LEAST_DECIDED
+    # Backwards is as bad as knowing nothing: it is left out, not believed the other way round.
+    other, _, _ = estimates(rng, 2000, probe_noise=0.5, world_noise=0.5)
+    backwards = np.where(came, np.minimum(other, 1 - other), np.maximum(other, 1 - other))
+    joint = fit_combination(probe, backwards, came, margin=0.5)
+    assert joint.world_weight == 0
+    assert joint.probe_weight > 0.5
+    blind = rng.random((2, 2000))
+    assert fit_combination(*blind, came, margin=0.5).band >= 0.4
+    assert decided_of(fit_combination(*blind, came), *blind, came)[0] < 0.02
+
+
+def test_judges_who_always_contradict_each_other_decide_nothing():
+    probe, world = np.full(20, 0.9), np.full(20, 0.1)
+    assert fit_combination(probe, world, np.arange(20) % 2 == 0).band == 0.5
+
+
+def test_two_probabilities_by_hand():
+    # Mean log odds of 0.8 and 0.5 are ln 4 / 2 = ln 2, so 2 / 3. Certainty counts as 0.99: log odds
+    # 4.595, halved, of which the sigmoid is 0.9087.
+    told = Combination().probabilities(np.array([0.8, 1.0]), np.array([0.5, 0.5]))
+    assert told == pytest.approx([2 / 3, 0.9087], abs=1e-4)
+    probe, world = np.array([0.6, 0.6, 0.1, 0.3, 0.9]), np.array([0.4, 0.5, 0.2, 0.8, 0.35])
+    opposite = Combination().contradictory(probe, world)
+    assert opposite.tolist() == [True, False, False, True, True]
+    tolerant = Combination(margin=0.17).contradictory(probe, world)
+    assert tolerant.tolist() == [False, False, False, True, False]
 
 
 def test_one_outcome_is_refused():

@@ -8,6 +8,7 @@ import pytest
 from dextouch.clients import http_link
 from dextouch.clients.rollouts import RolloutClient
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.schemas import Doubt
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.baseline import CopyFirstWorld
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
@@ -20,6 +21,19 @@ from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
 
 SEEDS = range(2000, 2003)
+
+
+class Hesitant(toy.ToyWorld):
+    """Doubts its second chunk alone, and estimates success at a quarter after the last one."""
+
+    def step(self, state, actions, **options):
+        stepped = super().step(state, actions, **options)
+        is_second = state.step == 16
+        doubt = Doubt(
+            disagreement=0, distance=0, outside=is_second, reason="slipped" if is_second else None,
+            success_probability=0.25 if stepped.observation.last_step == 80 else 1.0,
+        )  # fmt: skip
+        return toy.replace(stepped, observation=toy.replace(stepped.observation, doubt=doubt))
 
 
 class Forgetful(toy.ToyWorld):
@@ -38,6 +52,7 @@ def client():
         "judge": judge,
         "dream": toy.ToyWorld("dream", judge=False),
         "nightmare": toy.ToyWorld("nightmare", judge=False, drift_m=0.05),
+        "hesitant": Hesitant("hesitant", judge=False),
         "choosy": Choosy("choosy", judge=True),
         "forgetful": Forgetful("forgetful", judge=True),
         "copy-first": CopyFirstWorld.beside(judge.description),
@@ -79,6 +94,25 @@ def report(client, policies, probe):
         plan=EvaluationPlan(toy.INSTRUCTIONS, SEEDS),
         probe=probe,
     )
+
+
+def test_a_doubt_amid_a_rollout_is_not_forgotten_at_its_end(client, policies, probe):
+    found = evaluate(
+        real=WorldAddress(client, "judge"),
+        imagined=addresses(client, "dream", "hesitant"),
+        policies={"script": policies["script"]},
+        plan=EvaluationPlan({"reach": toy.INSTRUCTIONS["reach"]}, SEEDS),
+        probe=probe,
+    )
+    by_world = {
+        world: [one for one in found.scores if one.world == world]
+        for world in ("real", "dream", "hesitant")
+    }
+    for one in by_world["hesitant"]:
+        assert one.cannot_tell == "the world flags its prediction: at step 32, slipped"
+        assert one.world_probability == 0.25
+    assert {one.cannot_tell for one in (*by_world["real"], *by_world["dream"])} == {None}
+    assert found.agreement("hesitant")["reach"]["not_comparable"] == ["script"]
 
 
 def rate(report, policy, world):

@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import Doubt, Observation
-from services.evaluation.calibration import Calibration
+from dextouch.schemas import Doubt, Observation, RolloutDoubt
+from services.evaluation.calibration import Calibration, Combination
 from services.evaluation.endings import Ending, EndingEpisode, milestones_of
 from services.evaluation.judge_network import ProbeShape, probe_batch
 from services.evaluation.success_probe import SuccessProbe
 from services.evaluation.success_probe_data import labelled_endings
+from services.evaluation.success_probe_figures import fit_combinations
 from services.evaluation.success_probe_training import (
     ProbeSettings,
     some_parts,
@@ -177,6 +178,78 @@ def test_it_cannot_tell_within_its_band(judge):
     ]  # fmt: skip
 
 
+def _with_combination(judge, **fields):
+    """A probe of which only these fields of the combination are known, and no calibration."""
+    probe = object.__new__(SuccessProbe)
+    combination = {"reach": Combination(**fields)} if fields else {}
+    probe.__dict__ |= judge.__dict__ | {"_calibrations": {}, "_combinations": combination}
+    return probe
+
+
+def test_it_cannot_tell_where_the_world_itself_expects_the_opposite(judge):
+    ending = _episode("reach", 0, imagined=True).final
+    probe = _with_combination(judge)
+    alone = probe.verdict(ending)
+    assert (alone.world_probability, alone.decision) == (None, "success")
+    # The shipped probes hold no combination: a contradiction is all that they cannot tell.
+    for world, decision in ((0.9, "success"), (0.5, "success"), (0.49, "cannot tell")):
+        verdict = probe.verdict(replace(ending, success_probability=world))
+        assert (verdict.decision, verdict.world_probability) == (decision, world)
+    assert f"probability {alone.probability:.2f}, the world itself with 0.49" in verdict.reason
+    tolerant = _with_combination(judge, margin=0.1)
+    assert tolerant.verdict(replace(ending, success_probability=0.45)).decision == "success"
+    assert tolerant.verdict(replace(ending, success_probability=0.35)).decision == "cannot tell"
+
+
+def test_it_cannot_tell_within_the_band_of_both_estimates(judge):
+    ending = replace(_episode("reach", 0, imagined=True).final, success_probability=0.7)
+    # Of the world alone, so that its probability is that of the verdict.
+    for band, decision in ((0.19, "success"), (0.21, "cannot tell")):
+        probe = _with_combination(judge, probe_weight=0.0, world_weight=1.0, band=band)
+        verdict = probe.verdict(ending)
+        assert (verdict.probability, verdict.decision) == (pytest.approx(0.7), decision)
+    assert "within 0.21 of 0.5" in verdict.reason
+    # Doubt of the world comes first.
+    doubted = probe.verdict(replace(ending, doubted="at step 8, slipped"))
+    assert doubted.reason == "the world flags its prediction: at step 8, slipped"
+
+
+def test_estimates_of_development_endings_are_fitted_and_kept_in_the_checkpoint():
+    def estimated(seeds, *, sure):
+        rng = np.random.default_rng(6)
+        for item in _episodes(seeds):
+            told = None
+            if item.imagined:
+                told = 0.9 if item.success else 0.1
+                told = told if rng.random() < sure else 1 - told
+            final = replace(item.final, success_probability=told)
+            yield replace(item, endings={**item.endings, item.last_step: final})
+
+    settings = ProbeSettings(num_training_steps=2)
+    checkpoint = train_success_probe(
+        _episodes(range(30)),
+        settings,
+        command="x",
+        development=[*estimated(range(600, 660), sure=1.0)],
+        held_out=_episodes(range(700, 712)),
+    )
+    # The probe has learned nothing in two steps, the world is always right.
+    kept = checkpoint.metadata.settings["combination"]["reach"]
+    assert kept["world_weight"] > 0.5
+    ending = next(
+        e for e in estimated(range(700, 706), sure=1.0) if e.imagined and e.task == "reach"
+    )
+    found = SuccessProbe(checkpoint).verdict(ending.final)
+    assert found.world_probability in {0.1, 0.9}
+    doubted = [
+        replace(e, endings={**e.endings, e.last_step: replace(e.final, doubted="slipped")})
+        for e in estimated(range(600, 660), sure=1.0)
+    ]
+    probe = SuccessProbe(checkpoint)
+    assert fit_combinations(probe, doubted, risk=0.1, margin=0.0) == {}
+    assert fit_combinations(probe, _episodes(range(600, 660)), risk=0.1, margin=0.0) == {}
+
+
 def test_an_ending_of_an_observation():
     steps = np.arange(5, dtype=np.float32)[:, None, None]
     seen = Observation(
@@ -196,7 +269,10 @@ def test_an_ending_of_an_observation():
         seen, images={}, doubt=Doubt(disagreement=0, distance=9, outside=True, reason="far away")
     )
     ending = Ending.of(outside, "reach", imagined=True)
-    assert (ending.images, ending.doubted) == (None, "far away")
+    assert (ending.images, ending.doubted) == (None, "at step 80, far away")
+    whole = RolloutDoubt(reason="slipped", step=16, success_probability=0.25)
+    ending = Ending.of(outside, "reach", imagined=True, doubt=whole)
+    assert (ending.doubted, ending.success_probability) == ("at step 16, slipped", 0.25)
     with pytest.raises(InvalidInputError, match="at least 3"):
         Ending.of(seen.last(), "reach", imagined=True)
 

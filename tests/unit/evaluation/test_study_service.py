@@ -66,12 +66,13 @@ async def test_rates_and_intervals_are_those_of_the_rows(root):
     assert len(rates) == 2 * 3 * 3
     for place, one in rates.items():
         successes, trials = counted(*place)
-        assert one["num_finished"] == trials
         assert one["rate"] == pytest.approx(successes / trials)
         assert one["interval"] == pytest.approx(interval(*place), abs=1e-9)
         letters = ROWS[place[0]][place[1]][place[2]]
         assert (one["num_failed"], one["num_missing"]) == (letters.count("X"), letters.count("."))
         assert one["num_unreliable"] == letters.count("D")
+        assert one["num_finished"] == trials + letters.count("D")
+        assert one["is_comparable"]
         assert one["reasons"] == [DOUBTED] * ("D" in letters)
 
 

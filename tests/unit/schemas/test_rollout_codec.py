@@ -14,6 +14,7 @@ from dextouch.schemas import (
     Doubt,
     Observation,
     ReturnSelector,
+    RolloutDoubt,
     RolloutInfo,
     RolloutOrigin,
     RolloutStart,
@@ -24,6 +25,7 @@ from dextouch.schemas import (
     decode_start,
     encode_observation,
     encode_start,
+    rollout_doubt,
 )
 from dextouch.schemas.observations import check_observation_arrays
 from dextouch.streams import pack, unpack
@@ -140,6 +142,9 @@ def test_what_older_services_do_not_send_is_none():
         {"outside": True},
         {"reason": "far from everything"},
         {"outside": True, "reason": ""},
+        {"success_probability": 1.5},
+        {"success_probability": float("nan")},
+        {"success_spread": -0.1},
     ],
 )
 def test_doubt_that_contradicts_itself_is_refused(fields):
@@ -148,6 +153,64 @@ def test_doubt_that_contradicts_itself_is_refused(fields):
     raw, arrays = unpack(encode_observation(observation()), max_bytes=10**6)
     with pytest.raises(InvalidInputError, match="doubt"):
         decode_observation(pack(raw | {"doubt": good | fields}, arrays), max_bytes=10**6)
+
+
+def test_an_estimate_of_success_comes_back_and_is_omitted_where_there_is_none():
+    estimated = Doubt(disagreement=0, distance=0, success_probability=0.75, success_spread=0.5)
+    seen = dataclasses.replace(imagined_observation(), doubt=estimated)
+    assert_same(decode_answer(encode_answer(INFO, seen), max_bytes=10**6).observation, seen)
+    raw, _ = unpack(encode_observation(imagined_observation()), max_bytes=10**6)
+    # As services without these fields send it, and as older clients need it.
+    assert set(raw["doubt"]) == {"disagreement", "distance", "outside", "reason"}
+
+
+def test_one_doubted_chunk_makes_the_rollout_doubtful():
+    def told(step, probability=None, spread=None, reason=None):
+        doubt = Doubt(
+            disagreement=0, distance=0, outside=reason is not None, reason=reason,
+            success_probability=probability, success_spread=spread,
+        )  # fmt: skip
+        return dataclasses.replace(observation(4, first_step=step - 3), doubt=doubt)
+
+    start = observation(1)
+    chunks = [
+        told(4, 0.5),
+        told(8, 0.25, reason="slipped"),
+        told(12, reason="lost"),
+        told(16, 1, 0),
+    ]
+    found = rollout_doubt([start, *chunks])
+    assert (found.reason, found.step) == ("slipped", 8)
+    assert (found.success_probability, found.success_spread) == (1.0, 0.0)
+    assert rollout_doubt([start, *chunks[:3]]).success_probability is None
+    assert rollout_doubt([start, chunks[0]]).reason is None
+    assert rollout_doubt([start]) == RolloutDoubt()
+    # The same by the last step alone, which some clients ask for.
+    assert rollout_doubt([start, *(one.last() for one in chunks)]) == found
+
+
+def test_a_doubt_is_kept_as_figures_of_an_episode():
+    doubt = RolloutDoubt(reason="slipped", step=8, success_probability=0.25, success_spread=0.5)
+    quality = doubt.to_quality()
+    assert set(map(type, quality.values())) == {float}
+    back = RolloutDoubt.from_quality({"residual_mm": 1.0, **quality})
+    assert back == doubt.model_copy(update={"reason": back.reason})
+    assert back.reason is not None
+    assert RolloutDoubt().to_quality() == {}
+    assert RolloutDoubt.from_quality({"residual_mm": 1.0}) == RolloutDoubt()
+
+
+def test_the_state_of_a_rollout_carries_its_doubt():
+    assert INFO.after(None, 4) == INFO.model_copy(
+        update={"next_chunk": INFO.next_chunk + 1, "last_step": INFO.last_step + 4}
+    )
+    assert "rollout_doubt" not in INFO.after(None, 4).model_dump()
+    doubted = INFO.after(Doubt(disagreement=0, distance=0, outside=True, reason="slipped"), 4)
+    later = doubted.after(Doubt(disagreement=0, distance=0), 8).after(None, 4)
+    assert later.rollout_doubt == RolloutDoubt(reason="slipped", step=INFO.last_step + 4)
+    assert (later.next_chunk, later.last_step) == (INFO.next_chunk + 3, INFO.last_step + 16)
+    answer = decode_answer(encode_answer(later, observation(4)), max_bytes=10**6)
+    assert answer.rollout == later
 
 
 def test_last_step_and_one_camera():
