@@ -8,9 +8,15 @@ from jaxtyping import Float32, Float64, UInt8
 
 from benchmarks.evaluator.plan import CAMERA, CHUNK_STEPS, NUM_STEPS
 from dextouch.clients import Policy, PolicyStart
-from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.schemas import (
+    Observation,
+    ReturnSelector,
+    RolloutDoubt,
+    RolloutStart,
+    rollout_doubt,
+)
 from dextouch.worlds import StartedRollout, State, World
-from services.evaluation.endings import NUM_SEEN_STEPS, first_doubt
+from services.evaluation.endings import NUM_SEEN_STEPS
 from services.evaluation.policies.asking import action_chunk, ask
 from services.twin.scripted_actions import Actions
 from services.twin.world import TwinState, TwinWorld
@@ -37,18 +43,13 @@ class TrueRollout:
 
 @dataclass(frozen=True)
 class ImaginedRollout:
-    """Imagined rollout of the same policy.
-
-    `doubted` is the reason of the world's first doubt, `success_probability` its own estimate in
-    the end; None if it has none.
-    """
+    """Imagined rollout of the same policy, with the world's doubt of all of it."""
 
     tactile_kpa: Float32[np.ndarray, "81 2 320"]
     images_of_chunks: UInt8[np.ndarray, "chunks h w 3"]
     last_images: UInt8[np.ndarray, "3 h w 3"]
     object_poses: Float32[np.ndarray, "3 objects 7"] | None
-    doubted: str | None
-    success_probability: float | None = None
+    doubt: RolloutDoubt
 
 
 def play_in_twin(
@@ -122,8 +123,7 @@ def play_in_imagination(
         np.stack(images),
         seen.images[CAMERA][-NUM_SEEN_STEPS:],
         None if poses is None else poses[-NUM_SEEN_STEPS:],
-        first_doubt(shown),
-        None if seen.doubt is None else seen.doubt.success_probability,
+        rollout_doubt(shown),
     )
 
 

@@ -28,7 +28,7 @@ from benchmarks.evaluator.still_hand import StillRollout, hold_still, still_figu
 from dextouch.clients import Policy
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions
-from dextouch.schemas import RolloutStart
+from dextouch.schemas import RolloutDoubt, RolloutStart
 from dextouch.worlds import BatchWorld
 from services.evaluation.direct_network import Attempt
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
@@ -122,20 +122,12 @@ class PolicyRollout:
         path = self._path("imagined", self._twin.description.digest, world.description.digest)
         if path.is_file():
             kept = read_arrays(path)
-            poses, doubted = kept.pop("object_poses", None), str(kept.pop("doubted"))
-            own = kept.pop("success_probability", None)
-            return ImaginedRollout(
-                **kept,
-                object_poses=poses,
-                doubted=doubted or None,
-                success_probability=None if own is None else float(own),
-            )
+            poses = kept.pop("object_poses", None)
+            doubt = RolloutDoubt.model_validate_json(str(kept.pop("doubt")))
+            return ImaginedRollout(**kept, object_poses=poses, doubt=doubt)
         imagined = play_in_imagination(world, self._first, self._actor, self._for_policy)
         arrays = {n: a for n, a in vars(imagined).items() if isinstance(a, np.ndarray)}
-        arrays["doubted"] = np.array(imagined.doubted or "")
-        if imagined.success_probability is not None:
-            arrays["success_probability"] = np.array(imagined.success_probability)
-        write_arrays(path, arrays)
+        write_arrays(path, arrays | {"doubt": np.array(imagined.doubt.model_dump_json())})
         return imagined
 
     def _path(self, kind: str, *digests: str) -> Path:
@@ -155,7 +147,7 @@ class PolicyRollout:
             self._first_image,
             self._boxes_m,
         )
-        return {"doubted": imagined.doubted, **figures}
+        return {"doubted": imagined.doubt.reason, **figures}
 
     @property
     def _true_ending(self) -> Ending:
@@ -172,9 +164,7 @@ class PolicyRollout:
             self._task,
             imagined.object_poses,
             imagined=True,
-            doubted=imagined.doubted,
-            success_probability=imagined.success_probability,
-        )
+        ).with_doubt(imagined.doubt)
 
     def _context_row(self, member: Member) -> Row:
         contact = contact_with_true_context(
