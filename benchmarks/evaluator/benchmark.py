@@ -27,9 +27,8 @@ from benchmarks.evaluator.work import NEEDED, Missing, Study, open_study, unit_r
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.errors import InvalidInputError
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE, EARLY_POLICY
-from services.twin.mistakes import DEVELOPMENT, HELD_OUT, KINDS, TRAINING
 from services.twin.tasks import EVALUATED
 
 PACKAGES = ("numpy", "torch", "mujoco")
@@ -66,15 +65,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="checkpoint of a world model trained without touch, as a baseline (none); once "
         "for all worlds, or once for each",
     )
-    parser.add_argument(
-        "--kinds",
-        default="development",
-        metavar="SET|A,B",
-        help="kinds of mistakes: none, training, development, held-out, or names. A model is "
-        "developed by the kinds of development (%(default)s); the held-out ones measure it in "
-        "the end, once",
-    )
-    parser.add_argument("--only-kinds", action="store_true", help="no other policies than mistakes")
     parser.add_argument("--tasks", nargs="+", default=list(EVALUATED), help="(%(default)s)")
     parser.add_argument(
         "--starts", type=int, help=f"starts per task ({_USUAL_STARTS}; quick {_QUICK_STARTS})"
@@ -132,18 +122,15 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     policies = [row for each in figures for row in each.policy_rows()]
     chunks = [row for each in figures for row in each.chunk_rows()]
     rivals = [row for each in figures for row in each.rival_rows()]
-    kinds = [row for each in figures for row in each.kind_rows()]
     notes = [f"{task} is unknown to the world or the judge" for task in plan.tasks
              if task not in study.tasks]  # fmt: skip
     if failed:
         notes.append(f"{failed} rollouts failed and are missing; see {kept.path}")
-    shown = (policies, kinds, rivals, chunks)
-    write_page(plan.keep / "evaluator.html", study.about, lines, shown, notes)
+    write_page(plan.keep / "evaluator.html", study.about, lines, (policies, rivals, chunks), notes)
     content = {
         "about": study.about,
         "lines": [asdict(line) for line in lines],
         "policies": policies,
-        "kinds": kinds,
         "rivals": rivals,
         "chunks": chunks,
         "notes": notes,
@@ -157,7 +144,6 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         tables=[
             interval_table(lines),
             row_table("Success rates", policies),
-            row_table("Scripts with one kind of mistake", kinds),
             row_table("AUC of single rollouts, by who judges what", rivals),
             row_table("Chunks of scripts, each figure beside its rival", chunks),
         ],
@@ -166,7 +152,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             *(line.requirement() for line in lines),
             *(repetition(lines, earlier) if options.repeats else ()),
         ],
-        data={name: rows for name, rows in content.items() if name != "notes"},
+        data={name: content[name] for name in ("about", "lines", "policies", "rivals", "chunks")},
         notes=[*notes, f"rollouts, JSON and page: {plan.keep}"],
     )
 
@@ -184,8 +170,7 @@ def figures_of_tasks(study: Study, kept: KeptRows) -> tuple[list[TaskFigures], i
                 for mine, one in zip(by_seed, rolled, strict=False):
                     mine.append(one)
         if by_seed[0]:
-            plan = study.plan
-            figures.append(TaskFigures(task, by_seed, plan.scripts, plan.mistaken))
+            figures.append(TaskFigures(task, by_seed, study.plan.scripts))
     return figures, failed
 
 
@@ -242,16 +227,6 @@ def _results(
             yield done.result(), f"{task} {seed}"
 
 
-def _kinds(text: str) -> tuple[str, ...]:
-    """Kinds of mistakes from the name of a set, or from their names."""
-    named = {"none": (), "training": TRAINING, "development": DEVELOPMENT, "held-out": HELD_OUT}
-    found = tuple(named[text]) if text in named else tuple(text.split(","))
-    for kind in found:
-        if kind not in KINDS:
-            raise UnknownNameError("kind of mistake", kind, [*named, *KINDS])
-    return found
-
-
 def _plan(options: argparse.Namespace) -> StudyPlan:
     default = _QUICK_STARTS if options.quick else _USUAL_STARTS
     num_starts = default if options.starts is None else options.starts
@@ -270,8 +245,7 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
         ),
         tasks=tuple(options.tasks),
         seeds=tuple(range(options.first_seed, options.first_seed + num_starts)),
-        levels_mm=() if options.only_kinds else _QUICK_LEVELS_MM if options.quick else LEVELS_MM,
-        kinds=_kinds(options.kinds),
+        levels_mm=_QUICK_LEVELS_MM if options.quick else LEVELS_MM,
         cloned=tuple(ClonedPolicy.parse(text) for text in cloned),
         outside=tuple(OutsidePolicy.parse(text) for text in options.policy or [_SERVO]),
         num_still_starts=1 if options.quick else 3,

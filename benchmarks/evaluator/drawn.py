@@ -178,24 +178,6 @@ def probabilities(rollouts: Iterable[Rolled], kind: str) -> np.ndarray:
     return np.array([one.rows[kind]["probability"] for one in rollouts], dtype=float)
 
 
-def success_rates(
-    rollouts: Sequence[Rolled], seeds: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Real and imagined outcomes [policies, starts] of the policies that have every start."""
-    found = {(one.policy, one.seed): one for one in rollouts}
-    names = [
-        name
-        for name in dict.fromkeys(one.policy for one in rollouts)
-        if all((name, seed) in found for seed in seeds)
-    ]
-    if len(names) < 2:
-        return None
-    grid = [[found[name, seed] for seed in seeds] for name in names]
-    real = np.array([[one.success for one in row] for row in grid], dtype=float)
-    told = [[one.rows["imagined verdict"]["likely_success"] for one in row] for row in grid]
-    return real, np.array(told, dtype=float)
-
-
 def lines_over_seeds(task: str, by_seed: Sequence[Sequence[Drawn]]) -> list[Line]:
     """The mean of every figure over the training seeds, and the worst seed where it has a bound.
 

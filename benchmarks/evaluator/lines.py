@@ -14,10 +14,8 @@ from benchmarks.evaluator.drawn import (
     Rolled,
     Sampling,
     lines_over_seeds,
-    success_rates,
     undefined,
 )
-from benchmarks.evaluator.kind_lines import kind_figures, kind_rows
 from benchmarks.evaluator.plan import IDLE
 from benchmarks.evaluator.rival_lines import rival_figures, rival_rows
 from dextouch.metrics.policy import mmrv, pearson
@@ -36,37 +34,24 @@ class TaskFigures:
         by_seed: for every training seed the rollouts completed in both worlds, the same ones in
             the same order.
         scripts: names of the scripted policies.
-        mistaken: names of the scripts with one kind of mistake each.
     """
 
     def __init__(
-        self,
-        task: str,
-        by_seed: Sequence[Sequence[Rolled]],
-        scripts: Sequence[str],
-        mistaken: Sequence[str] = (),
+        self, task: str, by_seed: Sequence[Sequence[Rolled]], scripts: Sequence[str]
     ) -> None:
         self._task, self._by_seed = task, by_seed
         self._scripts = [[one for one in mine if one.policy in scripts] for mine in by_seed]
-        known = {*scripts, *mistaken}
-        self._others = [[one for one in mine if one.policy not in known] for mine in by_seed]
-        self._mistaken = [[one for one in mine if one.policy in mistaken] for mine in by_seed]
+        self._others = [[one for one in mine if one.policy not in scripts] for mine in by_seed]
         self._sampling = Sampling(by_seed[0])
 
     def lines(self) -> list[Line]:
         """Every line of the table."""
-        groups = zip(self._scripts, self._others, self._mistaken, strict=True)
-        return lines_over_seeds(self._task, [self._drawn(*group) for group in groups])
+        pairs = zip(self._scripts, self._others, strict=True)
+        return lines_over_seeds(self._task, [self._drawn(*pair) for pair in pairs])
 
-    def _drawn(
-        self, scripts: Sequence[Rolled], others: Sequence[Rolled], mistaken: Sequence[Rolled]
-    ) -> list[Drawn]:
+    def _drawn(self, scripts: Sequence[Rolled], others: Sequence[Rolled]) -> list[Drawn]:
         sampling, everything = self._sampling, [*scripts, *others]
-        of_kinds = kind_figures(sampling, mistaken) if mistaken else []
-        if not scripts:
-            return of_kinds
         return [
-            *of_kinds,
             *_judge_figures(sampling, scripts),
             *_rollout_figures(sampling, scripts),
             *_decision_figures(sampling, scripts),
@@ -100,13 +85,7 @@ class TaskFigures:
 
     def rival_rows(self) -> list[dict[str, Any]]:
         """AUC and successes of every judge, over scripts and over all other policies."""
-        if not self._scripts[0]:
-            return []
         return rival_rows(self._task, self._sampling, self._scripts, self._others)
-
-    def kind_rows(self) -> list[dict[str, Any]]:
-        """Success rates and agreement of every kind of mistake."""
-        return kind_rows(self._task, self._mistaken)
 
     def chunk_rows(self) -> list[dict[str, Any]]:
         """Figures of every chunk of the scripts, by training seed where there are several."""
@@ -162,7 +141,7 @@ def _policy_figures(
         correlation, violation = (
             f"{POLICIES} ({name}), {word}" for word in ("Pearson", "MMRV with ties")
         )
-        rates = success_rates(rollouts, sampling.seeds)
+        rates = _rates(rollouts, sampling.seeds)
         if rates is None:
             found += [
                 undefined(correlation, ("at least", least)),
@@ -228,3 +207,21 @@ def _still_figures(sampling: Sampling, everything: Sequence[Rolled]) -> list[Dra
         Drawn(touch, pressure, none, len(mine), ("at most", 2.0), "kPa"),
         Drawn(image, gain, none, len(mine), ("at least", -1.0), "dB"),
     ]
+
+
+def _rates(
+    rollouts: Sequence[Rolled], seeds: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Real and imagined outcomes [policies, starts] of the policies that have every start."""
+    found = {(one.policy, one.seed): one for one in rollouts}
+    names = [
+        name
+        for name in dict.fromkeys(one.policy for one in rollouts)
+        if all((name, seed) in found for seed in seeds)
+    ]
+    if len(names) < 2:
+        return None
+    grid = [[found[name, seed] for seed in seeds] for name in names]
+    real = np.array([[one.success for one in row] for row in grid], dtype=float)
+    told = [[one.rows[IMAGINED]["likely_success"] for one in row] for row in grid]
+    return real, np.array(told, dtype=float)

@@ -9,7 +9,7 @@ from typing import Final
 
 from dextouch.errors import InvalidInputError
 from services.evaluation.policies.outside import PolicySource
-from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, mistake_name, script_name
+from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name
 
 CAMERA: Final = "camera_head"
 # 5 1/3 s at 15 steps a second, in chunks as policies send them.
@@ -124,8 +124,7 @@ def _one_each(paths: Sequence[Path], count: int) -> list[Path | None]:
 class StudyPlan:
     """Everything that defines one run of the stage.
 
-    `trained` are the checkpoints of every training seed; `kinds` are those of mistakes; without
-    `levels_mm` there are no other policies; `keep` is the folder of results and
+    `trained` are the checkpoints of every training seed; `keep` is the folder of results and
     arrays; the first `num_still_starts` starts of a task are also held still for 1000 steps.
     """
 
@@ -134,17 +133,15 @@ class StudyPlan:
     tasks: tuple[str, ...]
     seeds: tuple[int, ...]
     levels_mm: tuple[float, ...] = LEVELS_MM
-    kinds: tuple[str, ...] = ()
     cloned: tuple[ClonedPolicy, ...] = ()
     outside: tuple[OutsidePolicy, ...] = ()
     num_still_starts: int = 3
 
     def __post_init__(self) -> None:
-        if not self.tasks or not self.seeds or not (self.levels_mm or self.kinds):
+        if not self.tasks or not self.seeds or not self.levels_mm:
             raise InvalidInputError(
-                f"evaluator: got {len(self.tasks)} tasks, {len(self.seeds)} starts, "
-                f"{len(self.levels_mm)} levels and {len(self.kinds)} kinds of mistakes, expected "
-                "at least one task, one start, and one level or kind"
+                f"evaluator: got {len(self.tasks)} tasks, {len(self.seeds)} starts and "
+                f"{len(self.levels_mm)} levels, expected at least one of each"
             )
 
     @property
@@ -153,15 +150,7 @@ class StudyPlan:
         return tuple(script_name(level_mm) for level_mm in self.levels_mm)
 
     @property
-    def mistaken(self) -> tuple[str, ...]:
-        """Names of the scripts with one kind of mistake each."""
-        return tuple(mistake_name(kind) for kind in self.kinds)
-
-    @property
     def policies(self) -> tuple[str, ...]:
         """Names of all policies."""
-        if not self.levels_mm:
-            return self.mistaken
         closed_loop: tuple[ClonedPolicy | OutsidePolicy, ...] = (*self.cloned, *self.outside)
-        others = (*IDLE, *(policy.key for policy in closed_loop))
-        return (*self.scripts, *self.mistaken, *others)
+        return (*self.scripts, *IDLE, *(policy.key for policy in closed_loop))

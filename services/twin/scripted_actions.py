@@ -15,8 +15,6 @@ from dextouch.hands.actions import (
     poses_from_actions,
 )
 from services.twin.demonstrators import NUM_GRID_STEPS
-from services.twin.mistakes import Mistake, with_mistakes
-from services.twin.motions import MotionScene
 from services.twin.stage import Stage
 
 # Names of the policies that should fail; scripts are named by `script_name`.
@@ -27,9 +25,6 @@ _SCRIPT: Final = re.compile(r"script (\d{1,3}(?:\.\d+)?) mm")
 OTHER_SCENE: Final = 5_000
 _RETREAT_M = np.array([0.0, -0.10, 0.12])
 _RETREAT_STEPS: Final = 24
-# Strengths of a mistake, one start after the other.
-MISTAKE_STRENGTHS: Final = (0.15, 0.3, 0.5, 0.8)
-_MISTAKE: Final = re.compile(r"mistake: ([a-z_]+)")
 Actions = Float64[np.ndarray, "80 67"]
 
 
@@ -38,30 +33,19 @@ def script_name(level_mm: float) -> str:
     return f"script {level_mm:g} mm"
 
 
-def mistake_name(kind: str) -> str:
-    """Name of the exact script with one kind of mistake, weak to strong from start to start."""
-    return f"mistake: {kind}"
-
-
 def scripted_actions(stage: Stage, seed: int, policy: str) -> Actions:
     """Open-loop commands of a policy, steps 1 … 80, relative to the start's poses.
 
     Raises:
         UnknownNameError: no such policy.
     """
-    level, mistaken = _SCRIPT.fullmatch(policy), _MISTAKE.fullmatch(policy)
-    if level is None and mistaken is None and policy not in FAILING:
-        known = [script_name(10.0), mistake_name("tilt"), *FAILING]
-        raise UnknownNameError("script", policy, known)
+    level = _SCRIPT.fullmatch(policy)
+    if level is None and policy not in FAILING:
+        raise UnknownNameError("script", policy, [script_name(10.0), *FAILING])
     noise_m = float(level[1]) / 1000 if level else 0.0
     plan = stage.plan(seed + OTHER_SCENE * (policy == ELSEWHERE), noise_m=noise_m)
     anchor = stage.start(plan)
-    commands = plan.commands
-    if mistaken is not None:
-        mistake = Mistake(mistaken[1], MISTAKE_STRENGTHS[seed % len(MISTAKE_STRENGTHS)])
-        scene = MotionScene(stage.domain, plan.object_poses)
-        commands = with_mistakes(commands, [mistake], scene, seed)
-    actions = actions_from_poses(commands, anchor)
+    actions = actions_from_poses(plan.commands, anchor)
     if policy == HOLD:
         actions[1:] = actions[0]
     if policy == RETREAT:
