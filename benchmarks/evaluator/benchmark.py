@@ -12,6 +12,8 @@ from typing import Any
 
 from benchmarks.evaluator.drawn import Line, Rolled
 from benchmarks.evaluator.keeping import KeptRows, Row
+from benchmarks.evaluator.kind_lines import VERDICTS
+from benchmarks.evaluator.kinds import NONE, STRENGTHS, KindsPlan
 from benchmarks.evaluator.lines import TaskFigures
 from benchmarks.evaluator.page import cell, write_page
 from benchmarks.evaluator.plan import (
@@ -29,6 +31,7 @@ from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE, EARLY_POLICY
+from services.twin.scripted_actions import mistake_of
 from services.twin.tasks import EVALUATED
 
 PACKAGES = ("numpy", "torch", "mujoco")
@@ -64,6 +67,30 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="checkpoint of a world model trained without touch, as a baseline (none); once "
         "for all worlds, or once for each",
+    )
+    parser.add_argument(
+        "--kinds",
+        default="development",
+        metavar="SET|NAME,…",
+        help="kinds of mistakes whose scripts are rolled out beside the ladder: development, "
+        "held-out, training, none, or names. A set that was used to choose anything is no "
+        "held-out set any more: ask for held-out once, at the end (%(default)s)",
+    )
+    parser.add_argument(
+        "--strengths",
+        nargs="+",
+        type=float,
+        default=list(STRENGTHS),
+        help="strengths of mistakes, 0 … 1; every kind has one at a start, in turn (%(default)s)",
+    )
+    parser.add_argument(
+        "--every-strength", action="store_true", help="every strength from every start instead"
+    )
+    parser.add_argument(
+        "--ladder",
+        choices=("usual", NONE),
+        default="usual",
+        help="scripts with position errors and all other policies; none: mistakes only (usual)",
     )
     parser.add_argument("--tasks", nargs="+", default=list(EVALUATED), help="(%(default)s)")
     parser.add_argument(
@@ -122,14 +149,17 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     policies = [row for each in figures for row in each.policy_rows()]
     chunks = [row for each in figures for row in each.chunk_rows()]
     rivals = [row for each in figures for row in each.rival_rows()]
+    kinds = [row for each in figures for row in each.kind_rows()]
     notes = [f"{task} is unknown to the world or the judge" for task in plan.tasks
              if task not in study.tasks]  # fmt: skip
     if failed:
         notes.append(f"{failed} rollouts failed and are missing; see {kept.path}")
-    write_page(plan.keep / "evaluator.html", study.about, lines, (policies, rivals, chunks), notes)
+    shown = (kinds, policies, rivals, chunks)
+    write_page(plan.keep / "evaluator.html", study.about, lines, shown, notes)
     content = {
         "about": study.about,
         "lines": [asdict(line) for line in lines],
+        "kinds": kinds,
         "policies": policies,
         "rivals": rivals,
         "chunks": chunks,
@@ -140,9 +170,15 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     return StageReport(
         stage="evaluator",
         machine=describe_machine(PACKAGES),
-        options={"tasks": study.tasks, "starts": len(plan.seeds), "policies": plan.policies},
+        options={
+            "tasks": study.tasks,
+            "starts": len(plan.seeds),
+            "policies": plan.policies,
+            "kinds": plan.kinds and asdict(plan.kinds),
+        },
         tables=[
             interval_table(lines),
+            row_table("Mistakes by kind, beside the ladder", kinds),
             row_table("Success rates", policies),
             row_table("AUC of single rollouts, by who judges what", rivals),
             row_table("Chunks of scripts, each figure beside its rival", chunks),
@@ -152,7 +188,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             *(line.requirement() for line in lines),
             *(repetition(lines, earlier) if options.repeats else ()),
         ],
-        data={name: content[name] for name in ("about", "lines", "policies", "rivals", "chunks")},
+        data={name: value for name, value in content.items() if name != "notes"},
         notes=[*notes, f"rollouts, JSON and page: {plan.keep}"],
     )
 
@@ -164,13 +200,14 @@ def figures_of_tasks(study: Study, kept: KeptRows) -> tuple[list[TaskFigures], i
     for task in study.tasks:
         by_seed: list[list[Rolled]] = [[] for _ in study.members]
         for seed in study.plan.seeds:
-            for policy in study.policies(task):
+            for policy in study.policies(task, seed):
                 rolled = _rolled(study, kept, (task, seed, policy))
                 failed += not rolled
                 for mine, one in zip(by_seed, rolled, strict=False):
                     mine.append(one)
         if by_seed[0]:
-            figures.append(TaskFigures(task, by_seed, study.plan.scripts))
+            name = study.plan.kinds.name if study.plan.kinds else NONE
+            figures.append(TaskFigures(task, by_seed, study.plan.scripts, name))
     return figures, failed
 
 
@@ -181,9 +218,10 @@ def _rolled(study: Study, kept: KeptRows, about: tuple[str, int, str]) -> list[R
         row = kept.get(**key)
         if row is not None and "error" not in row:
             rows[number][kind] = row
-    if any(kind not in each for each in rows for kind in NEEDED):
-        return []
     _, seed, policy = about
+    needed = NEEDED if mistake_of(policy) is None else VERDICTS
+    if any(kind not in each for each in rows for kind in needed):
+        return []
     return [Rolled(policy, seed, bool(each["real"]["success"]), each) for each in rows]
 
 
@@ -234,7 +272,14 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
         raise InvalidInputError(
             f"evaluator: got {num_starts} starts and {options.jobs} jobs, expected at least one"
         )
+    only_mistakes = options.ladder == NONE
+    if only_mistakes and (options.cloned or options.policy):
+        raise InvalidInputError(
+            "evaluator: got --cloned or --policy with --ladder none, expected mistakes only"
+        )
     cloned = options.cloned or [f"cloned={DEFAULT_POLICY}", f"cloned early={EARLY_POLICY}"]
+    servo = options.policy or [_SERVO]
+    levels_mm = _QUICK_LEVELS_MM if options.quick else LEVELS_MM
     return StudyPlan(
         keep=options.keep,
         trained=trained_seeds(
@@ -245,8 +290,11 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
         ),
         tasks=tuple(options.tasks),
         seeds=tuple(range(options.first_seed, options.first_seed + num_starts)),
-        levels_mm=_QUICK_LEVELS_MM if options.quick else LEVELS_MM,
-        cloned=tuple(ClonedPolicy.parse(text) for text in cloned),
-        outside=tuple(OutsidePolicy.parse(text) for text in options.policy or [_SERVO]),
+        levels_mm=() if only_mistakes else levels_mm,
+        kinds=KindsPlan.parse(
+            options.kinds, tuple(options.strengths), every_strength=options.every_strength
+        ),
+        cloned=() if only_mistakes else tuple(map(ClonedPolicy.parse, cloned)),
+        outside=() if only_mistakes else tuple(map(OutsidePolicy.parse, servo)),
         num_still_starts=1 if options.quick else 3,
     )

@@ -109,14 +109,26 @@ class Sampling:
     ) -> Drawn:
         """Area under the ROC curve of the probabilities in one kind of row."""
         mine, success = having(kind, rollouts)
-        if success.all() or not success.any():
-            return undefined(what, ("at least", bound))
-        told, starts = probabilities(mine, kind), self.starts(mine)
+        pair = (probabilities(mine, kind), success)
+        return self.area_of(what, pair, mine, ("at least", bound), worst)
+
+    def area_of(
+        self,
+        what: str,
+        scores_and_positive: tuple[np.ndarray, np.ndarray],
+        rollouts: Sequence[Rolled],
+        bound: Bound,
+        worst: float | None = None,
+    ) -> Drawn:
+        """Area under the ROC curve of a score of each rollout against a property of it."""
+        scores, positive = scores_and_positive
+        if positive.all() or not positive.any():
+            return undefined(what, bound)
         value, draws = (
-            area_under_roc_of_draws(told, success, starts, counts)
+            area_under_roc_of_draws(scores, positive, self.starts(rollouts), counts)
             for counts in (self._own, self.counts)
         )
-        return Drawn(what, float(value[0]), draws, len(mine), ("at least", bound), worst=worst)
+        return Drawn(what, float(value[0]), draws, len(rollouts), bound, worst=worst)
 
     def balanced(self, what: str, kind: str, rollouts: Sequence[Rolled], bound: float) -> Drawn:
         """Balanced accuracy of the likelier outcomes in one kind of row."""

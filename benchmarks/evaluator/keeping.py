@@ -1,6 +1,7 @@
 """Results of the stage `evaluator` as lines of JSON, so that no rollout is computed twice.
 
-A row is identified by the digests of twin, world and judge, the task, the seed and the policy.
+A row is identified by the digests of twin, world and judge, the task, the seed and the policy; of
+a policy with a mistake also by the digest of the mistakes.
 Arrays that other rows need (endings, images at the ends of chunks) are stored next to the file. A
 line that a killed run left incomplete is skipped.
 """
@@ -16,7 +17,7 @@ from dextouch.errors import CorruptDataError, StorageError
 
 # Fields that identify a row; a kind of row may lack some of them.
 KEY_FIELDS = (
-    "kind", "twin", "world", "judge", "direct judge", "world without touch",
+    "kind", "twin", "world", "judge", "direct judge", "world without touch", "mistakes",
     "task", "seed", "policy",
 )  # fmt: skip
 Row = dict[str, Any]
@@ -84,7 +85,8 @@ def _parsed(line: str) -> Row | None:
 
 def array_path(keep: Path, *, digests: Sequence[str], **about: object) -> Path:
     """Path of a rollout's arrays; `digests` are those of all worlds that they depend on."""
-    digest = "-".join(one[:12] for one in digests)
+    known = [*digests, str(about["mistakes"])] if "mistakes" in about else digests
+    digest = "-".join(one[:12] for one in known)
     policy = str(about["policy"]).replace(" ", "_").replace("'", "")
     name = f"{about['task']}-{about['seed']}-{policy}.npz"
     return keep / "arrays" / str(about["kind"]) / digest / name

@@ -16,11 +16,13 @@ from benchmarks.evaluator.drawn import (
     lines_over_seeds,
     undefined,
 )
+from benchmarks.evaluator.kind_lines import KindFigures
 from benchmarks.evaluator.plan import IDLE
 from benchmarks.evaluator.rival_lines import rival_figures, rival_rows
 from dextouch.metrics.policy import mmrv, pearson
 from services.evaluation.calibration import UNDECIDED_RISK
 from services.evaluation.resampling import mmrv_of_draws, pearson_of_draws, rates_of_draws
+from services.twin.scripted_actions import mistake_of
 
 TRUE, IMAGINED = "true verdict", "imagined verdict"
 _LAST_IMAGE = "verdict of the last image"
@@ -34,20 +36,37 @@ class TaskFigures:
         by_seed: for every training seed the rollouts completed in both worlds, the same ones in
             the same order.
         scripts: names of the scripted policies.
+        kinds: name of the set of kinds of mistakes.
     """
 
     def __init__(
-        self, task: str, by_seed: Sequence[Sequence[Rolled]], scripts: Sequence[str]
+        self,
+        task: str,
+        by_seed: Sequence[Sequence[Rolled]],
+        scripts: Sequence[str],
+        kinds: str = "",
     ) -> None:
         self._task, self._by_seed = task, by_seed
+        mistaken = [[one for one in mine if mistake_of(one.policy) is not None] for mine in by_seed]
         self._scripts = [[one for one in mine if one.policy in scripts] for mine in by_seed]
-        self._others = [[one for one in mine if one.policy not in scripts] for mine in by_seed]
+        self._others = [
+            [one for one in mine if one.policy not in scripts and mistake_of(one.policy) is None]
+            for mine in by_seed
+        ]
         self._sampling = Sampling(by_seed[0])
+        self._kinds = KindFigures(task, kinds, mistaken, self._scripts) if mistaken[0] else None
 
     def lines(self) -> list[Line]:
         """Every line of the table."""
-        pairs = zip(self._scripts, self._others, strict=True)
-        return lines_over_seeds(self._task, [self._drawn(*pair) for pair in pairs])
+        lines = [] if self._kinds is None else self._kinds.lines()
+        if self._scripts[0]:
+            pairs = zip(self._scripts, self._others, strict=True)
+            lines += lines_over_seeds(self._task, [self._drawn(*pair) for pair in pairs])
+        return lines
+
+    def kind_rows(self) -> list[dict[str, Any]]:
+        """Figures of the ladder of scripts, and of every kind of mistake beside it."""
+        return [] if self._kinds is None else self._kinds.rows()
 
     def _drawn(self, scripts: Sequence[Rolled], others: Sequence[Rolled]) -> list[Drawn]:
         sampling, everything = self._sampling, [*scripts, *others]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from benchmarks.evaluator.kinds import KindsPlan
 from dextouch.errors import InvalidInputError
 from services.evaluation.policies.outside import PolicySource
 from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name
@@ -125,7 +126,8 @@ class StudyPlan:
     """Everything that defines one run of the stage.
 
     `trained` are the checkpoints of every training seed; `keep` is the folder of results and
-    arrays; the first `num_still_starts` starts of a task are also held still for 1000 steps.
+    arrays; without `levels_mm` only mistakes are rolled out, those of `kinds`; the first
+    `num_still_starts` starts of a task are also held still for 1000 steps.
     """
 
     keep: Path
@@ -133,15 +135,17 @@ class StudyPlan:
     tasks: tuple[str, ...]
     seeds: tuple[int, ...]
     levels_mm: tuple[float, ...] = LEVELS_MM
+    kinds: KindsPlan | None = None
     cloned: tuple[ClonedPolicy, ...] = ()
     outside: tuple[OutsidePolicy, ...] = ()
     num_still_starts: int = 3
 
     def __post_init__(self) -> None:
-        if not self.tasks or not self.seeds or not self.levels_mm:
+        if not self.tasks or not self.seeds or not (self.levels_mm or self.kinds):
             raise InvalidInputError(
                 f"evaluator: got {len(self.tasks)} tasks, {len(self.seeds)} starts and "
-                f"{len(self.levels_mm)} levels, expected at least one of each"
+                f"{len(self.levels_mm)} levels, expected at least one of each, or kinds of "
+                "mistakes in place of levels"
             )
 
     @property
@@ -151,6 +155,8 @@ class StudyPlan:
 
     @property
     def policies(self) -> tuple[str, ...]:
-        """Names of all policies."""
+        """Names of all policies but those with mistakes, which differ from start to start."""
+        if not self.levels_mm:
+            return ()
         closed_loop: tuple[ClonedPolicy | OutsidePolicy, ...] = (*self.cloned, *self.outside)
         return (*self.scripts, *IDLE, *(policy.key for policy in closed_loop))

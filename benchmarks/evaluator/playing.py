@@ -24,7 +24,8 @@ class TrueRollout:
     """Rollout of a policy in the twin.
 
     Chunk ends are steps 16, 32 … 80. `actions` are what was sent, relative to step 0;
-    `object_poses` T_world_object at step 0 and the chunk ends.
+    `object_poses` T_world_object at step 0 and the chunk ends. `images_of_chunks` are those at the
+    chunk ends, or none.
     """
 
     success: bool
@@ -51,8 +52,18 @@ def play_in_twin(
     started: StartedRollout[TwinState],
     policy: Policy | Actions,
     start: PolicyStart,
+    *,
+    shows_chunks: bool = True,
 ) -> TrueRollout:
-    """Let a policy act in the twin from its start."""
+    """Let a policy act in the twin from its start.
+
+    Args:
+        twin: the world.
+        started: its start.
+        policy: closed loop, or the commands of all steps.
+        start: what a closed-loop policy is told.
+        shows_chunks: whether images at the ends of chunks are kept.
+    """
     stage, state = twin.stage(start.task), started.state
     touch, sent = [started.observation.tactile_kpa], []
     poses, images = [stage_poses(twin, state)], []
@@ -70,14 +81,15 @@ def play_in_twin(
             parts.append(twin.step(step.state, chunk[head:], seed=start.seed))
         touch.extend(part.observation.tactile_kpa for part in parts)
         state, seen = parts[-1].state, parts[-1].observation
-        images.append(stage.rig.image(stage.simulation, CAMERA))
+        if shows_chunks:
+            images.append(stage.rig.image(stage.simulation, CAMERA))
         poses.append(stage.simulation.object_poses())
         sent.append(chunk)
     return TrueRollout(
         bool(seen.success),
         np.concatenate(sent),
         np.concatenate(touch),
-        np.stack(images),
+        _stacked(images, seen),
         seen.images[CAMERA][-NUM_SEEN_STEPS:],
         np.stack(poses),
     )
@@ -91,9 +103,22 @@ def stage_poses(twin: TwinWorld, state: TwinState) -> Float64[np.ndarray, "objec
 
 
 def play_in_imagination(
-    world: World[State], first: RolloutStart, policy: Policy | Actions, start: PolicyStart
+    world: World[State],
+    first: RolloutStart,
+    policy: Policy | Actions,
+    start: PolicyStart,
+    *,
+    shows_chunks: bool = True,
 ) -> ImaginedRollout:
-    """Let a policy act in an imagined world; if it uses images, it observes imagined ones."""
+    """Let a policy act in an imagined world; if it uses images, it observes imagined ones.
+
+    Args:
+        world: the imagined one.
+        first: the first observation.
+        policy: closed loop, or the commands of all steps.
+        start: what a closed-loop policy is told.
+        shows_chunks: whether images at the ends of chunks are kept.
+    """
     started = world.reset(first)
     state, seen = started.state, started.observation
     touch, images = [seen.tactile_kpa], []
@@ -105,9 +130,11 @@ def play_in_imagination(
             step = last = world.step(state, chunk, seed=start.seed + at)
         else:
             # A world is functional: two calls give touch of all steps and only the last image.
-            step = world.step(state, chunk, seed=start.seed + at, selector=_NO_IMAGES)
-            last = world.step(state, chunk, seed=start.seed + at, selector=_LAST_IMAGE)
-        images.append(last.observation.images[CAMERA][-1])
+            step = last = world.step(state, chunk, seed=start.seed + at, selector=_NO_IMAGES)
+            if shows_chunks or looks == "last":
+                last = world.step(state, chunk, seed=start.seed + at, selector=_LAST_IMAGE)
+        if shows_chunks:
+            images.append(last.observation.images[CAMERA][-1])
         state, seen = step.state, last.observation
         touch.append(step.observation.tactile_kpa)
         if seen.doubt is not None and seen.doubt.outside:
@@ -115,11 +142,15 @@ def play_in_imagination(
     poses = seen.object_poses
     return ImaginedRollout(
         np.concatenate(touch),
-        np.stack(images),
+        _stacked(images, seen),
         seen.images[CAMERA][-NUM_SEEN_STEPS:],
         None if poses is None else poses[-NUM_SEEN_STEPS:],
         doubted,
     )
+
+
+def _stacked(images: list[np.ndarray], seen: Observation) -> UInt8[np.ndarray, "chunks h w 3"]:
+    return np.stack(images) if images else seen.images[CAMERA][:0]
 
 
 def _begin(policy: Policy | Actions, start: PolicyStart) -> Literal["no", "last", "all"]:

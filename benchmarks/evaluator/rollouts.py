@@ -60,7 +60,8 @@ class PolicyRollout:
     Args:
         twin: the real world.
         keep: folder of results; existing arrays are not computed again.
-        about: the task, the seed and the name of the policy.
+        about: the task, the seed and the name of the policy; of a policy with a mistake also the
+            digest of the mistakes, since only the ending of its rollouts is kept.
         actor: the policy, or its actions.
     """
 
@@ -68,6 +69,7 @@ class PolicyRollout:
         self, twin: TwinWorld, keep: Path, about: dict[str, Any], actor: Policy | Actions
     ) -> None:
         self._twin, self._keep, self._actor = twin, keep, actor
+        self._shows_chunks = "mistakes" not in about
         self._about = about
         self._task, self._seed = str(about["task"]), int(about["seed"])
         self._stage = twin.stage(self._task)
@@ -111,7 +113,10 @@ class PolicyRollout:
         if path.is_file():
             kept = read_arrays(path)
             return TrueRollout(success=bool(kept.pop("success")), **kept)
-        real = play_in_twin(self._twin, self._started, self._actor, self._for_policy)
+        real = play_in_twin(
+            self._twin, self._started, self._actor, self._for_policy,
+            shows_chunks=self._shows_chunks,
+        )  # fmt: skip
         write_arrays(path, vars(real) | {"success": np.array(real.success)})
         return real
 
@@ -124,7 +129,9 @@ class PolicyRollout:
             kept = read_arrays(path)
             poses, doubted = kept.pop("object_poses", None), str(kept.pop("doubted"))
             return ImaginedRollout(**kept, object_poses=poses, doubted=doubted or None)
-        imagined = play_in_imagination(world, self._first, self._actor, self._for_policy)
+        imagined = play_in_imagination(
+            world, self._first, self._actor, self._for_policy, shows_chunks=self._shows_chunks
+        )
         arrays = {n: a for n, a in vars(imagined).items() if isinstance(a, np.ndarray)}
         write_arrays(path, arrays | {"doubted": np.array(imagined.doubted or "")})
         return imagined

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 
 from benchmarks.evaluator.keeping import KeptRows, Row, row_key
+from benchmarks.evaluator.kind_lines import VERDICTS
+from benchmarks.evaluator.kinds import mistakes_digest
 from benchmarks.evaluator.members import Member, open_members, refuse_unequal_rivals
 from benchmarks.evaluator.plan import CAMERA, StudyPlan
 from benchmarks.evaluator.playing import start_in_twin
@@ -16,7 +18,14 @@ from dextouch.errors import DexTouchError
 from services.evaluation.matched_starts import first_digest
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.starts import refuse_training_starts
-from services.twin.scripted_actions import ELSEWHERE, HOLD, Actions, script_name, scripted_actions
+from services.twin.scripted_actions import (
+    ELSEWHERE,
+    HOLD,
+    Actions,
+    mistake_of,
+    script_name,
+    scripted_actions,
+)
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 
@@ -24,7 +33,7 @@ from services.twin.world import TwinWorld
 RowName = tuple[str, int]
 Missing = Mapping[str, Sequence[RowName]]
 EXACT = script_name(0.0)
-# Rows that every rollout needs, and those of scripts only.
+# Rows that every rollout needs, unless its policy has a mistake, and those of scripts only.
 NEEDED = ("real", "imagined", "true verdict", "imagined verdict")
 _OF_SCRIPTS = ("verdict of the last image", "sharpness", "true context")
 
@@ -57,17 +66,18 @@ class Study:
         known = set(self.twin.description.tasks).intersection(*(m.tasks for m in self.members))
         return tuple(task for task in self.plan.tasks if task in known)
 
-    def policies(self, task: str) -> tuple[str, ...]:
-        """The policies that can act in a task."""
-        return tuple(
+    def policies(self, task: str, seed: int) -> tuple[str, ...]:
+        """The policies that can act in a task, and those with mistakes from this start."""
+        usual = (
             name
             for name in self.plan.policies
             if task in getattr(self.actors.get(name), "tasks", (task,))
         )
+        return (*usual, *(self.plan.kinds.policies(seed) if self.plan.kinds else ()))
 
     def keys(self, task: str, seed: int, policy: str) -> dict[RowName, dict[str, Any]]:
         """Identity of each row of a rollout."""
-        rollout = {"task": task, "seed": seed, "policy": policy}
+        rollout = self._about(task, seed, policy)
         found: dict[RowName, dict[str, Any]] = {}
         for number, member in enumerate(self.members):
             digests = {"twin": self.twin.description.digest, **member.about}
@@ -78,6 +88,8 @@ class Study:
 
     def kinds(self, task: str, seed: int, policy: str, member: Member) -> tuple[str, ...]:
         """The kinds of rows that a policy has from a start."""
+        if mistake_of(policy) is not None:
+            return VERDICTS
         kinds = [*NEEDED, "verdict without touch"]
         if member.direct is not None and task in member.direct.shape.tasks:
             kinds.append("direct verdict")
@@ -94,7 +106,7 @@ class Study:
     def missing(self, kept: KeptRows, task: str, seed: int) -> dict[str, tuple[RowName, ...]]:
         """Missing rows of a start, by policy."""
         found = {}
-        for policy in self.policies(task):
+        for policy in self.policies(task, seed):
             # Training seeds may share rows: twin and judge are often the same.
             names = {
                 row_key(key): name
@@ -129,8 +141,13 @@ class Study:
         return rollout.row(kind, member)
 
     def _rollout(self, task: str, seed: int, policy: str) -> PolicyRollout:
-        about = {"task": task, "seed": seed, "policy": policy}
+        about = self._about(task, seed, policy)
         return PolicyRollout(self.twin, self.plan.keep, about, self.actor(task, seed, policy))
+
+    @staticmethod
+    def _about(task: str, seed: int, policy: str) -> dict[str, Any]:
+        about: dict[str, Any] = {"task": task, "seed": seed, "policy": policy}
+        return about if mistake_of(policy) is None else about | {"mistakes": mistakes_digest()}
 
     def _refuse_training_start(self, task: str, seed: int) -> None:
         instruction = self.twin.stage(task).task.instruction

@@ -1,0 +1,212 @@
+"""Lines and rows of scripts with mistakes: one group over all kinds, and one for each."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from benchmarks.evaluator.drawn import (
+    POLICIES,
+    Bound,
+    Drawn,
+    Line,
+    Rolled,
+    Sampling,
+    lines_over_seeds,
+    undefined,
+)
+from dextouch.metrics.policy import mmrv, pearson
+from services.evaluation.resampling import mmrv_of_draws, pearson_of_draws
+from services.twin.scripted_actions import mistake_of
+
+# Rows of a rollout that has no others than these.
+VERDICTS: Final = ("real", "true verdict", "imagined verdict")
+TRUE, IMAGINED = VERDICTS[1:]
+_OF_DRAWS: Final = (pearson_of_draws, mmrv_of_draws)
+_LADDER: Final = "position (ladder)"
+BySeed = Sequence[Sequence[Rolled]]
+
+
+class KindFigures:
+    """Figures of one task about scripts with mistakes.
+
+    Args:
+        task: its name.
+        name: of the set of kinds.
+        by_seed: their rollouts, for every training seed the same ones in the same order.
+        ladder: rollouts of the scripts that err in position only, to stand beside them.
+    """
+
+    def __init__(self, task: str, name: str, by_seed: BySeed, ladder: BySeed) -> None:
+        self._task, self._name, self._by_seed, self._ladder = task, name, by_seed, ladder
+        self._sampling = Sampling([*by_seed[0], *ladder[0]])
+
+    def lines(self) -> list[Line]:
+        """The figures over all kinds."""
+        return lines_over_seeds(self._task, [self._drawn(mine) for mine in self._by_seed])
+
+    def _drawn(self, rollouts: Sequence[Rolled]) -> list[Drawn]:
+        what = f"mistakes ({self._name})"
+        policies = {"kinds and strengths": _policy_name, "kinds": kind_of}
+        return [
+            *group_figures(self._sampling, what, rollouts),
+            *(
+                figure
+                for name, policy_of in policies.items()
+                for figure in policy_figures(
+                    self._sampling, f"{POLICIES} ({self._name} {name})", rollouts, policy_of
+                )
+            ),
+        ]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Means over the training seeds for the ladder, all kinds, and each kind.
+
+        With several training seeds also the least and the greatest AUC.
+        """
+        groups: dict[str, BySeed] = {_LADDER: self._ladder, f"all {self._name}": self._by_seed}
+        groups |= {
+            kind: [[one for one in seed if kind_of(one) == kind] for seed in self._by_seed]
+            for kind in dict.fromkeys(map(kind_of, self._by_seed[0]))
+        }
+        return [
+            {"task": self._task, "mistakes": name} | self._row(mine)
+            for name, mine in groups.items()
+            if mine[0]
+        ]
+
+    def _row(self, by_seed: BySeed) -> dict[str, Any]:
+        found = [group_figures(self._sampling, "", seed) for seed in by_seed]
+        figures = dict(zip(_COLUMNS, _means(found), strict=True))
+        first = by_seed[0]
+        told = [[one.rows[IMAGINED]["likely_success"] for one in seed] for seed in by_seed]
+        row: dict[str, Any] = {
+            "rollouts": len(first),
+            "real": float(np.mean([one.success for one in first])),
+            "imagined": float(np.mean(told)),
+            **figures,
+        }
+        areas = [seed[0].value for seed in found]
+        if len(areas) > 1 and np.isfinite(areas).all():
+            row |= {"auc_least": min(areas), "auc_greatest": max(areas)}
+        return row
+
+
+# Names of `group_figures` in rows.
+_COLUMNS: Final = (
+    "auc", "balanced_accuracy", "bias", "wrong_of_decided", "decided", "auc_of_doubt",
+    "auc_of_true_endings",
+)  # fmt: skip
+
+
+def group_figures(sampling: Sampling, what: str, rollouts: Sequence[Rolled]) -> list[Drawn]:
+    """Figures of single rollouts of one training seed, in the order of the table's columns."""
+    each = f"{what}, imagined against real, each rollout"
+    success = np.array([one.success for one in rollouts], dtype=bool)
+    likely, decided = (_of_verdicts(rollouts, about) for about in (_is_likely, _is_decided))
+    wrong = likely != success
+    told = [one for one, sure in zip(rollouts, decided, strict=True) if sure]
+    doubt = np.array([doubt_of(one.rows[IMAGINED]) for one in rollouts])
+    too_many: Bound = ("at most", 0.08)
+    off = sampling.mean(
+        f"{what}, bias of the success rate", likely.astype(float) - success, rollouts, too_many
+    )
+    return [
+        sampling.area(f"{each}, AUC", IMAGINED, rollouts, 0.90, 0.85),
+        sampling.balanced(f"{each}, balanced accuracy", IMAGINED, rollouts, 0.80),
+        Drawn(off.what, abs(off.value), abs(off.draws), off.num, off.bound),
+        sampling.mean(
+            f"{what}, wrong among the decided", wrong[decided].astype(float), told,
+            ("at most", 0.10),
+        ),
+        sampling.mean(f"{what}, decided", decided.astype(float), rollouts, ("at least", 0.60)),
+        sampling.area_of(
+            f"{what}, doubt of wrong verdicts, AUC", (doubt, wrong), rollouts, ("at least", 0.80)
+        ),
+        sampling.area(f"{what}, judge on true endings, AUC", TRUE, rollouts, 0.95, None),
+    ]  # fmt: skip
+
+
+def _means(by_seed: Sequence[Sequence[Drawn]]) -> list[float | None]:
+    """Mean of every figure over the training seeds; None where it is undefined."""
+    means = [float(np.mean([one.value for one in same])) for same in zip(*by_seed, strict=True)]
+    return [mean if math.isfinite(mean) else None for mean in means]
+
+
+def policy_figures(
+    sampling: Sampling,
+    what: str,
+    rollouts: Sequence[Rolled],
+    policy_of: Callable[[Rolled], str],
+) -> list[Drawn]:
+    """Agreement of success rates over policies, each from its own starts."""
+    names = list(dict.fromkeys(map(policy_of, rollouts)))
+    shape = (len(names), len(sampling.seeds))
+    count, real, told = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    for one, start in zip(rollouts, sampling.starts(rollouts), strict=True):
+        at = names.index(policy_of(one)), start
+        count[at] += 1
+        real[at] += one.success
+        told[at] += one.rows[IMAGINED]["likely_success"]
+    bounds: tuple[Bound, Bound] = (("at least", 0.85), ("at most", 0.12))
+    titles = (f"{what}, Pearson", f"{what}, MMRV with ties")
+    if len(names) < 2:
+        return [undefined(*pair) for pair in zip(titles, bounds, strict=True)]
+    means = {"real": _rates(real, count)[0], "imagined": _rates(told, count)[0]}
+    draws = [_rates(side, count, sampling.counts) for side in (real, told)]
+    values = (pearson(**means), mmrv(**means, ties="simpler"))
+    # A draw may lack all starts of a policy: its figures are undefined.
+    whole = np.isfinite(draws[0]).all(axis=1)
+    drawn = np.full((2, len(whole)), np.nan)
+    drawn[:, whole] = [of(*(side[whole] for side in draws)) for of in _OF_DRAWS]
+    return [
+        Drawn(title, value, each, len(names), bound)
+        for title, value, each, bound in zip(titles, values, drawn, bounds, strict=True)
+    ]
+
+
+def _rates(
+    sums: Float64[np.ndarray, "policies starts"],
+    count: Float64[np.ndarray, "policies starts"],
+    draws: Float64[np.ndarray, "draws starts"] | None = None,
+) -> Float64[np.ndarray, "draws policies"]:
+    weights = np.ones((1, sums.shape[1])) if draws is None else draws
+    with np.errstate(invalid="ignore"):
+        return (weights @ sums.T) / (weights @ count.T)
+
+
+def kind_of(one: Rolled) -> str:
+    """The kind of mistake of a rollout.
+
+    Raises:
+        ValueError: a policy without a mistake.
+    """
+    mistake = mistake_of(one.policy)
+    if mistake is None:
+        raise ValueError(f"got policy {one.policy!r}, expected one with a mistake")
+    return mistake.kind
+
+
+def _policy_name(one: Rolled) -> str:
+    return one.policy
+
+
+def doubt_of(verdict: Mapping[str, Any]) -> float:
+    """How doubtful a verdict is: more than 1 if it is left open, otherwise by its probability."""
+    return float(not _is_decided(verdict)) + 1 - abs(2 * float(verdict["probability"]) - 1)
+
+
+def _is_likely(verdict: Mapping[str, Any]) -> bool:
+    return bool(verdict["likely_success"])
+
+
+def _is_decided(verdict: Mapping[str, Any]) -> bool:
+    return bool(verdict["decision"] != "cannot tell")
+
+
+def _of_verdicts(
+    rollouts: Sequence[Rolled], about: Callable[[Mapping[str, Any]], bool]
+) -> np.ndarray:
+    return np.array([about(one.rows[IMAGINED]) for one in rollouts], dtype=bool)
