@@ -252,6 +252,36 @@ def test_absent_raters_are_left_out():
     assert np.isfinite(both.real).all()
 
 
+def test_undecided_rollouts_are_missing():
+    real, imagined = binary([0.2, 0.5, 0.8], 30, rng(50)), binary([0.3, 0.5, 0.7], 30, rng(51))
+    imagined[0, :12], imagined[2, 20:] = np.nan, np.nan
+    scores = MatchedScores(real, imagined)
+    agreement, draws = task_agreement("abc", scores, rng(52))
+    means = [side[np.isfinite(side)].mean() for side in imagined[:, :, 0]]
+    assert agreement.figures["bias"].value == pytest.approx(np.mean(means) - real.mean())
+    assert agreement.figures["pearson"].interval is not None
+    # Of a policy with fewer decided rollouts less is known; its draws lie about its own rate.
+    for drawn in (draws.posterior, draws.bootstrap):
+        assert np.isfinite(drawn.imagined).all()
+        assert drawn.imagined.mean(axis=0) == pytest.approx(means, abs=0.06)
+    (pair, *_) = paired_differences("ab", imagined[:2, :, 0], rng(53))
+    assert pair.difference == pytest.approx((imagined[0, 12:] - imagined[1, 12:]).mean())
+    never = np.array([[1.0, np.nan], [np.nan, 0.0]])
+    assert paired_differences("ab", never, rng(54)) == []
+
+
+def test_noise_of_missing_scores_is_that_of_the_known_ones():
+    rollouts = rng(55).random((2, 4000))
+    rollouts[1] = 0.5 * rollouts[0] + 0.5 * rollouts[1]
+    kept = rollouts.copy()
+    kept[0, :1000], kept[1, 3000:] = np.nan, np.nan
+    found = noise_covariance(kept)
+    # The covariance of two means over 3000 starts that share 2000 of them.
+    expected = np.cov(rollouts)[0, 1] * 2000 / (3000 * 3000)
+    assert found[0, 1] == pytest.approx(expected, rel=0.1)
+    assert found[0, 0] == pytest.approx(noise_covariance(rollouts[:, 1000:])[0, 0])
+
+
 def test_pooled_agreement_joins_tasks():
     tasks = [
         MatchedScores(binary(rates, 20, rng(22)), binary(rates, 20, rng(23)))
@@ -272,6 +302,7 @@ def test_pooled_agreement_joins_tasks():
         (np.zeros((2, 3, 1)), np.zeros((2, 4, 1)), ShapeError, "same policies and starts"),
         (np.zeros((0, 3, 1)), np.zeros((0, 3, 1)), ShapeError, "at least one"),
         (np.full((2, 3, 1), np.nan), np.zeros((2, 3, 1)), InvalidInputError, "has no score"),
+        (np.zeros((2, 3, 1)), np.full((2, 3, 1), np.nan), InvalidInputError, "no imagined score"),
         (np.full((2, 3, 1), 4.0), np.zeros((2, 3, 1)), InvalidInputError, "rubric's maximum"),
     ],
 )

@@ -11,6 +11,7 @@ from scipy.stats import binomtest
 from dextouch.errors import InvalidInputError
 from services.evaluation.command_line import print_scores
 from services.evaluation.reporting import ReportPictures, write_report
+from services.evaluation.reporting.latex import latex_tables
 from services.evaluation.reporting.sections import tiles
 from services.evaluation.scores import ClosedLoopReport, RolloutFailure, RolloutScore
 
@@ -250,6 +251,87 @@ def test_agreement_of_all_tasks_correlates_all_policies_of_all_tasks():
     )
     other = ClosedLoopReport(ended, ("model",), ("a", "b", "c"), failures).to_report()
     assert other["agreement_of_all_tasks"] == {}
+
+
+def undecided(whole: ClosedLoopReport, **starts: set[int]) -> ClosedLoopReport:
+    """The report when the probe had abstained on these starts of each policy in the model."""
+    scores = [
+        replace(s, cannot_tell="too close")
+        if s.world == "model" and s.seed in starts.get(s.policy, ())
+        else s
+        for s in whole.scores
+    ]
+    return replace(whole, scores=tuple(scores))
+
+
+TEN = {
+    "real": {"a": "1111111100", "b": "1111000000", "c": "1000000000", "d": "1010101010"},
+    "model": {"a": "1111111000", "b": "1100000000", "c": "0000000011", "d": "1111100000"},
+}
+
+
+def test_rates_are_of_decided_rollouts():
+    found = undecided(report(TEN), a={7, 8, 9}, c={9}, d={0, 1, 2, 3, 4}).to_report()
+    a, b, c, d = found["policies"]
+    assert [row["imagined_undecided"] for row in (a, b, c, d)] == [3, 0, 1, 5]
+    # Seven of seven, two of ten, one of nine, none of five; real ones are all decided.
+    assert [row["imagined"] for row in (a, b, c, d)] == pytest.approx([1, 0.2, 1 / 9, 0])
+    expected = binomtest(7, 7).proportion_ci(method="wilson")
+    assert a["imagined_interval"] == pytest.approx([expected.low, expected.high])
+    assert [row["real"] for row in (a, b, c, d)] == pytest.approx([0.8, 0.4, 0.1, 0.5])
+    assert [row["imagined_comparable"] for row in (a, b, c, d)] == [True, True, True, False]
+    # Fewer than 60 % of d are decided; the others are compared by their decided rollouts.
+    agreement = found["agreement"]["stand"]
+    assert agreement["not_comparable"] == ["d"]
+    assert (agreement["num_policies"], agreement["num_starts"]) == (3, 10)
+    real, imagined = [0.8, 0.4, 0.1], [1, 0.2, 1 / 9]
+    assert agreement["pearson"] == pytest.approx(np.corrcoef(real, imagined)[0, 1])
+    assert agreement["bias"] == pytest.approx(np.mean(imagined) - np.mean(real))
+    pair = agreement["differences"]["imagined"][0]
+    # a and b on the seven starts that both decided.
+    assert (pair["first"], pair["second"]) == ("a", "b")
+    assert pair["difference"] == pytest.approx(1 - 2 / 7)
+    first, second, compared, *_ = found["comments"]["stand"]
+    assert first.startswith("Of 9 of 40 rollouts in model it cannot be told")
+    assert second.endswith("60% of the rollouts in model were decided: 'd'.")
+    assert compared.startswith("Agreement is computed over 10 of 10 starts")
+    json.dumps(found, allow_nan=False)
+
+
+def test_undecided_rollouts_stand_beside_every_rate(tmp_path, capsys):
+    whole = undecided(report(TEN), a={7, 8, 9}, d={0, 1, 2, 3, 4})
+    print_scores(whole.to_report())
+    lines = {line.split()[1]: line for line in capsys.readouterr().out.splitlines()[1:5]}
+    assert lines["a"].endswith("1.00 of 7  3 of 10 cannot tell")
+    assert lines["b"].endswith("0.200 of 10")
+    assert lines["d"].endswith("0.0 of 5  5 of 10 cannot tell, not comparable")
+    write_report(whole.to_report(), ReportPictures(), tmp_path / "report.html")
+    shown = (tmp_path / "report.html").read_text().split("<details")[0]
+    assert "3 of 10 cannot tell</span>" in shown
+    assert "5 of 10 cannot tell, not comparable</span>" in shown
+    # Policies that are not comparable have no point beside the others.
+    assert shown.count("</title></circle>") == 3
+    rows = latex_tables(whole).splitlines()
+    assert (
+        r" & model & 1.000 {\scriptsize [0.65, 1.00]} {\scriptsize 3 of 10 cannot tell} \\" in rows
+    )
+
+
+def test_a_policy_of_which_nothing_is_decided_has_no_rate():
+    found = undecided(report(TEN), **{name: set(range(10)) for name in "abcd"}).to_report()
+    assert [row["imagined"] for row in found["policies"]] == ["undefined"] * 4
+    assert found["policies"][0]["imagined_undecided"] == 10
+    assert found["agreement"]["stand"]["pearson"] == "undefined"
+    assert found["agreement"]["stand"]["not_comparable"] == list("abcd")
+    assert found["comments"]["stand"][-1] == "No policy is left to compare."
+    json.dumps(found, allow_nan=False)
+
+
+def test_a_policy_that_decided_none_of_the_common_starts_is_left_out():
+    # Of c only starts 0 and 1 ended in the real world, and these are not decided.
+    whole = undecided(report(TEN), c={0, 1})
+    found = lost(whole, *(("real", "c", seed) for seed in range(2, 10)))
+    assert list(found["agreement"]["stand"]["rates"]) == ["a", "b", "d"]
 
 
 def test_probe_is_judged_on_real_rollouts():

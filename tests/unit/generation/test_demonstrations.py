@@ -8,7 +8,7 @@ import pytest
 from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import EVERYTHING
+from dextouch.schemas import EVERYTHING, Doubt
 from dextouch.worlds import CopyFirstWorld, SteppedRollout, WorldServiceSettings, create_world_app
 from services.cli.servers import served
 from services.evaluation.endings import read_ending_episode
@@ -58,7 +58,10 @@ def test_an_imagined_episode_shows_what_the_world_showed(sources, client, tmp_pa
 
 
 class _PoseWorld(CopyFirstWorld):
-    """Repeats the first image, and says that one bowl rises by a millimetre a step."""
+    """Repeats the first image, and says that one bowl rises by a millimetre a step.
+
+    It doubts its second chunk; success becomes likelier from step to step.
+    """
 
     @property
     def description(self):
@@ -70,7 +73,12 @@ class _PoseWorld(CopyFirstWorld):
         steps = state.first_step + 1 + np.arange(len(actions))
         poses = np.zeros((len(actions), 2, 7), np.float32)
         poses[:, :, 3], poses[:, 1, 2] = 1.0, 0.001 * steps
-        seen = replace(stepped.observation, object_poses=poses)
+        doubt = Doubt(
+            disagreement=0, distance=0,
+            outside=steps[0] == 17, reason="slipped" if steps[0] == 17 else None,
+            success_probability=float(steps[-1]) / 100, success_spread=0.5,
+        )  # fmt: skip
+        seen = replace(stepped.observation, object_poses=poses, doubt=doubt)
         return SteppedRollout(stepped.state, seen.selected(selector))
 
 
@@ -85,6 +93,18 @@ def test_imagined_poses_are_kept_for_the_judge(sources, tmp_path):
     ending = read_ending_episode(reader).final
     assert ending.imagined
     np.testing.assert_allclose(ending.object_poses[:, 1, 2], [0.078, 0.079, 0.080], atol=1e-6)
+    quality = reader.attributes.quality
+    assert quality["imagined_doubted_step"] == 32
+    assert (quality["imagined_success_probability"], quality["imagined_success_spread"]) == (
+        0.8,
+        0.5,
+    )
+    assert sources[0].attributes.quality.items() <= quality.items()
+    assert ending.success_probability == 0.8
+    assert ending.doubted == "at step 32, the world doubted its prediction"
+    # Only the end is what these figures are about.
+    endings = read_ending_episode(reader).endings
+    assert {one.success_probability for step, one in endings.items() if step != 80} == {None}
 
 
 def test_endings_of_a_true_episode_are_those_of_the_twin(sources):

@@ -1,7 +1,9 @@
 """Watching rollouts: what is listed and shown, to whom, and that nothing about them changes."""
 
 import asyncio
+from dataclasses import replace
 
+import httpx
 import msgpack
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from httpx import ASGITransport, AsyncClient
 from pydantic import SecretStr
 
 from dextouch.clients import RolloutClient
-from dextouch.schemas import decode_answer
+from dextouch.schemas import Doubt, RolloutDoubt, decode_answer
 from dextouch.serving.keys import ApiKey
 from dextouch.streams import unpack
 from dextouch.worlds import WorldServiceSettings, create_world_app
@@ -96,6 +98,42 @@ async def test_the_listing_says_who_does_what_since_when(client):
     # Neither the id nor anything that leads to it is listed.
     assert begun.rollout.id not in str(one)
     assert one["watch_id"] != begun.rollout.id
+
+
+class DoubtfulWorld(SumWorld):
+    """Doubts chunks of which joint values are negative."""
+
+    def step(self, state, rows, **options):
+        stepped = super().step(state, rows, **options)
+        slipped = bool((rows == -1.0).any())
+        doubt = Doubt(
+            disagreement=0, distance=0, outside=slipped, reason="slipped" if slipped else None,
+            success_probability=0.25,
+        )  # fmt: skip
+        return replace(stepped, observation=replace(stepped.observation, doubt=doubt))
+
+
+def test_every_answer_after_a_doubted_chunk_says_so():
+    with (
+        served(create_world_app({"sum": DoubtfulWorld()}, WorldServiceSettings())) as url,
+        RolloutClient(url) as client,
+        client.start(**BODY) as rollout,
+    ):
+        assert rollout.info.rollout_doubt is None
+        rollout.step(actions(4))
+        assert rollout.info.rollout_doubt == RolloutDoubt(success_probability=0.25)
+        rollout.step(actions(4, -1.0))
+        rollout.step(actions(8))
+        expected = RolloutDoubt(reason="slipped", step=8, success_probability=0.25)
+        assert rollout.observation.doubt.reason is None
+        assert rollout.info.rollout_doubt == expected
+        # Branches share the doubted past, and watchers see it.
+        with rollout.fork(seed=5) as branch:
+            branch.step(actions(4))
+            assert branch.info.rollout_doubt == expected
+        (one,) = httpx.get(f"{url}/v1/watch").json()["rollouts"]
+        assert one["rollout_doubt"] == expected.model_dump()
+        assert one["doubt"]["reason"] is None
 
 
 async def test_an_end_is_listed_with_its_reason(client):
