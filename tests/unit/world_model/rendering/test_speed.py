@@ -168,10 +168,10 @@ def test_starts_of_several_rollouts_are_remembered_up_to_a_limit(small, image, s
     for level in [*range(64), *range(64)]:
         draw(level)
     assert len(prepared) == 64
-    draw(200)
+    for level in (0, 200, 0):
+        draw(level)
+    assert len(prepared) == 65
     # The start that was not used for longest has been dropped.
     draw(1)
-    assert len(prepared) == 65
-    draw(0)
     assert len(prepared) == 66
     assert len(renderer._starts) == 64
