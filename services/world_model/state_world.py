@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, Float64
 
 from dextouch.errors import (
     EndedError,
@@ -51,7 +51,7 @@ from services.world_model.network.inputs import (
     build_inputs,
     check_reach,
 )
-from services.world_model.rendering.renderer import Renderer
+from services.world_model.rendering.renderer import Drawing, Renderer
 from services.world_model.rendering.scene_states import SceneState
 from services.world_model.starts import CAMERA, ObservedStart, check_geometry, observed_start
 from services.world_model.state_checkpoints import StateCheckpoint
@@ -202,7 +202,7 @@ class StateWorld:
         memory = stack_memories([state.memory for state in states])
         following, imagined = self._dynamics.advance(memory, Commands.of(motions))
         _refuse_non_finite(imagined)
-        return [
+        answers = [
             self._answer(
                 replace(
                     state,
@@ -216,6 +216,7 @@ class StateWorld:
             )
             for index, state in enumerate(states)
         ]
+        return self._drawn(answers)
 
     def _refuse_ended(self, state: StateRollout) -> None:
         limit = LAST_HORIZONS * self._metadata.bounds.horizon_latents
@@ -243,7 +244,8 @@ class StateWorld:
         chunk: np.ndarray,
         imagined: tuple[ImaginedSteps, int],
         selector: ReturnSelector,
-    ) -> SteppedRollout[StateRollout]:
+    ) -> tuple[SteppedRollout[StateRollout], Drawing | None]:
+        """The chunk's observation without images, and what to draw if images are requested."""
         steps, index = imagined
         one = ObjectPoses(
             steps.poses.position_m[index], steps.poses.axes[index], steps.poses.present[index]
@@ -258,24 +260,40 @@ class StateWorld:
             object_poses=poses,
             doubt=self._doubt(state, steps, index),
         ).selected(selector)
+        drawing = None
         if selector.wants(CAMERA):
             shown = slice(len(chunk) - len(observation), None)
-            images = self._drawn(state, chunk[shown], poses[shown])
-            observation = replace(observation, images={CAMERA: images})
-        return SteppedRollout(state, observation)
+            drawing = self._drawing(state, chunk[shown], poses[shown])
+        return SteppedRollout(state, observation), drawing
 
-    def _drawn(
+    def _drawing(
         self,
         state: StateRollout,
         actions: Float64[np.ndarray, "n 67"],
         poses: Float32[np.ndarray, "n objects 7"],
-    ) -> UInt8[np.ndarray, "n h w 3"]:
-        """Images of steps with hands and objects at the given poses."""
-        start_poses = self._poses(mean_start(state.memory), state.task)
+    ) -> Drawing:
+        """Steps of a rollout to draw, with hands and objects at the given poses."""
+        start, *states = _scene_states(
+            np.concatenate([state.first_reached[None], actions]),
+            state.anchor,
+            np.concatenate([self._poses(mean_start(state.memory), state.task), poses]),
+        )
         boxes_m = np.array(self._metadata.object_boxes_m[state.task])
-        start = _scene_states(state.first_reached[None], state.anchor, start_poses)[0]
-        states = _scene_states(actions, state.anchor, poses)
-        return self._renderer.draw(state.image, state.K_head, start, states, boxes_m)
+        return Drawing(state.image, state.K_head, start, states, boxes_m)
+
+    def _drawn(
+        self, answers: Sequence[tuple[SteppedRollout[StateRollout], Drawing | None]]
+    ) -> list[SteppedRollout[StateRollout]]:
+        """The answers with their images, all drawn together."""
+        images = iter(self._renderer.draw_all([drawing for _, drawing in answers if drawing]))
+        return [
+            stepped
+            if drawing is None
+            else replace(
+                stepped, observation=replace(stepped.observation, images={CAMERA: next(images)})
+            )
+            for stepped, drawing in answers
+        ]
 
     def _doubt(self, state: StateRollout, steps: ImaginedSteps, index: int) -> Doubt:
         bounds = self._metadata.bounds

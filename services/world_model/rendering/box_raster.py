@@ -64,50 +64,53 @@ def cast_boxes(
     Only pixels in the bounding rectangle of a box's corners are tested; a box with corners behind
     the camera is tested everywhere.
     """
-    half_m = np.maximum(half_m, MIN_HALF_M)
-    image, slot, v, u = np.nonzero(_tried(Ts_camera_box, half_m, present, K, shape_px))
-    Ts_box_camera = invert(Ts_camera_box)
-    unprojected = (Ts_box_camera[..., :3, :3] @ np.linalg.inv(K)[:, None])[image, slot]
-    pixels = np.stack([u + 0.5, v + 0.5, np.ones(len(u))], axis=1)
-    directions = (unprojected @ pixels[..., None])[..., 0]
-    origins, half = Ts_box_camera[image, slot, :3, 3], half_m[image, slot]
+    half_m = np.maximum(half_m, MIN_HALF_M)[present]
+    Ts_box_camera = invert(Ts_camera_box[present])
+    images, slots = np.nonzero(present)
+    box, v, u = np.nonzero(_tried(Ts_camera_box[present], half_m, K[images], shape_px))
+    image, slot = images[box], slots[box]
+    # Vectors are columns [3, tried]: one row of numbers per axis is much faster to compute with.
+    unprojected = (Ts_box_camera[:, :3, :3] @ np.linalg.inv(K)[images]).transpose(1, 2, 0)[..., box]
+    directions = unprojected[:, 0] * (u + 0.5) + unprojected[:, 1] * (v + 0.5) + unprojected[:, 2]
+    origins, half = Ts_box_camera[:, :3, 3].T[:, box], half_m.T[:, box]
     # Avoid division by zero for rays parallel to a face.
     inverse = 1.0 / np.where(np.abs(directions) < 1e-12, 1e-12, directions)
     middle, reach = -origins * inverse, half * np.abs(inverse)
-    enter, leave = (middle - reach).max(axis=1), (middle + reach).min(axis=1)
+    enter, leave = (middle - reach).max(axis=0), (middle + reach).min(axis=0)
     height, width = shape_px
     place = (image * height + v) * width + u
-    hit = np.flatnonzero((leave > enter) & (enter > NEAR_M))
-    # Sorted by pixel, then depth: the first hit of each pixel is the nearest.
-    hit = hit[np.lexsort((enter[hit], place[hit]))]
-    seen = hit[np.diff(place[hit], prepend=-1) > 0]
-    entry = origins[seen] + directions[seen] * enter[seen, None]
-    local = (entry / half[seen]).clip(-1.0, 1.0)
+    hit = (leave > enter) & (enter > NEAR_M)
+    # Depth buffer, slot by slot, in which no pixel occurs twice.
+    nearest_m = np.full(len(K) * height * width, np.inf)
+    row = np.full(len(nearest_m), -1)
+    for index in np.unique(slots):
+        tested = np.flatnonzero(hit & (slot == index))
+        tested = tested[enter[tested] < nearest_m[place[tested]]]
+        nearest_m[place[tested]], row[place[tested]] = enter[tested], tested
+    seen = row[row >= 0]
+    entry = origins[:, seen] + directions[:, seen] * enter[seen]
+    local = np.ascontiguousarray((entry / half[:, seen]).clip(-1.0, 1.0).T)
     return BoxHits(
         place[seen], image[seen], slot[seen], enter[seen], leave[seen] - enter[seen], local
     )
 
 
 def _tried(
-    Ts_camera_box: np.ndarray,
-    half_m: np.ndarray,
-    present: np.ndarray,
-    K: np.ndarray,
-    shape_px: tuple[int, int],
-) -> Bool[np.ndarray, "n k h w"]:
-    """Pixels in the bounding rectangle of each present box."""
+    Ts_camera_box: np.ndarray, half_m: np.ndarray, K: np.ndarray, shape_px: tuple[int, int]
+) -> Bool[np.ndarray, "boxes h w"]:
+    """Pixels in the bounding rectangle of each box."""
     corners = box_corners(Ts_camera_box, half_m)
     depth = corners[..., 2:]
-    pixels = (corners @ np.swapaxes(K, -1, -2)[:, None])[..., :2] / np.maximum(depth, NEAR_M)
-    everywhere = (depth.min(axis=(2, 3)) < NEAR_M)[..., None]
-    low, high = pixels.min(axis=2), pixels.max(axis=2)
+    pixels = (corners @ np.swapaxes(K, -1, -2))[..., :2] / np.maximum(depth, NEAR_M)
+    everywhere = depth.min(axis=(1, 2))[:, None] < NEAR_M
+    low, high = pixels.min(axis=1), pixels.max(axis=1)
     low, high = np.where(everywhere, -np.inf, low), np.where(everywhere, np.inf, high)
     inside = []
     for axis, count in ((0, shape_px[1]), (1, shape_px[0])):
         centres = np.arange(count) + 0.5
-        inside.append((centres >= low[..., axis, None]) & (centres <= high[..., axis, None]))
+        inside.append((centres >= low[:, axis, None]) & (centres <= high[:, axis, None]))
     across, down = inside
-    return np.asarray((down & present[..., None])[..., None] & across[..., None, :])
+    return np.asarray(down[..., None] & across[:, None, :])
 
 
 def positions_at_start(
@@ -124,13 +127,15 @@ def positions_at_start(
         half_m: half sizes of the boxes.
         K: intrinsics of the start camera.
     """
-    points = hits.local * np.maximum(half_m, MIN_HALF_M)[hits.image, hits.slot]
-    projections = (K[:, None] @ Ts_start_box[..., :3, :])[hits.image, hits.slot]
-    homogeneous = (projections[..., :3] @ points[..., None])[..., 0] + projections[..., 3]
-    depth = homogeneous[:, 2:]
-    return np.asarray(
-        np.where(depth > NEAR_M, homogeneous[:, :2] / np.maximum(depth, NEAR_M), -1e3)
-    )
+    x, y, z = hits.local.T
+    scaled = (K[:, None] @ Ts_start_box[..., :3, :]).transpose(2, 3, 0, 1)
+    scaled[:, :3] *= np.maximum(half_m, MIN_HALF_M).transpose(2, 0, 1)
+    projections = scaled[..., hits.image, hits.slot]
+    homogeneous = projections[:, 0] * x + projections[:, 1] * y + projections[:, 2] * z
+    homogeneous += projections[:, 3]
+    depth = homogeneous[2]
+    pixels = np.where(depth > NEAR_M, homogeneous[:2] / np.maximum(depth, NEAR_M), -1e3)
+    return np.ascontiguousarray(pixels.T)
 
 
 def colours_at_positions(

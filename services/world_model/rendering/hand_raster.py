@@ -106,18 +106,19 @@ def project_hands(
         middle_only: put every point on the centre line of its bone.
     """
     ribbons = _ribbons()
-    T_camera_world = invert(T_world_camera)[:, None]
-    base = apply(T_camera_world, base_world)
-    points = ribbons.mixture @ base
+    base = apply(invert(T_world_camera)[:, None], base_world)
+    # Vectors are [3, n, 2, points]: one block of numbers per axis is much faster to compute with.
+    axes = np.ascontiguousarray(np.moveaxis(base, -1, 0))
+    points = axes @ ribbons.mixture.T
     if not middle_only:
-        sideways = np.cross(ribbons.direction @ base, points)
-        length = np.linalg.norm(sideways, axis=-1, keepdims=True)
-        points = points + sideways / np.maximum(length, 1e-9) * ribbons.lateral_m[:, None]
-    depth = points[..., 2]
-    in_front = depth > MIN_DEPTH_M
-    homogeneous = points @ np.swapaxes(K, -1, -2)[:, None]
-    pixels = homogeneous[..., :2] / np.maximum(depth, MIN_DEPTH_M)[..., None]
-    return HandPoints(pixels, depth, in_front)
+        (ax, ay, az), (x, y, z) = axes @ ribbons.direction.T, points
+        sideways = np.stack([ay * z - az * y, az * x - ax * z, ax * y - ay * x])
+        length = np.sqrt((sideways**2).sum(axis=0))
+        points = points + sideways * (ribbons.lateral_m / np.maximum(length, 1e-9))
+    depth = points[2]
+    pixels = np.einsum("nij,jnsp->nspi", K[:, :2], points)
+    pixels /= np.maximum(depth, MIN_DEPTH_M)[..., None]
+    return HandPoints(pixels, depth, depth > MIN_DEPTH_M)
 
 
 def colours_at(
@@ -139,26 +140,25 @@ def splat_hands(points: HandPoints, colours: np.ndarray, shape_px: tuple[int, in
     num_images = len(points.pixels)
     place, weight, source = _taps(points, shape_px)
     size = num_images * height * width
-    depth = points.depth_m.reshape(-1)[source]
+    depth = points.depth_m.reshape(-1)
     # Weights are about one at a metre: exp does not overflow for any depth above MIN_DEPTH_M.
-    near = weight * np.exp(np.minimum((1.0 - depth) / _SOFT_DEPTH_M, 300.0))
-    is_right = (source // points.depth_m.shape[2]) % 2 == 1
-    total = np.bincount(place, near, size)
-    normal = 1.0 / np.maximum(total, 1e-300)
-    paint = colours.reshape(-1, 3)[source]
+    near = weight * np.exp(np.minimum((1.0 - depth) / _SOFT_DEPTH_M, 300.0))[source]
+    is_right = (source // points.depth_m.shape[2]) % 2
+    normal = 1.0 / np.maximum(np.bincount(place, near, size), 1e-300)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return np.bincount(place, near * values, size) * normal
+        """Of each pixel's points, whose values are given."""
+        return np.bincount(place, near * values.reshape(-1)[source], size) * normal
 
-    left = np.bincount(place, np.where(is_right, 0.0, weight), size)
-    right = np.bincount(place, np.where(is_right, weight, 0.0), size)
+    right = np.bincount(place, weight * is_right, size)
+    left = np.bincount(place, weight * (1 - is_right), size)
     cover = 1.0 - np.exp(-_OPACITY * np.stack([left, right]))
-    colour = np.stack([mean(paint[:, channel]) for channel in range(3)])
+    colour = np.stack([mean(colours[..., channel]) for channel in range(3)])
     images = (num_images, height, width)
     return HandRaster(
         cover.reshape(2, *images).swapaxes(0, 1).astype(np.float32),
         colour.reshape(3, *images).swapaxes(0, 1).astype(np.float32),
-        mean(1.0 / np.maximum(depth, MIN_DEPTH_M)).reshape(*images)[:, None].astype(np.float32),
+        mean(1.0 / np.maximum(depth, MIN_DEPTH_M)).reshape(images)[:, None].astype(np.float32),
     )
 
 
@@ -173,15 +173,23 @@ def _taps(
     source = np.flatnonzero(shown)
     corner = np.floor(flat[source])
     share = flat[source] - corner
-    u, v = corner.astype(np.int64).T
     image = source // (points.depth_m.shape[1] * points.depth_m.shape[2])
+    # Columns and rows of the neighbours, and the weight of each: zero beyond the border.
+    axes = []
+    for axis, count in ((0, width), (1, height)):
+        at = corner[:, axis].astype(np.int64)
+        upper = share[:, axis]
+        axes.append(
+            [
+                (at.clip(0), np.where(at >= 0, 1 - upper, 0.0)),
+                ((at + 1).clip(max=count - 1), np.where(at < count - 1, upper, 0.0)),
+            ]
+        )
+    first = image * (height * width)
     places, weights = [], []
-    for down in (0, 1):
-        for right in (0, 1):
-            inside = (u + right >= 0) & (u + right < width)
-            inside &= (v + down >= 0) & (v + down < height)
-            amount = np.abs(1 - right - share[:, 0]) * np.abs(1 - down - share[:, 1])
-            column, row = (u + right).clip(0, width - 1), (v + down).clip(0, height - 1)
-            places.append((image * height + row) * width + column)
-            weights.append(np.where(inside, amount, 0.0))
+    for row, down in axes[1]:
+        begin = first + row * width
+        for column, right in axes[0]:
+            places.append(begin + column)
+            weights.append(right * down)
     return np.concatenate(places), np.concatenate(weights), np.tile(source, 4)

@@ -5,8 +5,9 @@ and the image therefore exactly the warped start image, where no body moved rela
 and the camera stood still.
 """
 
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -75,12 +76,20 @@ class DrawingInputs:
 
 @dataclass(frozen=True)
 class _Start:
-    """Start images as planes: colours, coverage by each hand, object pixels."""
+    """Start images as planes: colours, coverage by the hands and by objects; and what is where.
 
-    rgb: Float32[np.ndarray, "b 3 h w"]
+    `shown` is 0, or one more than the slot of the object that a pixel shows.
+    """
+
+    layers: Float32[np.ndarray, "b 5 h w"]
     hands: Float32[np.ndarray, "b 2 h w"]
-    hits: BoxHits
+    shown: Int64[np.ndarray, "b h w"]
     hand_colours: Float32[np.ndarray, "b 2 points 3"]
+
+    @property
+    def rgb(self) -> Float32[np.ndarray, "b 3 h w"]:
+        """The start images."""
+        return self.layers[:, :3]
 
 
 @dataclass(frozen=True)
@@ -96,6 +105,23 @@ class PreparedScenes:
         """Bodies and planes of the start images."""
         before = Bodies.seen(scenes.states, scenes.boxes_m, scenes.K_head)
         return cls(scenes, before, _start(scenes, before))
+
+    @classmethod
+    def joined(cls, parts: "Sequence[PreparedScenes]") -> "PreparedScenes":
+        """All scenes of the parts, with equal image sizes and numbers of object slots."""
+        return parts[0] if len(parts) == 1 else cls(*_joined_fields(parts))
+
+
+def _joined_fields(parts: Sequence[Any]) -> list[Any]:
+    """Concatenated arrays of dataclasses of arrays, in the order of the fields."""
+    joined: list[Any] = []
+    for field in fields(parts[0]):
+        values = [getattr(part, field.name) for part in parts]
+        if isinstance(values[0], np.ndarray):
+            joined.append(np.concatenate(values))
+        else:
+            joined.append(type(values[0])(*_joined_fields(values)))
+    return joined
 
 
 @dataclass(frozen=True)
@@ -137,28 +163,36 @@ def drawing_inputs_from(
     seen = _SeenObjects(hits, owner, at_start)
     objects = _objects(seen, start)
     fine = [warped, objects[:, :3], hands.colour, hands.coverage, objects[:, 3:], marks, outside]
-    change = _camera_change(positions)
-    if not config.redraws_table or change.min() < 1.0:
+    change = np.tile(_camera_change(positions), (1, 1, *shape_px)).astype(np.float32)
+    # A camera that moved far enough changes the whole image, whatever its bodies do.
+    rows = np.flatnonzero((change[:, 0, 0, 0] < 1.0) | (not config.redraws_table))
+    if len(rows):
         moved = motion_shares(before, now, owner, motion)
         moved[:, 2:] *= present
-        body = _body_change(_Stirred(start, owner, positions, moved), hands.coverage, hits, outside)
-        change = np.maximum(body, change) if config.redraws_table else body
+        shown = _plane(hits, moved[hits.image, 2 + hits.slot][:, None], (len(owner), *shape_px))
+        stirred = _Stirred(start, owner[rows], positions[rows], moved[rows])
+        body = _body_change(stirred, hands.coverage[rows], shown[rows], outside[rows])
+        change[rows] = np.maximum(body, change[rows]) if config.redraws_table else body
     return DrawingInputs(
         torch.from_numpy(np.concatenate(fine, axis=1)),
         torch.from_numpy(_coarse(seen, start, states, boxes_m, hands.nearness)),
-        torch.from_numpy(np.broadcast_to(change, (len(owner), 1, *shape_px)).astype(np.float32)),
+        torch.from_numpy(change),
     )
 
 
 def _start(scenes: Scenes, before: Bodies) -> _Start:
-    shape_px = scenes.images.shape[1], scenes.images.shape[2]
+    shape = len(scenes.images), *scenes.images.shape[1:3]
     rgb = np.ascontiguousarray(np.moveaxis(scenes.images, -1, 1), dtype=np.float32) / 255.0
     K, cameras = scenes.K_head, scenes.states.Ts_world_camera
     points = project_hands(before.hands_world, K, cameras)
     colours = colours_at(rgb, project_hands(before.hands_world, K, cameras, middle_only=True))
+    hands = splat_hands(points, colours, shape[1:]).coverage
     present = scenes.states.object_present
-    hits = cast_boxes(before.Ts_camera_box, scenes.boxes_m[..., 3:], present, K, shape_px)
-    return _Start(rgb, splat_hands(points, colours, shape_px).coverage, hits, colours)
+    hits = cast_boxes(before.Ts_camera_box, scenes.boxes_m[..., 3:], present, K, shape[1:])
+    shown = np.zeros(shape, dtype=np.int64)
+    shown.reshape(-1)[hits.place] = hits.slot + 1
+    covered = [rgb, hands.max(axis=1, keepdims=True), (shown[:, None] > 0).astype(np.float32)]
+    return _Start(np.concatenate(covered, axis=1), hands, shown, colours)
 
 
 def _plane(hits: BoxHits, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -173,17 +207,14 @@ def _warped(
     start: _Start, owner: np.ndarray, positions: np.ndarray, config: RendererConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Start image, hands and objects under the camera motion, and pixels outside the view."""
-    num_starts, _, height, width = start.rgb.shape
-    hit = _plane(start.hits, np.ones((len(start.hits.place), 1)), (num_starts, height, width))
-    layers = np.concatenate([start.rgb, start.hands.max(axis=1, keepdims=True), hit], axis=1)
     # Outside the start image its border is repeated.
     sampled = sample_images(
-        torch.from_numpy(layers)[torch.from_numpy(owner)],
+        torch.from_numpy(start.layers)[torch.from_numpy(owner)],
         torch.from_numpy(positions),
         interpolation=config.interpolation,
     ).clamp_(0.0, 1.0)
     planes: np.ndarray = sampled.numpy()
-    outside = ~is_inside(positions, (height, width))
+    outside = ~is_inside(positions, start.layers.shape[2:])
     return planes[:, :3], planes[:, 3:], outside[:, None].astype(np.float32)
 
 
@@ -208,7 +239,7 @@ def _coarse(
     v, u = np.divmod(hits.place % (height * width), width)
     kept = np.flatnonzero((u % 2 == 0) & (v % 2 == 0))
     image, slot = hits.image[kept], hits.slot[kept]
-    hidden = start.hands.max(axis=1, keepdims=True)
+    hidden = start.layers[:, 3:4]
     upwards = object_transforms(states.object_poses[image, slot])[..., 2, :3]
     values = [
         colours_at_positions(hidden, owner[image], seen.at_start[kept]),
@@ -235,11 +266,8 @@ class _Stirred:
 
     def warped(self) -> Float32[np.ndarray, "n 1 h w"]:
         """Motion share of the body shown at each pixel, warped by the camera motion."""
-        num_starts, _, height, width = self.start.rgb.shape
-        slots = self.start.hits.slot[:, None] + 1
-        shown = _plane(self.start.hits, slots, (num_starts, height, width))[self.owner, 0]
         table = np.concatenate([np.zeros((len(self.owner), 1)), self.moved[:, 2:]], axis=1)
-        boxes = table[np.arange(len(self.owner))[:, None, None], shown.astype(np.int64)]
+        boxes = table[np.arange(len(self.owner))[:, None, None], self.start.shown[self.owner]]
         hands = (self.start.hands[self.owner] > _COVERED) * self.moved[:, :2, None, None]
         stirred = np.maximum(hands.max(axis=1), boxes).astype(np.float32)[:, None]
         sampled = sample_images(
@@ -249,13 +277,11 @@ class _Stirred:
 
 
 def _body_change(
-    stirred: _Stirred, cover: np.ndarray, hits: BoxHits, outside: np.ndarray
+    stirred: _Stirred, cover: np.ndarray, objects: np.ndarray, outside: np.ndarray
 ) -> Float32[np.ndarray, "n 1 h w"]:
     """Change mask: around moved bodies at the start and now, and pixels outside the view."""
     moved = stirred.moved
-    shape = (len(cover), *cover.shape[2:])
     hands = ((cover > _COVERED) * moved[:, :2, None, None]).max(axis=1, keepdims=True)
-    objects = _plane(hits, moved[hits.image, 2 + hits.slot][:, None], shape)
     change = np.maximum(np.maximum(hands, objects), np.maximum(stirred.warped(), outside))
     reach = functional.max_pool2d(
         torch.from_numpy(change.astype(np.float32)), 2 * _REACH_PX + 1, 1, _REACH_PX

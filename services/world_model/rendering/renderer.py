@@ -1,7 +1,11 @@
 """Renderer: draws head camera images of known states from one start image."""
 
 import copy
+import threading
+from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Final
 
 import numpy as np
 import torch
@@ -18,7 +22,32 @@ from services.world_model.rendering.inputs import (
 )
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.precision import uses_bfloat16 as uses_bfloat16_here
-from services.world_model.rendering.scene_states import SceneState, SceneStates
+from services.world_model.rendering.scene_states import MAX_OBJECTS, SceneState, SceneStates
+
+# Chosen: about 1.5 MB of working memory an image; larger blocks are not faster.
+_BLOCK_IMAGES: Final = 32
+# Starts are 0.2 MB each at 64 px; as many as rollouts are advanced in turn.
+_KEPT_STARTS: Final = 64
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """States of one rollout to draw, at least one, and its start; checked as it is drawn.
+
+    Attributes:
+        start_image: uint8 [h, w, 3], the head camera image at the start.
+        K_head: intrinsics [3, 3] in pixels; lens distortion is not modelled.
+        start: state at the start.
+        states: states to draw, which follow the start, or precede it.
+        boxes_m: [k, 6], centre and half sizes (x y z, x y z) of the bounding box of each object
+            slot, in the object frame.
+    """
+
+    start_image: np.ndarray
+    K_head: np.ndarray
+    start: SceneState
+    states: Sequence[SceneState]
+    boxes_m: np.ndarray
 
 
 class Renderer:
@@ -34,8 +63,9 @@ class Renderer:
         dtype = torch.bfloat16 if uses_bfloat16_here(setting=uses_bfloat16) else torch.float32
         self._network = copy.deepcopy(network).eval().requires_grad_(requires_grad=False)
         self._network.to(dtype)
-        # A rollout draws all its chunks from one start.
-        self._last_start: tuple[bytes, PreparedScenes] | None = None
+        # A rollout draws all its chunks from one start. Those used last are at the end.
+        self._starts: OrderedDict[bytes, PreparedScenes] = OrderedDict()
+        self._lock = threading.Lock()
 
     @property
     def config(self) -> RendererConfig:
@@ -50,35 +80,46 @@ class Renderer:
         states: Sequence[SceneState],
         boxes_m: np.ndarray,
     ) -> UInt8[np.ndarray, "n h w 3"]:
-        """Draw images of states that follow a start, or precede it.
+        """`draw_all` for one rollout."""
+        return self.draw_all([Drawing(start_image, K_head, start, states, boxes_m)])[0]
+
+    def draw_all(self, drawings: Sequence[Drawing]) -> list[UInt8[np.ndarray, "n h w 3"]]:
+        """Draw images of any number of rollouts; equal to those of `draw`, except for rounding.
 
         If camera, hands and objects are where they were at the start, the image is exactly the
         start image.
 
-        Args:
-            start_image: uint8 [h, w, 3], the head camera image at the start.
-            K_head: intrinsics [3, 3] in pixels; lens distortion is not modelled.
-            start: state at the start.
-            states: states to draw, at least one.
-            boxes_m: [k, 6], centre and half sizes (x y z, x y z) of the bounding box of each object
-                slot, in the object frame.
-
         Raises:
-            ShapeError: wrong array shapes, no state, or object slots that do not match the boxes.
+            ShapeError: wrong array shapes, no state, object slots that do not match the boxes, or
+                start images of several sizes.
             InvalidInputError: image sides that the network does not support.
             NonFiniteError: NaN or infinity.
         """
-        scenes = self._scene(start_image, K_head, start, boxes_m)
-        stacked = SceneStates.stack(states)
-        if stacked.object_present.shape[1] != len(boxes_m):
-            raise ShapeError(
-                f"renderer: states have {stacked.object_present.shape[1]} object slots but there "
-                f"are {len(boxes_m)} boxes; expected equal numbers"
+        if not drawings:
+            return []
+        sizes = {drawing.start_image.shape for drawing in drawings}
+        if len(sizes) > 1:
+            raise ShapeError(f"renderer: got start images {sorted(sizes)}, expected one size")
+        starts = [self._prepared(drawing) for drawing in drawings]
+        stacked = [_stacked(drawing) for drawing in drawings]
+        counts = [len(states) for states in stacked]
+        states = SceneStates.joined(stacked)
+        owner = np.repeat(np.arange(len(drawings)), counts)
+        blocks = [
+            self._drawn_block(starts, states.take(rows), owner[rows])
+            for rows in np.split(
+                np.arange(len(states)), range(_BLOCK_IMAGES, len(states), _BLOCK_IMAGES)
             )
-        owner = np.zeros(len(states), dtype=np.int64)
+        ]
+        return np.split(np.concatenate(blocks), np.cumsum(counts)[:-1])
+
+    def _drawn_block(
+        self, starts: Sequence[PreparedScenes], states: SceneStates, owner: np.ndarray
+    ) -> UInt8[np.ndarray, "n h w 3"]:
+        used, local = np.unique(owner, return_inverse=True)
+        prepared = PreparedScenes.joined([starts[index] for index in used])
         with torch.inference_mode():
-            prepared = self._prepared(scenes)
-            images = self._drawn(drawing_inputs_from(prepared, stacked, owner, self.config))
+            images = self._drawn(drawing_inputs_from(prepared, states, local, self.config))
             rounded = (images * 255.0).round_().clamp_(0, 255).to(torch.uint8)
             return np.ascontiguousarray(rounded.permute(0, 2, 3, 1).numpy())
 
@@ -95,46 +136,55 @@ class Renderer:
             images[changed] = self._network(some)
         return images
 
-    def _prepared(self, scenes: Scenes) -> PreparedScenes:
-        """Prepared scenes; those of the last start are cached."""
-        states = scenes.states
-        arrays = (
-            scenes.images, scenes.K_head, scenes.boxes_m, states.Ts_world_camera,
-            states.Ts_world_wrist, states.joints_rad, states.object_poses, states.object_present,
-        )  # fmt: skip
-        key = b"".join(array.tobytes() for array in arrays) + bytes(
-            str(scenes.images.shape), "ascii"
-        )
-        last = self._last_start
-        if last is None or last[0] != key:
-            copied = copy.deepcopy(scenes)
-            last = self._last_start = (key, PreparedScenes.of(copied))
-        return last[1]
+    def _prepared(self, drawing: Drawing) -> PreparedScenes:
+        """The prepared start of a drawing; those that were used last are kept."""
+        scenes = self._scene(drawing)
+        arrays = [scenes.images, scenes.K_head, scenes.boxes_m]
+        arrays += [getattr(scenes.states, field.name) for field in fields(scenes.states)]
+        key = b"".join(array.tobytes() for array in arrays) + str(scenes.images.shape).encode()
+        with self._lock:
+            prepared = self._starts.get(key)
+            if prepared is None:
+                prepared = self._starts[key] = PreparedScenes.of(copy.deepcopy(scenes))
+            self._starts.move_to_end(key)
+            if len(self._starts) > _KEPT_STARTS:
+                self._starts.popitem(last=False)
+        return prepared
 
-    def _scene(
-        self,
-        start_image: np.ndarray,
-        K_head: np.ndarray,
-        start: SceneState,
-        boxes_m: np.ndarray,
-    ) -> Scenes:
-        if start_image.ndim != 3 or start_image.shape[2] != 3 or start_image.dtype != np.uint8:
+    def _scene(self, drawing: Drawing) -> Scenes:
+        """The start of a drawing, with empty object slots up to the maximum."""
+        image, start = drawing.start_image, drawing.start
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise ShapeError(
-                f"renderer: got a start image {start_image.dtype} {start_image.shape}, expected "
-                "uint8 [h, w, 3]"
+                f"renderer: got a start image {image.dtype} {image.shape}, expected uint8 [h, w, 3]"
             )
         multiple = self.config.pixel_multiple
-        if any(side % multiple or side == 0 for side in start_image.shape[:2]):
+        if any(side % multiple or side == 0 for side in image.shape[:2]):
             raise InvalidInputError(
-                f"renderer: got a start image of {start_image.shape[:2]} px, expected sides that "
-                f"are multiples of {multiple}"
+                f"renderer: got a start image of {image.shape[:2]} px, expected sides that are "
+                f"multiples of {multiple}"
             )
-        K, boxes = np.asarray(K_head, dtype=np.float64), np.asarray(boxes_m, dtype=np.float64)
-        if K.shape != (3, 3) or boxes.shape != (len(start.object_present), 6):
+        K = np.asarray(drawing.K_head, dtype=np.float64)
+        boxes_m = np.asarray(drawing.boxes_m, dtype=np.float64)
+        if K.shape != (3, 3) or boxes_m.shape != (len(start.object_present), 6):
             raise ShapeError(
-                f"renderer: got K_head {K.shape} and boxes {boxes.shape}, expected (3, 3) and "
+                f"renderer: got K_head {K.shape} and boxes {boxes_m.shape}, expected (3, 3) and "
                 f"({len(start.object_present)}, 6) for the start's object slots"
             )
-        if not (np.isfinite(K).all() and np.isfinite(boxes).all()):
+        if not (np.isfinite(K).all() and np.isfinite(boxes_m).all()):
             raise NonFiniteError("renderer: K_head or boxes contain NaN or infinity")
-        return Scenes(start_image[None], K[None], SceneStates.stack([start]), boxes[None])
+        states = SceneStates.stack([start]).padded(MAX_OBJECTS)
+        padded_m = np.zeros((1, MAX_OBJECTS, 6))
+        padded_m[0, : len(boxes_m)] = boxes_m
+        return Scenes(image[None], K[None], states, padded_m)
+
+
+def _stacked(drawing: Drawing) -> SceneStates:
+    """The states to draw, with empty object slots up to the maximum."""
+    states = SceneStates.stack(drawing.states)
+    if states.object_present.shape[1] != len(drawing.boxes_m):
+        raise ShapeError(
+            f"renderer: states have {states.object_present.shape[1]} object slots but there are "
+            f"{len(drawing.boxes_m)} boxes; expected equal numbers"
+        )
+    return states.padded(MAX_OBJECTS)

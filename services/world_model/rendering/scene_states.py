@@ -1,7 +1,7 @@
 """Scene states that a renderer draws: head camera, both hands and every object at one step."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -59,8 +59,24 @@ class SceneStates:
         made._check()
         return made
 
+    @classmethod
+    def joined(cls, parts: "Sequence[SceneStates]") -> "SceneStates":
+        """All states of the parts, which have equal numbers of object slots."""
+        names = [field.name for field in fields(cls)]
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
     def __len__(self) -> int:
         return len(self.Ts_world_camera)
+
+    def padded(self, num_slots: int) -> "SceneStates":
+        """The same states with absent objects in further slots, `num_slots` in all."""
+        count = self.object_present.shape[1]
+        poses = np.zeros((len(self), num_slots, 7))
+        poses[..., 3] = 1.0
+        poses[:, :count] = self.object_poses
+        present = np.zeros((len(self), num_slots), dtype=np.bool_)
+        present[:, :count] = self.object_present
+        return replace(self, object_poses=poses, object_present=present)
 
     def take(self, rows: Int64[np.ndarray, " m"]) -> "SceneStates":
         """Select states, in the order of `rows`."""

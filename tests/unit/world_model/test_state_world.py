@@ -8,6 +8,7 @@ import torch
 
 from dextouch.errors import EndedError, InvalidInputError, NonFiniteError
 from dextouch.hands.actions import AnchorPoses
+from dextouch.schemas import EVERYTHING, ReturnSelector
 from dextouch.streams import pack, unpack
 from services.world_model.state_world import ABSENT_POSE, StateWorld
 from tests.contracts.test_world import from_observation, hold, move, untrained_state_checkpoint
@@ -125,3 +126,34 @@ def test_snapshots_with_impossible_numbers_are_refused(world, damage):
         arrays[damage][...] = 3e38
     with pytest.raises((InvalidInputError, NonFiniteError)):
         world.restore(pack(fields, arrays))
+
+
+def test_images_of_a_batch_are_drawn_together_as_requested(world, monkeypatch):
+    """Every rollout has its own start image, and images of its own steps."""
+    start = from_observation(world)
+    rng = np.random.default_rng(0)
+    states = []
+    for _ in range(4):
+        image = rng.integers(0, 256, start.observation.images["camera_head"].shape, dtype=np.uint8)
+        seen = dataclasses.replace(start.observation, images={"camera_head": image})
+        states.append(world.reset(dataclasses.replace(start, observation=seen)).state)
+    chunk = move(start.observation, 8)
+    actions = np.stack([hold(start.observation, 8), chunk, chunk, chunk])
+    selectors = [
+        EVERYTHING, ReturnSelector(steps="last"), ReturnSelector(cameras=()), EVERYTHING
+    ]  # fmt: skip
+    calls, draw = [], world._renderer.draw_all
+    monkeypatch.setattr(
+        world._renderer, "draw_all", lambda drawings: calls.append(len(drawings)) or draw(drawings)
+    )
+    together = world.step_batch(states, actions, seeds=[0] * 4, selectors=selectors)
+    assert calls == [3]
+    assert [sorted(one.observation.images) for one in together] == [
+        ["camera_head"], ["camera_head"], [], ["camera_head"]
+    ]  # fmt: skip
+    for one, state, rows, selector in zip(together, states, actions, selectors, strict=True):
+        alone = world.step(world.restore(world.snapshot(state)), rows, seed=0, selector=selector)
+        for camera, images in alone.observation.images.items():
+            drawn = one.observation.images[camera]
+            assert drawn.shape == images.shape
+            assert np.abs(drawn.astype(int) - images.astype(int)).max() <= 1

@@ -49,6 +49,8 @@ def test_the_nearer_of_two_boxes_is_seen():
     half = np.full((1, 2, 3), 0.02)
     hits = cast_boxes(Ts, half, np.array([[True, True]]), K[None], SHAPE)
     assert (hits.slot == 1).all()
+    swapped = cast_boxes(Ts[:, ::-1], half[:, ::-1], np.array([[True, True]]), K[None], SHAPE)
+    assert (swapped.slot == 0).all()
     alone = cast_boxes(Ts, half, np.array([[True, False]]), K[None], SHAPE)
     assert len(alone.place) > 0
     assert (alone.slot == 0).all()
