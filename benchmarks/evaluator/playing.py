@@ -8,7 +8,13 @@ from jaxtyping import Float32, Float64, UInt8
 
 from benchmarks.evaluator.plan import CAMERA, CHUNK_STEPS, NUM_STEPS
 from dextouch.clients import Policy, PolicyStart
-from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.schemas import (
+    Observation,
+    ReturnSelector,
+    RolloutDoubt,
+    RolloutStart,
+    rollout_doubt,
+)
 from dextouch.worlds import StartedRollout, State, World
 from services.evaluation.endings import NUM_SEEN_STEPS
 from services.evaluation.policies.asking import action_chunk, ask
@@ -38,13 +44,13 @@ class TrueRollout:
 
 @dataclass(frozen=True)
 class ImaginedRollout:
-    """Imagined rollout of the same policy; `doubted` is the reason of the world's doubt."""
+    """Imagined rollout of the same policy, with the world's doubt of all of it."""
 
     tactile_kpa: Float32[np.ndarray, "81 2 320"]
     images_of_chunks: UInt8[np.ndarray, "chunks h w 3"]
     last_images: UInt8[np.ndarray, "3 h w 3"]
     object_poses: Float32[np.ndarray, "3 objects 7"] | None
-    doubted: str | None
+    doubt: RolloutDoubt
 
 
 def play_in_twin(
@@ -123,7 +129,7 @@ def play_in_imagination(
     state, seen = started.state, started.observation
     touch, images = [seen.tactile_kpa], []
     looks = _begin(policy, start)
-    doubted: str | None = None
+    shown: list[Observation] = []
     for at in range(0, NUM_STEPS, CHUNK_STEPS):
         chunk = _chunk(policy, seen, at, world)
         if looks == "all" or at + CHUNK_STEPS == NUM_STEPS:
@@ -137,15 +143,14 @@ def play_in_imagination(
             images.append(last.observation.images[CAMERA][-1])
         state, seen = step.state, last.observation
         touch.append(step.observation.tactile_kpa)
-        if seen.doubt is not None and seen.doubt.outside:
-            doubted = doubted or seen.doubt.reason
+        shown.append(seen)
     poses = seen.object_poses
     return ImaginedRollout(
         np.concatenate(touch),
         _stacked(images, seen),
         seen.images[CAMERA][-NUM_SEEN_STEPS:],
         None if poses is None else poses[-NUM_SEEN_STEPS:],
-        doubted,
+        rollout_doubt(shown),
     )
 
 

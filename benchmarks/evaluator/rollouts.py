@@ -28,7 +28,7 @@ from benchmarks.evaluator.still_hand import StillRollout, hold_still, still_figu
 from dextouch.clients import Policy
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions
-from dextouch.schemas import RolloutStart
+from dextouch.schemas import RolloutDoubt, RolloutStart
 from dextouch.worlds import BatchWorld
 from services.evaluation.direct_network import Attempt
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
@@ -127,13 +127,14 @@ class PolicyRollout:
         path = self._path("imagined", self._twin.description.digest, world.description.digest)
         if path.is_file():
             kept = read_arrays(path)
-            poses, doubted = kept.pop("object_poses", None), str(kept.pop("doubted"))
-            return ImaginedRollout(**kept, object_poses=poses, doubted=doubted or None)
+            poses = kept.pop("object_poses", None)
+            doubt = RolloutDoubt.model_validate_json(str(kept.pop("doubt")))
+            return ImaginedRollout(**kept, object_poses=poses, doubt=doubt)
         imagined = play_in_imagination(
             world, self._first, self._actor, self._for_policy, shows_chunks=self._shows_chunks
         )
         arrays = {n: a for n, a in vars(imagined).items() if isinstance(a, np.ndarray)}
-        write_arrays(path, arrays | {"doubted": np.array(imagined.doubted or "")})
+        write_arrays(path, arrays | {"doubt": np.array(imagined.doubt.model_dump_json())})
         return imagined
 
     def _path(self, kind: str, *digests: str) -> Path:
@@ -153,7 +154,7 @@ class PolicyRollout:
             self._first_image,
             self._boxes_m,
         )
-        return {"doubted": imagined.doubted, **figures}
+        return {"doubted": imagined.doubt.reason, **figures}
 
     @property
     def _true_ending(self) -> Ending:
@@ -170,8 +171,7 @@ class PolicyRollout:
             self._task,
             imagined.object_poses,
             imagined=True,
-            doubted=imagined.doubted,
-        )
+        ).with_doubt(imagined.doubt)
 
     def _context_row(self, member: Member) -> Row:
         contact = contact_with_true_context(
