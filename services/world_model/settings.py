@@ -212,7 +212,7 @@ class AdaptSettings(RunSettings):
 class ReaderSettings(FrozenModel):
     """Training of start readers."""
 
-    num_steps: NumSteps = 6000
+    num_steps: NumSteps = 5000
     batch: Batch = 32
     learning_rate: LearningRate = 2e-3
     ema_decay: AverageDecay = 0.995

@@ -94,6 +94,12 @@ def test_a_rollout_is_watched_step_by_step(opened, world_url):
         expect(opened.locator("#watched")).to_have_attribute("data-step", "11")
         for camera, images in rollout.observation.images.items():
             assert np.array_equal(shown_image(opened, camera), images[-2])
+        # The next chunk is within the bound, but what it goes on from is not.
+        assert_shows(opened, rollout.step(actions(4, 0.1)))
+        since = f"unreliable since step 12: {DOUBTED}"
+        expect(opened.locator("#watched_note")).to_have_text(since)
+        expect(row).to_contain_text(since)
+        expect(row).to_contain_text("unreliable")
     expect(opened.locator("#watched_note")).to_have_text(
         "This rollout is over: It was ended, or expired."
     )

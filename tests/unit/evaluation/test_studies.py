@@ -9,6 +9,7 @@ import pytest
 from dextouch.clients import RolloutClient, http_link
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
+from dextouch.schemas import Doubt
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.checkpoints import save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
@@ -93,11 +94,20 @@ def test_a_study_that_makes_no_sense_is_refused(tmp_path, old, new, message):
         definition_of(STUDY.replace(old, new), tmp_path)
 
 
+class Spread(toy.ToyWorld):
+    """Says how far its members are apart about success, and no more."""
+
+    def step(self, state, actions, **options):
+        stepped = super().step(state, actions, **options)
+        doubt = Doubt(disagreement=0, distance=0, success_spread=0.125)
+        return replace(stepped, observation=replace(stepped.observation, doubt=doubt))
+
+
 @pytest.fixture(scope="module")
 def url():
     worlds = {
         "judge": toy.ToyWorld("judge", judge=True),
-        "dream": toy.ToyWorld("dream", judge=False, drift_m=0.01),
+        "dream": Spread("dream", judge=False, drift_m=0.01),
     }
     with served(create_world_app(worlds, WorldServiceSettings())) as address:
         yield address
@@ -358,6 +368,7 @@ def test_kept_rollouts_hold_what_the_worlds_returned(tmp_path, url, study, parts
     )
     judged = store.open(rollout_episode_id(results.header, cell._replace(world="real"))).attributes
     assert (judged.origin, judged.success) == ("twin", True)
+    assert (about.quality, judged.quality) == ({"imagined_success_spread": 0.125}, {})
     # The same rollout by hand, over HTTP.
     demonstration = toy.demonstration("reach", 2000)
     with RolloutClient(url) as client:
