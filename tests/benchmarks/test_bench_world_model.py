@@ -162,7 +162,8 @@ class OneAtATime(CopyFirstWorld):
 
 def test_a_batch_plays_the_episodes_in_turn(episode):
     world = OneAtATime(tasks=("stand_bottle",), image_height_px=16, image_width_px=16)
-    other = replace(episode, actions=episode.actions[32:64])
+    later = {name: getattr(episode, name)[32:64] for name in ("actions", "images", "tactile_kpa")}
+    other = replace(episode, **later)
     imagine_together(world, [episode, other], 3, ReturnSelector())
     assert len(world.played) == 2
     for chunk, actions in enumerate(world.played):
