@@ -164,8 +164,8 @@ STAGES = {
         "Records held-out demonstrations of the twin and predicts them with the world model from "
         "their first step, chunk after chunk, with 1, 2 and 4 Euler steps, in float32 and "
         "bfloat16, compared with repeating the first step; then times it by requested images and "
-        "batch size. Reports processor time per chunk and errors of images and touch over whole "
-        "rollouts.",
+        "batch size, and likewise the state model. Reports processor time per chunk and errors of "
+        "images and touch over whole rollouts.",
     ),
     "stress": StageEntry(
         "benchmarks.stress.benchmark",

@@ -22,19 +22,23 @@ from benchmarks.world_model.rollouts import (
 )
 from benchmarks.world_model.tables import (
     COPY_FIRST,
+    STATE_BATCHES,
     Variant,
+    asked_name,
     cost_table,
     error_table,
     panels,
     requirements,
+    state_model_requirements,
+    state_model_table,
 )
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import EVERYTHING, ReturnSelector
-from dextouch.worlds import CopyFirstWorld, World
+from dextouch.worlds import BatchWorld, CopyFirstWorld, World
 from services.twin.tasks import TASK_NAMES
 
 if TYPE_CHECKING:
-    from services.world_model.world import ModelWorld
+    from services.world_model.state_world import StateWorld
 
 PACKAGES: Final = ("numpy", "torch", "mujoco-core")
 # Of demonstrations that nothing is trained on.
@@ -59,6 +63,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this stage."""
     parser.add_argument(
         "--checkpoint", type=Path, help="model in the paper's form (default: the package's own)"
+    )
+    parser.add_argument(
+        "--state-model", type=Path, help="state model to time (default: the package's own)"
     )
     parser.add_argument("--rounds", type=int, help=f"rounds ({USUAL['rounds']}; quick 1)")
     parser.add_argument("--seeds", type=int, help=f"episodes per task ({USUAL['seeds']}; quick 1)")
@@ -105,15 +112,24 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     }
     errors = {name: rollout_error(imagine(one, episodes), episodes) for name, one in worlds.items()}
     times_ms = _times(worlds, episodes, plan["rounds"], bar)
-    costs_ms = _costs(world, episodes, plan["rounds"], bar)
+    costs_ms = _costs(world, episodes[:1], TOGETHER, plan["rounds"], bar)
+    state_world = _state_world(options.state_model)
+    state_ms = _state_costs(state_world, plan["rounds"], bar)
     return StageReport(
         stage="world-model",
         machine=describe_machine(PACKAGES),
         options={**plan, "tasks": tasks, "checkpoint": world.description.name, "served": served},
-        tables=[error_table(times_ms, errors, served, len(episodes)), cost_table(costs_ms, served)],
+        tables=[
+            error_table(times_ms, errors, served, len(episodes)),
+            cost_table(costs_ms, served),
+            state_model_table(state_ms, state_world.description.name),
+        ],
         panels=panels(times_ms, errors, served),
-        requirements=requirements(times_ms, errors, served),
-        data=_data(times_ms, errors, costs_ms),
+        requirements=[
+            *requirements(times_ms, errors, served),
+            *state_model_requirements(state_ms),
+        ],
+        data=_data(times_ms, errors, costs_ms, state_ms),
         notes=[
             "times are processor time of the whole process; OMP_NUM_THREADS=1 gives one thread",
             "every chunk starts from the predicted end of the previous one",
@@ -130,13 +146,34 @@ def _times(
     return {name: Figure.of([one.ms for one in rounds]) for name, rounds in found.items()}
 
 
+def _state_world(path: Path | None) -> "StateWorld":
+    from services.world_model.shipped_checkpoints import PRETRAINED, STATE_MODEL
+    from services.world_model.state_checkpoints import read_state_checkpoint
+    from services.world_model.state_world import StateWorld
+
+    return StateWorld(read_state_checkpoint(path or PRETRAINED / STATE_MODEL))
+
+
+def _state_costs(world: "StateWorld", num_rounds: int, bar: Bar) -> dict[str, Figure]:
+    """Milliseconds per chunk of the state model, with one demonstration of each of its tasks."""
+    tasks = [task for task in TASK_NAMES if task in world.description.tasks]
+    episodes = held_out(tasks, [FIRST_SEED], world.description.image_height_px)
+    # Choice of precision, and memory of the first images.
+    imagine_together(world, episodes, 1, EVERYTHING)
+    return _costs(world, episodes, STATE_BATCHES, num_rounds, bar)
+
+
 def _costs(
-    world: "ModelWorld", episodes: Sequence[HeldOut], num_rounds: int, bar: Bar
+    world: BatchWorld[Any],
+    episodes: Sequence[HeldOut],
+    batches: Sequence[int],
+    num_rounds: int,
+    bar: Bar,
 ) -> dict[str, Figure]:
-    """Milliseconds per chunk of the world as served, by requested images and batch size."""
+    """Milliseconds per chunk of one rollout, by requested images and batch size."""
     subjects: dict[str, Callable[[int], Imagined]] = {
-        f"{asked}, batch of {count}": partial(_together, world, episodes[0], count, selector)
-        for count in TOGETHER
+        asked_name(asked, count): partial(_together, world, episodes, count, selector)
+        for count in batches
         for asked, selector in SELECTORS.items()
     }
     with bar("requested images and batch sizes", num_rounds * len(subjects)) as step:
@@ -150,25 +187,27 @@ def _imagined(world: World[Any], episodes: Sequence[HeldOut], round_index: int) 
 
 
 def _together(
-    world: "ModelWorld",
-    episode: HeldOut,
+    world: BatchWorld[Any],
+    episodes: Sequence[HeldOut],
     num_rollouts: int,
     selector: ReturnSelector,
     round_index: int,
 ) -> Imagined:
     del round_index
-    return imagine_together(world, episode, num_rollouts, selector)
+    return imagine_together(world, episodes, num_rollouts, selector)
 
 
 def _data(
     times_ms: Mapping[str, Figure],
     errors: Mapping[str, RolloutError],
     costs_ms: Mapping[str, Figure],
+    state_ms: Mapping[str, Figure],
 ) -> dict[str, Any]:
     return {
         "chunk_ms": {name: list(figure.values) for name, figure in times_ms.items()},
         "errors": {name: asdict(error) for name, error in errors.items()},
         "asked_ms": {name: list(figure.values) for name, figure in costs_ms.items()},
+        "state_model_ms": {name: list(figure.values) for name, figure in state_ms.items()},
     }
 
 

@@ -49,21 +49,23 @@ def imagine(
 
 
 def imagine_together(
-    world: BatchWorld[Any], episode: HeldOut, num_rollouts: int, selector: ReturnSelector
+    world: BatchWorld[Any], episodes: Sequence[HeldOut], num_rollouts: int, selector: ReturnSelector
 ) -> Imagined:
-    """Several rollouts of one episode in one batch; milliseconds per chunk of one rollout."""
-    states = [world.reset(episode.start).state] * num_rollouts
+    """Several rollouts in one batch, of the episodes in turn; milliseconds per rollout's chunk."""
+    played = [episodes[index % len(episodes)] for index in range(num_rollouts)]
+    states = [world.reset(episode.start).state for episode in played]
+    num_chunks = min(len(episode.chunks) for episode in played)
     begin_s = time.process_time()
-    for actions in episode.chunks:
+    for chunk in range(num_chunks):
         stepped = world.step_batch(
             states,
-            np.repeat(actions[None], num_rollouts, axis=0),
+            np.stack([episode.chunks[chunk] for episode in played]),
             seeds=range(num_rollouts),
             selectors=[selector] * num_rollouts,
         )
         states = [one.state for one in stepped]
     elapsed_s = time.process_time() - begin_s
-    return Imagined([], 1e3 * elapsed_s / (num_rollouts * len(episode.chunks)))
+    return Imagined([], 1e3 * elapsed_s / (num_rollouts * num_chunks))
 
 
 def rollout_error(imagined: Imagined, episodes: Sequence[HeldOut]) -> RolloutError:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement
 from benchmarks.report import ResultTable
+from benchmarks.world_model.held_out import CHUNK_STEPS
 from benchmarks.world_model.rollouts import RolloutError
 
 if TYPE_CHECKING:
@@ -14,6 +15,11 @@ if TYPE_CHECKING:
 
 COPY_FIRST: Final = "copy-first"
 MAX_CHUNK_MS: Final = 50.0
+# Requirements on the state model as served: one rollout, and sixteen in a batch.
+MAX_STATE_CHUNK_MS: Final = {"no image": 7.0, "the last image": 14.0, "all images": 45.0}
+MIN_BATCH_SPEEDUP: Final = 2.0
+STATE_BATCHES: Final = (1, 4, 16)
+IMAGES_PER_CHUNK: Final = {"no image": 0, "the last image": 1, "all images": CHUNK_STEPS}
 
 
 @dataclass(frozen=True)
@@ -63,6 +69,44 @@ def cost_table(costs_ms: Mapping[str, Figure], served: str) -> ResultTable:
         ("requested", "ms"),
         [(name, figure.text()) for name, figure in costs_ms.items()],
     )
+
+
+def asked_name(asked: str, batch: int) -> str:
+    """Name of the figure for requested images and a batch size."""
+    return f"{asked}, batch of {batch}"
+
+
+def state_model_table(costs_ms: Mapping[str, Figure], name: str) -> ResultTable:
+    """Time and image rate of the state model by requested images and batch size."""
+    rows = []
+    for batch in STATE_BATCHES:
+        for asked, num_images in IMAGES_PER_CHUNK.items():
+            figure = costs_ms[asked_name(asked, batch)]
+            rate = f"{1e3 * num_images / figure.median:.0f}" if num_images else ""
+            rows.append((asked, str(batch), figure.text(), rate))
+    return ResultTable(
+        f"State model {name}: a chunk of one rollout, by requested images and batch size",
+        ("requested", "batch", "ms a chunk", "images a second"),
+        rows,
+    )
+
+
+def state_model_requirements(costs_ms: Mapping[str, Figure]) -> list[Requirement]:
+    """Requirements on single rollouts, and on batches compared with them."""
+    chunks = [
+        Requirement(
+            f"state model, a chunk, {asked}",
+            costs_ms[asked_name(asked, 1)].median,
+            "at most",
+            bound_ms,
+            "ms",
+        )
+        for asked, bound_ms in MAX_STATE_CHUNK_MS.items()
+    ]
+    single, batch = (costs_ms[asked_name("all images", count)] for count in (1, 16))
+    speedup = single.over(batch).median
+    what = "state model, all images, throughput of a batch of 16 over single rollouts"
+    return [*chunks, Requirement(what, speedup, "at least", MIN_BATCH_SPEEDUP)]
 
 
 def panels(

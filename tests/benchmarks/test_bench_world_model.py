@@ -6,6 +6,7 @@ What a run says of speed is not judged here: that is for a quiet machine.
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from benchmarks.world_model.rollouts import (
     Imagined,
     RolloutError,
     imagine,
+    imagine_together,
     rollout_error,
 )
 from dextouch.errors import InvalidInputError
@@ -44,6 +46,7 @@ def test_a_quick_run_measures_everything(run):
     names = {one.name for one in benchmark.VARIANTS}
     assert set(figures["chunk_ms"]) == set(figures["errors"]) == names | {tables.COPY_FIRST}
     assert len(figures["asked_ms"]) == len(benchmark.SELECTORS) * len(benchmark.TOGETHER)
+    assert len(figures["state_model_ms"]) == len(benchmark.SELECTORS) * len(tables.STATE_BATCHES)
     assert figures["options"]["served"] in names
     assert "as served" in (folder / "bench_world-model.md").read_text()
     assert "Imagined touch" in (folder / "bench_world-model.svg").read_text()
@@ -126,6 +129,48 @@ def test_verdicts():
     found = tables.requirements({served: Figure.of([40.0])}, errors, served)
     assert [one.figure for one in found] == [40.0, 0.5, 1.25]
     assert [one.is_met for one in found] == [True, True, False]
+
+
+def test_the_state_model_is_judged_by_its_rounds():
+    costs = {
+        tables.asked_name(asked, batch): Figure.of([8.0 / batch, 16.0 / batch, 8.0 / batch])
+        for asked in benchmark.SELECTORS
+        for batch in tables.STATE_BATCHES
+    }
+    found = tables.state_model_requirements(costs)
+    assert [one.figure for one in found] == [8.0, 8.0, 8.0, 16.0]
+    assert [one.is_met for one in found] == [False, True, True, True]
+    rows = tables.state_model_table(costs, "state").rows
+    assert [row[3] for row in rows] == ["", "125", "2000", "", "500", "8000", "", "2000", "32000"]
+
+
+class OneAtATime(CopyFirstWorld):
+    """Steps the rollouts of a batch in turn and keeps their actions."""
+
+    def __init__(self, **shape):
+        super().__init__(**shape)
+        self.played = []
+
+    def step_batch(self, states, actions, *, seeds, selectors):
+        self.played.append(actions)
+        rows = zip(states, actions, seeds, selectors, strict=True)
+        return [
+            self.step(state, chunk, seed=seed, selector=selector)
+            for state, chunk, seed, selector in rows
+        ]
+
+
+def test_a_batch_plays_the_episodes_in_turn(episode):
+    world = OneAtATime(tasks=("stand_bottle",), image_height_px=16, image_width_px=16)
+    later = {name: getattr(episode, name)[32:64] for name in ("actions", "images", "tactile_kpa")}
+    other = replace(episode, **later)
+    imagine_together(world, [episode, other], 3, ReturnSelector())
+    assert len(world.played) == 2
+    for chunk, actions in enumerate(world.played):
+        rows = slice(16 * chunk, 16 * chunk + 16)
+        np.testing.assert_array_equal(
+            actions, [one.actions[rows] for one in (episode, other, episode)]
+        )
 
 
 @pytest.mark.parametrize("words", [["--rounds", "0"], ["--seeds", "0"]])

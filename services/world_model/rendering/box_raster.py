@@ -70,9 +70,12 @@ def cast_boxes(
     box, v, u = np.nonzero(_tried(Ts_camera_box[present], half_m, K[images], shape_px))
     image, slot = images[box], slots[box]
     # Vectors are columns [3, tried]: one row of numbers per axis is much faster to compute with.
-    unprojected = (Ts_box_camera[:, :3, :3] @ np.linalg.inv(K)[images]).transpose(1, 2, 0)[..., box]
-    directions = unprojected[:, 0] * (u + 0.5) + unprojected[:, 1] * (v + 0.5) + unprojected[:, 2]
-    origins, half = Ts_box_camera[:, :3, 3].T[:, box], half_m.T[:, box]
+    unprojected = Ts_box_camera[:, :3, :3] @ np.linalg.inv(K)[images]
+    by_box = [unprojected.reshape(-1, 9), Ts_box_camera[:, :3, 3], half_m]
+    columns = np.take(np.concatenate(by_box, axis=1).T.copy(), box, axis=1)
+    across, down, forward = columns[0:9:3], columns[1:9:3], columns[2:9:3]
+    directions = across * (u + 0.5) + down * (v + 0.5) + forward
+    origins, half = columns[9:12], columns[12:]
     # Avoid division by zero for rays parallel to a face.
     inverse = 1.0 / np.where(np.abs(directions) < 1e-12, 1e-12, directions)
     middle, reach = -origins * inverse, half * np.abs(inverse)

@@ -139,27 +139,34 @@ def splat_hands(points: HandPoints, colours: np.ndarray, shape_px: tuple[int, in
     height, width = shape_px
     num_images = len(points.pixels)
     place, weight, source = _taps(points, shape_px)
-    size = num_images * height * width
+    # Hands cover few of the pixels: sums are of these alone, and the others stay zero.
+    row = np.zeros(num_images * height * width, dtype=np.int64)
+    row[place] = 1
+    covered = np.flatnonzero(row)
+    row[covered] = np.arange(len(covered))
+    pixel = row[place]
+
+    def total(values: np.ndarray) -> Float64[np.ndarray, " covered"]:
+        return np.bincount(pixel, values, len(covered)).astype(np.float64)
+
+    def plane(values: np.ndarray) -> Float32[np.ndarray, "n h w"]:
+        filled = np.zeros(len(row), dtype=np.float32)
+        filled[covered] = values
+        return filled.reshape(num_images, height, width)
+
     depth = points.depth_m.reshape(-1)
     # Weights are about one at a metre: exp does not overflow for any depth above MIN_DEPTH_M.
     near = weight * np.exp(np.minimum((1.0 - depth) / _SOFT_DEPTH_M, 300.0))[source]
+    normal = 1.0 / np.maximum(total(near), 1e-300)
     is_right = (source // points.depth_m.shape[2]) % 2
-    normal = 1.0 / np.maximum(np.bincount(place, near, size), 1e-300)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        """Of each pixel's points, whose values are given."""
-        return np.bincount(place, near * values.reshape(-1)[source], size) * normal
-
-    right = np.bincount(place, weight * is_right, size)
-    left = np.bincount(place, weight * (1 - is_right), size)
-    cover = 1.0 - np.exp(-_OPACITY * np.stack([left, right]))
-    colour = np.stack([mean(colours[..., channel]) for channel in range(3)])
-    images = (num_images, height, width)
-    return HandRaster(
-        cover.reshape(2, *images).swapaxes(0, 1).astype(np.float32),
-        colour.reshape(3, *images).swapaxes(0, 1).astype(np.float32),
-        mean(1.0 / np.maximum(depth, MIN_DEPTH_M)).reshape(images)[:, None].astype(np.float32),
-    )
+    sides = [total(weight * (1 - is_right)), total(weight * is_right)]
+    cover = [plane(1.0 - np.exp(-_OPACITY * amount)) for amount in sides]
+    values = [*np.moveaxis(colours, -1, 0), 1.0 / np.maximum(points.depth_m, MIN_DEPTH_M)]
+    red, green, blue, nearness = [
+        plane(total(near * value.reshape(-1)[source]) * normal) for value in values
+    ]
+    colour = np.stack([red, green, blue], axis=1)
+    return HandRaster(np.stack(cover, axis=1), colour, nearness[:, None])
 
 
 def _taps(
