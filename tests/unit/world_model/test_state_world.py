@@ -157,3 +157,26 @@ def test_images_of_a_batch_are_drawn_together_as_requested(world, monkeypatch):
             drawn = one.observation.images[camera]
             assert drawn.shape == images.shape
             assert np.abs(drawn.astype(int) - images.astype(int)).max() <= 1
+
+
+def test_success_is_estimated_by_all_members():
+    untrained_state_checkpoint.cache_clear()
+    checkpoint = untrained_state_checkpoint()
+    untrained_state_checkpoint.cache_clear()
+    for member, log_odds in zip(checkpoint.dynamics.members, (2.0, -1.0), strict=True):
+        with torch.no_grad():
+            member.core.success[-1].weight.zero_()
+            member.core.success[-1].bias.fill_(log_odds)
+    world = StateWorld(checkpoint)
+    started = world.reset(from_observation(world))
+    stepped = world.step(started.state, move(started.observation, 8), seed=0)
+    doubt = stepped.observation.doubt
+    assert doubt.success_probability == pytest.approx(1 / (1 + np.exp(-0.5)), abs=1e-6)
+    spread = 1 / (1 + np.exp(-2.0)) - 1 / (1 + np.exp(1.0))
+    assert doubt.success_spread == pytest.approx(spread, abs=1e-6)
+    # Hands that stand for two seconds change nothing, nor does a snapshot.
+    held = stepped.state
+    for _ in range(3):
+        step = world.step(held, hold(stepped.observation, 16), seed=0)
+        held = world.restore(world.snapshot(step.state))
+    assert step.observation.doubt.success_probability == pytest.approx(doubt.success_probability)
