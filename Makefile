@@ -83,14 +83,10 @@ stress: $(VENV)/.dev     ## check every stage against numerical hazards; ARGS="-
 
 # Run again to resume after an interruption. The last step reports which bounds are met and which figures match docs/evaluator.json.
 reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's state model, success probe and cloned policies, and measure them, in runs/reproduce
-	$(BIN)/dextouch train data --store $(MADE)/train --count 600 --images 4
-	$(BIN)/dextouch train data --store $(MADE)/train --tasks insert_peg,place_phone --count 650 --images 4
-	$(BIN)/dextouch train data --store $(MADE)/train --tasks place_shoes --count 750 --images 4
-	$(BIN)/dextouch train data --store $(MADE)/train --tasks stack_bowls --count 800 --images 4
-	$(BIN)/dextouch train data --store $(MADE)/train --tasks open_drawer --count 900 --images 4
-	$(BIN)/dextouch train data --store $(MADE)/judge --first 1000 --count 300 --images 4
+	$(BIN)/dextouch train data --store $(MADE)/train --count 800 --images 4 --varied 0.7
+	$(BIN)/dextouch train data --store $(MADE)/judge --first 1000 --count 300 --images 4 --varied 0.7
 	$(BIN)/dextouch train data --store $(MADE)/development --mix ladder --first 20000 --count 144 --images 4
-	$(BIN)/dextouch train state --episodes $(MADE)/train --output $(MADE)/state.safetensors
+	$(BIN)/dextouch train state --episodes $(MADE)/train --output $(MADE)/state.safetensors --jobs 3
 	$(BIN)/dextouch train imagined --episodes $(MADE)/judge --store $(MADE)/imagined \
 		--checkpoint $(MADE)/state.safetensors
 	$(BIN)/dextouch train imagined --episodes $(MADE)/train --seeds 0:300 --store $(MADE)/imagined \

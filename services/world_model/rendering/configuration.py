@@ -49,7 +49,7 @@ class RendererConfig(FrozenModel):
 class RendererTraining(FrozenModel):
     """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
 
-    cpu_budget_s: CpuBudget = 540.0
+    cpu_budget_s: CpuBudget = 400.0
     max_steps: MaxSteps = None
     batch: Batch = 24
     learning_rate: LearningRate = 2e-3

@@ -2,13 +2,13 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float32
 from torch import Tensor
 from torch.nn import functional
 
+from dextouch.images import decode_jpeg, encode_jpeg
 from services.world_model.dynamics.start_reader import FirstStep
 
 # Standard deviations of the logarithm of gain, of each channel's gain, of contrast and of gamma.
@@ -77,7 +77,6 @@ def _compressed(image: Float32[Tensor, "batch 3 px px"], draw: np.ndarray) -> Te
     for index in np.flatnonzero(draw[:, 0] < _JPEG_SHARE):
         pixels = (image[index].permute(1, 2, 0) * 255).round().byte().numpy()
         quality = int(low + (high - low) * draw[index, 1])
-        _, coded = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-        decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR))[..., ::-1].copy()
+        decoded = decode_jpeg(encode_jpeg(pixels, quality=quality)).copy()
         image[index] = torch.from_numpy(decoded).permute(2, 0, 1).float() / 255
     return image
