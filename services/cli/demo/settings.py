@@ -27,7 +27,7 @@ class DemoPlan:
     train: bool
     num_seeds: int
     levels_mm: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0)
-    mistakes: tuple[str, ...] = ("low_rate 0.3", "overshoot 0.8", "side_approach 0.5")
+    mistakes: tuple[str, ...] = ("frame_yaw 0.4", "low_rate 0.5", "side_approach 0.4")
     predicted_noise_m: tuple[float, ...] = (0.0, 0.02)
     num_predicted: int = 3
     take_seed: int = FIRST_HELD_OUT_SEED + 900
