@@ -72,10 +72,11 @@ STAGES = {
     "evaluator": StageEntry(
         "benchmarks.evaluator.benchmark",
         "compare imagined success with success in the twin",
-        "Rolls out scripts with graded errors, policies that cannot succeed (holding still, "
-        "retreating, another scene's actions) and cloned policies in closed loop, in the twin and "
-        "in the world model, from the same held-out first observations. The success probe (judge) "
-        "decides imagined success from the imagined ending alone. Reports the judge's accuracy on "
+        "Rolls out scripts with graded position errors, scripts with mistakes of other kinds, "
+        "policies that cannot succeed (holding still, retreating, another scene's actions) and "
+        "cloned policies in closed loop, in the twin and in the world model, from the same "
+        "held-out first observations. The success probe (judge) decides imagined success from the "
+        "imagined ending alone. Reports the judge's accuracy on "
         "true endings, imagined against real success of rollouts and of policies, calibration, "
         "errors of chained touch and images compared with baselines, the effect of another "
         "episode's actions, and hands that hold still for 1000 steps, with intervals over the "

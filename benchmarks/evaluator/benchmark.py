@@ -3,12 +3,12 @@
 import argparse
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from benchmarks.evaluator.drawn import Line, Rolled
 from benchmarks.evaluator.keeping import KeptRows, Row
@@ -37,6 +37,13 @@ from services.twin.tasks import EVALUATED
 PACKAGES = ("numpy", "torch", "mujoco")
 _SERVO = "colour servo=services.evaluation.policies.colour_servo:ColourServo"
 _USUAL_STARTS, _QUICK_STARTS = 20, 2
+# Titles of the tables, by their names in `evaluator.json`.
+_ROWS: Final[Mapping[str, tuple[str, Callable[[TaskFigures], list[dict[str, Any]]]]]] = {
+    "kinds": ("Mistakes by kind, beside the ladder", TaskFigures.kind_rows),
+    "policies": ("Success rates", TaskFigures.policy_rows),
+    "rivals": ("AUC of single rollouts, by who judges what", TaskFigures.rival_rows),
+    "chunks": ("Chunks of scripts, each figure beside its rival", TaskFigures.chunk_rows),
+}
 _QUICK_LEVELS_MM = (0.0, 10.0, 30.0)
 
 
@@ -146,23 +153,17 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             step(name)
     figures, failed = figures_of_tasks(study, kept)
     lines = [line for each in figures for line in each.lines()]
-    policies = [row for each in figures for row in each.policy_rows()]
-    chunks = [row for each in figures for row in each.chunk_rows()]
-    rivals = [row for each in figures for row in each.rival_rows()]
-    kinds = [row for each in figures for row in each.kind_rows()]
+    rows = {name: [row for each in figures for row in of(each)] for name, (_, of) in _ROWS.items()}
+    titled = {title: rows[name] for name, (title, _) in _ROWS.items()}
     notes = [f"{task} is unknown to the world or the judge" for task in plan.tasks
              if task not in study.tasks]  # fmt: skip
     if failed:
         notes.append(f"{failed} rollouts failed and are missing; see {kept.path}")
-    shown = (kinds, policies, rivals, chunks)
-    write_page(plan.keep / "evaluator.html", study.about, lines, shown, notes)
+    write_page(plan.keep / "evaluator.html", study.about, lines, titled, notes)
     content = {
         "about": study.about,
         "lines": [asdict(line) for line in lines],
-        "kinds": kinds,
-        "policies": policies,
-        "rivals": rivals,
-        "chunks": chunks,
+        **rows,
         "notes": notes,
     }
     text = json.dumps(content, indent=1, allow_nan=False)
@@ -178,10 +179,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         },
         tables=[
             interval_table(lines),
-            row_table("Mistakes by kind, beside the ladder", kinds),
-            row_table("Success rates", policies),
-            row_table("AUC of single rollouts, by who judges what", rivals),
-            row_table("Chunks of scripts, each figure beside its rival", chunks),
+            *(row_table(title, each) for title, each in titled.items() if each),
         ],
         panels=[],
         requirements=[

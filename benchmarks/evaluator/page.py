@@ -20,10 +20,10 @@ def write_page(
     path: Path,
     about: Mapping[str, str],
     lines: Sequence[Line],
-    rows: Sequence[Sequence[Mapping[str, Any]]],
+    rows: Mapping[str, Sequence[Mapping[str, Any]]],
     notes: Sequence[str],
 ) -> None:
-    """Write the digests, one table per task, and the tables of other rows."""
+    """Write the digests, one table per task, and the tables of other rows by title."""
     tables = "".join(
         _table(task, [line for line in lines if line.task == task])
         for task in dict.fromkeys(line.task for line in lines)
@@ -33,12 +33,13 @@ def write_page(
         for name, digest in about.items()
     )
     remarks = "".join(f"<li>{escape(note)}</li>" for note in notes)
+    others = "".join(_plain_table(title, each) for title, each in rows.items() if each)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         f"<title>Evaluator</title><style>{_STYLE}</style></head><body>"
         "<h1>How reliable is imagined success?</h1>"
-        f"<ul>{digests}{remarks}</ul>{tables}{''.join(_plain_table(each) for each in rows)}"
+        f"<ul>{digests}{remarks}</ul>{tables}{others}"
         "<p>Intervals are 95 % bootstrap intervals over the starts.</p></body></html>\n",
         encoding="utf-8",
     )
@@ -67,14 +68,14 @@ def _row(line: Line, *, several: bool) -> str:
     return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 
 
-def _plain_table(rows: Sequence[Mapping[str, Any]]) -> str:
+def _plain_table(title: str, rows: Sequence[Mapping[str, Any]]) -> str:
     columns = list(dict.fromkeys(name for row in rows for name in row))
     head = "".join(f"<th>{escape(name.replace('_', ' '))}</th>" for name in columns)
     body = "".join(
         "<tr>" + "".join(f"<td>{escape(cell(row.get(n)))}</td>" for n in columns) + "</tr>"
         for row in rows
     )
-    return f"<table><tr>{head}</tr>{body}</table>"
+    return f"<table><caption>{escape(title)}</caption><tr>{head}</tr>{body}</table>"
 
 
 def cell(value: object) -> str:

@@ -97,9 +97,16 @@ def test_lines_by_hand(rolled, tmp_path):
     assert lines["sharpness of chained images as a share of the truth"].value == pytest.approx(0.7)
     assert lines["still hands over 1000 steps, greatest pressure"].value is None
     page = tmp_path / "page.html"
-    write_page(page, {"twin": "0" * 64}, list(lines.values()), [figures.policy_rows()], ["<note>"])
+    write_page(
+        page,
+        {"twin": "0" * 64},
+        list(lines.values()),
+        {"<Rates>": figures.policy_rows()},
+        ["<note>"],
+    )
     text = page.read_text(encoding="utf-8")
     assert "&lt;note&gt;" in text
+    assert "<caption>&lt;Rates&gt;</caption>" in text
     assert 'class="missed"' in text
     assert 'class="met"' in text
     assert "training seeds" not in text
@@ -128,7 +135,7 @@ def test_several_training_seeds_give_their_mean_and_the_worst(rolled, tmp_path):
     assert table.columns[-1] == "training seeds"
     assert table.rows[4][-1] == "1.000, 0.875"
     page = tmp_path / "page.html"
-    write_page(page, {"twin": "0" * 64}, list(lines.values()), [], [])
+    write_page(page, {"twin": "0" * 64}, list(lines.values()), {}, [])
     assert "1.000, 0.875" in page.read_text(encoding="utf-8")
 
 

@@ -239,8 +239,8 @@ def test_outside_policies_are_known_by_their_files(tmp_path, monkeypatch):
 def test_policies_act_in_their_own_tasks(plan):
     servo = OutsidePolicy.parse("servo=services.evaluation.policies.colour_servo:ColourServo")
     study = work.Study(replace(plan, outside=(servo,)))
-    assert servo.key in study.policies("stand_bottle")
-    assert servo.key not in study.policies("insert_peg")
+    assert servo.key in study.policies("stand_bottle", 39_077)
+    assert servo.key not in study.policies("insert_peg", 39_077)
     assert isinstance(study.actor("stand_bottle", 39_077, servo.key), ColourServo)
 
 

@@ -265,6 +265,7 @@ def show(report: Mapping[str, Any]) -> None:
     console.print(_table(title, ("error", "value", "bound"), rows))
     console.print(_world_model(report["world_model"]))
     print_scores(report)
+    console.print(_mistakes(report["mistakes"]))
     accuracy = report["success_probe"]["held_out_accuracy"]
     console.print(
         f"\nImagined success is classified by a probe that is correct on {accuracy:.0%} of true "
@@ -281,6 +282,15 @@ def _table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]] = (
     for row in rows:
         table.add_row(*row)
     return table
+
+
+def _mistakes(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Successes in both worlds, by kind of mistake."""
+    names = ("rollouts", "real", "imagined", "wrong", "cannot_tell")
+    columns = ("task", "mistake", "rollouts", "real", "imagined", "wrongly imagined", "undecided")
+    cells = [(row["task"], row["mistake"], *(str(row[name]) for name in names)) for row in rows]
+    return _table("Successes by kind of mistake, beside the ladder of position errors",
+                  columns, cells)  # fmt: skip
 
 
 def _world_model(figures: Mapping[str, Any]) -> Table:

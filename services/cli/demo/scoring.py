@@ -1,6 +1,6 @@
 """Networks of the demo, shipped or freshly trained, and the scoring of policies by them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from services.cli.main import run_command
 from services.cli.study.command import demonstrator
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
+from services.evaluation.scores import REAL, RolloutScore
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
 from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_probe import SuccessProbe
@@ -23,6 +24,7 @@ from services.world_model.world import open_world
 
 MODEL = "world_model"
 BASELINE = "copy-first"
+LADDER = "position only"
 DEMONSTRATIONS = ("--mix", "demonstrations")
 # Exact demonstrations for the policy: seeds that nothing else uses, no noise, no misses.
 EXACT_DATA = ("--first", "1000", "--count", "120", "--exact")
@@ -100,12 +102,16 @@ def _load(world_model: Path, policy: Path, probe: Path) -> Models:
 def ladder(plan: DemoPlan) -> dict[str, Policy]:
     """Open-loop policies of graded quality.
 
-    The scripted demonstrator with errors, and three that should fail: holding still, retreating,
-    and the actions of another scene. The twin only plans the demonstrator's commands, without
-    simulation.
+    The scripted demonstrator with position errors, the same with other mistakes, and three that
+    should fail: holding still, retreating, and the actions of another scene. The twin only plans
+    the demonstrator's commands, without simulation.
     """
-    names = (*(script_name(level) for level in plan.levels_mm), HOLD, RETREAT, ELSEWHERE)
+    names = (*_scripts(plan), *plan.mistakes, HOLD, RETREAT, ELSEWHERE)
     return {name: demonstrator(TASKS, plan.seeds, name) for name in names}
+
+
+def _scripts(plan: DemoPlan) -> tuple[str, ...]:
+    return tuple(script_name(level) for level in plan.levels_mm)
 
 
 def judge(
@@ -114,7 +120,7 @@ def judge(
     """Roll out all policies from matched starts in the twin, the model and the copy baseline.
 
     Returns:
-        `policies`, `agreement` and other entries of `report.json`.
+        `policies`, `agreement`, `mistakes` and other entries of `report.json`.
     """
     twin, imagined = RolloutClient(urls["twin"]), RolloutClient(urls["imagined"])
     tasks = EvaluationPlan(
@@ -135,4 +141,50 @@ def judge(
             f"{len(report.failures)} of {len(report.rollouts)} rollouts failed, first "
             f"{first.policy!r} in {first.world!r}: {first.message}"
         )
-    return report.to_report()
+    found = report.to_report()
+    found["mistakes"] = mistake_rows(report.scores, plan)
+    for task, comments in found["comments"].items():
+        comments.append(mistake_comment(task, found["mistakes"]))
+    return found
+
+
+def mistake_rows(scores: Iterable[RolloutScore], plan: DemoPlan) -> list[dict[str, Any]]:
+    """Real against imagined outcomes of the ladder of scripts, and of every mistake beside it."""
+    known = {(s.world, s.task, s.policy, s.seed): s for s in scores}
+    groups = {LADDER: _scripts(plan), **{name: (name,) for name in plan.mistakes}}
+    rows = []
+    for task in TASKS:
+        for name, policies in groups.items():
+            pairs = [
+                (known[REAL, task, policy, seed], known[MODEL, task, policy, seed])
+                for policy in policies
+                for seed in plan.seeds
+            ]
+            rows.append(
+                {
+                    "task": task,
+                    "mistake": name,
+                    "rollouts": len(pairs),
+                    "real": sum(real.success for real, _ in pairs),
+                    "imagined": sum(imagined.success for _, imagined in pairs),
+                    "wrong": sum(real.success != imagined.success for real, imagined in pairs),
+                    "cannot_tell": sum(imagined.cannot_tell is not None for _, imagined in pairs),
+                }
+            )
+    return rows
+
+
+def mistake_comment(task: str, rows: Iterable[Mapping[str, Any]]) -> str:
+    """How many rollouts of a task are judged wrongly, without and with mistakes."""
+    mine = [row for row in rows if row["task"] == task]
+    told = []
+    for is_ladder in (True, False):
+        group = [row for row in mine if (row["mistake"] == LADDER) == is_ladder]
+        wrong, rollouts = (sum(row[name] for row in group) for name in ("wrong", "rollouts"))
+        told.append(f"{wrong} of {rollouts}")
+    names = ", ".join(row["mistake"] for row in mine if row["mistake"] != LADDER)
+    return (
+        f"Imagined outcomes differ from the real ones in {told[0]} rollouts of scripts that err in "
+        f"position only, and in {told[1]} with mistakes of kinds that no training data contain "
+        f"({names})."
+    )

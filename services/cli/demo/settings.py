@@ -17,7 +17,8 @@ class DemoPlan:
     """Plan of one run.
 
     `levels_mm` are the errors of the scripted demonstrator, which give policies of different
-    quality; `num_seeds` is the number of held-out scenes per task. The world model is measured on
+    quality; `mistakes` are scripts with mistakes of kinds that no training data contain;
+    `num_seeds` is the number of held-out scenes per task. The world model is measured on
     `num_predicted` scenes per task, with each of the errors `predicted_noise_m`.
     """
 
@@ -26,6 +27,7 @@ class DemoPlan:
     train: bool
     num_seeds: int
     levels_mm: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0)
+    mistakes: tuple[str, ...] = ("frame_yaw 0.4", "low_rate 0.5", "side_approach 0.4")
     predicted_noise_m: tuple[float, ...] = (0.0, 0.02)
     num_predicted: int = 3
     take_seed: int = FIRST_HELD_OUT_SEED + 900

@@ -15,10 +15,13 @@ from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas import LineageEntry
 from services.cli.demo.command import Stages, show, worst_errors
 from services.cli.demo.recording import align, forget_take
-from services.cli.demo.scoring import ladder
+from services.cli.demo.scoring import LADDER, MODEL, ladder, mistake_comment, mistake_rows
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, parse
 from services.cli.servers import bind, served
 from services.cli.study.command import refuse_trained
+from services.evaluation.scores import REAL, RolloutScore
+from services.twin.mistakes import DEVELOPMENT
+from services.twin.scripted_actions import mistake_of
 from services.world_model.state_checkpoints import write_state_checkpoint
 from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.bridges.takes import write_episode, write_recording
@@ -168,18 +171,30 @@ def test_the_table_shows_undefined_agreement(capsys):
             "comments": {"t": ["It flatters."]},
             "imagined_world": "world_model",
             "real_differences": {},
+            "mistakes": [
+                {"task": "t", "mistake": "tilt 0.5", "rollouts": 6, "real": 1, "imagined": 4}
+                | {"wrong": 3, "cannot_tell": 0}
+            ],
         }
     )
     shown = capsys.readouterr().out
-    for words in ("undefined", "another scene", "≥ 0.98", "0.100", "It flatters.", "0.0 of 7"):
+    for words in (
+        "undefined",
+        "another scene",
+        "≥ 0.98",
+        "0.100",
+        "It flatters.",
+        "0.0 of 7",
+        "tilt 0.5",
+    ):
         assert words in shown
 
 
 def test_policies_that_do_not_look_are_good_and_bad_ones():
-    plan = replace(parse(["--seeds", "1"]), levels_mm=(0.0, 30.0))
+    plan = replace(parse(["--seeds", "1"]), levels_mm=(0.0, 30.0), mistakes=("tilt 0.5",))
     policies = ladder(plan)
     assert list(policies) == [
-        "script 0 mm", "script 30 mm", "hold", "retreat", "another scene's actions",
+        "script 0 mm", "script 30 mm", "tilt 0.5", "hold", "retreat", "another scene's actions",
     ]  # fmt: skip
     assert not any(policy.looks for policy in policies.values())
     seed, task = plan.seeds[0], "stand_bottle"
@@ -193,6 +208,35 @@ def test_policies_that_do_not_look_are_good_and_bad_ones():
     assert not np.array_equal(chunks["script 0 mm"], chunks["another scene's actions"])
     np.testing.assert_array_equal(chunks["hold"], np.repeat(chunks["hold"][:1], 16, axis=0))
     assert chunks["retreat"][-1, 11] != chunks["retreat"][0, 11]
+
+
+def test_the_demo_shows_three_kinds_of_mistakes_that_no_training_data_contain():
+    mistakes = [mistake_of(name) for name in parse(["--seeds", "1"]).mistakes]
+    assert len({mistake.kind for mistake in mistakes} & set(DEVELOPMENT)) >= 3
+
+
+def test_rollouts_are_counted_by_kind_of_mistake():
+    plan = replace(parse(["--seeds", "2"]), levels_mm=(0.0, 30.0), mistakes=("tilt 0.5",))
+    # Real and imagined success of the first and the second seed.
+    outcomes = {"script 0 mm": "1111", "script 30 mm": "0001", "tilt 0.5": "0101"}
+    scores = [
+        RolloutScore(world, policy, task, seed, "", told[2 * index + number] == "1", 0.5, reason)
+        for task in ("stand_bottle", "stack_bowls")
+        for policy, told in outcomes.items()
+        for index, seed in enumerate(plan.seeds)
+        for number, (world, reason) in enumerate(((REAL, None), (MODEL, "unsure")))
+    ]
+    rows = mistake_rows(scores, plan)
+    assert [(row["task"], row["mistake"]) for row in rows] == [
+        (task, name) for task in ("stand_bottle", "stack_bowls") for name in (LADDER, "tilt 0.5")
+    ]
+    counted = [[row[n] for n in ("rollouts", "real", "imagined", "wrong")] for row in rows[:2]]
+    assert counted == [[4, 2, 3, 1], [2, 0, 2, 2]]
+    assert rows[1]["cannot_tell"] == 2
+    comment = mistake_comment("stand_bottle", rows)
+    assert "1 of 4 rollouts of scripts" in comment
+    assert "2 of 2 with mistakes" in comment
+    assert "(tilt 0.5)" in comment
 
 
 def test_seeds_of_training_are_refused(tmp_path):
