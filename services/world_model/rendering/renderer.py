@@ -63,6 +63,10 @@ class Renderer:
         dtype = torch.bfloat16 if uses_bfloat16_here(setting=uses_bfloat16) else torch.float32
         self._network = copy.deepcopy(network).eval().requires_grad_(requires_grad=False)
         self._network.to(dtype)
+        # As the images are, so that convolutions do not rearrange their weights at each call.
+        for weight in self._network.parameters():
+            if weight.ndim == 4:
+                weight.data = weight.data.contiguous(memory_format=torch.channels_last)
         # A rollout draws all its chunks from one start. Those used last are at the end.
         self._starts: OrderedDict[bytes, PreparedScenes] = OrderedDict()
         self._lock = threading.Lock()
