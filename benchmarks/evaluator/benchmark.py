@@ -148,8 +148,8 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         if (missing := study.missing(kept, task, seed))
     ]
     with bar("rolling out", len(units)) as step:
-        for rows, name in _results(plan, units, options.jobs):
-            kept.add(rows)
+        for new, name in _results(plan, units, options.jobs):
+            kept.add(new)
             step(name)
     figures, failed = figures_of_tasks(study, kept)
     lines = [line for each in figures for line in each.lines()]
