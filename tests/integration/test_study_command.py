@@ -16,7 +16,7 @@ from services.cli import main
 ROOT = Path(__file__).parents[2]
 STUDY = """
 name = "bottle"
-tasks = ["stand_bottle"]
+tasks = ["stack_bowls"]
 first_seed = 31000
 num_starts = {starts}
 in_flight = 2
@@ -68,9 +68,9 @@ def test_a_study_from_file_to_tables(study, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("first_seed = 31000", "first_seed = 100", "trained on task 'stand_bottle' with seeds"),
+        ("first_seed = 31000", "first_seed = 100", "trained on task 'stack_bowls' with seeds"),
         ('"script 0 mm"', '"script clumsy"', "unknown script 'script clumsy'"),
-        ('"stand_bottle"', '"stand_bottel"', "'stand_bottel'"),
+        ('"stack_bowls"', '"stack_bowl"', "'stack_bowl'"),
         ('builtin = "world-model"', 'checkpoint = "no.safetensors"', "no.safetensors"),
     ],
 )
