@@ -50,8 +50,7 @@ class Combination(FrozenModel):
 
     The log odds of the result are the weighted sum of both log odds and `bias`; it is undecided
     within `band` of 0.5. The two contradict each other if they lie on different sides of 0.5, each
-    by more than `margin`; with a margin of 0.5 they never do. Without a fit the result is the mean
-    of both log odds, and nothing but a contradiction is undecided.
+    by more than `margin`; with a margin of 0.5 they never do.
     """
 
     probe_weight: float = Field(default=0.5, ge=0)
@@ -69,6 +68,11 @@ class Combination(FrozenModel):
         """Whether classifier and world contradict each other."""
         low, high = np.minimum(probe, world), np.maximum(probe, world)
         return np.asarray((low < 0.5 - self.margin) & (high > 0.5 + self.margin))
+
+
+# For probes that were trained before their world estimated success: the mean of both log odds, with
+# the band outside of which a tenth of the development kinds of mistakes was judged wrongly.
+UNFITTED: Final = Combination(band=0.3)
 
 
 @dataclass(frozen=True)

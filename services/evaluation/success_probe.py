@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float32, Float64
 
 from dextouch.errors import InvalidInputError
-from services.evaluation.calibration import Calibration, Combination, sigmoid
+from services.evaluation.calibration import UNFITTED, Calibration, Combination, sigmoid
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_network
 from services.evaluation.endings import Ending
 from services.evaluation.judge_network import ProbeBatch, ProbeNetwork, ProbeShape, probe_batch
@@ -173,7 +173,7 @@ class SuccessProbe:
         band = self.calibration(ending.task, imagined=ending.imagined).band
         contradiction = None
         if ending.success_probability is not None:
-            joint = self._combinations.get(ending.task, Combination(band=band))
+            joint = self._combinations.get(ending.task, UNFITTED)
             pair = np.array([probability]), np.array([ending.success_probability])
             if joint.contradictory(*pair)[0]:
                 contradiction = (

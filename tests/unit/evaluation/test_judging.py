@@ -191,7 +191,7 @@ def test_it_cannot_tell_where_the_world_itself_expects_the_opposite(judge):
     probe = _with_combination(judge)
     alone = probe.verdict(ending)
     assert (alone.world_probability, alone.decision) == (None, "success")
-    # The shipped probes hold no combination: a contradiction is all that they cannot tell.
+    # The shipped probes hold no combination.
     for world, decision in ((0.9, "success"), (0.5, "success"), (0.49, "cannot tell")):
         verdict = probe.verdict(replace(ending, success_probability=world))
         assert (verdict.decision, verdict.world_probability) == (decision, world)
@@ -199,6 +199,16 @@ def test_it_cannot_tell_where_the_world_itself_expects_the_opposite(judge):
     tolerant = _with_combination(judge, margin=0.1)
     assert tolerant.verdict(replace(ending, success_probability=0.45)).decision == "success"
     assert tolerant.verdict(replace(ending, success_probability=0.35)).decision == "cannot tell"
+
+
+def test_without_a_fit_only_what_both_are_sure_of_is_decided(judge):
+    ending = replace(_episode("reach", 0, imagined=True).final, success_probability=0.7)
+    probe = _with_combination(judge)
+    probability, reason = probe._judged(ending, 0.8)
+    # sqrt(0.8/0.2 · 0.7/0.3) = 3.055 to 1.
+    assert probability == pytest.approx(3.055 / 4.055, abs=1e-3)
+    assert "within 0.30 of 0.5" in reason
+    assert probe._judged(ending, 0.9) == (pytest.approx(4.583 / 5.583, abs=1e-3), None)
 
 
 def test_it_cannot_tell_within_the_band_of_both_estimates(judge):
