@@ -464,8 +464,12 @@ def test_chunks_in_turn_imagine_what_one_long_chunk_does(model):
     halves = []
     for steps in (slice(0, 8), slice(8, 16)):
         memory, imagined = model.advance(memory, Commands.of([lifted(16)[steps]] * 2))
-        halves.append(imagined.poses.position_m)
-    torch.testing.assert_close(torch.cat(halves, dim=1), whole.poses.position_m)
+        halves.append(imagined)
+    for name, dim in (("success", 2), ("tactile_kpa", 1)):
+        parts = torch.cat([getattr(half, name) for half in halves], dim=dim)
+        torch.testing.assert_close(parts, getattr(whole, name))
+    positions = torch.cat([half.poses.position_m for half in halves], dim=1)
+    torch.testing.assert_close(positions, whole.poses.position_m)
 
 
 def test_members_that_agree_do_not_disagree(model):
