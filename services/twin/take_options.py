@@ -14,6 +14,7 @@ from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.hands import Domain
 from services.twin.mistakes import Mistake
 from services.twin.motions import Motion
+from services.twin.sizes import Sizes
 
 StreamChoice = Literal["all", "training"]
 STREAM_CHOICES: Final[tuple[StreamChoice, ...]] = get_args(StreamChoice)
@@ -29,8 +30,8 @@ class TakeOptions:
     replaces the script, and `actions_of_seed` plays the demonstration of another seed, relative to
     this take's start. `mistakes` change the commands of the script, in their order.
 
-    With `varied`, colours, light and the home of the head camera differ from take to take. Cameras
-    record at 30 Hz, or at grid steps that are multiples of `image_every` and the last three. With
+    With `varied`, colours, light and the home of the head camera differ from take to take; `sizes`
+    are those of the objects, unknown to the demonstrator. Cameras record at 30 Hz, or at grid steps that are multiples of `image_every` and the last three. With
     `training`, only touch, images, actions, and object poses at grid steps are recorded.
     """
 
@@ -44,6 +45,7 @@ class TakeOptions:
     streams: StreamChoice = "all"
     mistakes: tuple[Mistake, ...] = ()
     varied: bool = False
+    sizes: Sizes = Sizes()
 
     def __post_init__(self) -> None:
         frozen = self.frozen_from_step
@@ -91,6 +93,8 @@ class TakeOptions:
             words += ["--mistake", str(mistake)]
         if self.varied:
             words.append("--varied")
+        if self.sizes != Sizes():
+            words += ["--width", repr(self.sizes.width), "--height", repr(self.sizes.height)]
         return words
 
     def figures(self) -> dict[str, float]:
@@ -103,6 +107,8 @@ class TakeOptions:
         if self.actions_of_seed is not None:
             figures["actions_of_seed"] = float(self.actions_of_seed)
         figures |= {f"mistake_{one.kind}": one.strength for one in self.mistakes}
+        if self.sizes != Sizes():
+            figures |= {"width": self.sizes.width, "height": self.sizes.height}
         return figures
 
 
@@ -157,6 +163,8 @@ def episode_id(
     parts += [f"{one.kind}{round(1000 * one.strength)}" for one in options.mistakes]
     if options.varied:
         parts.append("varied")
+    if options.sizes != Sizes():
+        parts.append(f"w{round(1000 * options.sizes.width)}h{round(1000 * options.sizes.height)}")
     if played is not None:
         parts.append(f"by_{played}")
     if options.image_every is not None:
