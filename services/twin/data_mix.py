@@ -129,18 +129,16 @@ def options_of(task: str, seed: int, mix: Mix) -> TakeOptions:
     if kind in {"frozen", "hold"}:
         step = int(draw.integers(*_FROM_STEPS["frozen"]))
         return TakeOptions(noise_m, frozen_from_step=step) if kind == "frozen" else _HOLD
-    if kind == "miss":
-        return TakeOptions(noise_m, miss=True)
     if kind == "other_scene":
         return TakeOptions(noise_m, actions_of_seed=_another_seed(seed, draw))
-    if kind in SCRIPTS:
-        return TakeOptions(noise_m)
+    if kind in MOTION_KINDS:
+        return _with_motion(kind, noise_m, draw)
+    if kind == "otherwise_mistaken":
+        return TakeOptions(mistakes=(_one_of(DEVELOPMENT, draw),))
     if kind == "mistaken":
         noise_m = _noise_m("fine", seed, draw) if draw.random() < _NOISY else 0.0
         return TakeOptions(noise_m, mistakes=mistakes_of(task, draw))
-    if kind == "otherwise_mistaken":
-        return TakeOptions(mistakes=(_one_of(DEVELOPMENT, draw),))
-    return _with_motion(kind, noise_m, draw)
+    return TakeOptions(noise_m, miss=kind == "miss")
 
 
 def mistakes_of(task: str, draw: np.random.Generator) -> tuple[Mistake, ...]:

@@ -49,6 +49,16 @@ class Sizes:
         """Factors along x, y and z."""
         return np.array([self.width, self.width, self.height])
 
+    @property
+    def labels(self) -> list[str]:
+        """Parts of an episode's id; none for the usual sizes."""
+        if self == USUAL:
+            return []
+        return [f"w{round(1000 * self.width)}h{round(1000 * self.height)}"]
+
+
+USUAL: Final = Sizes()
+
 
 class Geometry:
     """The usual geometry of a scene's objects, and changes of it.
@@ -73,7 +83,7 @@ class Geometry:
         model = self._scene.model
         for name, values in self._usual.items():
             getattr(model, name)[:] = values
-        if sizes == Sizes():
+        if sizes == USUAL:
             return
         for geom in self._geoms.tolist():
             pose = np.concatenate([model.geom_pos[geom], model.geom_quat[geom]])

@@ -22,11 +22,10 @@ from services.twin.hands import Domain
 from services.twin.scene import compile_scene
 from services.twin.settings import TwinSettings
 from services.twin.simulation import Command, Simulation
-from services.twin.sizes import Geometry, Sizes
+from services.twin.sizes import USUAL, Geometry, Sizes
 from services.twin.tasks import get_task
 
 MAX_NOISE_M: Final = 0.2
-USUAL: Final = Sizes()
 # Positions of the objects in a miss episode: aside, or out of view behind the viewer.
 _ASIDE_M: Final = 0.13
 _SHELF_Y_M: Final = -3.0
