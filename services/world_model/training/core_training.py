@@ -23,6 +23,8 @@ _UNIT_M = 0.05
 _FIT_EPISODES = 1000
 # Assumed of readers where no label says it.
 _READER_SD_M = 0.004
+# Largest standard deviation of the logarithm of a size.
+_SIZE_SD = 0.06
 # Weight of the outcome as predicted at every latent step, relative to that at the last.
 _EARLY_SUCCESS = 0.2
 # Factor by which hands are held still more often at later starts, where fewer scenes allow it.
@@ -140,6 +142,7 @@ def _draw(
         start=SceneStart(
             objects,
             sd_m,
+            _read_size(table.size[rows], generator),
             data.touch[rows, start_step].float(),
             table.pads_kpa[rows, start_step],
             table.task[rows],
@@ -187,6 +190,14 @@ def _start_objects(
         torch.where(known, noisy.present, read.present),
     )
     return objects, torch.where(known, sd_m, _READER_SD_M)
+
+
+def _read_size(
+    true: Float32[Tensor, "batch objects 2"], generator: torch.Generator
+) -> Float32[Tensor, "batch objects 2"]:
+    """Sizes with the noise of a reader, whose standard deviation is up to `_SIZE_SD`."""
+    sd = _SIZE_SD * torch.rand((len(true), 1, 1), generator=generator)
+    return true * (sd * torch.randn(true.shape, generator=generator)).exp()
 
 
 def _held_still(commands: Commands, held: Bool[Tensor, " batch"]) -> Commands:

@@ -7,10 +7,10 @@ run resumes with the missing ones.
 import hashlib
 import multiprocessing
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
@@ -21,7 +21,8 @@ from dextouch.command_line import ProgressLines
 from dextouch.errors import InvalidInputError
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.configuration import DynamicsConfig
-from services.world_model.dynamics.model import DynamicsMember, DynamicsModel
+from services.world_model.dynamics.core import RecurrentCore
+from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.touch_codec import TouchCodec
@@ -51,11 +52,16 @@ from services.world_model.training.scene_episodes import (
     refuse_shared_scenes,
     split_by_scene,
 )
-from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
+from services.world_model.training.scene_table import (
+    SceneTable,
+    scene_table,
+    usual_boxes_m,
+    vocabulary,
+)
 from services.world_model.training.state_evaluation import evaluate_dynamics
 
 # Increment when a change of training gives other weights for the same settings and data.
-READER_VERSION, CORE_VERSION, RENDERER_VERSION = 4, 5, 3
+READER_VERSION, CORE_VERSION, RENDERER_VERSION = 5, 6, 3
 # Largest number of episodes the renderer is trained on; it samples few of their images anyway.
 MAX_CLIPS = 1500
 _SEED_STRIDE = 1000
@@ -111,7 +117,8 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         renderer=settings.renderer,
         object_names={e.task: e.object_names for e in episodes},
         object_boxes_m={
-            e.task: tuple(tuple(map(float, row)) for row in e.object_boxes_m) for e in episodes
+            task: tuple(tuple(map(float, row)) for row in boxes_m)
+            for task, boxes_m in usual_boxes_m(episodes).items()
         },
         bounds=StateBounds(
             disagreement_m=measured.disagreement_m,
@@ -342,13 +349,21 @@ def _assembled(work: _Work, codec: TouchCodec) -> tuple[DynamicsModel, RendererN
     dynamics = DynamicsModel(work.config, work.settings.num_members)
     dynamics.codec.load_state_dict(codec.state_dict())
     cpu_s = 0.0
-    for index, module in enumerate(dynamics.members):
-        member = cast("DynamicsMember", module)
-        cpu_s += _load(member.reader, work.reader_file(index))
-        cpu_s += _load(member.core, work.core_file(index))
+    cores = [RecurrentCore(work.config) for _ in range(work.settings.num_members)]
+    for index, (reader, core) in enumerate(zip(dynamics.readers(), cores, strict=True)):
+        cpu_s += _load(reader, work.reader_file(index))
+        cpu_s += _load(core, work.core_file(index))
+    dynamics.core.load_state_dict(_together(cores))
     renderer = RendererNetwork(work.settings.renderer)
     cpu_s += _load(renderer, work.renderer_file)
     return dynamics.eval().requires_grad_(requires_grad=False), renderer, cpu_s
+
+
+def _together(cores: Sequence[RecurrentCore]) -> dict[str, Tensor]:
+    """Weights of cores of one member each as those of one core with all members."""
+    weights = [dict(core.named_parameters()) for core in cores]
+    shared = dict(cores[0].named_buffers())
+    return shared | {name: torch.cat([each[name] for each in weights]) for name in weights[0]}
 
 
 def _command(settings: StateTrainSettings) -> str:

@@ -132,9 +132,8 @@ def test_a_core_feels_what_it_touches_and_nothing_elsewhere(reader, table, held_
     dynamics.codec.fit(table.tactile_kpa.float().flatten(0, 2))
     data = CoreData(table, touch_latents(dynamics.codec, table), {})
     settings = CoreSettings(num_steps=250, batch=16)
-    member = dynamics.members[0]
-    member.reader = reader
-    member.core = train_core(data, config, settings, seed=0)
+    dynamics.eyes[0] = reader
+    dynamics.core = train_core(data, config, settings, seed=0)
     measured = evaluate_dynamics(dynamics.eval(), held_out)
     assert measured.figures["contact_f1_chunk_1"] > 0.8
     assert measured.figures["contact_f1_chunk_1_of_copy"] == 0.0
