@@ -265,6 +265,11 @@ class StateTrainSettings(FrozenModel):
         default=Path("runs/world_model/state.safetensors"), description="checkpoint to write"
     )
     name: str = Field(default="state", description="model name in the checkpoint")
+    base: Path | None = Field(
+        default=None,
+        description="state model to start from, for new tasks: its cores, touch codec and renderer "
+        "are kept, start readers and the estimate of success are trained",
+    )
     seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
     num_members: int = Field(default=2, ge=1, le=16, description="members of the ensemble")
     heldout_share: float = Field(default=0.08, gt=0, lt=1, description="share of held-out scenes")

@@ -28,7 +28,7 @@ _OUTPUTS = 13
 _FINE = 0.1
 # Width and height of an image's crop about an object.
 _CROP_PX = 24
-_LOG_SIZE = 0.3
+_LOG_SIZE = 0.5
 LEAST_SD_M = 0.001
 # Uncertainty of an output of zero.
 _USUAL_SD_M = 0.005

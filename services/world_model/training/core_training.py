@@ -66,6 +66,7 @@ def train_core(
     *,
     seed: int,
     on_step: OnStep | None = None,
+    initial: RecurrentCore | None = None,
 ) -> RecurrentCore:
     """Train a core to predict scenes from any start step to the end.
 
@@ -75,11 +76,12 @@ def train_core(
         settings: number of steps, loss weights and so on.
         seed: seed of weights and sampling.
         on_step: called with the step and its loss.
+        initial: core to start from; those of its weights that require gradients are changed.
     """
     generator, rng = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        core = RecurrentCore(config)
+        core = initial or RecurrentCore(config)
         describe(core, data.table)
 
         def loss() -> Tensor:

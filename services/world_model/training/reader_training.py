@@ -44,6 +44,7 @@ def train_reader(
     *,
     seed: int,
     on_step: OnStep | None = None,
+    initial: StartReader | None = None,
 ) -> StartReader:
     """Train a reader of objects from single steps, both first and later ones.
 
@@ -53,11 +54,12 @@ def train_reader(
         settings: number of steps and so on.
         seed: seed of weights and sampling.
         on_step: called with the step and its loss.
+        initial: reader to start from; its weights are changed.
     """
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        reader = StartReader(config)
+        reader = initial or StartReader(config)
     _fit_heights(reader, table, config)
     later = [step for step in table.image_steps if step % 4 == 0 and step > 0]
     known = torch.nonzero(table.labelled)[:, 0]

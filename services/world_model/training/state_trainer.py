@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,7 @@ from services.world_model.training.scene_table import (
     vocabulary,
 )
 from services.world_model.training.state_evaluation import evaluate_dynamics
+from services.world_model.training.transfer import Base
 
 # Increment when a change of training gives other weights for the same settings and data.
 READER_VERSION, CORE_VERSION, RENDERER_VERSION = 5, 6, 3
@@ -93,6 +95,12 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     training, heldout = split_by_scene(episodes, held_out_share=settings.heldout_share)
     refuse_shared_scenes(training, heldout)
     config = _config(episodes, settings)
+    base = None if settings.base is None else Base(settings.base)
+    if base is not None:
+        config = base.configured(config)
+        about = base.checkpoint.metadata
+        kept = {"num_members": about.num_members, "renderer": about.renderer}
+        settings = settings.model_copy(update=kept)
     parts = settings.output.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
     data_hash = _data_hash(training)
@@ -100,9 +108,11 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     heldout_table = scene_table(heldout, config)
     table = scene_table(training, config, labelled=_labelled(training, settings))
     codec = TouchCodec(config.touch_channels)
-    codec.fit(
-        table.tactile_kpa[:, ::4].float().flatten(0, 2), peak_kpa=float(table.tactile_kpa.max())
-    )
+    if base is None:
+        touch_kpa = table.tactile_kpa[:, ::4].float().flatten(0, 2)
+        codec.fit(touch_kpa, peak_kpa=float(table.tactile_kpa.max()))
+    else:
+        codec.load_state_dict(base.checkpoint.dynamics.codec.state_dict())
     table_file = parts / "table.safetensors"
     save_file({**table.tensors(), **_prefixed(codec)}, table_file)
     del table
@@ -157,6 +167,11 @@ class _Work:
     parts: Path
     data_hash: str
 
+    @cached_property
+    def base(self) -> Base | None:
+        """The model that this one starts from, if any."""
+        return None if self.settings.base is None else Base(self.settings.base)
+
     def reader_file(self, member: int) -> Path:
         """File of a member's finished reader; its name depends on settings and data."""
         return self.parts / f"reader-{self._key(READER_VERSION, 'reader')}-{member}.safetensors"
@@ -178,7 +193,8 @@ class _Work:
         chosen = self.settings.model_dump_json(
             include={"seed", "heldout_share", "labelled_share", *names}
         )
-        text = f"{version} {chosen} {self.data_hash}"
+        base = "" if self.base is None else self.base.checkpoint.digest
+        text = f"{version} {chosen} {self.data_hash} {base}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -248,11 +264,11 @@ def _train_parts(work: _Work) -> None:
     members = range(work.settings.num_members)
     spawned = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(work.settings.jobs, spawned) as pool:
-        # Cores first: they take longest.
-        orders = [pool.submit(_train_core, work, m) for m in members]
+        orders = []
         if work.settings.labelled_share == 1:
             orders += [pool.submit(_train_reader, work, m) for m in members]
-        if not work.renderer_file.exists():
+        orders += [pool.submit(_train_core, work, m) for m in members]
+        if work.base is None and not work.renderer_file.exists():
             orders.append(pool.submit(_train_renderer, work))
         for done in as_completed(orders):
             done.result()
@@ -309,7 +325,11 @@ def _train_reader(work: _Work, member: int) -> None:
     started_s = time.process_time()
     on_step = _on_step(member, "reader")
     seed = work.settings.seed * _SEED_STRIDE + member
-    trained = train_reader(table, work.config, work.settings.reader, seed=seed, on_step=on_step)
+    settings, base = work.settings.reader, work.base
+    initial = None if base is None else base.reader(work.config, member, seed=seed)
+    trained = train_reader(
+        table, work.config, settings, seed=seed, on_step=on_step, initial=initial
+    )
     _keep(trained, work.reader_file(member), time.process_time() - started_s)
 
 
@@ -330,7 +350,10 @@ def _train_core(work: _Work, member: int) -> None:
     data = CoreData(table, touch_latents(codec, table), readings)
     on_step = _on_step(member, "core")
     seed = work.settings.seed * _SEED_STRIDE + member
-    core = train_core(data, work.config, work.settings.core, seed=seed, on_step=on_step)
+    initial = None if work.base is None else work.base.core(work.config, member)
+    core = train_core(
+        data, work.config, work.settings.core, seed=seed, on_step=on_step, initial=initial
+    )
     _keep(core, work.core_file(member), time.process_time() - started_s)
 
 
@@ -355,7 +378,10 @@ def _assembled(work: _Work, codec: TouchCodec) -> tuple[DynamicsModel, RendererN
         cpu_s += _load(core, work.core_file(index))
     dynamics.core.load_state_dict(_together(cores))
     renderer = RendererNetwork(work.settings.renderer)
-    cpu_s += _load(renderer, work.renderer_file)
+    if work.base is None:
+        cpu_s += _load(renderer, work.renderer_file)
+    else:
+        renderer.load_state_dict(work.base.checkpoint.renderer.state_dict())
     return dynamics.eval().requires_grad_(requires_grad=False), renderer, cpu_s
 
 
