@@ -235,7 +235,7 @@ class CoreLossWeights(FrozenModel):
 class CoreSettings(FrozenModel):
     """Training of recurrent cores."""
 
-    num_steps: NumSteps = 5000
+    num_steps: NumSteps = 4000
     batch: Batch = 64
     learning_rate: LearningRate = 2e-3
     weight_decay: WeightDecay = 0.05
