@@ -271,7 +271,7 @@ class StateTrainSettings(FrozenModel):
         "are kept, start readers and the estimate of success are trained",
     )
     seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
-    num_members: int = Field(default=2, ge=1, le=16, description="members of the ensemble")
+    num_members: int = Field(default=3, ge=1, le=16, description="members of the ensemble")
     heldout_share: float = Field(default=0.08, gt=0, lt=1, description="share of held-out scenes")
     jobs: int = Field(default=2, ge=1, le=64, description="members trained in parallel")
     labelled_share: float = Field(
