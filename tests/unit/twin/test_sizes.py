@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError
+from dextouch.schemas import RolloutStart
 from services.twin.episodes import record
 from services.twin.scene import compile_scene
 from services.twin.settings import TwinSettings
 from services.twin.sizes import Geometry, Sizes
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions, episode_id
+from services.twin.world import TwinWorld
 
 
 @pytest.fixture(scope="module")
@@ -95,3 +97,13 @@ def test_fixed_objects_keep_their_size():
     wide = taken(stage, width=1.2).attributes.object_boxes_m
     assert wide[0][3] == pytest.approx(1.2 * usual[0][3])
     assert wide[1] == usual[1]
+
+
+def test_rollouts_of_a_twin_with_other_sizes_begin_and_stay_with_them():
+    settings = TwinSettings(cameras=(), image_height_px=16, image_width_px=16, object_width=0.8)
+    twin = TwinWorld(settings)
+    assert twin.description.digest != TwinWorld(TwinSettings(cameras=())).description.digest
+    for seed in (40000, 40001):
+        twin.reset(RolloutStart("stand_bottle", seed, ""))
+        height_m = twin.stage("stand_bottle").simulation.object_poses()[0, 2]
+        assert height_m == pytest.approx(0.0272, abs=3e-4)
