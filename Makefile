@@ -84,8 +84,8 @@ stress: $(VENV)/.dev     ## check every stage against numerical hazards; ARGS="-
 # Run again to resume after an interruption. The last step reports which bounds are met and which figures match docs/evaluator.json.
 reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's state model, success probe and cloned policies, and measure them, in runs/reproduce
 	$(BIN)/dextouch train data --store $(MADE)/train --count 800 --images 4 --varied 0.7 --resized 0.2
-	$(BIN)/dextouch train data --store $(MADE)/judge --first 1000 --count 300 --images 4 --varied 0.7 --resized 0.2
-	$(BIN)/dextouch train data --store $(MADE)/kinds --mix development --first 21000 --count 60 --images 4
+	$(BIN)/dextouch train data --store $(MADE)/judge --first 1000 --count 200 --images 4 --varied 0.7 --resized 0.2
+	$(BIN)/dextouch train data --store $(MADE)/kinds --mix development --first 21000 --count 150 --images 4
 	$(BIN)/dextouch train data --store $(MADE)/development --mix ladder --first 20000 --count 144 --images 4
 	$(BIN)/dextouch train state --episodes $(MADE)/train --output $(MADE)/state.safetensors --jobs 3
 	$(BIN)/dextouch train imagined --episodes $(MADE)/judge --store $(MADE)/imagined \

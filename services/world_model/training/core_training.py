@@ -82,7 +82,7 @@ def train_core(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         core = initial or RecurrentCore(config)
-        describe(core, data.table)
+        describe(core, data.table, widens=initial is not None)
 
         def loss() -> Tensor:
             return core_loss(core, data, _draw(data, settings, generator, rng), settings)
@@ -93,16 +93,23 @@ def train_core(
 
 
 @torch.no_grad()
-def describe(core: RecurrentCore, table: SceneTable) -> None:
-    """Tell a core the objects of every task, and the range of the hands' motion."""
+def describe(core: RecurrentCore, table: SceneTable, *, widens: bool = False) -> None:
+    """Set a core's objects of every task, and the range of the hands' motion.
+
+    Args:
+        core: its buffers are changed.
+        table: training episodes.
+        widens: whether the range that the core already has is kept, and widened.
+    """
     core.boxes_m.copy_(table.boxes_m)
     core.movable.copy_(table.movable())
     rows = torch.arange(0, len(table), max(1, len(table) // _FIT_EPISODES))
     commands = table.commands(rows, 0, torch.zeros(len(rows), dtype=torch.bool))
     wrist_m = commands.points_m[:, :, -1, :, 0]
     own = own_features(commands, torch.cat([wrist_m[:, :1], wrist_m], dim=1)).flatten(0, 2)
-    core.lowest.copy_(own.amin(0))
-    core.highest.copy_(own.amax(0))
+    lowest, highest = own.amin(0), own.amax(0)
+    core.lowest.copy_(torch.minimum(core.lowest, lowest) if widens else lowest)
+    core.highest.copy_(torch.maximum(core.highest, highest) if widens else highest)
 
 
 def start_steps(table: SceneTable) -> list[int]:

@@ -135,7 +135,9 @@ def train_state(settings: StateTrainSettings) -> StateReport:
             distance=measured.distance,
             horizon_latents=measured.num_latents,
             of_chunks=True,
-        ),
+        )
+        if base is None
+        else base.checkpoint.metadata.bounds,
         command=_command(settings),
         seed=settings.seed,
         training_cpu_s=round(cpu_s, 1),

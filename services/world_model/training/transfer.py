@@ -63,6 +63,8 @@ class Base:
         core, known = RecurrentCore(config), self.checkpoint.dynamics.core
         kept = {name: value[member : member + 1] for name, value in known.named_parameters()}
         core.load_state_dict(kept, strict=False)
+        core.lowest.copy_(known.lowest)
+        core.highest.copy_(known.highest)
         core.requires_grad_(requires_grad=False)
         core.success.requires_grad_(requires_grad=True)
         return core
