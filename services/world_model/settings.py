@@ -8,7 +8,6 @@ from pydantic_settings import (
     BaseSettings,
     CliImplicitFlag,
     PydanticBaseSettingsSource,
-    SettingsConfigDict,
 )
 
 from dextouch.command_line import JSON_HELP
@@ -235,7 +234,7 @@ class CoreLossWeights(FrozenModel):
 class CoreSettings(FrozenModel):
     """Training of recurrent cores."""
 
-    num_steps: NumSteps = 4000
+    num_steps: NumSteps = 3500
     batch: Batch = 64
     learning_rate: LearningRate = 2e-3
     weight_decay: WeightDecay = 0.05
@@ -287,7 +286,7 @@ class StateTrainSettings(FrozenModel):
     core: CoreSettings = Field(default=CoreSettings(), description="training of recurrent cores")
     renderer: RendererConfig = Field(default=RendererConfig(), description="shape of the renderer")
     drawing: RendererTraining = Field(
-        default=RendererTraining(cpu_budget_s=1400.0), description="training of the renderer"
+        default=RendererTraining(), description="training of the renderer"
     )
 
 
@@ -298,11 +297,7 @@ class TrainStateCommand(CommandSettings, StateTrainSettings):
       dextouch train state --episodes runs/episodes --output runs/state.safetensors
     """
 
-    model_config = SettingsConfigDict(
-        **service_config("world_model_train_state", "dextouch train state"),
-        # One flag of `drawing` leaves its other defaults, which are not those of its class.
-        nested_model_default_partial_update=True,
-    )
+    model_config = service_config("world_model_train_state", "dextouch train state")
 
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 

@@ -17,8 +17,8 @@ from services.world_model.dynamics.nested import mapped
 class Commands:
     """Motion of both hands at the sampled steps of each latent.
 
-    `points_m` are those of `HandMotion` at the middle and the end of each latent, `axes` and
-    `joints_rad` at its end.
+    `points_m` are those of `HandMotion` at the `LOOKS` of each latent, `axes` and `joints_rad` at
+    its end.
     """
 
     points_m: Float32[Tensor, "batch latents looks 2 points 3"]

@@ -23,7 +23,7 @@ from services.world_model.dynamics.configuration import (
     STEPS_PER_LATENT,
     DynamicsConfig,
 )
-from services.world_model.dynamics.features import SLOT_SIZE, compressed, slot_features
+from services.world_model.dynamics.features import LOOKS, SLOT_SIZE, compressed, slot_features
 from services.world_model.dynamics.hand_motion import NUM_POINTS
 from services.world_model.dynamics.member_layers import MemberGRU, MemberLinear, MemberNorm
 from services.world_model.dynamics.nested import combined
@@ -39,8 +39,8 @@ _SIDES = 2
 _SLOT_WIDTH, _HAND_WIDTH = 64, 96
 # Of an object: size (6), movability, presence, uncertainty, height, and way from the start (3).
 _ABOUT_SIZE = 6 + 1 + 1 + 1 + 1 + 3
-# Joints, wrist axes, heights of the points at two looks, wrist velocity (twice scaled), side.
-_OWN_SIZE = 20 + 6 + 2 * NUM_POINTS + 2 * 3 + 1
+# Joints, wrist axes, heights of the points at all looks, wrist velocity (twice scaled), side.
+_OWN_SIZE = 20 + 6 + len(LOOKS) * NUM_POINTS + 2 * 3 + 1
 # At first, objects move with no hand.
 _BY_ITSELF = 2.0
 
