@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
+from functools import cache
 from typing import Any, TypeVar
 
 import torch
@@ -26,16 +27,21 @@ def named(
     else:
         made = type(first)(
             **{
-                field.name: named(
-                    [getattr(part, field.name) for part in parts],
+                field: named(
+                    [getattr(part, field) for part in parts],
                     change,
-                    f"{name}.{field.name}".removeprefix("."),
+                    f"{name}.{field}" if name else field,
                 )
-                for field in fields(first)
+                for field in _names(first.__class__)
             }
         )
     result: Part = made
     return result
+
+
+@cache
+def _names(kind: type) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))
 
 
 def mapped(part: Part, change: Callable[[Tensor], Tensor]) -> Part:
