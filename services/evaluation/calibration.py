@@ -165,7 +165,8 @@ def fit_combination(
 
     Logistic regression as in `fit_calibration`, with a weak prior towards the mean of both log
     odds. An estimate that would count negatively is left out. The band is the narrowest that keeps
-    the risk, so it decides as many endings as possible; where none keeps it, nothing is decided.
+    the risk, so it decides as many endings as possible. Where fewer than `LEAST_DECIDED` would be
+    decided, twice the risk is allowed; where no band keeps that, nothing is decided.
 
     Args:
         probe: [n] calibrated probabilities of the classifier.
@@ -192,7 +193,10 @@ def fit_combination(
     if not agreed.any():
         return fitted.model_copy(update={"band": _WHOLE_BAND})
     joint = fitted.probabilities(told, estimated)[agreed]
-    band = undecided_band(joint, outcomes[agreed], risk=risk, widest=_WHOLE_BAND)
+    for allowed in (risk, 2 * risk):
+        band = undecided_band(joint, outcomes[agreed], risk=allowed, widest=_WHOLE_BAND)
+        if np.mean(np.abs(joint - 0.5) > band) >= LEAST_DECIDED:
+            break
     return fitted.model_copy(update={"band": band})
 
 
