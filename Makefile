@@ -90,7 +90,7 @@ reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's st
 	$(BIN)/dextouch train state --episodes $(MADE)/train --output $(MADE)/state.safetensors --jobs 3
 	$(BIN)/dextouch train imagined --episodes $(MADE)/judge --store $(MADE)/imagined \
 		--checkpoint $(MADE)/state.safetensors
-	$(BIN)/dextouch train imagined --episodes $(MADE)/train --seeds 0:300 --store $(MADE)/imagined \
+	$(BIN)/dextouch train imagined --episodes $(MADE)/train --seeds 0:100 --store $(MADE)/imagined \
 		--checkpoint $(MADE)/state.safetensors
 	$(BIN)/dextouch train imagined --episodes $(MADE)/development --store $(MADE)/imagined_development \
 		--checkpoint $(MADE)/state.safetensors

@@ -64,10 +64,11 @@ class Reading:
 
 
 class StartReader(nn.Module):
-    """Predicts object poses, their uncertainty and presence probabilities from the first step.
+    """Predicts object poses, sizes, their uncertainty and presence from one observed step.
 
-    Channels of the image are standardized, so that exposure, gain and the colour of the light
-    have no effect.
+    Feature points of the whole image give a first guess; a crop about each guess, with the hands as
+    seen from there, corrects it. Channels of the image are standardized, so that exposure, gain and
+    the colour of the light have no effect.
 
     Args:
         config: configuration of the dynamics model.
