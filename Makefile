@@ -7,7 +7,7 @@ LEROBOT_VENV ?= .venv-lerobot
 OPENPI_VENV ?= .venv-openpi
 LEROBOT_POLICY_VENV ?= .venv-lerobot-policy
 RAY_VENV ?= .venv-ray
-STAGE ?= store loader acquisition clocks calibration retargeting alignment closure twin world-model evaluator agreement rollouts
+STAGE ?= store loader acquisition clocks calibration retargeting alignment closure twin world-model starts evaluator agreement rollouts
 MADE := runs/reproduce
 DOCS_VENV ?= .venv-docs
 SITE := build/docs
@@ -83,18 +83,21 @@ stress: $(VENV)/.dev     ## check every stage against numerical hazards; ARGS="-
 
 # Run again to resume after an interruption. The last step reports which bounds are met and which figures match docs/evaluator.json.
 reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's state model, success probe and cloned policies, and measure them, in runs/reproduce
-	$(BIN)/dextouch train data --store $(MADE)/train --count 800 --images 4 --varied 0.7
-	$(BIN)/dextouch train data --store $(MADE)/judge --first 1000 --count 300 --images 4 --varied 0.7
+	$(BIN)/dextouch train data --store $(MADE)/train --count 800 --images 4 --varied 0.7 --resized 0.2
+	$(BIN)/dextouch train data --store $(MADE)/judge --first 1000 --count 200 --images 4 --varied 0.7 --resized 0.2
+	$(BIN)/dextouch train data --store $(MADE)/kinds --mix development --first 21000 --count 150 --images 4
 	$(BIN)/dextouch train data --store $(MADE)/development --mix ladder --first 20000 --count 144 --images 4
 	$(BIN)/dextouch train state --episodes $(MADE)/train --output $(MADE)/state.safetensors --jobs 3
 	$(BIN)/dextouch train imagined --episodes $(MADE)/judge --store $(MADE)/imagined \
 		--checkpoint $(MADE)/state.safetensors
-	$(BIN)/dextouch train imagined --episodes $(MADE)/train --seeds 0:300 --store $(MADE)/imagined \
+	$(BIN)/dextouch train imagined --episodes $(MADE)/train --seeds 0:100 --store $(MADE)/imagined \
 		--checkpoint $(MADE)/state.safetensors
 	$(BIN)/dextouch train imagined --episodes $(MADE)/development --store $(MADE)/imagined_development \
 		--checkpoint $(MADE)/state.safetensors
+	$(BIN)/dextouch train imagined --episodes $(MADE)/kinds --store $(MADE)/imagined_development \
+		--checkpoint $(MADE)/state.safetensors
 	$(BIN)/dextouch train probe --episodes $(MADE)/train --episodes $(MADE)/judge --episodes $(MADE)/imagined \
-		--development $(MADE)/development --development $(MADE)/imagined_development \
+		--development $(MADE)/development --development $(MADE)/kinds --development $(MADE)/imagined_development \
 		--output $(MADE)/success_probe.safetensors --training.num-training-steps 1500 --training.held-out-share 0.1
 	$(BIN)/dextouch train data --store $(MADE)/exact --mix exact --first 700 --count 50 --images 8
 	$(BIN)/dextouch train policy --episodes $(MADE)/train --episodes $(MADE)/exact --early-at 0.1 \

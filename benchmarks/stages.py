@@ -83,6 +83,15 @@ STAGES = {
         "starts, and mean and worst of several training seeds. Results are kept in --keep, so an "
         "interrupted run resumes.",
     ),
+    "starts": StageEntry(
+        "benchmarks.starts",
+        "read starts under other cameras, amid episodes and with objects of other sizes",
+        "Starts the state model from observations of the twin whose image another camera might "
+        "have taken (exposure, colour, contrast, blur, noise, JPEG, a shift), from steps 32 and 64 "
+        "of a take, and with objects of other widths. Reports the error of every object's "
+        "position at the start, whether it is within what the readers expect of themselves, and "
+        "the success of the exact script, real and imagined, with how much of it is decided.",
+    ),
     "rollouts": StageEntry(
         "benchmarks.rollouts.benchmark",
         "time a chunk of a rollout, compared with an echo of the same bytes",

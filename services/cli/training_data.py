@@ -17,6 +17,7 @@ import os
 import re
 import shlex
 import time
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
@@ -41,6 +42,7 @@ from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TruthEpisode, episode_id, record, write_episode
 from services.twin.hands import DOMAINS, Domain
 from services.twin.settings import TwinSettings
+from services.twin.sizes import Sizes
 from services.twin.stage import Stage
 from services.twin.take_options import STREAM_CHOICES, PlayedActions, StreamChoice, TakeOptions
 from services.twin.tasks import EVALUATED, TASK_NAMES, TASK_SETS, named_tasks
@@ -49,7 +51,7 @@ from services.twin.world import TwinWorld
 CAMERAS = ("camera_head",)
 DEFAULT_MIX = "evaluator"
 MAX_LABEL = 32
-_VARIED_DRAW: Final = 103
+_VARIED_DRAW, _SIZES_DRAW = 103, 104
 # How a take becomes an episode: written as it is, or by devices, drivers, recorder and alignment.
 TakePath = Literal["direct", "devices"]
 TAKE_PATHS: Final[tuple[TakePath, ...]] = get_args(TakePath)
@@ -62,7 +64,8 @@ Result = TypeVar("Result")
 class Scope:
     """Tasks, domains, images and streams to record.
 
-    In a share `varied` of the scenes, colours, light and head camera are drawn anew. Images are
+    In a share `varied` of the scenes, colours, light and head camera are drawn anew, in a share
+    `resized` the sizes of the objects. Images are
     recorded at the grid steps (15 Hz) that are multiples of `image_every`, and at the last three.
     Without a `path` robots are written directly and humans by devices: the actions of a human take
     that is written directly are the joint angles of a human hand.
@@ -74,6 +77,7 @@ class Scope:
     streams: StreamChoice = "training"
     path: TakePath | None = None
     varied: float = 0.0
+    resized: float = 0.0
 
     def path_of(self, domain: Domain) -> TakePath:
         """The path of the takes of a domain."""
@@ -261,6 +265,7 @@ def make_training_data(
             options = replace(
                 made, images=CAMERAS, image_every=scope.image_every, streams=scope.streams,
                 varied=bool(np.random.default_rng([seed, _VARIED_DRAW]).random() < scope.varied),
+                sizes=_sizes(task, seed, scope),
             )  # fmt: skip
             orders += [
                 Order(task, domain, seed, options, store, policy, scope.path_of(domain))
@@ -285,6 +290,11 @@ def make_training_data(
                 episodes_per_s=1 / each_s, minutes_left=each_s * (len(missing) - done) / 60
             )
     return counts
+
+
+def _sizes(task: str, seed: int, scope: Scope) -> Sizes:
+    draw = np.random.default_rng([seed, zlib.crc32(task.encode()), _SIZES_DRAW])
+    return Sizes.drawn(draw) if draw.random() < scope.resized else Sizes()
 
 
 def in_processes(
@@ -356,6 +366,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--images", type=int, default=1, metavar="N", help=images)
     looks = "share of scenes with other colours, light and head camera (%(default)s)"
     add("--varied", type=float, default=0.0, metavar="SHARE", help=looks)
+    sizes = "share of takes whose objects are wider, narrower, higher or lower (%(default)s)"
+    add("--resized", type=float, default=0.0, metavar="SHARE", help=sizes)
     add("--streams", choices=STREAM_CHOICES, default="training", help="(%(default)s)")
     add("--jobs", type=int, help="processes (default: one per core)")
     add_json(parser)
@@ -369,7 +381,7 @@ def main(argv: Sequence[str]) -> int:
     mix = MIXES[arguments.mix].changed(miss=arguments.miss_fraction, still=arguments.still_fraction)
     tasks = named_tasks(arguments.tasks)
     scope = Scope(tasks, arguments.domains, arguments.images, arguments.streams, arguments.path,
-                  arguments.varied)  # fmt: skip
+                  arguments.varied, arguments.resized)  # fmt: skip
     log_warnings()
     policy = arguments.policy and PolicyChoice.parse(arguments.policy, arguments.policy_arguments)
     counts = make_training_data(

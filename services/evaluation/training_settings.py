@@ -90,7 +90,7 @@ class ProbeSettings(FrozenModel):
         default=0.05, gt=0, lt=1, description="allowed share of errors among decided endings"
     )
     imagined_risk: float = Field(
-        default=0.10,
+        default=0.05,
         gt=0,
         lt=1,
         description="the same for imagined endings of worlds that estimate success",

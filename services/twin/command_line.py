@@ -19,6 +19,7 @@ from services.twin.hands import DOMAINS, Domain
 from services.twin.mistakes import KINDS, Mistake
 from services.twin.motions import MOTION_KINDS, Motion
 from services.twin.settings import TwinSettings
+from services.twin.sizes import Sizes
 from services.twin.stage import Stage
 from services.twin.take_options import STREAM_CHOICES, TakeOptions
 from services.twin.tasks import TASK_NAMES
@@ -123,6 +124,14 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument(
         "--varied", action="store_true", help="vary colours, light and head camera by seed"
     )
+    for name, axes in (("width", "x and y"), ("height", "z")):
+        make.add_argument(
+            f"--{name}",
+            type=float,
+            default=1.0,
+            metavar="FACTOR",
+            help=f"of objects that hands can carry, along {axes} of their frames (%(default)s)",
+        )
     make.add_argument("--cameras", nargs="*", default=list(CAMERAS), choices=CAMERAS, help="(all)")
     make.add_argument(
         "--image-every",
@@ -165,6 +174,7 @@ def _orders(arguments: argparse.Namespace) -> list[TakeOrder]:
             arguments.streams,
             tuple(arguments.mistake),
             arguments.varied,
+            Sizes(arguments.width, arguments.height),
         )
         orders.append(TakeOrder(arguments.task, arguments.domain, seed, options, arguments.store))
     return orders

@@ -1,13 +1,14 @@
 """Composition of training data sets, selected by `--mix` of `dextouch train data`."""
 
 import zlib
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from dextouch.errors import InvalidInputError
-from services.twin.mistakes import TRAINING, Mistake
+from services.twin.mistakes import DEVELOPMENT, TRAINING, Mistake
 from services.twin.motions import MOTION_KINDS, Motion, MotionKind
 from services.twin.take_options import TakeOptions
 
@@ -45,7 +46,8 @@ class Mix:
     the noise of a script: `miss` has displaced objects; `frozen` stops midway and `hold` never
     starts; `retreat`, `push`, `slip` and `wander` are motions of `services.twin.motions`;
     `other_scene` plays the actions of another seed; `mistaken` has one to four of the mistakes
-    `services.twin.mistakes.TRAINING`, half of them in a script that is also noisy.
+    `services.twin.mistakes.TRAINING`, two of five in a script that is also noisy;
+    `otherwise_mistaken` has one of the kinds `services.twin.mistakes.DEVELOPMENT`.
     """
 
     exact: float = 0.0
@@ -62,6 +64,7 @@ class Mix:
     other_scene: float = 0.0
     wander: float = 0.0
     mistaken: float = 0.0
+    otherwise_mistaken: float = 0.0
 
     def __post_init__(self) -> None:
         shares = asdict(self)
@@ -105,6 +108,7 @@ MIXES: Final[dict[str, Mix]] = {
     ),
     "demonstrations": Mix(exact=0.28, medium=0.52, miss=0.20),
     "ladder": Mix(ladder=1.0),
+    "development": Mix(ladder=0.4, otherwise_mistaken=0.6),
     "exact": Mix(exact=1.0),
 }  # fmt: skip
 
@@ -125,16 +129,16 @@ def options_of(task: str, seed: int, mix: Mix) -> TakeOptions:
     if kind in {"frozen", "hold"}:
         step = int(draw.integers(*_FROM_STEPS["frozen"]))
         return TakeOptions(noise_m, frozen_from_step=step) if kind == "frozen" else _HOLD
-    if kind == "miss":
-        return TakeOptions(noise_m, miss=True)
     if kind == "other_scene":
         return TakeOptions(noise_m, actions_of_seed=_another_seed(seed, draw))
-    if kind in SCRIPTS:
-        return TakeOptions(noise_m)
+    if kind in MOTION_KINDS:
+        return _with_motion(kind, noise_m, draw)
+    if kind == "otherwise_mistaken":
+        return TakeOptions(mistakes=(_one_of(DEVELOPMENT, draw),))
     if kind == "mistaken":
         noise_m = _noise_m("fine", seed, draw) if draw.random() < _NOISY else 0.0
         return TakeOptions(noise_m, mistakes=mistakes_of(task, draw))
-    return _with_motion(kind, noise_m, draw)
+    return TakeOptions(noise_m, miss=kind == "miss")
 
 
 def mistakes_of(task: str, draw: np.random.Generator) -> tuple[Mistake, ...]:
@@ -144,6 +148,10 @@ def mistakes_of(task: str, draw: np.random.Generator) -> tuple[Mistake, ...]:
     largest = STRENGTHS.get(task, 1.0) / count**0.5
     strengths = np.round(draw.uniform(0, largest, size=count), 3)
     return tuple(Mistake(str(kind), float(s)) for kind, s in zip(kinds, strengths, strict=True))
+
+
+def _one_of(kinds: Collection[str], draw: np.random.Generator) -> Mistake:
+    return Mistake(str(draw.choice(list(kinds))), float(np.round(draw.uniform(), 3)))
 
 
 def _with_motion(kind: str, noise_m: float, draw: np.random.Generator) -> TakeOptions:

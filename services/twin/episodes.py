@@ -59,8 +59,11 @@ def record(
         options: options of the take; they determine the commands unless `played` is given.
         played: actions from another source.
     """
-    plan = stage.plan(seed, noise_m=options.noise_m, miss=options.miss, varied=options.varied)
-    stage.dress(seed, varied=options.varied)
+    sizes = options.sizes
+    plan = stage.plan(
+        seed, noise_m=options.noise_m, miss=options.miss, varied=options.varied, sizes=sizes
+    )
+    stage.dress(seed, varied=options.varied, sizes=sizes)
     anchor = stage.start(plan)
     # Commands are converted to 67-D and back, so that the take exactly follows its
     # `action_commanded`.

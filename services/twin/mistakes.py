@@ -301,6 +301,20 @@ def _sweep(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
     return take.of(Ts)
 
 
+def _wrong_object(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
+    """Until they hold something, hands go towards another object, or beside the right one."""
+    places_m = take.scene.object_poses[:, :2]
+    first = int(draw.integers(len(places_m)))
+    way_m = _direction(draw, 2) * 0.12
+    if len(places_m) > 1 and draw.random() < 0.6:
+        other = int(draw.choice(np.delete(np.arange(len(places_m)), first)))
+        way_m = places_m[other] - places_m[first]
+    side = _one_side(take, draw)[..., None]
+    later = take.closing_step + draw.uniform(2, 40)
+    back = (1 - _ramp(later, later + 10))[:, None]
+    return take.shifted(side * strength * _onset() * back * [*way_m, 0.0])
+
+
 def _jitter(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
     tau_s = draw.uniform(0.1, 0.8)
     moved = take.shifted(_onset() * _correlated(draw, tau_s, 3) * 0.012 * strength)
@@ -448,6 +462,7 @@ TRAINING: Final[dict[str, Kind]] = {
     "release": _release,
     "bumps": _bumps,
     "sweep": _sweep,
+    "wrong_object": _wrong_object,
     "jitter": _jitter,
     "drift": _drift,
     "second_half": _second_half,

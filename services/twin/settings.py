@@ -17,6 +17,13 @@ class TwinSettings(FrozenModel):
     )
     image_height_px: int = Field(default=64, ge=16, le=512, description="height of every image")
     image_width_px: int = Field(default=64, ge=16, le=512, description="width of every image")
+    object_width: float = Field(
+        default=1.0,
+        ge=0.5,
+        le=1.5,
+        description="factor of the width of objects that can be carried",
+    )
+    object_height: float = Field(default=1.0, ge=0.5, le=1.5, description="and of their height")
     settle_s: float = Field(
         default=0.2, ge=0.0, le=2.0, description="seconds that objects settle before a take"
     )

@@ -9,6 +9,7 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import transform_from_pose
 from dextouch.hands.actions import AnchorPoses, HandTrajectory
+from services.twin.bounding_boxes import object_boxes_m
 from services.twin.cameras import CameraRig
 from services.twin.demonstrators import (
     WaypointNoise,
@@ -21,6 +22,7 @@ from services.twin.hands import Domain
 from services.twin.scene import compile_scene
 from services.twin.settings import TwinSettings
 from services.twin.simulation import Command, Simulation
+from services.twin.sizes import USUAL, Geometry, Sizes
 from services.twin.tasks import get_task
 
 MAX_NOISE_M: Final = 0.2
@@ -58,12 +60,19 @@ class Stage:
             domain, objects=self.task.objects_mjcf(), object_names=self.task.object_names
         )
         self.simulation = Simulation(scene)
+        self._geometry, self._boxes_m = Geometry(scene), object_boxes_m(scene)
         self.rig = CameraRig(
             scene, height_px=settings.image_height_px, width_px=settings.image_width_px
         )
 
     def plan(
-        self, seed: int, *, noise_m: float = 0.0, miss: bool = False, varied: bool = False
+        self,
+        seed: int,
+        *,
+        noise_m: float = 0.0,
+        miss: bool = False,
+        varied: bool = False,
+        sizes: Sizes = USUAL,
     ) -> Plan:
         """Plan the take of a seed.
 
@@ -72,6 +81,7 @@ class Stage:
             noise_m: standard deviation of the demonstrator's error at each location, 0 … 0.2 m.
             miss: whether the objects are moved away, unknown to the demonstrator.
             varied: whether the head camera's home differs from take to take.
+            sizes: of the objects, unknown to the demonstrator; see `dress`.
         """
         if seed < 0 or not 0.0 <= noise_m <= MAX_NOISE_M:
             raise InvalidInputError(
@@ -93,6 +103,8 @@ class Stage:
         commands = follow(waypoints, head)
         if miss:
             placed = _displaced(placed, np.random.default_rng([seed, _MISS]))
+        if sizes != USUAL:
+            placed = self._geometry.on_the_same_level(placed, sizes, self._boxes_m)
         return Plan(placed, commands)
 
     def start(self, plan: Plan) -> AnchorPoses:
@@ -102,8 +114,12 @@ class Stage:
         )
         return self.anchor()
 
-    def dress(self, seed: int, *, varied: bool) -> None:
-        """Give a take its appearance: that of the task, or one drawn from the seed."""
+    def dress(self, seed: int, *, varied: bool, sizes: Sizes = USUAL) -> None:
+        """Give a take its appearance: that of the task, or one drawn from the seed.
+
+        Objects get their sizes, until the next take.
+        """
+        self._geometry.resize(sizes)
         look, scene = self.rig.own_appearance, self.simulation.scene
         if varied:
             draw = np.random.default_rng([seed, _LOOK])

@@ -14,6 +14,7 @@ from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.hands import Domain
 from services.twin.mistakes import Mistake
 from services.twin.motions import Motion
+from services.twin.sizes import USUAL, Sizes
 
 StreamChoice = Literal["all", "training"]
 STREAM_CHOICES: Final[tuple[StreamChoice, ...]] = get_args(StreamChoice)
@@ -29,9 +30,10 @@ class TakeOptions:
     replaces the script, and `actions_of_seed` plays the demonstration of another seed, relative to
     this take's start. `mistakes` change the commands of the script, in their order.
 
-    With `varied`, colours, light and the home of the head camera differ from take to take. Cameras
-    record at 30 Hz, or at grid steps that are multiples of `image_every` and the last three. With
-    `training`, only touch, images, actions, and object poses at grid steps are recorded.
+    With `varied`, colours, light and the home of the head camera differ from take to take; `sizes`
+    are those of the objects, unknown to the demonstrator. Cameras record at 30 Hz, or at grid steps
+    that are multiples of `image_every` and the last three. With `training`, only touch, images,
+    actions, and object poses at grid steps are recorded.
     """
 
     noise_m: float = 0.0
@@ -44,6 +46,7 @@ class TakeOptions:
     streams: StreamChoice = "all"
     mistakes: tuple[Mistake, ...] = ()
     varied: bool = False
+    sizes: Sizes = USUAL
 
     def __post_init__(self) -> None:
         frozen = self.frozen_from_step
@@ -91,6 +94,8 @@ class TakeOptions:
             words += ["--mistake", str(mistake)]
         if self.varied:
             words.append("--varied")
+        if self.sizes != USUAL:
+            words += ["--width", repr(self.sizes.width), "--height", repr(self.sizes.height)]
         return words
 
     def figures(self) -> dict[str, float]:
@@ -103,6 +108,8 @@ class TakeOptions:
         if self.actions_of_seed is not None:
             figures["actions_of_seed"] = float(self.actions_of_seed)
         figures |= {f"mistake_{one.kind}": one.strength for one in self.mistakes}
+        if self.sizes != USUAL:
+            figures |= {"width": self.sizes.width, "height": self.sizes.height}
         return figures
 
 
@@ -144,10 +151,8 @@ def episode_id(
         played: name of the `PlayedActions`, if there are any.
     """
     parts = ["twin", task, domain, f"{seed:06d}"]
-    if options.noise_m > 0:
-        parts.append(f"n{round(options.noise_m * 1e6)}um")
-    if options.miss:
-        parts.append("miss")
+    parts += [f"n{round(options.noise_m * 1e6)}um"] * (options.noise_m > 0)
+    parts += ["miss"] * options.miss
     if options.frozen_from_step is not None:
         parts.append(f"f{options.frozen_from_step}")
     if options.motion is not None:
@@ -155,8 +160,8 @@ def episode_id(
     if options.actions_of_seed is not None:
         parts.append(f"of{options.actions_of_seed:06d}")
     parts += [f"{one.kind}{round(1000 * one.strength)}" for one in options.mistakes]
-    if options.varied:
-        parts.append("varied")
+    parts += ["varied"] * options.varied
+    parts += options.sizes.labels
     if played is not None:
         parts.append(f"by_{played}")
     if options.image_every is not None:

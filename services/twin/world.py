@@ -26,6 +26,7 @@ from services.twin.simulation import (
     STEPS_PER_GRID,
     STEPS_PER_TACTILE,
 )
+from services.twin.sizes import Sizes
 from services.twin.stage import Stage, command_row
 from services.twin.tasks import TASK_NAMES, get_task
 
@@ -62,13 +63,16 @@ class TwinWorld:
             if camera not in CAMERAS:
                 raise UnknownNameError("camera", camera, list(CAMERAS))
         self._settings = settings
+        self._sizes = Sizes(settings.object_width, settings.object_height)
         self._stages: dict[str, Stage] = {}
         self._description = self._describe()
 
     def stage(self, task: str) -> Stage:
         """Stage of a task with robot hands, shared by all rollouts (in the last call's state)."""
         if task not in self._stages:
-            self._stages[get_task(task).name] = Stage(task, "robot", self._settings)
+            stage = Stage(task, "robot", self._settings)
+            stage.dress(0, varied=False, sizes=self._sizes)
+            self._stages[get_task(task).name] = stage
         return self._stages[task]
 
     def _describe(self) -> WorldDescription:
@@ -100,7 +104,7 @@ class TwinWorld:
                 "world twin: got a start with an observation, expected only a task and seed"
             )
         stage = self.stage(start.task)
-        anchor = stage.start(stage.plan(start.seed))
+        anchor = stage.start(stage.plan(start.seed, sizes=self._sizes))
         log = _StepLog(stage, self._settings.cameras)
         log.step()
         log.draw()

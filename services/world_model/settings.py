@@ -8,7 +8,6 @@ from pydantic_settings import (
     BaseSettings,
     CliImplicitFlag,
     PydanticBaseSettingsSource,
-    SettingsConfigDict,
 )
 
 from dextouch.command_line import JSON_HELP
@@ -235,7 +234,7 @@ class CoreLossWeights(FrozenModel):
 class CoreSettings(FrozenModel):
     """Training of recurrent cores."""
 
-    num_steps: NumSteps = 5000
+    num_steps: NumSteps = 3500
     batch: Batch = 64
     learning_rate: LearningRate = 2e-3
     weight_decay: WeightDecay = 0.05
@@ -265,8 +264,13 @@ class StateTrainSettings(FrozenModel):
         default=Path("runs/world_model/state.safetensors"), description="checkpoint to write"
     )
     name: str = Field(default="state", description="model name in the checkpoint")
+    base: Path | None = Field(
+        default=None,
+        description="state model to start from, for new tasks: its cores, touch codec and renderer "
+        "are kept, start readers and the estimate of success are trained",
+    )
     seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
-    num_members: int = Field(default=2, ge=1, le=16, description="members of the ensemble")
+    num_members: int = Field(default=3, ge=1, le=16, description="members of the ensemble")
     heldout_share: float = Field(default=0.08, gt=0, lt=1, description="share of held-out scenes")
     jobs: int = Field(default=2, ge=1, le=64, description="members trained in parallel")
     labelled_share: float = Field(
@@ -282,7 +286,7 @@ class StateTrainSettings(FrozenModel):
     core: CoreSettings = Field(default=CoreSettings(), description="training of recurrent cores")
     renderer: RendererConfig = Field(default=RendererConfig(), description="shape of the renderer")
     drawing: RendererTraining = Field(
-        default=RendererTraining(cpu_budget_s=1400.0), description="training of the renderer"
+        default=RendererTraining(), description="training of the renderer"
     )
 
 
@@ -293,11 +297,7 @@ class TrainStateCommand(CommandSettings, StateTrainSettings):
       dextouch train state --episodes runs/episodes --output runs/state.safetensors
     """
 
-    model_config = SettingsConfigDict(
-        **service_config("world_model_train_state", "dextouch train state"),
-        # One flag of `drawing` leaves its other defaults, which are not those of its class.
-        nested_model_default_partial_update=True,
-    )
+    model_config = service_config("world_model_train_state", "dextouch train state")
 
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 

@@ -88,7 +88,7 @@ def rollout_from_bytes(data: bytes, metadata: StateMetadata, digest: str) -> Sta
     anchor, K_head = AnchorPoses(*np.array(arrays["anchor"])), np.array(arrays["K_head"])
     check_geometry(anchor, K_head)
     memory = memory_from_arrays(arrays, config, metadata.num_members)
-    if int(memory.start[0].task[0]) != config.tasks.index(name):
+    if int(memory.start.task[0, 0]) != config.tasks.index(name):
         raise InvalidInputError(f"snapshot: its memory belongs to another task than {name!r}")
     first_reached = check_actions(arrays["first_reached"][None], where="snapshot")
     check_reach(first_reached)

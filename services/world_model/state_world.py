@@ -39,10 +39,11 @@ from services.world_model.dynamics.memory import (
 from services.world_model.dynamics.model import (
     PRESENCE_THRESHOLD,
     ImaginedSteps,
+    mean_size,
     mean_start,
     pad_means_kpa,
 )
-from services.world_model.dynamics.objects import ObjectPoses, poses_from_objects
+from services.world_model.dynamics.objects import BOX_AXES, ObjectPoses, poses_from_objects
 from services.world_model.dynamics.start_reader import FirstStep
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import (
@@ -279,6 +280,8 @@ class StateWorld:
             np.concatenate([self._poses(mean_start(state.memory), state.task), poses]),
         )
         boxes_m = np.array(self._metadata.object_boxes_m[state.task])
+        size = mean_size(state.memory)[0, : len(boxes_m)].double().numpy()
+        boxes_m = boxes_m * size[:, BOX_AXES]
         return Drawing(state.image, state.K_head, start, states, boxes_m)
 
     def _drawn(
@@ -301,7 +304,7 @@ class StateWorld:
         disagreement_m = float(steps.disagreement_m[index].max())
         distance = float(steps.distance[index].max())
         count = len(self._metadata.object_names[state.task])
-        seen = torch.stack([start.objects.present[0, :count] for start in state.memory.start])
+        seen = state.memory.start.objects.present[..., :count]
         found = bool((seen > PRESENCE_THRESHOLD).all())
         reason = None
         if state.num_moving > DOUBTED_HORIZONS * bounds.horizon_latents:

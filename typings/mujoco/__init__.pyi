@@ -68,6 +68,13 @@ class MjModel:
     geom_rgba: np.ndarray
     jnt_axis: np.ndarray
     geom_size: np.ndarray
+    geom_pos: np.ndarray
+    geom_quat: np.ndarray
+    geom_aabb: np.ndarray
+    geom_rbound: np.ndarray
+    body_bvhadr: np.ndarray
+    body_bvhnum: np.ndarray
+    bvh_aabb: np.ndarray
     geom_type: np.ndarray
     jnt_dofadr: np.ndarray
     jnt_qposadr: np.ndarray

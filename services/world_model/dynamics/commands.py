@@ -10,14 +10,15 @@ from torch import Tensor
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT
 from services.world_model.dynamics.features import LOOKS
 from services.world_model.dynamics.hand_motion import HandMotion
+from services.world_model.dynamics.nested import mapped
 
 
 @dataclass(frozen=True)
 class Commands:
     """Motion of both hands at the sampled steps of each latent.
 
-    `points_m` are those of `HandMotion` at the middle and the end of each latent, `axes` and
-    `joints_rad` at its end.
+    `points_m` are those of `HandMotion` at the `LOOKS` of each latent, `axes` and `joints_rad` at
+    its end.
     """
 
     points_m: Float32[Tensor, "batch latents looks 2 points 3"]
@@ -32,6 +33,10 @@ class Commands:
         return Commands(
             self.points_m[:, latents], self.axes[:, latents], self.joints_rad[:, latents]
         )
+
+    def repeated(self, times: int) -> "Commands":
+        """The same commands for each of several members, whose entries follow each other."""
+        return mapped(self, lambda values: values.repeat(times, *[1] * (values.ndim - 1)))
 
     @classmethod
     def of(cls, motions: list[HandMotion]) -> "Commands":

@@ -9,7 +9,7 @@ Hidden units stay within −1 … 1 by construction, and predicted positions wit
 a rollout carries from one chunk to the next is bounded.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float32, Int64
@@ -23,9 +23,11 @@ from services.world_model.dynamics.configuration import (
     STEPS_PER_LATENT,
     DynamicsConfig,
 )
-from services.world_model.dynamics.features import SLOT_SIZE, compressed, slot_features
+from services.world_model.dynamics.features import LOOKS, SLOT_SIZE, compressed, slot_features
 from services.world_model.dynamics.hand_motion import NUM_POINTS
-from services.world_model.dynamics.objects import MAX_DISTANCE_M, ObjectPoses, rotations
+from services.world_model.dynamics.member_layers import MemberGRU, MemberLinear, MemberNorm
+from services.world_model.dynamics.nested import combined
+from services.world_model.dynamics.objects import BOX_AXES, MAX_DISTANCE_M, ObjectPoses, rotations
 
 NUM_PADS = 12
 # The contact of a hand's taxels is modelled as a mixture of this many patterns.
@@ -37,8 +39,8 @@ _SIDES = 2
 _SLOT_WIDTH, _HAND_WIDTH = 64, 96
 # Of an object: size (6), movability, presence, uncertainty, height, and way from the start (3).
 _ABOUT_SIZE = 6 + 1 + 1 + 1 + 1 + 3
-# Joints, wrist axes, heights of the points at two looks, wrist velocity (twice scaled), side.
-_OWN_SIZE = 20 + 6 + 2 * NUM_POINTS + 2 * 3 + 1
+# Joints, wrist axes, heights of the points at all looks, wrist velocity (twice scaled), side.
+_OWN_SIZE = 20 + 6 + len(LOOKS) * NUM_POINTS + 2 * 3 + 1
 # At first, objects move with no hand.
 _BY_ITSELF = 2.0
 
@@ -49,16 +51,18 @@ class SceneStart:
 
     `touch` holds the latents of both hands, `pads_kpa` the mean pressures of the twelve pads (thumb
     … little, palm; left, right); `sd_m` is how uncertain each object's position is, on each axis of
-    the table; `commanded` is 1 for commanded actions and 0 for measured ones.
-    `task` selects the objects' boxes.
+    the table; `size` are factors of its usual width (x and y of its frame) and height (z);
+    `commanded` is 1 for commanded actions and 0 for measured ones. `task` selects the objects'
+    boxes.
     """
 
     objects: ObjectPoses
-    sd_m: Float32[Tensor, "batch objects"]
-    touch: Float32[Tensor, "batch 2 channels"]
-    pads_kpa: Float32[Tensor, "batch 12"]
-    task: Int64[Tensor, " batch"]
-    commanded: Float32[Tensor, " batch"]
+    sd_m: Float32[Tensor, "*batch objects"]
+    size: Float32[Tensor, "*batch objects 2"]
+    touch: Float32[Tensor, "*batch 2 channels"]
+    pads_kpa: Float32[Tensor, "*batch 12"]
+    task: Int64[Tensor, "*batch"]
+    commanded: Float32[Tensor, "*batch"]
 
 
 @dataclass(frozen=True)
@@ -69,21 +73,18 @@ class CoreState:
     position and axes.
     """
 
-    hidden: Float32[Tensor, "batch width"]
-    position_m: Float32[Tensor, "batch objects 3"]
-    axes: Float32[Tensor, "batch objects 2 3"]
-    wrist_m: Float32[Tensor, "batch 2 3"]
-    wrist_axes: Float32[Tensor, "batch 2 6"]
+    hidden: Float32[Tensor, "*batch width"]
+    position_m: Float32[Tensor, "*batch objects 3"]
+    axes: Float32[Tensor, "*batch objects 2 3"]
+    wrist_m: Float32[Tensor, "*batch 2 3"]
+    wrist_axes: Float32[Tensor, "*batch 2 6"]
 
     def where(self, chosen: Bool[Tensor, " batch"], other: "CoreState") -> "CoreState":
         """This state where chosen, another one elsewhere."""
-
-        def either(name: str) -> Tensor:
-            mine: Tensor = getattr(self, name)
-            shape = (-1, *[1] * (mine.ndim - 1))
-            return torch.where(chosen.view(shape), mine, getattr(other, name))
-
-        return CoreState(**{one.name: either(one.name) for one in fields(self)})
+        return combined(
+            [self, other],
+            lambda pair: torch.where(chosen.view(-1, *[1] * (pair[0].ndim - 1)), pair[0], pair[1]),
+        )
 
 
 @dataclass(frozen=True)
@@ -96,17 +97,21 @@ class SceneFuture:
     """
 
     objects: ObjectPoses
-    touch: Float32[Tensor, "batch latents 4 2 channels"]
-    contact: Float32[Tensor, "batch latents 4 12"]
-    pattern: Float32[Tensor, "batch latents 4 2 patterns"]
-    success: Float32[Tensor, "batch latents"]
+    touch: Float32[Tensor, "*batch latents 4 2 channels"]
+    contact: Float32[Tensor, "*batch latents 4 12"]
+    pattern: Float32[Tensor, "*batch latents 4 2 patterns"]
+    success: Float32[Tensor, "*batch latents"]
 
 
 class RecurrentCore(nn.Module):
     """Predicts object poses and touch from commands and a start.
 
+    The members of an ensemble are computed together: entries of the first member come first, then
+    those of the second, and so on, equally many of each.
+
     Args:
         config: configuration of the dynamics model.
+        members: number of members.
     """
 
     boxes_m: Tensor
@@ -114,10 +119,14 @@ class RecurrentCore(nn.Module):
     lowest: Tensor
     highest: Tensor
 
-    def __init__(self, config: DynamicsConfig) -> None:
+    def __init__(self, config: DynamicsConfig, members: int = 1) -> None:
         super().__init__()
-        self.config = config
+        self.config, self.members = config, members
         width, channels = config.width, config.touch_channels
+
+        def linear(inputs: int, outputs: int) -> MemberLinear:
+            return MemberLinear(members, inputs, outputs)
+
         # Not weights: what the objects of each task are.
         tasks = len(config.tasks)
         self.register_buffer("boxes_m", torch.zeros(tasks, MAX_OBJECTS, 6))
@@ -125,34 +134,34 @@ class RecurrentCore(nn.Module):
         self.register_buffer("lowest", torch.full((_OWN_SIZE,), -10.0))
         self.register_buffer("highest", torch.full((_OWN_SIZE,), 10.0))
         self.slot = nn.Sequential(
-            nn.Linear(SLOT_SIZE + _ABOUT_SIZE, 128), nn.GELU(),
-            nn.Linear(128, _SLOT_WIDTH), nn.GELU(),
+            linear(SLOT_SIZE + _ABOUT_SIZE, 128), nn.GELU(),
+            linear(128, _SLOT_WIDTH), nn.GELU(),
         )  # fmt: skip
-        self.hand = nn.Sequential(nn.Linear(_SLOT_WIDTH + _OWN_SIZE, _HAND_WIDTH), nn.GELU())
+        self.hand = nn.Sequential(linear(_SLOT_WIDTH + _OWN_SIZE, _HAND_WIDTH), nn.GELU())
         self.mix = nn.Sequential(
-            nn.Linear(_SIDES * _HAND_WIDTH + 1, width), nn.LayerNorm(width), nn.GELU()
+            linear(_SIDES * _HAND_WIDTH + 1, width), MemberNorm(members, width), nn.GELU()
         )
         self.begin = nn.Sequential(
-            nn.Linear(NUM_PADS + _SIDES * channels + 1, width), nn.GELU(),
-            nn.Linear(width, width), nn.Tanh(),
+            linear(NUM_PADS + _SIDES * channels + 1, width), nn.GELU(),
+            linear(width, width), nn.Tanh(),
         )  # fmt: skip
-        self.memory = nn.GRUCell(width, width)
+        self.memory = MemberGRU(members, width, width)
         self.dropout = nn.Dropout(0.1)
         self.objects = nn.Sequential(
-            nn.Linear(width + _SIDES * _SLOT_WIDTH + _ABOUT_SIZE + 6, 128), nn.GELU()
+            linear(width + _SIDES * _SLOT_WIDTH + _ABOUT_SIZE + 6, 128), nn.GELU()
         )
         self.feel = nn.Sequential(
-            nn.Linear(width + _HAND_WIDTH + 1, 160), nn.GELU(), nn.Linear(160, 160), nn.GELU()
+            linear(width + _HAND_WIDTH + 1, 160), nn.GELU(), linear(160, 160), nn.GELU()
         )
-        self.touch = nn.Linear(160, STEPS_PER_LATENT * channels)
-        self.contact = nn.Linear(160, STEPS_PER_LATENT * (NUM_PADS // _SIDES))
-        self.pattern = nn.Linear(160, STEPS_PER_LATENT * NUM_PATTERNS)
-        self.taxels = nn.Linear(NUM_PATTERNS, NUM_TAXELS)
+        self.touch = linear(160, STEPS_PER_LATENT * channels)
+        self.contact = linear(160, STEPS_PER_LATENT * (NUM_PADS // _SIDES))
+        self.pattern = linear(160, STEPS_PER_LATENT * NUM_PATTERNS)
+        self.taxels = linear(NUM_PATTERNS, NUM_TAXELS)
         self.success = nn.Sequential(
-            nn.Linear(width + MAX_OBJECTS * (_ABOUT_SIZE + 6 + 3 + 3), 128), nn.GELU(),
-            nn.Dropout(0.2), nn.Linear(128, 1),
+            linear(width + MAX_OBJECTS * (_ABOUT_SIZE + 6 + 3 + 3), 128), nn.GELU(),
+            nn.Dropout(0.2), linear(128, 1),
         )  # fmt: skip
-        self.motion = nn.Linear(128, 3 + 3 + 6)
+        self.motion = linear(128, 3 + 3 + 6)
         nn.init.zeros_(self.motion.weight)
         with torch.no_grad():
             self.motion.bias.copy_(torch.tensor([0.0, 0.0, _BY_ITSELF, *[0.0] * 9]))
@@ -203,7 +212,7 @@ class RecurrentCore(nn.Module):
         there = start.objects.present * (torch.arange(MAX_OBJECTS) < counts[:, None])
         present = there[:, :used]
         first_m = start.objects.position_m[:, :used]
-        box = self.boxes_m[start.task, :used]
+        box = self.boxes_m[start.task, :used] * start.size[:, :used, BOX_AXES]
         moves = self.movable[start.task, :used] * present
         doubt = 5.0 * compressed(start.sd_m[:, :used])
         known = torch.cat([box * 10.0, torch.stack([moves, present, doubt], dim=-1)], dim=-1)

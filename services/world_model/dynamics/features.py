@@ -12,8 +12,8 @@ from torch import Tensor
 from services.world_model.dynamics.hand_motion import NUM_POINTS
 
 NEAR_M = 0.01
-# Features are computed at these two of the four steps of a latent: the middle and the end.
-LOOKS = (2, 4)
+# Features are computed at these of the four steps of a latent: hands may shake within one.
+LOOKS = (1, 2, 3, 4)
 # The wrist is left out: it touches nothing.
 _FIRST_POINT = 1
 _PER_POINT = 7

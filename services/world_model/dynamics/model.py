@@ -22,8 +22,9 @@ from services.world_model.dynamics.core import (
     SceneFuture,
     SceneStart,
 )
+from services.world_model.dynamics.nested import folded, stacked, unfolded
 from services.world_model.dynamics.objects import ObjectPoses
-from services.world_model.dynamics.start_reader import FirstStep, StartReader
+from services.world_model.dynamics.start_reader import FirstStep, Reading, StartReader
 from services.world_model.dynamics.stillness import REST_LATENTS, stillness
 from services.world_model.dynamics.touch_codec import FREE_KPA, TouchCodec
 
@@ -45,16 +46,16 @@ def pad_means_kpa(tactile_kpa: Float32[np.ndarray, "*batch 2 320"]) -> np.ndarra
 class SceneMemory:
     """State of the dynamics that a rollout carries from one chunk to the next.
 
-    `start` holds objects and touch at the first step for every member, `states` the states of the
-    cores, `poses` the current object poses (mean over members), `disagreement_m` the
-    ensemble disagreement about them, `success` the members' probability that the task is done at
-    the end, `points_m` the hand points when they last moved, and
-    `num_still` the number of latent steps since then (at least `REST_LATENTS` from the start on
-    for hands that touch nothing).
+    `start` holds objects and touch at the first step as every member knows them, `state` the state
+    of every member's core (both with axes members, batch, …), `poses` the current object poses
+    (mean over members), `disagreement_m` the ensemble disagreement about them, `success` the
+    members' probability that the task is done at the end, `points_m` the hand points when they last
+    moved, and `num_still` the number of latent steps since then (at least `REST_LATENTS` from the
+    start on for hands that touch nothing).
     """
 
-    start: tuple[SceneStart, ...]
-    states: tuple[CoreState, ...]
+    start: SceneStart
+    state: CoreState
     poses: ObjectPoses
     disagreement_m: Float32[Tensor, " batch"]
     tactile_kpa: Float32[Tensor, "batch 2 320"]
@@ -82,17 +83,8 @@ class ImaginedSteps:
     at_rest: Bool[Tensor, "batch latents"]
 
 
-class DynamicsMember(nn.Module):
-    """One start reader with its recurrent core."""
-
-    def __init__(self, config: DynamicsConfig) -> None:
-        super().__init__()
-        self.reader = StartReader(config)
-        self.core = RecurrentCore(config)
-
-
 class DynamicsModel(nn.Module):
-    """Ensemble members trained from different seeds, with a shared touch codec.
+    """Ensemble of start readers and cores trained from different seeds, with a shared touch codec.
 
     Args:
         config: configuration of every member.
@@ -103,7 +95,8 @@ class DynamicsModel(nn.Module):
         super().__init__()
         self.config = config
         self.codec = TouchCodec(config.touch_channels)
-        self.members = nn.ModuleList(DynamicsMember(config) for _ in range(num_members))
+        self.eyes = nn.ModuleList(StartReader(config) for _ in range(num_members))
+        self.core = RecurrentCore(config, num_members)
 
     @torch.no_grad()
     def begin(
@@ -123,23 +116,18 @@ class DynamicsModel(nn.Module):
             standing: the measured hands, from `Commands.standing`.
             commanded: 1 if the rollout's actions are commanded, 0 if they are measured.
         """
-        starts, states, success = [], [], []
-        touch = self.codec.encode(tactile_kpa)
-        for member in self._members():
-            reading = member.reader(first)
-            seen = (reading.objects, reading.sd_m)
-            start = SceneStart(*seen, touch, first.pads_kpa, first.task, commanded)
-            future, state = member.core(standing, start, member.core.first_state(start, standing))
-            starts.append(start)
-            states.append(state)
-            success.append(future.success[:, -1].sigmoid())
+        known = (self.codec.encode(tactile_kpa), first.pads_kpa, first.task, commanded)
+        readings: list[Reading] = [reader(first) for reader in self.readers()]
+        start = stacked([SceneStart(one.objects, one.sd_m, one.size, *known) for one in readings])
+        each, still = folded(start), standing.repeated(self.core.members)
+        future, state = self.core(still, each, self.core.first_state(each, still))
         return SceneMemory(
-            start=tuple(starts),
-            states=tuple(states),
-            poses=_mean([start.objects for start in starts]),
-            disagreement_m=_spread_m([start.objects for start in starts]),
+            start=start,
+            state=unfolded(state, self.core.members),
+            poses=_mean(start.objects),
+            disagreement_m=_spread_m(start.objects),
             tactile_kpa=torch.minimum(tactile_kpa, self.codec.peak_kpa),
-            success=torch.stack(success),
+            success=unfolded(future, self.core.members).success[..., -1].sigmoid(),
             points_m=standing.points_m[:, -1, -1],
             num_still=REST_LATENTS * (tactile_kpa.amax((1, 2)) < FREE_KPA).long(),
         )
@@ -176,25 +164,18 @@ class DynamicsModel(nn.Module):
         self, memory: SceneMemory, commands: Commands, at_rest: Bool[Tensor, " batch"]
     ) -> tuple[SceneMemory, "_Run"]:
         """Advance by latent steps during which the same entries are at rest."""
-        distance = torch.stack(
-            [
-                member.core.distance(commands, state.wrist_m)
-                for member, state in zip(self._members(), memory.states, strict=True)
-            ]
-        ).mean(0)
+        # The wrists are where they were commanded to be, for all members.
+        distance = self.core.distance(commands, memory.state.wrist_m[0])
         resting = _resting(memory, distance)
         if bool(at_rest.all()):
             return memory, resting
-        futures, states = [], []
-        for index, member in enumerate(self._members()):
-            before = memory.states[index]
-            future, state = member.core(commands, memory.start[index], before)
-            futures.append(future)
-            states.append(state.where(~at_rest, before))
-        run = _chosen(at_rest, resting, self._imagined(memory, futures, distance))
+        members = self.core.members
+        before = folded(memory.state)
+        future, state = self.core(commands.repeated(members), folded(memory.start), before)
+        run = _chosen(at_rest, resting, self._imagined(memory, future, distance))
         following = replace(
             memory,
-            states=tuple(states),
+            state=unfolded(state.where(~at_rest.repeat(members), before), members),
             poses=run.poses[:, -1],
             disagreement_m=run.disagreement_m[:, -1],
             tactile_kpa=run.tactile_kpa[:, -1],
@@ -204,28 +185,18 @@ class DynamicsModel(nn.Module):
 
     def readers(self) -> list[StartReader]:
         """The start reader of every member."""
-        return [member.reader for member in self._members()]
+        return [reader for reader in self.eyes if isinstance(reader, StartReader)]
 
-    def _members(self) -> list[DynamicsMember]:
-        return [member for member in self.members if isinstance(member, DynamicsMember)]
-
-    def _imagined(
-        self, memory: SceneMemory, futures: list[SceneFuture], distance: Tensor
-    ) -> "_Run":
-        objects = [future.objects for future in futures]
-        touch = torch.stack([future.touch for future in futures]).mean(0)
-        taxels = torch.stack(
-            [
-                member.core.taxels(future.pattern)
-                for member, future in zip(self._members(), futures, strict=True)
-            ]
-        ).mean(0)
+    def _imagined(self, memory: SceneMemory, future: SceneFuture, distance: Tensor) -> "_Run":
+        members = self.core.members
+        each = unfolded(future, members)
+        taxels = self.core.taxels(future.pattern).view(*each.pattern.shape[:-1], -1)
         return _Run(
-            poses=_between(memory.poses, _mean(objects)),
-            tactile_kpa=self.decode_touch(touch, taxels).flatten(1, 2),
-            disagreement_m=_spread_m(objects),
+            poses=_between(memory.poses, _mean(each.objects)),
+            tactile_kpa=self.decode_touch(each.touch.mean(0), taxels.mean(0)).flatten(1, 2),
+            disagreement_m=_spread_m(each.objects),
             distance=distance,
-            success=torch.stack([future.success.sigmoid() for future in futures]),
+            success=each.success.sigmoid(),
         )
 
     def decode_touch(
@@ -252,27 +223,30 @@ class _Run:
     success: Float32[Tensor, "members batch latents"]
 
 
-def _spread_m(poses: list[ObjectPoses]) -> Float32[Tensor, "*batch"]:
+def _spread_m(poses: ObjectPoses) -> Float32[Tensor, "*batch"]:
     """Largest standard deviation over members of the position of an object that is present."""
-    used = torch.stack([each.present for each in poses]).mean(0) > PRESENCE_THRESHOLD
-    positions = torch.stack([each.position_m for each in poses])
-    return (positions.std(0, correction=0).norm(dim=-1) * used).amax(-1)
+    used = poses.present.mean(0) > PRESENCE_THRESHOLD
+    return (poses.position_m.std(0, correction=0).norm(dim=-1) * used).amax(-1)
 
 
-def _mean(poses: list[ObjectPoses]) -> ObjectPoses:
-    """Mean over members; members that see no object do not contribute to its pose."""
-    present = torch.stack([each.present for each in poses])
-    share = present / present.sum(0).clamp_min(1e-6)
+def _mean(poses: ObjectPoses) -> ObjectPoses:
+    """Mean over members, the first axis; those that see no object do not contribute to its pose."""
+    share = poses.present / poses.present.sum(0).clamp_min(1e-6)
     return ObjectPoses(
-        (torch.stack([each.position_m for each in poses]) * share[..., None]).sum(0),
-        (torch.stack([each.axes for each in poses]) * share[..., None, None]).sum(0),
-        present.mean(0),
+        (poses.position_m * share[..., None]).sum(0),
+        (poses.axes * share[..., None, None]).sum(0),
+        poses.present.mean(0),
     )
 
 
 def mean_start(memory: SceneMemory) -> ObjectPoses:
     """Object poses at the start, averaged over members."""
-    return _mean([start.objects for start in memory.start])
+    return _mean(memory.start.objects)
+
+
+def mean_size(memory: SceneMemory) -> Float32[Tensor, "batch objects 2"]:
+    """Width and height of the objects as factors of the usual ones, averaged over members."""
+    return memory.start.size.mean(0)
 
 
 def _between(now: ObjectPoses, latents: ObjectPoses) -> ObjectPoses:

@@ -13,6 +13,10 @@ from services.world_model.dynamics.configuration import MAX_OBJECTS
 
 # Objects farther than this from the world's origin count as absent.
 MAX_DISTANCE_M = 1.0
+# Factors of the usual size that an object may have.
+SIZE_RANGE = (0.5, 2.0)
+# Which factor, width or height, each number of a box has: middle, half sizes; x, y, z.
+BOX_AXES = [0, 0, 1, 0, 0, 1]
 # Shorter axes have no direction.
 _SHORTEST = 1e-3
 

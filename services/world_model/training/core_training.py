@@ -23,6 +23,8 @@ _UNIT_M = 0.05
 _FIT_EPISODES = 1000
 # Assumed of readers where no label says it.
 _READER_SD_M = 0.004
+# Largest standard deviation of the logarithm of a size.
+_SIZE_SD = 0.06
 # Weight of the outcome as predicted at every latent step, relative to that at the last.
 _EARLY_SUCCESS = 0.2
 # Factor by which hands are held still more often at later starts, where fewer scenes allow it.
@@ -64,6 +66,7 @@ def train_core(
     *,
     seed: int,
     on_step: OnStep | None = None,
+    initial: RecurrentCore | None = None,
 ) -> RecurrentCore:
     """Train a core to predict scenes from any start step to the end.
 
@@ -73,12 +76,13 @@ def train_core(
         settings: number of steps, loss weights and so on.
         seed: seed of weights and sampling.
         on_step: called with the step and its loss.
+        initial: core to start from; those of its weights that require gradients are changed.
     """
     generator, rng = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        core = RecurrentCore(config)
-        describe(core, data.table)
+        core = initial or RecurrentCore(config)
+        describe(core, data.table, widens=initial is not None)
 
         def loss() -> Tensor:
             return core_loss(core, data, _draw(data, settings, generator, rng), settings)
@@ -89,16 +93,23 @@ def train_core(
 
 
 @torch.no_grad()
-def describe(core: RecurrentCore, table: SceneTable) -> None:
-    """Tell a core the objects of every task, and the range of the hands' motion."""
+def describe(core: RecurrentCore, table: SceneTable, *, widens: bool = False) -> None:
+    """Set a core's objects of every task, and the range of the hands' motion.
+
+    Args:
+        core: its buffers are changed.
+        table: training episodes.
+        widens: whether the range that the core already has is kept, and widened.
+    """
     core.boxes_m.copy_(table.boxes_m)
     core.movable.copy_(table.movable())
     rows = torch.arange(0, len(table), max(1, len(table) // _FIT_EPISODES))
     commands = table.commands(rows, 0, torch.zeros(len(rows), dtype=torch.bool))
     wrist_m = commands.points_m[:, :, -1, :, 0]
     own = own_features(commands, torch.cat([wrist_m[:, :1], wrist_m], dim=1)).flatten(0, 2)
-    core.lowest.copy_(own.amin(0))
-    core.highest.copy_(own.amax(0))
+    lowest, highest = own.amin(0), own.amax(0)
+    core.lowest.copy_(torch.minimum(core.lowest, lowest) if widens else lowest)
+    core.highest.copy_(torch.maximum(core.highest, highest) if widens else highest)
 
 
 def start_steps(table: SceneTable) -> list[int]:
@@ -140,6 +151,7 @@ def _draw(
         start=SceneStart(
             objects,
             sd_m,
+            _read_size(table.size[rows], generator),
             data.touch[rows, start_step].float(),
             table.pads_kpa[rows, start_step],
             table.task[rows],
@@ -187,6 +199,14 @@ def _start_objects(
         torch.where(known, noisy.present, read.present),
     )
     return objects, torch.where(known, sd_m, _READER_SD_M)
+
+
+def _read_size(
+    true: Float32[Tensor, "batch objects 2"], generator: torch.Generator
+) -> Float32[Tensor, "batch objects 2"]:
+    """Sizes with the noise of a reader, whose standard deviation is up to `_SIZE_SD`."""
+    sd = _SIZE_SD * torch.rand((len(true), 1, 1), generator=generator)
+    return true * (sd * torch.randn(true.shape, generator=generator)).exp()
 
 
 def _held_still(commands: Commands, held: Bool[Tensor, " batch"]) -> Commands:

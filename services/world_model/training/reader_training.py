@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
 from services.world_model.dynamics.objects import ObjectPoses
-from services.world_model.dynamics.start_reader import StartReader
+from services.world_model.dynamics.start_reader import Reading, StartReader
 from services.world_model.rendering.precision import uses_bfloat16
 from services.world_model.settings import ReaderSettings
 from services.world_model.training.augmentation import as_another_camera
@@ -21,6 +21,9 @@ _UNIT_M = 0.05
 _BATCH_OF_READING = 128
 _WEIGHT_DECAY = 1e-3
 _SD_WEIGHT = 0.02
+_SIZE_WEIGHT, _UNIT_LOG = 0.3, 0.1
+# Of the first guess, which the correction starts from.
+_GUESS_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ def train_reader(
     *,
     seed: int,
     on_step: OnStep | None = None,
+    initial: StartReader | None = None,
 ) -> StartReader:
     """Train a reader of objects from single steps, both first and later ones.
 
@@ -50,11 +54,12 @@ def train_reader(
         settings: number of steps and so on.
         seed: seed of weights and sampling.
         on_step: called with the step and its loss.
+        initial: reader to start from; its weights are changed.
     """
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        reader = StartReader(config)
+        reader = initial or StartReader(config)
     _fit_heights(reader, table, config)
     later = [step for step in table.image_steps if step % 4 == 0 and step > 0]
     known = torch.nonzero(table.labelled)[:, 0]
@@ -94,10 +99,18 @@ def _loss(
     table, rows, steps = places
     first, true = table.first_steps(rows, steps), table.objects_at(rows, steps)
     image, first = as_another_camera(first, generator)
-    reading = reader.read(image, first, bfloat16=bfloat16)
-    predicted = reading.objects
-    there = true.present
-    used = torch.arange(MAX_OBJECTS) < torch.tensor(reader.config.num_objects)[first.task][:, None]
+    guess, reading = reader.read(image, first, bfloat16=bfloat16)
+    size = table.size[rows]
+    return _error(reader, reading, true, size, first.task) + _GUESS_WEIGHT * _error(
+        reader, guess, true, size, first.task
+    )
+
+
+def _error(
+    reader: StartReader, reading: Reading, true: ObjectPoses, size: Tensor, task: Tensor
+) -> Float32[Tensor, ""]:
+    predicted, there = reading.objects, true.present
+    used = torch.arange(MAX_OBJECTS) < torch.tensor(reader.config.num_objects)[task][:, None]
     position = functional.smooth_l1_loss(
         predicted.position_m / _UNIT_M, true.position_m / _UNIT_M, beta=0.1, reduction="none"
     ).sum(-1)
@@ -108,7 +121,9 @@ def _loss(
     # Of a Gaussian on both axes of the table; the position is not trained by it.
     lateral_m = (predicted.position_m - true.position_m)[..., :2].detach().square().sum(-1)
     surprise = 2 * reading.sd_m.log() + lateral_m / (2 * reading.sd_m.square())
-    each = position + axes + _SD_WEIGHT * surprise
+    # Squared: of an unclear size the mean is wanted, not the usual size, which most objects have.
+    grown = ((reading.size.log() - size.log()) / _UNIT_LOG).square().sum(-1)
+    each = position + axes + _SD_WEIGHT * surprise + _SIZE_WEIGHT * grown
     return (each * there).sum() / there.sum().clamp_min(1.0) + 0.3 * (
         presence * used
     ).sum() / used.sum()

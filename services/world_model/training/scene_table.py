@@ -1,11 +1,11 @@
 """Tensors of whole episodes for training start readers and recurrent cores."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float16, Float32, Int64, UInt8
+from jaxtyping import Bool, Float16, Float32, Float64, Int64, UInt8
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError
@@ -21,7 +21,7 @@ from services.world_model.dynamics.core import NUM_PADS
 from services.world_model.dynamics.features import LOOKS
 from services.world_model.dynamics.hand_motion import HandMotion, hand_motion
 from services.world_model.dynamics.model import pad_means_kpa
-from services.world_model.dynamics.objects import ObjectPoses, objects_from_poses
+from services.world_model.dynamics.objects import SIZE_RANGE, ObjectPoses, objects_from_poses
 from services.world_model.dynamics.start_reader import FirstStep
 from services.world_model.dynamics.touch_codec import FREE_KPA
 from services.world_model.training.scene_episodes import SceneEpisode
@@ -54,8 +54,9 @@ class SceneTable:
 
     `images` are those of the steps `image_steps`; `in_contact` marks pads in contact; `sent` are
     commanded hands where available and measured ones elsewhere, as given by `commanded`.
-    `labelled` marks episodes whose object poses are trained on; `boxes_m` are the boxes of each
-    task's objects in their frames (middle, half sizes).
+    `labelled` marks episodes whose object poses are trained on; `boxes_m` are the usual boxes of
+    each task's objects in their frames (middle, half sizes), and `size` factors of their width and
+    height.
     """
 
     sent: HandTable
@@ -72,6 +73,7 @@ class SceneTable:
     success: Float32[Tensor, " episodes"]
     task: Int64[Tensor, " episodes"]
     labelled: Bool[Tensor, " episodes"]
+    size: Float32[Tensor, "episodes objects 2"]
     boxes_m: Float32[Tensor, "tasks objects 6"]
 
     def __len__(self) -> int:
@@ -224,6 +226,7 @@ def scene_table(
         sent.append(hand_motion(episode.actions, anchor))
     tactile = np.stack([episode.tactile_kpa for episode in episodes])
     objects = [objects_from_poses(episode.object_poses) for episode in episodes]
+    boxes_m = usual_boxes_m(episodes)
     return SceneTable(
         sent=HandTable.of(sent),
         measured=HandTable.of(measured),
@@ -243,17 +246,43 @@ def scene_table(
         success=torch.tensor([float(episode.success) for episode in episodes]),
         task=torch.tensor([config.tasks.index(episode.task) for episode in episodes]),
         labelled=torch.tensor(list(labelled) or [True] * len(episodes)),
-        boxes_m=_boxes_m(episodes, config),
+        size=torch.from_numpy(np.stack([_size(e, boxes_m[e.task]) for e in episodes])),
+        boxes_m=_padded(boxes_m, config),
     )
 
 
-def _boxes_m(
-    episodes: Sequence[SceneEpisode], config: DynamicsConfig
+def usual_boxes_m(episodes: Sequence[SceneEpisode]) -> dict[str, Float64[np.ndarray, "objects 6"]]:
+    """Boxes of each task's objects (middle, half sizes, in their frames), medians over episodes."""
+    by_task: dict[str, list[np.ndarray]] = {episode.task: [] for episode in episodes}
+    for episode in episodes:
+        if len(episode.object_boxes_m):
+            by_task[episode.task].append(episode.object_boxes_m)
+    return {
+        task: np.median(boxes, axis=0) if boxes else np.zeros((0, 6))
+        for task, boxes in by_task.items()
+    }
+
+
+def _size(
+    episode: SceneEpisode, usual_m: Float64[np.ndarray, "objects 6"]
+) -> Float32[np.ndarray, "slots 2"]:
+    """Width and height of an episode's objects relative to the usual ones; 1 in empty slots."""
+    size = np.ones((MAX_OBJECTS, 2), dtype=np.float32)
+    if not len(episode.object_boxes_m):
+        return size
+    across, height = (slice(3, 5), slice(5, 6))
+    for column, part in enumerate((across, height)):
+        factors = episode.object_boxes_m[:, part].mean(1) / usual_m[:, part].mean(1).clip(1e-6)
+        size[: len(factors), column] = factors.clip(*SIZE_RANGE)
+    return size
+
+
+def _padded(
+    boxes_m: Mapping[str, np.ndarray], config: DynamicsConfig
 ) -> Float32[Tensor, "tasks objects 6"]:
     boxes = torch.zeros(len(config.tasks), MAX_OBJECTS, 6)
-    for episode in episodes:
-        known = torch.from_numpy(episode.object_boxes_m).float()
-        boxes[config.tasks.index(episode.task), : len(known)] = known
+    for task, known in boxes_m.items():
+        boxes[config.tasks.index(task), : len(known)] = torch.from_numpy(known).float()
     return boxes
 
 

@@ -7,10 +7,11 @@ run resumes with the missing ones.
 import hashlib
 import multiprocessing
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
@@ -21,7 +22,8 @@ from dextouch.command_line import ProgressLines
 from dextouch.errors import InvalidInputError
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.configuration import DynamicsConfig
-from services.world_model.dynamics.model import DynamicsMember, DynamicsModel
+from services.world_model.dynamics.core import RecurrentCore
+from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.touch_codec import TouchCodec
@@ -51,11 +53,17 @@ from services.world_model.training.scene_episodes import (
     refuse_shared_scenes,
     split_by_scene,
 )
-from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
+from services.world_model.training.scene_table import (
+    SceneTable,
+    scene_table,
+    usual_boxes_m,
+    vocabulary,
+)
 from services.world_model.training.state_evaluation import evaluate_dynamics
+from services.world_model.training.transfer import Base
 
 # Increment when a change of training gives other weights for the same settings and data.
-READER_VERSION, CORE_VERSION, RENDERER_VERSION = 4, 5, 3
+READER_VERSION, CORE_VERSION, RENDERER_VERSION = 5, 7, 3
 # Largest number of episodes the renderer is trained on; it samples few of their images anyway.
 MAX_CLIPS = 1500
 _SEED_STRIDE = 1000
@@ -87,6 +95,12 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     training, heldout = split_by_scene(episodes, held_out_share=settings.heldout_share)
     refuse_shared_scenes(training, heldout)
     config = _config(episodes, settings)
+    base = None if settings.base is None else Base(settings.base)
+    if base is not None:
+        config = base.configured(config)
+        about = base.checkpoint.metadata
+        kept = {"num_members": about.num_members, "renderer": about.renderer}
+        settings = settings.model_copy(update=kept)
     parts = settings.output.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
     data_hash = _data_hash(training)
@@ -94,9 +108,11 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     heldout_table = scene_table(heldout, config)
     table = scene_table(training, config, labelled=_labelled(training, settings))
     codec = TouchCodec(config.touch_channels)
-    codec.fit(
-        table.tactile_kpa[:, ::4].float().flatten(0, 2), peak_kpa=float(table.tactile_kpa.max())
-    )
+    if base is None:
+        touch_kpa = table.tactile_kpa[:, ::4].float().flatten(0, 2)
+        codec.fit(touch_kpa, peak_kpa=float(table.tactile_kpa.max()))
+    else:
+        codec.load_state_dict(base.checkpoint.dynamics.codec.state_dict())
     table_file = parts / "table.safetensors"
     save_file({**table.tensors(), **_prefixed(codec)}, table_file)
     del table
@@ -111,14 +127,17 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         renderer=settings.renderer,
         object_names={e.task: e.object_names for e in episodes},
         object_boxes_m={
-            e.task: tuple(tuple(map(float, row)) for row in e.object_boxes_m) for e in episodes
+            task: tuple(tuple(map(float, row)) for row in boxes_m)
+            for task, boxes_m in usual_boxes_m(episodes).items()
         },
         bounds=StateBounds(
             disagreement_m=measured.disagreement_m,
             distance=measured.distance,
             horizon_latents=measured.num_latents,
             of_chunks=True,
-        ),
+        )
+        if base is None
+        else base.checkpoint.metadata.bounds,
         command=_command(settings),
         seed=settings.seed,
         training_cpu_s=round(cpu_s, 1),
@@ -150,6 +169,11 @@ class _Work:
     parts: Path
     data_hash: str
 
+    @cached_property
+    def base(self) -> Base | None:
+        """The model that this one starts from, if any."""
+        return None if self.settings.base is None else Base(self.settings.base)
+
     def reader_file(self, member: int) -> Path:
         """File of a member's finished reader; its name depends on settings and data."""
         return self.parts / f"reader-{self._key(READER_VERSION, 'reader')}-{member}.safetensors"
@@ -171,7 +195,8 @@ class _Work:
         chosen = self.settings.model_dump_json(
             include={"seed", "heldout_share", "labelled_share", *names}
         )
-        text = f"{version} {chosen} {self.data_hash}"
+        base = "" if self.base is None else self.base.checkpoint.digest
+        text = f"{version} {chosen} {self.data_hash} {base}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -241,11 +266,11 @@ def _train_parts(work: _Work) -> None:
     members = range(work.settings.num_members)
     spawned = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(work.settings.jobs, spawned) as pool:
-        # Cores first: they take longest.
-        orders = [pool.submit(_train_core, work, m) for m in members]
+        orders = []
         if work.settings.labelled_share == 1:
             orders += [pool.submit(_train_reader, work, m) for m in members]
-        if not work.renderer_file.exists():
+        orders += [pool.submit(_train_core, work, m) for m in members]
+        if work.base is None and not work.renderer_file.exists():
             orders.append(pool.submit(_train_renderer, work))
         for done in as_completed(orders):
             done.result()
@@ -302,7 +327,11 @@ def _train_reader(work: _Work, member: int) -> None:
     started_s = time.process_time()
     on_step = _on_step(member, "reader")
     seed = work.settings.seed * _SEED_STRIDE + member
-    trained = train_reader(table, work.config, work.settings.reader, seed=seed, on_step=on_step)
+    settings, base = work.settings.reader, work.base
+    initial = None if base is None else base.reader(work.config, member, seed=seed)
+    trained = train_reader(
+        table, work.config, settings, seed=seed, on_step=on_step, initial=initial
+    )
     _keep(trained, work.reader_file(member), time.process_time() - started_s)
 
 
@@ -323,7 +352,10 @@ def _train_core(work: _Work, member: int) -> None:
     data = CoreData(table, touch_latents(codec, table), readings)
     on_step = _on_step(member, "core")
     seed = work.settings.seed * _SEED_STRIDE + member
-    core = train_core(data, work.config, work.settings.core, seed=seed, on_step=on_step)
+    initial = None if work.base is None else work.base.core(work.config, member)
+    core = train_core(
+        data, work.config, work.settings.core, seed=seed, on_step=on_step, initial=initial
+    )
     _keep(core, work.core_file(member), time.process_time() - started_s)
 
 
@@ -342,13 +374,24 @@ def _assembled(work: _Work, codec: TouchCodec) -> tuple[DynamicsModel, RendererN
     dynamics = DynamicsModel(work.config, work.settings.num_members)
     dynamics.codec.load_state_dict(codec.state_dict())
     cpu_s = 0.0
-    for index, module in enumerate(dynamics.members):
-        member = cast("DynamicsMember", module)
-        cpu_s += _load(member.reader, work.reader_file(index))
-        cpu_s += _load(member.core, work.core_file(index))
+    cores = [RecurrentCore(work.config) for _ in range(work.settings.num_members)]
+    for index, (reader, core) in enumerate(zip(dynamics.readers(), cores, strict=True)):
+        cpu_s += _load(reader, work.reader_file(index))
+        cpu_s += _load(core, work.core_file(index))
+    dynamics.core.load_state_dict(_together(cores))
     renderer = RendererNetwork(work.settings.renderer)
-    cpu_s += _load(renderer, work.renderer_file)
+    if work.base is None:
+        cpu_s += _load(renderer, work.renderer_file)
+    else:
+        renderer.load_state_dict(work.base.checkpoint.renderer.state_dict())
     return dynamics.eval().requires_grad_(requires_grad=False), renderer, cpu_s
+
+
+def _together(cores: Sequence[RecurrentCore]) -> dict[str, Tensor]:
+    """Weights of cores of one member each as those of one core with all members."""
+    weights = [dict(core.named_parameters()) for core in cores]
+    shared = dict(cores[0].named_buffers())
+    return shared | {name: torch.cat([each[name] for each in weights]) for name in weights[0]}
 
 
 def _command(settings: StateTrainSettings) -> str:

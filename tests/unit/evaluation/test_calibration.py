@@ -5,7 +5,6 @@ import pytest
 
 from dextouch.errors import InvalidInputError
 from services.evaluation.calibration import (
-    IMAGINED_RISK,
     LEAST_DECIDED,
     Calibration,
     Combination,
@@ -17,6 +16,9 @@ from services.evaluation.calibration import (
     sigmoid,
     undecided_band,
 )
+
+# Allowed share of wrong answers among what is decided.
+RISK = 0.10
 
 
 def test_expected_calibration_error_by_hand():
@@ -117,11 +119,11 @@ def test_judges_that_know_something_decide_most_and_err_within_the_risk():
     rng = np.random.default_rng(3)
     for noises in ((0.5, 0.5), (0.5, 3.0), (2.0, 0.5)):
         noise = dict(zip(("probe_noise", "world_noise"), noises, strict=True))
-        joint = fit_combination(*estimates(rng, 300, **noise))
+        joint = fit_combination(*estimates(rng, 300, **noise), risk=RISK)
         decided, wrong = decided_of(joint, *estimates(rng, 20_000, **noise))
         assert decided >= LEAST_DECIDED
         # Up to the error of a rate among some 200 development endings.
-        assert wrong <= IMAGINED_RISK + 0.03
+        assert wrong <= RISK + 0.03
 
 
 def test_a_judge_that_is_too_sure_gets_a_band_and_its_risk():
@@ -132,17 +134,20 @@ def test_a_judge_that_is_too_sure_gets_a_band_and_its_risk():
         probe, world = (p**5 / (p**5 + (1 - p) ** 5) for p in (probe, world))
         return probe, world, came
 
-    joint = fit_combination(*too_sure(400), margin=0.5)
+    joint = fit_combination(*too_sure(400), risk=RISK, margin=0.5)
     probe, world, came = too_sure(20_000)
     assert joint.band > 0
-    assert decided_of(Combination(margin=0.5), probe, world, came)[1] > IMAGINED_RISK + 0.03
-    assert decided_of(joint, probe, world, came)[1] <= IMAGINED_RISK + 0.03
+    assert decided_of(Combination(margin=0.5), probe, world, came)[1] > RISK + 0.03
+    # With the risk itself too few would be decided.
+    decided, wrong = decided_of(joint, probe, world, came)
+    assert decided >= LEAST_DECIDED
+    assert RISK < wrong <= 2 * RISK
 
 
 def test_of_a_world_that_knows_nothing_the_probe_is_believed_and_of_two_nobody():
     rng = np.random.default_rng(5)
     probe, _, came = estimates(rng, 2000, probe_noise=0.5, world_noise=0.5)
-    joint = fit_combination(probe, rng.random(2000), came, margin=0.5)
+    joint = fit_combination(probe, rng.random(2000), came, risk=RISK, margin=0.5)
     assert joint.world_weight < 0.1 * joint.probe_weight
     assert decided_of(joint, probe, rng.random(2000), came)[0] >= LEAST_DECIDED
     # Backwards is as bad as knowing nothing: it is left out, not believed the other way round.

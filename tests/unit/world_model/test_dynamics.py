@@ -24,9 +24,9 @@ from services.world_model.dynamics.memory import (
 )
 from services.world_model.dynamics.model import (
     DynamicsModel,
-    SceneMemory,
     mean_start,
 )
+from services.world_model.dynamics.nested import mapped, stacked
 from services.world_model.dynamics.objects import (
     ObjectPoses,
     objects_from_poses,
@@ -240,6 +240,7 @@ def start(batch=2, seed=0):
     return SceneStart(
         objects(batch, position_m=0.1 * torch.randn(batch, MAX_OBJECTS, 3, generator=generator)),
         0.005 * torch.rand(batch, MAX_OBJECTS, generator=generator),
+        1 + 0.1 * torch.rand(batch, MAX_OBJECTS, 2, generator=generator),
         torch.randn(batch, 2, CONFIG.touch_channels, generator=generator),
         torch.rand(batch, 12, generator=generator),
         torch.arange(batch) % 2,
@@ -298,11 +299,8 @@ def test_one_at_a_time_is_as_a_batch(core):
     """The second entry has more objects than the first."""
     commands, both = random_commands(2, 5), start()
     together, _ = core(commands, both, first_of(core, both, commands))
-    one = SceneStart(
-        both.objects[:1], both.sd_m[:1], both.touch[:1], both.pads_kpa[:1], both.task[:1],
-        both.commanded[:1],
-    )  # fmt: skip
-    first = Commands(commands.points_m[:1], commands.axes[:1], commands.joints_rad[:1])
+    one = mapped(both, lambda values: values[:1])
+    first = mapped(commands, lambda values: values[:1])
     alone, _ = core(first, one, first_of(core, one, first))
     torch.testing.assert_close(alone.touch, together.touch[:1], atol=1e-5, rtol=1e-5)
 
@@ -312,8 +310,8 @@ def test_one_at_a_time_is_as_a_batch(core):
 def test_what_a_hand_holds_moves_rigidly_with_it(core, hand):
     """With the gate of one hand open, against scipy's composition of rigid motions."""
     core.movable.fill_(1.0)
-    core.motion.bias.copy_(torch.tensor([0.0] * 12))
-    core.motion.bias[hand] = 50.0
+    core.motion.bias.zero_()
+    core.motion.bias[0, hand] = 50.0
     commands, begun_at = random_commands(1, 6), start(1)
     future, _ = core(commands, begun_at, first_of(core, begun_at, commands))
     columns = commands.axes[0, :, hand].double().numpy()
@@ -330,7 +328,7 @@ def test_what_a_hand_holds_moves_rigidly_with_it(core, hand):
 @torch.no_grad()
 def test_fixed_objects_stay_whatever_the_gates_say(core):
     commands, begun_at = random_commands(2, 6), start()
-    core.motion.bias.copy_(torch.ones(12))
+    core.motion.bias.fill_(1.0)
     future, _ = core(commands, begun_at, first_of(core, begun_at, commands))
     still = begun_at.objects.position_m[1, :2].expand(6, 2, 3)
     torch.testing.assert_close(future.objects.position_m[1, :, :2], still)
@@ -409,13 +407,14 @@ def test_hands_that_stand_for_two_seconds_bring_everything_to_rest(model):
     for _ in range(REST_LATENTS // 4):
         memory, _ = model.advance(memory, still)
     rested, imagined = model.advance(memory, still)
-    assert all(map(same_state, rested.states, memory.states))
+    assert same_state(rested.state, memory.state)
     assert (imagined.tactile_kpa == memory.tactile_kpa[:, None]).all()
     for _ in range(60):
         rested, imagined = model.advance(rested, still)
     assert (imagined.tactile_kpa == memory.tactile_kpa[:, None]).all()
     moving, _ = model.advance(rested, Commands.of([lifted(16)] * 2))
-    assert not any(map(same_state, moving.states, rested.states))
+    hidden = zip(moving.state.hidden, rested.state.hidden, strict=True)
+    assert not any(torch.equal(*pair) for pair in hidden)
 
 
 def test_hands_that_creep_do_not_stand_still(model):
@@ -431,18 +430,13 @@ def test_hands_that_creep_do_not_stand_still(model):
     assert memory.num_still.max() < REST_LATENTS
 
 
-def test_members_that_see_nothing_have_no_say_about_the_place():
+def test_members_that_see_nothing_have_no_say_about_the_place(model):
     seen = objects(position_m=torch.full((1, MAX_OBJECTS, 3), 0.2))
     blind = objects(
         position_m=torch.full((1, MAX_OBJECTS, 3), 0.9), present=torch.zeros(1, MAX_OBJECTS)
     )
-    memory = SceneMemory(
-        start=tuple(dataclasses.replace(start(1), objects=each) for each in (seen, seen, blind)),
-        states=(), poses=seen, disagreement_m=torch.zeros(1),
-        tactile_kpa=torch.zeros(1, 2, 320),
-        points_m=torch.zeros(1, 2, NUM_POINTS, 3), success=torch.zeros(3, 1),
-        num_still=torch.zeros(1, dtype=torch.int64),
-    )  # fmt: skip
+    starts = [dataclasses.replace(start(1), objects=each) for each in (seen, seen, blind)]
+    memory = dataclasses.replace(begun(model), start=stacked(starts))
     mean = mean_start(memory)
     torch.testing.assert_close(mean.position_m, torch.full((1, MAX_OBJECTS, 3), 0.2))
     torch.testing.assert_close(mean.present, torch.full((1, MAX_OBJECTS), 2 / 3))
@@ -453,7 +447,7 @@ def test_rollouts_of_a_batch_share_no_memory(model):
     one = memory_of(both, 0)
     before = both.tactile_kpa.clone()
     one.tactile_kpa.add_(1.0)
-    one.states[0].hidden.add_(1.0)
+    one.state.hidden.add_(1.0)
     assert (both.tactile_kpa == before).all()
     assert one.tactile_kpa.untyped_storage().nbytes() == 2 * 320 * 4
 
@@ -473,7 +467,9 @@ def test_chunks_in_turn_imagine_what_one_long_chunk_does(model):
 
 
 def test_members_that_agree_do_not_disagree(model):
-    model.members[1].load_state_dict(model.members[0].state_dict())
+    model.eyes[1].load_state_dict(model.eyes[0].state_dict())
+    for weight in model.core.parameters():
+        weight.data[1] = weight.data[0]
     _, imagined = model.advance(begun(model), Commands.of([lifted(8)] * 2))
     torch.testing.assert_close(imagined.disagreement_m, torch.zeros(2, 2), atol=1e-6, rtol=0)
 
@@ -487,19 +483,19 @@ def test_a_memory_survives_its_arrays(model):
     expected, got = model.advance(one, command)[1], model.advance(back, command)[1]
     assert (expected.tactile_kpa == got.tactile_kpa).all()
     both = stack_memories([memory_of(memory, 0), one])
-    assert all(map(same_state, both.states, memory.states))
+    assert same_state(both.state, memory.state)
 
 
 @pytest.mark.parametrize("damage", ["missing", "shape", "nan", "task"])
 def test_damaged_memories_are_refused(model, damage):
     arrays = memory_arrays(memory_of(begun(model), 0))
     if damage == "missing":
-        del arrays["state_hidden"]
+        del arrays["state.hidden"]
     elif damage == "shape":
-        arrays["axes"] = arrays["axes"][:1]
+        arrays["poses.axes"] = arrays["poses.axes"][:, :1]
     elif damage == "nan":
-        arrays["position_m"] = arrays["position_m"] * np.float32(np.nan)
+        arrays["poses.position_m"] = arrays["poses.position_m"] * np.float32(np.nan)
     else:
-        arrays["task"] = np.array([7])
+        arrays["start.task"] = np.array([[7], [7]])
     with pytest.raises((InvalidInputError, NonFiniteError)):
         memory_from_arrays(arrays, CONFIG, 2)

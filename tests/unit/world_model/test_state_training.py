@@ -13,7 +13,8 @@ from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
 from dextouch.serving import load_settings
 from services.world_model.dynamics.configuration import DynamicsConfig
-from services.world_model.dynamics.core import RecurrentCore
+from services.world_model.dynamics.core import RecurrentCore, SceneStart
+from services.world_model.dynamics.features import SLOT_SIZE
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.touch_codec import TouchCodec
@@ -132,9 +133,8 @@ def test_a_core_feels_what_it_touches_and_nothing_elsewhere(reader, table, held_
     dynamics.codec.fit(table.tactile_kpa.float().flatten(0, 2))
     data = CoreData(table, touch_latents(dynamics.codec, table), {})
     settings = CoreSettings(num_steps=250, batch=16)
-    member = dynamics.members[0]
-    member.reader = reader
-    member.core = train_core(data, config, settings, seed=0)
+    dynamics.eyes[0] = reader
+    dynamics.core = train_core(data, config, settings, seed=0)
     measured = evaluate_dynamics(dynamics.eval(), held_out)
     assert measured.figures["contact_f1_chunk_1"] > 0.8
     assert measured.figures["contact_f1_chunk_1_of_copy"] == 0.0
@@ -340,3 +340,39 @@ def test_the_command_in_a_checkpoint_can_be_typed_again():
     assert again.core.num_steps == 7
     assert again.core.weights.touch == 0.0
     assert again.tasks == ("press",)
+
+
+def test_sizes_are_factors_of_the_usual_boxes():
+    config = DynamicsConfig(tasks=("press",), num_objects=(1,), image_px=PX, width=32)
+    episodes = [episode(seed) for seed in range(5)]
+    box = episodes[0].object_boxes_m * [[1, 1, 1, 1.25, 1.25, 0.9]]
+    episodes[3] = dataclasses.replace(episodes[3], object_boxes_m=box)
+    table = scene_table(episodes, config)
+    np.testing.assert_allclose(table.boxes_m[0, 0], episodes[0].object_boxes_m[0], rtol=1e-6)
+    expected = np.ones((5, 3, 2))
+    expected[3, 0] = 1.25, 0.9
+    np.testing.assert_allclose(table.size, expected, rtol=1e-5)
+
+
+@torch.no_grad()
+def test_a_core_feels_the_size_that_was_read(config, table):
+    """A hand beside a block of twice the width is inside it."""
+    core = RecurrentCore(config).eval()
+    describe(core, table)
+    rows = torch.arange(2)
+    commands = table.commands(rows, 0, torch.zeros(2, dtype=torch.bool))
+    start = SceneStart(
+        table.objects_at(rows, 0), torch.zeros(2, 3), torch.ones(2, 3, 2),
+        torch.zeros(2, 2, 8), table.pads_kpa[rows, 0], table.task[rows], torch.ones(2),
+    )  # fmt: skip
+    boxes = []
+    core.slot.register_forward_pre_hook(lambda _, inputs: boxes.append(inputs[0]))
+    for factor in (1.0, 2.0):
+        core(commands, dataclasses.replace(start, size=start.size * factor),
+             core.first_state(start, commands[:1]))  # fmt: skip
+    usual, doubled = boxes[0], boxes[len(boxes) // 2]
+    # The box among the inputs, in decimetres.
+    at = SLOT_SIZE
+    torch.testing.assert_close(doubled[..., at : at + 6], 2 * usual[..., at : at + 6])
+    # The first point's distance to it.
+    assert (doubled[..., 0, 0] < usual[..., 0, 0]).all()

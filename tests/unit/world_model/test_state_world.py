@@ -32,7 +32,7 @@ def with_presence(checkpoint, *odds):
             bias = reader.head[-1].bias.clone()
             reader.head[-1].weight.zero_()
             bias.zero_()
-            bias[9::11] = value
+            bias[9::13] = value
             reader.head[-1].bias.copy_(bias)
     return StateWorld(checkpoint)
 
@@ -109,7 +109,8 @@ def test_what_a_caller_does_to_its_arrays_changes_no_rollout(world):
 
 
 @pytest.mark.parametrize(
-    "damage", ["K_head", "anchor", "image", "num_moving", "start_axes", "start_position_m"]
+    "damage",
+    ["K_head", "anchor", "image", "num_moving", "start.objects.axes", "start.objects.position_m"],
 )
 def test_snapshots_with_impossible_numbers_are_refused(world, damage):
     fields, arrays = unpack(
@@ -163,10 +164,10 @@ def test_success_is_estimated_by_all_members():
     untrained_state_checkpoint.cache_clear()
     checkpoint = untrained_state_checkpoint()
     untrained_state_checkpoint.cache_clear()
-    for member, log_odds in zip(checkpoint.dynamics.members, (2.0, -1.0), strict=True):
-        with torch.no_grad():
-            member.core.success[-1].weight.zero_()
-            member.core.success[-1].bias.fill_(log_odds)
+    last = checkpoint.dynamics.core.success[-1]
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.copy_(torch.tensor([[2.0], [-1.0]]))
     world = StateWorld(checkpoint)
     started = world.reset(from_observation(world))
     stepped = world.step(started.state, move(started.observation, 8), seed=0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter
 
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
@@ -18,6 +19,7 @@ from services.world_model.rendering.hand_raster import (
     project_hands,
     splat_hands,
 )
+from services.world_model.rendering.inputs import grown
 from services.world_model.rendering.scene_states import SceneStates
 from tests.unit.world_model.rendering.scene_by_hand import K
 
@@ -155,3 +157,12 @@ def test_hands_behind_the_camera_leave_nothing(still):
     raster = splat_hands(points, np.ones((1, 2, points.depth_m.shape[2], 3)), SHAPE)
     assert raster.coverage.max() == 0
     assert np.isfinite(raster.colour).all()
+
+
+@pytest.mark.parametrize("reach_px", [1, 3, 4])
+def test_masks_grow_by_the_largest_value_near(reach_px):
+    draw = np.random.default_rng(0)
+    mask = (draw.random((2, 1, 17, 23)) * (draw.random((2, 1, 17, 23)) > 0.9)).astype(np.float32)
+    size = (1, 1, 2 * reach_px + 1, 2 * reach_px + 1)
+    expected = maximum_filter(mask, size=size, mode="constant")
+    np.testing.assert_array_equal(grown(mask, reach_px), expected)

@@ -1,0 +1,121 @@
+"""Sizes of the objects that hands can carry: scaled in the compiled scene of a take."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry import transform_from_pose
+from services.twin.scene import Scene
+
+# Ranges of the factors: a hand still gets around the objects, and they do not tip by themselves.
+_LEAST, _MOST = 0.5, 1.5
+# Of objects of other sizes: those of a data set differ about this much from the usual ones.
+_DRAWN: Final = {"width": (0.75, 1.30), "height": (0.90, 1.10)}
+# Fields of a model that depend on the size of a geom.
+_GEOMETRY: Final = ("geom_size", "geom_pos", "geom_rbound", "geom_aabb", "bvh_aabb")
+_ROUND: Final = {int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_CAPSULE)}
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Factors of the usual size of all objects that hands can carry, in the objects' frames.
+
+    `width` is along x and y and `height` along z, the axis of round objects. Masses stay, and fixed
+    objects keep their size.
+    """
+
+    width: float = 1.0
+    height: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (_LEAST <= self.width <= _MOST and _LEAST <= self.height <= _MOST):
+            raise InvalidInputError(
+                f"twin: got objects of {self.width} times the usual width and {self.height} times "
+                f"the usual height, expected {_LEAST} … {_MOST}"
+            )
+
+    @classmethod
+    def drawn(cls, generator: np.random.Generator) -> "Sizes":
+        """Other sizes for a take of a training set."""
+        width, height = (round(float(generator.uniform(*_DRAWN[name])), 3) for name in _DRAWN)
+        return cls(width, height)
+
+    @property
+    def factors(self) -> Float64[np.ndarray, "3"]:
+        """Factors along x, y and z."""
+        return np.array([self.width, self.width, self.height])
+
+    @property
+    def labels(self) -> list[str]:
+        """Parts of an episode's id; none for the usual sizes."""
+        if self == USUAL:
+            return []
+        return [f"w{round(1000 * self.width)}h{round(1000 * self.height)}"]
+
+
+USUAL: Final = Sizes()
+
+
+class Geometry:
+    """The usual geometry of a scene's objects, and changes of it.
+
+    Args:
+        scene: compiled, with its usual sizes.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._usual = {name: np.array(getattr(scene.model, name)) for name in _GEOMETRY}
+        free = np.flatnonzero(scene.bodies.is_free)
+        self._geoms = np.flatnonzero(np.isin(scene.geom_object, free))
+        self._bodies = np.flatnonzero(np.isin(scene.bodies.of_body, free))
+
+    def resize(self, sizes: Sizes) -> None:
+        """Give objects their sizes of a take, from the usual ones.
+
+        Geoms that are turned in their object grow along each of their own axes as the object does
+        along it.
+        """
+        model = self._scene.model
+        for name, values in self._usual.items():
+            getattr(model, name)[:] = values
+        if sizes == USUAL:
+            return
+        for geom in self._geoms.tolist():
+            pose = np.concatenate([model.geom_pos[geom], model.geom_quat[geom]])
+            R = transform_from_pose(pose)[:3, :3]
+            along = np.linalg.norm(sizes.factors[:, None] * R, axis=0)
+            size = along.copy()
+            if int(model.geom_type[geom]) in _ROUND:
+                size = np.array([along[:2].mean(), along[2], 1.0])
+            model.geom_size[geom] *= size
+            model.geom_pos[geom] *= sizes.factors
+            model.geom_aabb[geom] *= np.tile(along, 2)
+            model.geom_rbound[geom] *= along.max()
+        for body in self._bodies.tolist():
+            first = model.body_bvhadr[body]
+            # Boxes that collisions are searched in: larger ones find the same contacts.
+            model.bvh_aabb[first : first + model.body_bvhnum[body], 3:] *= 2 * _MOST
+
+    def on_the_same_level(
+        self, poses: Float64[np.ndarray, "objects 7"], sizes: Sizes, boxes_m: np.ndarray
+    ) -> Float64[np.ndarray, "objects 7"]:
+        """Poses with the lowest point of every resized object where it was before.
+
+        Args:
+            poses: planned for the usual sizes.
+            sizes: of the take.
+            boxes_m: [objects, 6] middle and half sizes of the usual boxes in the objects' frames.
+        """
+        placed = np.array(poses)
+        up = transform_from_pose(placed)[:, 2, :3]
+        low_m = [
+            (up * boxes_m[:, :3] * factors).sum(1) - (np.abs(up) * boxes_m[:, 3:] * factors).sum(1)
+            for factors in (np.ones(3), sizes.factors)
+        ]
+        placed[:, 2] += np.where(self._scene.bodies.is_free, low_m[0] - low_m[1], 0.0)
+        return placed

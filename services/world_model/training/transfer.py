@@ -1,0 +1,70 @@
+"""A state model for new tasks that keeps what another one learned of hands and objects."""
+
+from functools import cached_property
+from pathlib import Path
+
+import torch
+
+from dextouch.errors import InvalidInputError
+from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.core import RecurrentCore
+from services.world_model.dynamics.start_reader import StartReader
+from services.world_model.state_checkpoints import StateCheckpoint, read_state_checkpoint
+
+# Weights of a reader that belong to its tasks.
+_OF_TASKS = {"task.weight", "height_mean"}
+
+
+class Base:
+    """A trained state model whose cores, touch codec and renderer are kept.
+
+    Args:
+        path: its checkpoint.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @cached_property
+    def checkpoint(self) -> StateCheckpoint:
+        """The checkpoint, read once.
+
+        Raises:
+            NotFoundError, CorruptDataError, InvalidInputError: as `read_state_checkpoint`.
+        """
+        return read_state_checkpoint(self._path)
+
+    def configured(self, config: DynamicsConfig) -> DynamicsConfig:
+        """A configuration with the shape of the base's networks.
+
+        Raises:
+            InvalidInputError: images of another size.
+        """
+        own = self.checkpoint.metadata.dynamics
+        if own.image_px != config.image_px:
+            raise InvalidInputError(
+                f"--base {self._path.name}: reads images of {own.image_px} px, the episodes have "
+                f"{config.image_px} px; record them with its size"
+            )
+        return own.model_copy(update={"tasks": config.tasks, "num_objects": config.num_objects})
+
+    def reader(self, config: DynamicsConfig, member: int, *, seed: int) -> StartReader:
+        """A member's reader with fresh weights for the tasks."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            reader = StartReader(config)
+        known = self.checkpoint.dynamics.readers()[member].state_dict()
+        kept = {name: value for name, value in known.items() if name not in _OF_TASKS}
+        reader.load_state_dict(kept, strict=False)
+        return reader
+
+    def core(self, config: DynamicsConfig, member: int) -> RecurrentCore:
+        """A member's core, in which only the weights that predict success can be trained."""
+        core, known = RecurrentCore(config), self.checkpoint.dynamics.core
+        kept = {name: value[member : member + 1] for name, value in known.named_parameters()}
+        core.load_state_dict(kept, strict=False)
+        core.lowest.copy_(known.lowest)
+        core.highest.copy_(known.highest)
+        core.requires_grad_(requires_grad=False)
+        core.success.requires_grad_(requires_grad=True)
+        return core

@@ -1,0 +1,73 @@
+"""A state model that starts from another one keeps its cores and learns the outcomes of a task."""
+
+import pytest
+import torch
+
+from dextouch.errors import InvalidInputError
+from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.touch_codec import TouchCodec
+from services.world_model.settings import CoreSettings, ReaderSettings
+from services.world_model.state_checkpoints import write_state_checkpoint
+from services.world_model.training.core_training import CoreData, touch_latents, train_core
+from services.world_model.training.reader_training import train_reader
+from services.world_model.training.scene_table import scene_table
+from services.world_model.training.transfer import Base
+from tests.contracts.test_world import untrained_state_checkpoint
+from tests.unit.world_model.test_state_training import PX, episode
+
+NEW = DynamicsConfig(tasks=("press",), num_objects=(1,), image_px=PX)
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    one = untrained_state_checkpoint()
+    path = tmp_path_factory.mktemp("base") / "base.safetensors"
+    write_state_checkpoint(path, one.dynamics, one.renderer, one.metadata)
+    return Base(path)
+
+
+@pytest.fixture(scope="module")
+def config(base):
+    return base.configured(NEW)
+
+
+@pytest.fixture(scope="module")
+def table(config):
+    return scene_table([episode(seed) for seed in range(8)], config)
+
+
+def test_shapes_are_the_bases_and_tasks_the_new_ones(base, config):
+    own = base.checkpoint.metadata.dynamics
+    assert (config.width, config.tasks) == (own.width, ("press",))
+    with pytest.raises(InvalidInputError, match="images of 32 px"):
+        base.configured(NEW.model_copy(update={"image_px": 48}))
+
+
+def test_only_the_estimate_of_success_of_a_core_changes(base, config, table):
+    data = CoreData(table, touch_latents(TouchCodec(config.touch_channels), table), {})
+    core = base.core(config, 1)
+    trained = train_core(
+        data, config, CoreSettings(num_steps=5, batch=4), seed=0, initial=core
+    ).state_dict()
+    known = base.checkpoint.dynamics.core.named_parameters()
+    changed = {
+        name.partition(".")[0] for name, value in known if not torch.equal(trained[name], value[1:])
+    }
+    assert changed == {"success"}
+    torch.testing.assert_close(trained["boxes_m"][0, 0], table.boxes_m[0, 0])
+
+
+def test_a_reader_starts_from_the_member_it_replaces(base, config, table):
+    settings = ReaderSettings(num_steps=1, batch=4, learning_rate=1e-9, bfloat16=False)
+    for member, old in enumerate(base.checkpoint.dynamics.readers()):
+        initial = base.reader(config, member, seed=0)
+        reader = train_reader(table, config, settings, seed=0, initial=initial)
+        for name, value in reader.named_parameters():
+            if name != "task.weight":
+                torch.testing.assert_close(value, dict(old.named_parameters())[name])
+
+
+def test_new_weights_of_tasks_are_drawn_from_the_seed(base, config):
+    one, same, other = (base.reader(config, 0, seed=seed).task.weight for seed in (1, 1, 2))
+    assert torch.equal(one, same)
+    assert not torch.equal(one, other)
