@@ -13,7 +13,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.free_text import printable
 from dextouch.serving import load_settings
-from services.evaluation.checkpoints import Checkpoint, save_checkpoint
+from services.evaluation.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.direct_data import read_attempts
 from services.evaluation.direct_training import train_direct_judge
@@ -38,8 +38,11 @@ from services.evaluation.settings import (
     command_line,
 )
 from services.evaluation.study_worlds import WorldAddress
-from services.evaluation.success_probe import SuccessProbe
-from services.evaluation.success_probe_training import train_success_probe
+from services.evaluation.success_probe import KIND, SuccessProbe
+from services.evaluation.success_probe_training import (
+    calibrate_success_probe,
+    train_success_probe,
+)
 
 EXIT_FAILED = 1
 
@@ -71,6 +74,14 @@ def run_train_probe(arguments: list[str]) -> int:
         stores = [EpisodeStore(url) for url in urls]
         return read_ending_episodes(*stores, tasks=settings.tasks) if stores else []
 
+    if settings.base is not None:
+        calibrated = calibrate_success_probe(
+            load_checkpoint(settings.base, kind=KIND),
+            [*read(settings.episodes), *read(settings.development)],
+            settings.training,
+            command=command_line("probe", arguments),
+        )
+        return _keep(calibrated, settings.output, settings.json_path)
     checkpoint = train_success_probe(
         read(settings.episodes),
         settings.training,

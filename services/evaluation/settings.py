@@ -55,15 +55,24 @@ class TrainPolicySettings(CommandSettings):
 
 
 class TrainProbeSettings(CommandSettings):
-    """Train the success probe on true and imagined robot episodes of some stores.
+    r"""Train the success probe on true and imagined robot episodes of some stores.
 
     Example:
       dextouch train probe --episodes runs/true,runs/imagined --output runs/probe.safetensors
+
+    To calibrate a trained probe to another world model, on what that imagined:
+      dextouch train probe --base runs/probe.safetensors --episodes runs/true,runs/imagined_anew \
+        --output runs/calibrated.safetensors
     """
 
     model_config = service_config("evaluation_train_probe", "dextouch train probe")
 
     episodes: Stores
+    base: Path | None = Field(
+        default=None,
+        description="success probe whose weights are kept: only its probabilities and bands are "
+        "fitted, to all of --episodes and --development",
+    )
     development: tuple[str, ...] = Field(
         default=(), description="stores to calibrate on (default: a share of the seeds)"
     )

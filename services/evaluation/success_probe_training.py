@@ -123,6 +123,29 @@ def train_success_probe(
     return _measured(_calibrated(plain, sets, settings), sets)
 
 
+def calibrate_success_probe(
+    base: Checkpoint, episodes: Sequence[EndingEpisode], settings: ProbeSettings, *, command: str
+) -> Checkpoint:
+    """Fit the probabilities and the bands of a trained probe anew, for another world model.
+
+    Args:
+        base: its weights and metrics are kept.
+        episodes: true and imagined ones of known success, that the weights were not trained on.
+        settings: allowed risks; all others have no effect.
+        command: command to store in the settings of the checkpoint, as `calibrated_by`.
+    """
+    metadata = base.metadata
+    names = {*metadata.training_episodes, *(e.episode_id for e in episodes)}
+    starts = {*metadata.training_starts, *(e.start_digest for e in episodes)}
+    known = {
+        "training_episodes": tuple(sorted(names)),
+        "training_starts": tuple(sorted(starts)),
+        "settings": {**metadata.settings, "calibrated_by": command},
+    }
+    checkpoint = replace(base, metadata=metadata.model_copy(update=known))
+    return _calibrated(checkpoint, ProbeSets((), episodes, ()), settings)
+
+
 def _image_size_px(episodes: Sequence[EndingEpisode]) -> int:
     images = (e.images for item in episodes for e in item.endings.values())
     return next((int(one.shape[1]) for one in images if one is not None), 64)

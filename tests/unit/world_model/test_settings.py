@@ -80,6 +80,6 @@ def test_the_default_preset_is_that_of_no_preset():
     )
 
 
-def test_one_flag_of_a_group_leaves_the_other_defaults_of_the_command():
+def test_one_flag_of_a_group_leaves_its_other_defaults():
     drawing = load_settings(TrainStateCommand, ["--episodes", "s", "--drawing.batch", "3"]).drawing
-    assert (drawing.batch, drawing.cpu_budget_s) == (3, 1400)
+    assert (drawing.batch, drawing.cpu_budget_s) == (3, 400)
