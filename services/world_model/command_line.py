@@ -131,6 +131,7 @@ def open_worlds(settings: WorldModelSettings) -> dict[str, World[Any]]:
         settings.checkpoint,
         sampling_steps=settings.sampling_steps,
         sampler=settings.sampler,
+        objects=settings.objects,
         placement=settings.placement,
     )
     return {settings.world_name: world}
@@ -146,6 +147,7 @@ def open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> World[A
                 path,
                 sampling_steps=settings.sampling_steps,
                 sampler=settings.sampler,
+                objects=settings.objects,
                 placement=settings.placement,
             )
     return None

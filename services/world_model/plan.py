@@ -21,6 +21,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from dextouch.tactile.layout import NUM_TAXELS
 from services.networks.memory import memory_of
 from services.world_model.network.configuration import NetworkConfig, num_latents
+from services.world_model.network.contact_geometry import GEOMETRY_SIZE
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.instruction import MAX_WORDS
 from services.world_model.network.mirroring import CAMERA_DIM, HAND_DIM
@@ -291,6 +292,7 @@ def _inputs(config: NetworkConfig, num_steps: int) -> ModelInputs:
         camera=torch.zeros(1, num_steps, 2, CAMERA_DIM),
         layout=torch.zeros(1, 2, CAMERA_DIM),
         raster=torch.zeros(1, num_steps, 2, cells, cells),
+        geometry=torch.zeros(1, num_steps, 2, GEOMETRY_SIZE * config.use_contact_geometry),
         commanded=torch.zeros(1),
         words=torch.zeros(1, MAX_WORDS, dtype=torch.int64),
         instructions=("",),

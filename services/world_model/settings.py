@@ -390,6 +390,11 @@ class WorldModelSettings(WorldServiceSettings):
     sampler: Sampler | None = Field(
         default=None, description="solver of a flow-matching model (default: the checkpoint's)"
     )
+    objects: Path | None = Field(
+        default=None,
+        description="state model that finds the objects for a flow-matching model with contact "
+        "geometry (default: the package's)",
+    )
     placement: Placement = Field(
         default=Placement(), description="device and precision of a flow-matching model"
     )

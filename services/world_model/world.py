@@ -36,6 +36,7 @@ from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest,
 from services.world_model.network.model import Prediction, Sampling, stack_noise
 from services.world_model.network.visual_codec import to_uint8, to_unit
 from services.world_model.placement import Placement
+from services.world_model.scene_reader import SceneReader
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.starts import CAMERA, observed_start
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
@@ -57,6 +58,7 @@ class ModelState:
     instruction: str
     action_kind: ActionKind
     step: int
+    task: str = ""
 
 
 class ModelWorld:
@@ -66,6 +68,11 @@ class ModelWorld:
         checkpoint: loaded, from `read_checkpoint`.
         sampling: network calls, solver and so on; None uses the checkpoint's.
         precision: of the experts' matrix products; codecs are always float32.
+        reader: finds the objects of every chunk's first step, for a model that is conditioned on
+            contact geometry.
+
+    Raises:
+        InvalidInputError: a model with contact geometry, and no reader of all its tasks.
     """
 
     def __init__(
@@ -74,12 +81,21 @@ class ModelWorld:
         *,
         sampling: Sampling | None = None,
         precision: Precision = "float32",
+        reader: SceneReader | None = None,
     ) -> None:
         self._model = checkpoint.model
         self._digest = checkpoint.digest
         self._sampling = sampling
         self._precision: Precision = precision
         config, metadata = checkpoint.metadata.network, checkpoint.metadata
+        known = () if reader is None else reader.tasks
+        if config.use_contact_geometry and not set(metadata.tasks) <= set(known):
+            raise InvalidInputError(
+                f"world model {metadata.name}: is conditioned on objects, got start readers for "
+                f"{sorted(known)}, expected a state model of {sorted(metadata.tasks)}; name one "
+                "by --objects"
+            )
+        self._reader = reader if config.use_contact_geometry else None
         self._description = WorldDescription(
             name=metadata.name,
             kind="model",
@@ -118,12 +134,13 @@ class ModelWorld:
             instruction=start.instruction,
             action_kind=start.action_kind,
             step=0,
+            task=start.task,
         )
         # The checks of a chunk, so that they fail here rather than at the first one.
         if self._model.text_features is not None:
             self._model.text_features.of(start.instruction)
         standing = np.repeat(first.reached[None], self._description.chunk_multiple, axis=0)
-        build_inputs([_request(state, standing)], self._model.config)
+        build_inputs(self._requests([state], [standing]), self._model.config)
         return StartedRollout(state, first.observation(), first.anchor, first.K_head)
 
     def step(
@@ -165,7 +182,7 @@ class ModelWorld:
                 f"{counts[3]} selectors, expected one of each for every rollout"
             )
         chunks = [self._checked_chunk(chunk) for chunk in actions]
-        requests = [_request(state, chunk) for state, chunk in zip(states, chunks, strict=True)]
+        requests = self._requests(states, chunks)
         inputs = build_inputs(requests, self._model.config)
         noise = stack_noise(
             [self._model.noise(inputs.num_steps, _generator(seed)) for seed in seeds]
@@ -186,6 +203,16 @@ class ModelWorld:
                 states, chunks, zip(images, touches, strict=True), requested, strict=True
             )
         ]
+
+    def _requests(
+        self, states: Sequence[ModelState], chunks: Sequence[np.ndarray]
+    ) -> list[PredictionRequest]:
+        """Requests for the chunks, with the objects as they are seen at the first step."""
+        requests = [_request(state, chunk) for state, chunk in zip(states, chunks, strict=True)]
+        if self._reader is None:
+            return requests
+        objects = self._reader.objects(requests, [state.task for state in states])
+        return [replace(one, objects=seen) for one, seen in zip(requests, objects, strict=True)]
 
     @torch.no_grad()
     def reconstruct(
@@ -209,6 +236,7 @@ class ModelWorld:
             "instruction": state.instruction,
             "action_kind": state.action_kind,
             "step": state.step,
+            "task": state.task,
         }
         arrays = {
             "image": state.image,
@@ -231,11 +259,12 @@ class ModelWorld:
                 f"snapshot: made by world {str(fields.get('digest'))[:12]!r}, expected "
                 f"{self._digest[:12]!r}; restore it in the world that made it"
             )
-        step, words = fields.get("step"), fields.get("instruction")
+        step, words, task = fields.get("step"), fields.get("instruction"), fields.get("task")
         if (
             set(arrays) != set(_SNAPSHOT_ARRAYS)
             or not isinstance(step, int)
             or not isinstance(words, str)
+            or task not in self._description.tasks
             or fields.get("action_kind") not in ACTION_KINDS
             or arrays["anchor"].shape != (3, 4, 4)
         ):
@@ -252,9 +281,10 @@ class ModelWorld:
             instruction=words,
             action_kind=fields["action_kind"],
             step=step,
+            task=str(task),
         )
         standing = np.repeat(state.reached[None], self._description.chunk_multiple, axis=0)
-        build_inputs([_request(state, standing)], self._model.config)
+        build_inputs(self._requests([state], [standing]), self._model.config)
         return state
 
     def _checked_chunk(self, actions: np.ndarray) -> Float64[np.ndarray, "steps 67"]:
@@ -274,6 +304,7 @@ def open_world(
     sampling_steps: int | None = None,
     sampler: Sampler | None = None,
     needs_touch: bool = True,
+    objects: Path | None = None,
     placement: Placement = Placement(),  # noqa: B008 - immutable
 ) -> ModelWorld | StateWorld:
     """Open the world of a checkpoint file of either kind; default: the package's own.
@@ -282,6 +313,8 @@ def open_world(
         path: safetensors file; None for the one that ships with the package.
         sampling_steps: network calls per chunk of a flow-matching model; a state model has none.
         sampler: solver of a flow-matching model.
+        objects: state model whose start readers find the objects, for a flow-matching model that
+            is conditioned on contact geometry; None for the package's own.
         needs_touch: refuse a model that does not predict touch, in which policies feel nothing.
         placement: device and precision of a flow-matching model.
 
@@ -297,7 +330,10 @@ def open_world(
                 f"world model {file.name}: got one that predicts images alone, expected touch, "
                 "too; only `dextouch evaluate prediction` accepts it"
             )
-        return ModelWorld(checkpoint, sampling=Sampling(sampling_steps, sampler))
+        reader = None
+        if checkpoint.metadata.network.use_contact_geometry:
+            reader = SceneReader(read_state_checkpoint(objects or default_checkpoint()))
+        return ModelWorld(checkpoint, sampling=Sampling(sampling_steps, sampler), reader=reader)
     if sampling_steps is not None or sampler is not None:
         raise InvalidInputError(
             f"state model {file.name}: got {sampling_steps} sampling steps and the sampler "

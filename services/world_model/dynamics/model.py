@@ -124,7 +124,7 @@ class DynamicsModel(nn.Module):
         return SceneMemory(
             start=start,
             state=unfolded(state, self.core.members),
-            poses=_mean(start.objects),
+            poses=mean_poses(start.objects),
             disagreement_m=_spread_m(start.objects),
             tactile_kpa=torch.minimum(tactile_kpa, self.codec.peak_kpa),
             success=unfolded(future, self.core.members).success[..., -1].sigmoid(),
@@ -192,7 +192,7 @@ class DynamicsModel(nn.Module):
         each = unfolded(future, members)
         taxels = self.core.taxels(future.pattern).view(*each.pattern.shape[:-1], -1)
         return _Run(
-            poses=_between(memory.poses, _mean(each.objects)),
+            poses=_between(memory.poses, mean_poses(each.objects)),
             tactile_kpa=self.decode_touch(each.touch.mean(0), taxels.mean(0)).flatten(1, 2),
             disagreement_m=_spread_m(each.objects),
             distance=distance,
@@ -229,7 +229,7 @@ def _spread_m(poses: ObjectPoses) -> Float32[Tensor, "*batch"]:
     return (poses.position_m.std(0, correction=0).norm(dim=-1) * used).amax(-1)
 
 
-def _mean(poses: ObjectPoses) -> ObjectPoses:
+def mean_poses(poses: ObjectPoses) -> ObjectPoses:
     """Mean over members, the first axis; those that see no object do not contribute to its pose."""
     share = poses.present / poses.present.sum(0).clamp_min(1e-6)
     return ObjectPoses(
@@ -241,7 +241,7 @@ def _mean(poses: ObjectPoses) -> ObjectPoses:
 
 def mean_start(memory: SceneMemory) -> ObjectPoses:
     """Object poses at the start, averaged over members."""
-    return _mean(memory.start.objects)
+    return mean_poses(memory.start.objects)
 
 
 def mean_size(memory: SceneMemory) -> Float32[Tensor, "batch objects 2"]:

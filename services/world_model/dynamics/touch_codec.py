@@ -5,8 +5,7 @@ from jaxtyping import Float32
 from torch import Tensor, nn
 
 from dextouch.tactile.layout import NUM_TAXELS
-from services.world_model.network.principal_axes import principal_axes
-from services.world_model.network.tactile_tokenizer import root_pressure
+from services.networks.principal_axes import principal_axes, root_pressure
 
 # Pads with a lower peak pressure count as free when contact is learned.
 FREE_KPA = 2.0

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from services.world_model.network.action_attention import ActionTokens
 from services.world_model.network.axes import split_axis
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
+from services.world_model.network.contact_geometry import GEOMETRY_SIZE
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.instruction import InstructionEncoder, SubwordEncoder
 from services.world_model.network.mirroring import CAMERA_DIM, HAND_DIM
@@ -133,6 +134,9 @@ class VideoCondition(nn.Module):
         else:
             # Both hands and the camera for each of the four steps of a latent frame.
             self.actions = two_layers(FRAMES_PER_LATENT * ACTION_WIDTH, 2 * width, width)
+        self.geometry: nn.Sequential | None = None
+        if config.use_contact_geometry:
+            self.geometry = two_layers(FRAMES_PER_LATENT * 2 * GEOMETRY_SIZE, 2 * width, width)
         self.time = TimeEmbedding(width)
         self.static = StaticCondition(config, width)
 
@@ -152,6 +156,9 @@ class VideoCondition(nn.Module):
             terms.append(after_first(self.actions(actions.flatten(2))))
         if self.action_tokens is not None:
             tokens = after_first(self.action_tokens(actions))
+        if self.geometry is not None:
+            near = split_axis(inputs.geometry[:, 1:], 1, (-1, FRAMES_PER_LATENT)).flatten(2)
+            terms.append(after_first(self.geometry(near)))
         return Constants((*terms, self.static(inputs)[:, None]), tokens)
 
     def at(self, constants: Constants, t: Float32[Tensor, "batch latents"]) -> Condition:
@@ -171,6 +178,9 @@ class TactileCondition(nn.Module):
             self.action_tokens = ActionTokens(num_steps=1, width=width)
         else:
             self.actions = two_layers(ACTION_WIDTH, 2 * width, width)
+        self.geometry: nn.Sequential | None = None
+        if config.use_contact_geometry:
+            self.geometry = two_layers(2 * GEOMETRY_SIZE, 2 * width, width)
         self.layout: nn.Sequential | None = None
         self.scene: SceneEncoder | None = None
         if config.use_scene_encoder:
@@ -196,6 +206,9 @@ class TactileCondition(nn.Module):
         if self.action_tokens is not None:
             tokens = after_first(self.action_tokens(features.per_hand[:, 1:, :, None]))
             tokens = tokens.flatten(1, 2)
+        if self.geometry is not None:
+            own = inputs.geometry[:, 1:]
+            terms.append(after_first(self.geometry(torch.cat([own, own.flip(2)], dim=-1))))
         if self.scene is not None and self.layout is not None:
             terms.append((self.scene(inputs) + self.layout(features.layout))[:, None])
         return Constants((*terms, self.static(inputs)[:, None, None]), tokens)

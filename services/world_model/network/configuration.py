@@ -77,6 +77,11 @@ class NetworkConfig(FrozenModel):
         default=True,
         description="condition touch on an encoding of the first image and the hands' places, too",
     )
+    use_contact_geometry: bool = Field(
+        default=False,
+        description="condition on the distances of hand points to the boxes of the objects, as "
+        "they lie at a chunk's first step, too; needs episodes with object poses",
+    )
     prediction: Literal["clean", "velocity"] = Field(
         default="clean",
         description="what the network predicts and the loss compares: the clean latents, or the "
@@ -129,6 +134,7 @@ class NetworkConfig(FrozenModel):
             "codec_channels": LATENT_CHANNELS,
             "video_width": self.num_heads * self.head_width,
             "use_pose_raster": False,
+            "use_contact_geometry": False,
             "action_conditioning": "adaln",
             "prediction": "velocity",
             "video_target": "plain",

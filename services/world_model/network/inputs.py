@@ -27,6 +27,7 @@ from dextouch.hands.actions import (
 from dextouch.schemas import ActionKind
 from dextouch.tactile.layout import NUM_TAXELS
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
+from services.world_model.network.contact_geometry import SeenObjects, contact_geometry
 from services.world_model.network.instruction import instruction_ids
 from services.world_model.network.mirroring import (
     MIRROR_CAMERA,
@@ -51,7 +52,8 @@ class PredictionRequest:
     """One window to predict.
 
     `actions` [T, 67], T = 1 + 4k, are relative to `anchor`, the poses of row 0; the poses in row 0
-    are the anchor by definition and are ignored.
+    are the anchor by definition and are ignored. `objects` are those of row 0, where they are
+    known.
     """
 
     first_image: UInt8[np.ndarray, "h w 3"]
@@ -61,6 +63,7 @@ class PredictionRequest:
     instruction: str
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"]
+    objects: SeenObjects | None = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,7 @@ class ModelInputs:
     camera: Float32[Tensor, "batch time 2 9"]
     layout: Float32[Tensor, "batch 2 9"]
     raster: Float32[Tensor, "batch time 2 cells cells"]
+    geometry: Float32[Tensor, "batch time 2 features"]
     commanded: Float32[Tensor, " batch"]
     words: Int64[Tensor, "batch ids"]
     instructions: tuple[str, ...]
@@ -119,10 +123,21 @@ def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -
         camera=_float_tensor(camera_features(actions)),
         layout=_float_tensor(_hand_layout(anchors)),
         raster=torch.from_numpy(raster),
+        geometry=torch.from_numpy(_geometry(requests, actions, config)),
         commanded=torch.tensor([float(_is_commanded(r.action_kind)) for r in requests]),
         words=torch.stack([_instruction_ids(r.instruction, config) for r in requests]),
         instructions=tuple(r.instruction for r in requests),
     )
+
+
+def _geometry(
+    requests: Sequence[PredictionRequest], actions: np.ndarray, config: NetworkConfig
+) -> Float32[np.ndarray, "batch time 2 features"]:
+    """Contact geometry of every step; no features for a network that does not use it."""
+    if not config.use_contact_geometry:
+        return np.zeros((*actions.shape[:2], 2, 0), dtype=np.float32)
+    each = zip(requests, actions, strict=True)
+    return np.stack([contact_geometry(rows, one.anchor, one.objects) for one, rows in each])
 
 
 def _instruction_ids(instruction: str, config: NetworkConfig) -> Int64[Tensor, " ids"]:

@@ -10,9 +10,10 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from dextouch.tactile.layout import NUM_TAXELS
+from services.networks.principal_axes import root_pressure
 from services.world_model.network.axes import split_axis
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.network.tactile_tokenizer import TactileTokenizer, root_pressure
+from services.world_model.network.tactile_tokenizer import TactileTokenizer
 
 NUM_PADS = 6
 

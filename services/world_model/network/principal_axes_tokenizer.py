@@ -9,9 +9,9 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from dextouch.tactile.layout import NUM_TAXELS, NUM_TIP_TAXELS
+from services.networks.principal_axes import principal_axes, root_pressure, root_scale
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.network.principal_axes import principal_axes, root_scale
-from services.world_model.network.tactile_tokenizer import TactileTokenizer, root_pressure
+from services.world_model.network.tactile_tokenizer import TactileTokenizer
 
 # Amplitude of palms relative to that of tips; the best value in an ablation on touch.
 PALM_SCALE = 0.7

@@ -56,8 +56,3 @@ class TactileTokenizer(nn.Module, ABC):
         """Clip decoded pressures to the larger of the training peak and the first touch's peak."""
         highest_kpa = torch.maximum(first_kpa.flatten(1).amax(dim=1), self.peak_kpa)
         return torch.minimum(tactile_kpa, highest_kpa[:, None, None, None])
-
-
-def root_pressure(tactile_kpa: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:
-    """Square root of pressures; negative ones count as zero."""
-    return tactile_kpa.clamp_min(0.0).sqrt()

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float32, UInt8
 from torch import Tensor, nn
 
+from services.networks.principal_axes import principal_axes, root_scale
 from services.world_model.network.axes import split_axis
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
-from services.world_model.network.principal_axes import principal_axes, root_scale
 
 
 class VisualCodec(nn.Module):

@@ -18,6 +18,7 @@ from torch import Tensor
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, Domain
+from services.world_model.network.contact_geometry import SeenObjects
 from services.world_model.network.inputs import PredictionRequest
 
 
@@ -98,9 +99,17 @@ class EpisodeArrays:
     K_head: Float64[np.ndarray, "3 3"]
     model_rate_hz: float
     domain: Domain = "robot"
+    object_poses: Float32[np.ndarray, "steps objects 7"] | None = None
+    boxes_m: Float64[np.ndarray, "objects 6"] | None = None
 
     def __len__(self) -> int:
         return len(self.tactile_kpa)
+
+    def objects_at(self, step: int) -> SeenObjects | None:
+        """Objects at a step, if their poses and boxes are known."""
+        if self.object_poses is None or self.boxes_m is None:
+            return None
+        return SeenObjects(self.object_poses[step].astype(np.float64), self.boxes_m)
 
     @property
     def action_kinds(self) -> tuple[ActionKind, ...]:
@@ -204,6 +213,7 @@ def cut_window(
         instruction=episode.instruction,
         anchor=poses_from_actions(origin[None], episode.anchor).anchor(0),
         K_head=episode.K_head,
+        objects=episode.objects_at(start),
     )
     return Window(
         request, episode.images[steps], episode.tactile_kpa[steps], episode.tactile_valid[steps]

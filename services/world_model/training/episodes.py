@@ -2,18 +2,20 @@
 
 import hashlib
 from collections.abc import Collection, Sequence
-from typing import TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, Int64
 
 from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, is_rejected
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ActionKind, Domain
 from services.world_model.starts import CAMERA
 from services.world_model.training.dataset import EpisodeArrays, TrainingEpisode
+from services.world_model.training.scene_episodes import poses_at
 
 E = TypeVar("E", bound=TrainingEpisode)
+OBJECT_POSES: Final = "object_poses"
 
 
 def load_episodes(
@@ -79,6 +81,7 @@ def read_episode(reader: EpisodeReader) -> EpisodeArrays:
         sent = reader.window(0, reader.num_steps, cameras=(), action_kind="commanded")
         actions["commanded"] = sent.actions
     attributes = reader.attributes
+    poses, boxes_m = objects_of(reader, measured.t_ref_ns) or (None, None)
     return EpisodeArrays(
         episode_id=attributes.episode_id,
         task=attributes.task,
@@ -92,7 +95,19 @@ def read_episode(reader: EpisodeReader) -> EpisodeArrays:
         K_head=measured.K_head,
         model_rate_hz=attributes.model_rate_hz,
         domain=attributes.domain,
+        object_poses=poses,
+        boxes_m=boxes_m,
     )
+
+
+def objects_of(
+    reader: EpisodeReader, t_ref_ns: Int64[np.ndarray, " steps"]
+) -> tuple[Float32[np.ndarray, "steps objects 7"], Float64[np.ndarray, "objects 6"]] | None:
+    """Poses of an episode's objects at given times and their boxes; None where unknown."""
+    boxes_m = np.array(reader.attributes.object_boxes_m, dtype=np.float64).reshape(-1, 6)
+    if OBJECT_POSES not in reader.streams or not len(boxes_m):
+        return None
+    return poses_at(reader, t_ref_ns), boxes_m
 
 
 def split_by_hash(episodes: Sequence[E], *, heldout_percent: int) -> tuple[list[E], list[E]]:

@@ -11,6 +11,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions, reanchor
 from services.world_model.network.flow_matching import sampling_times
 from services.world_model.network.inputs import ModelInputs, PredictionRequest, build_inputs
@@ -38,7 +39,15 @@ def own_context(
 
     Half of the batches are the second chunks, each with the last image and touch that the model
     predicts for the first chunk; the others are the first chunks.
+
+    Raises:
+        InvalidInputError: a model that is conditioned on contact geometry.
     """
+    if model.config.use_contact_geometry:
+        raise InvalidInputError(
+            "distillation: got a model with contact geometry, expected one without: it would need "
+            "the objects as they lie where its own first chunk ends"
+        )
     middle = len(batch.requests[0].actions) // 2
     firsts = [replace(request, actions=request.actions[: middle + 1]) for request in batch.requests]
     if torch.rand((), generator=generator).item() >= OWN_CONTEXT_SHARE:

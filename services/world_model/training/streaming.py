@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
+import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 from dextouch.episodes import EpisodeReader, EpisodeStore, Split
 from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, Domain
+from services.world_model.network.contact_geometry import SeenObjects
 from services.world_model.network.inputs import PredictionRequest
 from services.world_model.starts import CAMERA
 from services.world_model.training.dataset import (
@@ -27,7 +29,12 @@ from services.world_model.training.dataset import (
     fingerprint,
     stack_windows,
 )
-from services.world_model.training.episodes import check_rates, read_episode, training_ids
+from services.world_model.training.episodes import (
+    check_rates,
+    objects_of,
+    read_episode,
+    training_ids,
+)
 
 # Open readers per process; each holds an episode's timestamps and actions.
 MAX_OPEN_READERS = 512
@@ -80,6 +87,9 @@ class StoredEpisode:
             anchor = poses_from_actions(actions[:1], anchor).anchor(0)
             actions = reanchor(actions, 0)
         images = read.images[CAMERA]
+        reader = _reader(self.url, self.episode_id)
+        known = objects_of(reader, read.t_ref_ns[:1])
+        objects = None if known is None else SeenObjects(known[0][0].astype(np.float64), known[1])
         request = PredictionRequest(
             first_image=images[0],
             first_tactile_kpa=read.tactile_kpa[0],
@@ -88,6 +98,7 @@ class StoredEpisode:
             instruction=read.instruction,
             anchor=anchor,
             K_head=read.K_head,
+            objects=objects,
         )
         return Window(request, images, read.tactile_kpa, read.tactile_valid)
 

@@ -22,8 +22,9 @@ from services.networks.optimizer import (
     half_cosine,
     update_average,
 )
+from services.networks.principal_axes import root_pressure
 from services.world_model.network.learned_tokenizer import LearnedTokenizer
-from services.world_model.network.tactile_tokenizer import TactileTokenizer, root_pressure
+from services.world_model.network.tactile_tokenizer import TactileTokenizer
 from services.world_model.network.tokenizer_choice import build_tokenizer
 from services.world_model.tokenizer_files import (
     Reconstruction,

@@ -87,6 +87,8 @@ def _drawn_episode(seed, num_steps):
         anchor=anchor,
         K_head=K_HEAD,
         model_rate_hz=15.0,
+        object_poses=np.tile(np.float32([*box_m, 1, 0, 0, 0]), (num_steps, 1, 1)),
+        boxes_m=np.array([[0, 0, 0, 0.03, 0.03, 0.02]]),
     )
 
 
@@ -159,6 +161,8 @@ def write_episode(store, episode, image_every=1):
     }
     if "commanded" in episode.actions:
         streams["action_commanded"] = ("robot_state", episode.actions["commanded"], "action67")
+    if episode.object_poses is not None:
+        streams["object_poses"] = ("pose", episode.object_poses, "pose_m_wxyz")
     attributes = EpisodeAttributes(
         episode_id=episode.episode_id,
         task=episode.task,
@@ -169,6 +173,8 @@ def write_episode(store, episode, image_every=1):
         model_rate_hz=episode.model_rate_hz,
         anchor=StoredAnchor.from_poses(episode.anchor),
         K_head=matrix_rows(episode.K_head),
+        object_names=("box",),
+        object_boxes_m=tuple(map(tuple, episode.boxes_m.tolist())),
     )
     with store.writer(attributes=attributes) as writer:
         for name, (kind, values, unit) in streams.items():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from services.networks.principal_axes import principal_axes, root_scale
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.network.principal_axes import principal_axes, root_scale
 from services.world_model.network.principal_axes_tokenizer import PrincipalAxesTokenizer
 from services.world_model.network.visual_codec import VisualCodec, to_uint8, to_unit
 

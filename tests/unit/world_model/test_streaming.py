@@ -56,6 +56,8 @@ def assert_same_window(got, expected):
     ours, theirs = got.request, expected.request
     np.testing.assert_array_equal(ours.first_image, theirs.first_image)
     np.testing.assert_array_equal(ours.first_tactile_kpa, theirs.first_tactile_kpa)
+    np.testing.assert_array_equal(ours.objects.poses, theirs.objects.poses)
+    np.testing.assert_array_equal(ours.objects.boxes_m, theirs.objects.boxes_m)
     # Re-anchored once here and twice there.
     np.testing.assert_allclose(ours.actions, theirs.actions, atol=1e-12)
     for a, b in zip(ours.anchor.as_tuple(), theirs.anchor.as_tuple(), strict=True):

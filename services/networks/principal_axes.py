@@ -32,3 +32,8 @@ def root_scale(rms: Float32[Tensor, " channels"]) -> Float32[Tensor, " channels"
     """
     strongest = rms[0].clamp_min(1e-6)
     return torch.sqrt((rms / strongest).clamp_min(MIN_RELATIVE_SCALE)) * strongest
+
+
+def root_pressure(tactile_kpa: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:
+    """Square root of pressures; negative ones count as zero."""
+    return tactile_kpa.clamp_min(0.0).sqrt()
