@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +21,6 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.images import decode_jpeg, encode_jpeg
 from dextouch.schemas import Observation, ReturnSelector, RolloutStart
-from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
 from services.twin.scripted_actions import Actions, script_name, scripted_actions
@@ -169,7 +169,7 @@ class _Judged:
             verdict = self._verdict(seen, actions, start) if is_played else None
             found[name] = replace(self._read(seen, truth_m), verdict=verdict, real=real)
         state = started.state
-        for before, step in zip((0, *STEPS), STEPS, strict=False):
+        for before, step in pairwise((0, *STEPS)):
             stepped = twin.step(state, actions[before:step], seed=0, selector=_LAST)
             state = stepped.state
             later = _amid(first, stepped.observation)
@@ -195,14 +195,7 @@ class _Judged:
 
     def _verdict(self, first: RolloutStart, actions: Actions, start: PolicyStart) -> str:
         imagined = play_in_imagination(self._world, first, actions, start, shows_chunks=False)
-        ending = Ending(
-            imagined.last_images,
-            imagined.tactile_kpa[-NUM_SEEN_STEPS:],
-            first.task,
-            imagined.object_poses,
-            imagined=True,
-        ).with_doubt(imagined.doubt)
-        return self._probe.verdict(ending).decision
+        return self._probe.verdict(imagined.ending(first.task)).decision
 
 
 def _true_m(twin: TwinWorld, state: TwinState) -> Float64[np.ndarray, "objects 3"]:

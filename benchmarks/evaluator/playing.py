@@ -16,7 +16,7 @@ from dextouch.schemas import (
     rollout_doubt,
 )
 from dextouch.worlds import StartedRollout, State, World
-from services.evaluation.endings import NUM_SEEN_STEPS
+from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.policies.asking import action_chunk, ask
 from services.twin.scripted_actions import Actions
 from services.twin.world import TwinState, TwinWorld
@@ -51,6 +51,16 @@ class ImaginedRollout:
     last_images: UInt8[np.ndarray, "3 h w 3"]
     object_poses: Float32[np.ndarray, "3 objects 7"] | None
     doubt: RolloutDoubt
+
+    def ending(self, task: str) -> Ending:
+        """What the judge sees of it."""
+        return Ending(
+            self.last_images,
+            self.tactile_kpa[-NUM_SEEN_STEPS:],
+            task,
+            self.object_poses,
+            imagined=True,
+        ).with_doubt(self.doubt)
 
 
 def play_in_twin(

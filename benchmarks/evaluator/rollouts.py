@@ -162,16 +162,7 @@ class PolicyRollout:
         return Ending(self.real.last_images, touch, self._task)
 
     def _imagined_ending(self, member: Member) -> Ending:
-        return self._ending(self.imagined(member))
-
-    def _ending(self, imagined: ImaginedRollout) -> Ending:
-        return Ending(
-            imagined.last_images,
-            imagined.tactile_kpa[-NUM_SEEN_STEPS:],
-            self._task,
-            imagined.object_poses,
-            imagined=True,
-        ).with_doubt(imagined.doubt)
+        return self.imagined(member).ending(self._task)
 
     def _context_row(self, member: Member) -> Row:
         contact = contact_with_true_context(
@@ -196,7 +187,7 @@ class PolicyRollout:
         """Verdict on the ending of a world model trained without touch, with touch at zero."""
         if member.untouched is None:
             raise InvalidInputError("evaluator: no world was given by --without-touch")
-        ending = self._ending(self._imagined_by(member.untouched))
+        ending = self._imagined_by(member.untouched).ending(self._task)
         return asdict(member.probe.verdict(without_touch(ending)))
 
     def _direct_row(self, member: Member) -> Row:

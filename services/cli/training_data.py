@@ -84,6 +84,11 @@ class Scope:
         return self.path or ("devices" if domain == "human" else "direct")
 
     def __post_init__(self) -> None:
+        if not (0 <= self.varied <= 1 and 0 <= self.resized <= 1):
+            raise InvalidInputError(
+                f"training data: got a share of {self.varied} varied and {self.resized} resized "
+                "takes, expected 0 … 1"
+            )
         for task in self.tasks:
             if task not in TASK_NAMES:
                 raise UnknownNameError("task", task, list(TASK_NAMES))

@@ -245,7 +245,10 @@ def _world_model(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
 
     settings = WorldModelSettings()
     world = open_world(
-        settings.checkpoint, sampling_steps=settings.sampling_steps, sampler=settings.sampler
+        settings.checkpoint,
+        sampling_steps=settings.sampling_steps,
+        sampler=settings.sampler,
+        objects=settings.objects,
     )
     return create_world_app({settings.world_name: world}, settings, name="world_model")
 

@@ -75,6 +75,11 @@ def run_train_probe(arguments: list[str]) -> int:
         return read_ending_episodes(*stores, tasks=settings.tasks) if stores else []
 
     if settings.base is not None:
+        if settings.held_out:
+            raise InvalidInputError(
+                f"train probe --base: got --held-out {','.join(settings.held_out)}, expected none: "
+                "the figures of the base's weights are kept"
+            )
         calibrated = calibrate_success_probe(
             load_checkpoint(settings.base, kind=KIND),
             [*read(settings.episodes), *read(settings.development)],

@@ -1,5 +1,7 @@
 """The success probe: accuracy on held-out toys, balance, and honest refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,11 @@ from services.evaluation.endings import endings_hash
 from services.evaluation.judge_network import ProbeShape
 from services.evaluation.success_probe import SuccessProbe
 from services.evaluation.success_probe_data import labelled_endings
-from services.evaluation.success_probe_training import ProbeSettings, train_success_probe
+from services.evaluation.success_probe_training import (
+    ProbeSettings,
+    calibrate_success_probe,
+    train_success_probe,
+)
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.shown_endings import ending_episode, final_ending
 
@@ -124,3 +130,24 @@ def test_data_hash_sees_every_change(demonstrations):
     touched[48, 1, 5] += 0.5
     changed = [toy.replace(few[0], tactile_kpa=touched), *few[1:]]
     assert endings_hash(_episodes(changed)) != whole
+
+
+def test_a_probe_with_spoiled_probabilities_is_calibrated_to_what_happened(
+    probe_checkpoint, demonstrations
+):
+    """Against the frequency of success, with the weights as they were."""
+    episodes = _episodes(demonstrations)
+    spoiled = {"calibration": {}, "threshold": probe_checkpoint.metadata.settings["threshold"]}
+    settings = {**probe_checkpoint.metadata.settings, **spoiled}
+    for task in probe_checkpoint.metadata.tasks:
+        settings["calibration"][f"{task}/true"] = {"temperature": 1.0, "bias": 8.0, "band": 0.0}
+    metadata = probe_checkpoint.metadata.model_copy(update={"settings": settings})
+    base = replace(probe_checkpoint, metadata=metadata)
+    calibrated = calibrate_success_probe(base, episodes, ProbeSettings(), command="test")
+    for name, tensor in base.tensors.items():
+        assert (calibrated.tensors[name] == tensor).all()
+    assert calibrated.metadata.settings["calibrated_by"] == "test"
+    last = [one.endings[max(one.endings)] for one in episodes]
+    rate = sum(one.success for one in episodes) / len(episodes)
+    assert SuccessProbe(base).probabilities(last).mean() > rate + 0.2
+    assert SuccessProbe(calibrated).probabilities(last).mean() == pytest.approx(rate, abs=0.08)
