@@ -25,6 +25,7 @@ from benchmarks.evaluator.plan import (
     trained_seeds,
 )
 from benchmarks.evaluator.repetition import read_lines, repetition
+from benchmarks.evaluator.single_members import write_single_members
 from benchmarks.evaluator.work import NEEDED, Missing, Study, open_study, unit_rows
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
@@ -74,6 +75,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="checkpoint of a world model trained without touch, as a baseline (none); once "
         "for all worlds, or once for each",
+    )
+    parser.add_argument(
+        "--each-member",
+        action="store_true",
+        help="evaluate every member of a world model's ensemble alone, as a training seed",
     )
     parser.add_argument(
         "--kinds",
@@ -263,6 +269,15 @@ def _results(
             yield done.result(), f"{task} {seed}"
 
 
+def _worlds(options: argparse.Namespace) -> Sequence[Path | None]:
+    given: Sequence[Path | None] = options.world or [None]
+    if not options.each_member:
+        return given
+    return [
+        path for world in given for path in write_single_members(world, options.keep / "members")
+    ]
+
+
 def _plan(options: argparse.Namespace) -> StudyPlan:
     default = _QUICK_STARTS if options.quick else _USUAL_STARTS
     num_starts = default if options.starts is None else options.starts
@@ -281,7 +296,7 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
     return StudyPlan(
         keep=options.keep,
         trained=trained_seeds(
-            options.world or [None],
+            _worlds(options),
             options.probe or [DEFAULT_PROBE],
             options.direct or [],
             options.without_touch or [],

@@ -17,6 +17,8 @@ from services.evaluation.starts import start_digest
 
 NUM_SEEN_STEPS: Final = 3
 OBJECT_POSES: Final = "object_poses"
+# Share of an object's usual size. Start readers err by 4 to 7 % (`python -m benchmarks starts`).
+UNUSUAL_SIZE: Final = 0.1
 # Each training episode is cut at one early and one middle step, in turn of seeds. Early endings are
 # failures, since nothing was done yet; in the middle only the milestones are known.
 EARLY_ENDS: Final = (2, 8, 14)
@@ -40,8 +42,9 @@ class Ending:
     `object_poses` are T_world_object (x y z m, qw qx qy qz) of at most three objects, NaN for an
     unknown object; only imagined worlds provide them. `images` are None if they were not
     requested; images or object poses are required. `doubted` is the reason why the world itself
-    flags its prediction as uncertain, and `success_probability` its own estimate of the outcome;
-    both are of the whole rollout.
+    flags its prediction as uncertain, `success_probability` its own estimate of the outcome, and
+    `size_deviation` how much the size of an object differs from the usual one; all are of the whole
+    rollout.
     """
 
     images: UInt8[np.ndarray, "3 h w 3"] | None
@@ -51,6 +54,12 @@ class Ending:
     imagined: bool = False
     doubted: str | None = None
     success_probability: float | None = None
+    size_deviation: float | None = None
+
+    @property
+    def has_unusual_sizes(self) -> bool:
+        """Whether an object is clearly larger or smaller than usual, in the world's estimate."""
+        return self.size_deviation is not None and self.size_deviation > UNUSUAL_SIZE
 
     @classmethod
     def of(
@@ -94,6 +103,7 @@ class Ending:
             self,
             doubted=None if doubt.reason is None else f"at step {doubt.step}, {doubt.reason}",
             success_probability=doubt.success_probability,
+            size_deviation=doubt.size_deviation,
         )
 
 

@@ -64,8 +64,8 @@ class SuccessProbe:
             for name, values in settings.get("calibration", {}).items()
         }
         self._combinations = {
-            task: Combination.model_validate(values)
-            for task, values in settings.get("combination", {}).items()
+            name: Combination.model_validate(values)
+            for name, values in settings.get("combination", {}).items()
         }
         self._told: Mapping[str, Sequence[str]] = settings.get("told_milestones", {})
         self._network = ProbeNetwork(self.shape)
@@ -171,9 +171,15 @@ class SuccessProbe:
             probability: calibrated, of the probe alone.
         """
         band = self.calibration(ending.task, imagined=ending.imagined).band
-        contradiction = None
+        contradiction = unknown_size = None
         if ending.success_probability is not None:
-            joint = self._combinations.get(ending.task, UNFITTED)
+            name = combination_name(ending.task, unusual_sizes=ending.has_unusual_sizes)
+            joint = self._combinations.get(name, UNFITTED)
+            if ending.has_unusual_sizes and name not in self._combinations:
+                unknown_size = (
+                    f"the size of an object differs by {ending.size_deviation:.0%} from the usual "
+                    "one, and the probe was not calibrated on such objects"
+                )
             pair = np.array([probability]), np.array([ending.success_probability])
             if joint.contradictory(*pair)[0]:
                 contradiction = (
@@ -183,6 +189,8 @@ class SuccessProbe:
             probability, band = float(joint.probabilities(*pair)[0]), joint.band
         if ending.doubted is not None:
             return probability, f"the world flags its prediction: {ending.doubted}"
+        if unknown_size is not None:
+            return probability, unknown_size
         if contradiction is None and band > 0 and abs(probability - self.threshold) <= band:
             return probability, (
                 f"its probability is within {band:.2f} of {self.threshold:g}, where the probe "
@@ -194,3 +202,8 @@ class SuccessProbe:
 def calibration_name(task: str, kind: str) -> str:
     """Key of a task's calibration for true or imagined endings, in checkpoints."""
     return f"{task}/{kind}"
+
+
+def combination_name(task: str, *, unusual_sizes: bool) -> str:
+    """Key of a task's combination for objects of about the usual size or of others."""
+    return f"{task}/unusual sizes" if unusual_sizes else task

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -17,7 +18,13 @@ from services.evaluation.calibration import (
 )
 from services.evaluation.endings import Ending, EndingEpisode
 from services.evaluation.statistics import area_under_roc, balanced_accuracy
-from services.evaluation.success_probe import IMAGINED, TRUE, SuccessProbe, calibration_name
+from services.evaluation.success_probe import (
+    IMAGINED,
+    TRUE,
+    SuccessProbe,
+    calibration_name,
+    combination_name,
+)
 
 # No calibration is fitted with fewer endings of either outcome.
 MIN_OUTCOMES: Final = 5
@@ -47,22 +54,26 @@ def fit_combinations(
     """Combination of a calibrated probe with the world's own estimates, of every task.
 
     Only imagined endings count that the world estimates and does not doubt, since it is for these
-    that the probe decides.
+    that the probe decides. Objects of unusual sizes have a combination of their own: a world is
+    right about them less often.
     """
     found: dict[str, Combination] = {}
-    for task in probe.shape.tasks:
+    for task, unusual_sizes in product(probe.shape.tasks, (False, True)):
         endings, success = final_endings(episodes, task, IMAGINED)
         rows = [
             row
             for row, ending in enumerate(endings)
-            if ending.success_probability is not None and ending.doubted is None
+            if ending.success_probability is not None
+            and ending.doubted is None
+            and ending.has_unusual_sizes == unusual_sizes
         ]
         outcomes = success[rows]
         if min(outcomes.sum(), (~outcomes).sum()) < MIN_OUTCOMES:
             continue
         mine = [endings[row] for row in rows]
         world = np.array([ending.success_probability for ending in mine], dtype=np.float64)
-        found[task] = fit_combination(
+        name = combination_name(task, unusual_sizes=unusual_sizes)
+        found[name] = fit_combination(
             probe.probabilities(mine), world, outcomes, risk=risk, margin=margin
         )
     return found

@@ -195,7 +195,7 @@ def _calibrated(checkpoint: Checkpoint, sets: ProbeSets, settings: ProbeSettings
         margin=settings.contradiction_margin,
     )
     return _with_settings(
-        calibrated, combination={task: one.model_dump() for task, one in combinations.items()}
+        calibrated, combination={name: one.model_dump() for name, one in combinations.items()}
     )
 
 

@@ -327,7 +327,14 @@ class StateWorld:
             reason=reason,
             success_probability=float(success.logit(1e-6).mean().sigmoid()),
             success_spread=float(success.max() - success.min()),
+            size_deviation=self._size_deviation(state),
         )
+
+    def _size_deviation(self, state: StateRollout) -> float:
+        """Largest deviation of a movable object's size from the usual one, as a share of it."""
+        movable = self._dynamics.core.movable[self._description.tasks.index(state.task)]
+        deviations = (mean_size(state.memory)[0] - 1.0).abs() * movable[:, None]
+        return float(deviations.max())
 
     def _poses(self, objects: ObjectPoses, task: str) -> Float32[np.ndarray, "n objects 7"]:
         """Poses of the task's objects; absent ones lie below the table."""

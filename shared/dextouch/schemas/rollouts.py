@@ -16,6 +16,7 @@ _QUALITY: Final = {
     "imagined_doubted_step": "step",
     "imagined_success_probability": "success_probability",
     "imagined_success_spread": "success_spread",
+    "imagined_size_deviation": "size_deviation",
 }
 
 
@@ -74,7 +75,7 @@ class Doubt(FrozenModel):
     """Uncertainty of an imagining world about its prediction.
 
     `disagreement` and `distance` are non-negative, and comparable within one world digest only. The
-    last two fields are omitted by a world that does not estimate success.
+    last three fields are omitted by a world that does not estimate them.
 
     Attributes:
         disagreement: between several predictions of the same steps.
@@ -84,6 +85,8 @@ class Doubt(FrozenModel):
         success_probability: probability that the task is done after these steps, in the world's own
             estimate: the mean over ensemble members and possible starts.
         success_spread: largest difference between the probabilities of two members.
+        size_deviation: how much the size of an object differs from the usual one at most, as a
+            share of it: 0.2 for a bottle seen 20 % thicker than those of training usually are.
     """
 
     disagreement: float = Field(ge=0, allow_inf_nan=False)
@@ -92,6 +95,9 @@ class Doubt(FrozenModel):
     reason: str | None = Field(default=None, min_length=1, max_length=500)
     success_probability: float | None = Field(default=None, ge=0, le=1, exclude_if=_is_none)
     success_spread: float | None = Field(default=None, ge=0, le=1, exclude_if=_is_none)
+    size_deviation: float | None = Field(
+        default=None, ge=0, allow_inf_nan=False, exclude_if=_is_none
+    )
 
     @model_validator(mode="after")
     def _a_reason_if_outside(self) -> "Doubt":
@@ -114,12 +120,14 @@ class RolloutDoubt(FrozenModel):
         step: last step of that chunk.
         success_probability: of the newest chunk; None where the world does not estimate it.
         success_spread: of the newest chunk.
+        size_deviation: of the newest chunk.
     """
 
     reason: str | None = None
     step: int | None = None
     success_probability: float | None = None
     success_spread: float | None = None
+    size_deviation: float | None = None
 
     def after(self, doubt: Doubt | None, *, last_step: int) -> "RolloutDoubt":
         """The doubt of the rollout after one more chunk.
@@ -136,6 +144,7 @@ class RolloutDoubt(FrozenModel):
             step=step,
             success_probability=None if doubt is None else doubt.success_probability,
             success_spread=None if doubt is None else doubt.success_spread,
+            size_deviation=None if doubt is None else doubt.size_deviation,
         )
 
     def to_quality(self) -> dict[str, float]:

@@ -178,10 +178,10 @@ def test_it_cannot_tell_within_its_band(judge):
     ]  # fmt: skip
 
 
-def _with_combination(judge, **fields):
+def _with_combination(judge, *, name="reach", **fields):
     """A probe of which only these fields of the combination are known, and no calibration."""
     probe = object.__new__(SuccessProbe)
-    combination = {"reach": Combination(**fields)} if fields else {}
+    combination = {name: Combination(**fields)} if fields else {}
     probe.__dict__ |= judge.__dict__ | {"_calibrations": {}, "_combinations": combination}
     return probe
 
@@ -224,6 +224,21 @@ def test_it_cannot_tell_within_the_band_of_both_estimates(judge):
     assert doubted.reason == "the world flags its prediction: at step 8, slipped"
 
 
+def test_objects_of_unusual_sizes_are_decided_by_their_own_combination(judge):
+    ending = replace(_episode("reach", 0, imagined=True).final, success_probability=0.7)
+    unusual = replace(ending, size_deviation=0.18)
+    weights = {"probe_weight": 0.0, "world_weight": 1.0}
+    usual = _with_combination(judge, **weights)
+    assert usual.verdict(replace(ending, size_deviation=0.09)).decision == "success"
+    verdict = usual.verdict(unusual)
+    assert (verdict.decision, verdict.likely_success) == ("cannot tell", True)
+    assert "differs by 18% from the usual" in verdict.reason
+    fitted = _with_combination(judge, name="reach/unusual sizes", **weights, band=0.19)
+    assert fitted.verdict(unusual).decision == "success"
+    doubted = fitted.verdict(replace(unusual, doubted="at step 8, slipped"))
+    assert doubted.reason == "the world flags its prediction: at step 8, slipped"
+
+
 def test_estimates_of_development_endings_are_fitted_and_kept_in_the_checkpoint():
     def estimated(seeds, *, sure):
         rng = np.random.default_rng(6)
@@ -260,6 +275,32 @@ def test_estimates_of_development_endings_are_fitted_and_kept_in_the_checkpoint(
     assert fit_combinations(probe, _episodes(range(600, 660)), risk=0.1, margin=0.0) == {}
 
 
+def test_a_world_that_is_wrong_about_unusual_sizes_decides_nothing_about_them():
+    def estimated(item):
+        is_unusual = item.seed % 2 == 1
+        told = 0.9 if item.success != is_unusual else 0.1
+        final = replace(
+            item.final,
+            success_probability=told if item.imagined else None,
+            size_deviation=0.2 if is_unusual else 0.02,
+        )
+        return replace(item, endings={**item.endings, item.last_step: final})
+
+    development = [estimated(item) for item in _episodes(range(600, 720))]
+    checkpoint = train_success_probe(
+        _episodes(range(30)),
+        ProbeSettings(num_training_steps=2),
+        command="x",
+        development=development,
+        held_out=_episodes(range(800, 812)),
+    )
+    kept = checkpoint.metadata.settings["combination"]
+    usual, unusual = kept["reach"], kept["reach/unusual sizes"]
+    assert usual["world_weight"] > 0.5
+    assert unusual["world_weight"] < 0.1
+    assert (usual["band"], unusual["band"]) == (0.0, 0.5)
+
+
 def test_an_ending_of_an_observation():
     steps = np.arange(5, dtype=np.float32)[:, None, None]
     seen = Observation(
@@ -280,9 +321,10 @@ def test_an_ending_of_an_observation():
     )
     ending = Ending.of(outside, "reach", imagined=True)
     assert (ending.images, ending.doubted) == (None, "at step 80, far away")
-    whole = RolloutDoubt(reason="slipped", step=16, success_probability=0.25)
+    whole = RolloutDoubt(reason="slipped", step=16, success_probability=0.25, size_deviation=0.1)
     ending = Ending.of(outside, "reach", imagined=True, doubt=whole)
     assert (ending.doubted, ending.success_probability) == ("at step 16, slipped", 0.25)
+    assert (ending.size_deviation, ending.has_unusual_sizes) == (0.1, False)
     with pytest.raises(InvalidInputError, match="at least 3"):
         Ending.of(seen.last(), "reach", imagined=True)
 

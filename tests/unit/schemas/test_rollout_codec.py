@@ -145,6 +145,8 @@ def test_what_older_services_do_not_send_is_none():
         {"success_probability": 1.5},
         {"success_probability": float("nan")},
         {"success_spread": -0.1},
+        {"size_deviation": -0.1},
+        {"size_deviation": float("inf")},
     ],
 )
 def test_doubt_that_contradicts_itself_is_refused(fields):
@@ -156,7 +158,9 @@ def test_doubt_that_contradicts_itself_is_refused(fields):
 
 
 def test_an_estimate_of_success_comes_back_and_is_omitted_where_there_is_none():
-    estimated = Doubt(disagreement=0, distance=0, success_probability=0.75, success_spread=0.5)
+    estimated = Doubt(
+        disagreement=0, distance=0, success_probability=0.75, success_spread=0.5, size_deviation=0.2
+    )
     seen = dataclasses.replace(imagined_observation(), doubt=estimated)
     assert_same(decode_answer(encode_answer(INFO, seen), max_bytes=10**6).observation, seen)
     raw, _ = unpack(encode_observation(imagined_observation()), max_bytes=10**6)
@@ -190,7 +194,9 @@ def test_one_doubted_chunk_makes_the_rollout_doubtful():
 
 
 def test_a_doubt_is_kept_as_figures_of_an_episode():
-    doubt = RolloutDoubt(reason="slipped", step=8, success_probability=0.25, success_spread=0.5)
+    doubt = RolloutDoubt(
+        reason="slipped", step=8, success_probability=0.25, success_spread=0.5, size_deviation=0.2
+    )
     quality = doubt.to_quality()
     assert set(map(type, quality.values())) == {float}
     back = RolloutDoubt.from_quality({"residual_mm": 1.0, **quality})

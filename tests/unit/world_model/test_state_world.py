@@ -160,6 +160,21 @@ def test_images_of_a_batch_are_drawn_together_as_requested(world, monkeypatch):
             assert np.abs(drawn.astype(int) - images.astype(int)).max() <= 1
 
 
+def test_the_size_of_objects_is_reported_beside_the_usual_one(world):
+    started = world.reset(from_observation(world))
+    for factors, expected in (((1.0, 0.75), 0.25), ((1.3, 0.9), 0.3)):
+        memory = started.state.memory
+        size = torch.tensor(factors).expand_as(memory.start.size).clone()
+        # Slots without an object do not count.
+        size[..., 1:, :] = 2.0
+        start = dataclasses.replace(memory.start, size=size)
+        state = dataclasses.replace(started.state, memory=dataclasses.replace(memory, start=start))
+        for movable in (1.0, 0.0):
+            world._dynamics.core.movable[:, 0] = movable
+            doubt = world.step(state, move(started.observation, 4), seed=0).observation.doubt
+            assert doubt.size_deviation == pytest.approx(movable * expected, abs=1e-6)
+
+
 def test_success_is_estimated_by_all_members():
     untrained_state_checkpoint.cache_clear()
     checkpoint = untrained_state_checkpoint()
