@@ -93,6 +93,7 @@ def run_train_probe(arguments: list[str]) -> int:
         command=command_line("probe", arguments),
         development=read(settings.development),
         held_out=read(settings.held_out),
+        jobs=settings.jobs,
     )
     return _keep(checkpoint, settings.output, settings.json_path)
 

@@ -5,9 +5,12 @@ Three disjoint sets of episodes: training, development (to calibrate the probabi
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 
 import torch
+from torch import Tensor
 from torch.nn import functional
 
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
@@ -88,6 +91,7 @@ def train_success_probe(
     command: str,
     development: Sequence[EndingEpisode] = (),
     held_out: Sequence[EndingEpisode] = (),
+    jobs: int = 1,
 ) -> Checkpoint:
     """Train a probe to predict success from the end of a rollout.
 
@@ -97,6 +101,7 @@ def train_success_probe(
         command: command to store in the checkpoint.
         development: episodes to calibrate on; default: a share of the seeds of `episodes`.
         held_out: episodes to evaluate on; default: a share of the seeds of `episodes`.
+        jobs: processes, each of which trains one task at a time; the weights do not depend on it.
 
     Returns:
         Weights and calibration; the metadata holds the metrics on held-out episodes.
@@ -115,9 +120,15 @@ def train_success_probe(
     )
     network = ProbeNetwork(shape)
     learned = labelled_endings(sets.training, shape, imagined_share=settings.imagined_share)
+    orders = [
+        (network.of(task), learned.of_task(index), settings, f"probe {task}")
+        for index, task in enumerate(shape.tasks)
+    ]
     cpu_s = 0.0
-    for index, task in enumerate(shape.tasks):
-        cpu_s += _optimize(network.of(task), learned.of_task(index), settings, name=f"probe {task}")
+    for task, (weights, used_s) in zip(shape.tasks, _all_optimized(orders, jobs), strict=True):
+        network.of(task).load_state_dict(weights)
+        cpu_s += used_s
+    network.eval()
     metadata = _metadata(sets, settings, shape, command, cpu_s)
     plain = Checkpoint(metadata, network_tensors(network))
     return _measured(_calibrated(plain, sets, settings), sets)
@@ -215,10 +226,26 @@ def _measured(checkpoint: Checkpoint, sets: ProbeSets) -> Checkpoint:
     )
 
 
-def _optimize(
-    network: TaskNetwork, learned: Labelled, settings: ProbeSettings, *, name: str
-) -> float:
-    """Minimize the balanced cross entropy of one task; returns the CPU seconds used."""
+_Order = tuple[TaskNetwork, Labelled, ProbeSettings, str]
+_Optimized = tuple[dict[str, Tensor], float]
+
+
+def _all_optimized(orders: Sequence[_Order], jobs: int) -> list[_Optimized]:
+    if jobs == 1 or len(orders) < 2:
+        return [_optimized(*order) for order in orders]
+    # A fresh interpreter: a forked one would share the threads of torch.
+    spawned = get_context("spawn")
+    with ProcessPoolExecutor(jobs, spawned, torch.set_num_threads, (1,)) as pool:
+        running = [pool.submit(_optimized, *order) for order in orders]
+        return [one.result() for one in running]
+
+
+def _optimized(
+    network: TaskNetwork, learned: Labelled, settings: ProbeSettings, name: str
+) -> _Optimized:
+    """Minimize the balanced cross entropy of one task; returns weights and CPU seconds."""
+    # Dropout draws from the global generator.
+    torch.manual_seed(settings.seed)
     mean, std = object_scale(learned.batch)
     network.object_mean.copy_(mean)
     network.object_std.copy_(std)
@@ -237,8 +264,7 @@ def _optimize(
     cpu_s = 0.0
     for used in steps:
         cpu_s = used.cpu_s
-    network.eval()
-    return cpu_s
+    return network.state_dict(), cpu_s
 
 
 def _loss(

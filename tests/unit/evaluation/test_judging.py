@@ -275,6 +275,23 @@ def test_estimates_of_development_endings_are_fitted_and_kept_in_the_checkpoint(
     assert fit_combinations(probe, _episodes(range(600, 660)), risk=0.1, margin=0.0) == {}
 
 
+def test_processes_do_not_change_the_weights():
+    one, two = (
+        train_success_probe(
+            _episodes(range(30)),
+            ProbeSettings(num_training_steps=3),
+            command="x",
+            development=_episodes(range(600, 612)),
+            held_out=_episodes(range(700, 712)),
+            jobs=jobs,
+        )
+        for jobs in (1, 2)
+    )
+    assert one.tensors.keys() == two.tensors.keys()
+    for name, tensor in one.tensors.items():
+        assert torch.equal(tensor, two.tensors[name]), name
+
+
 def test_a_world_that_is_wrong_about_unusual_sizes_decides_nothing_about_them():
     def estimated(item):
         is_unusual = item.seed % 2 == 1
