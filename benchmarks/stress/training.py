@@ -188,7 +188,7 @@ def _episode() -> EpisodeArrays:
         episode_id="stress",
         task=start.task,
         instruction=start.instruction,
-        seed=start.seed,
+        scene=f"{start.task}/{start.seed}",
         images=np.repeat(observation.images["camera_head"], _STEPS, axis=0),
         tactile_kpa=touch,
         tactile_valid=np.ones((_STEPS, 2), dtype=np.bool_),

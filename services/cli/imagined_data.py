@@ -16,7 +16,7 @@ from rich.progress import track
 
 from dextouch.clients import RolloutClient
 from dextouch.command_line import CommandParser, add_json, write_result
-from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore, scene_of
 from dextouch.serving import configure_logging
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli.servers import served
@@ -76,8 +76,8 @@ def imagine_all(
 
 def judged_steps(episode: EpisodeReader) -> set[int]:
     """Steps of an episode whose images the success probe uses."""
-    seed, last = episode.attributes.seed or 0, episode.num_steps - 1
-    ends = (early_step(seed), middle_step(seed), last - 1, last)
+    scene, last = scene_of(episode.attributes), episode.num_steps - 1
+    ends = (early_step(scene), middle_step(scene), last - 1, last)
     return {step for end in ends for step in range(end - NUM_SEEN_STEPS + 1, end + 1)}
 
 

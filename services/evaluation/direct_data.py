@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore, scene_of
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions
 from services.evaluation.demonstrations import CAMERA
@@ -35,7 +35,7 @@ class LabelledAttempt:
 
     episode_id: str
     instruction: str
-    seed: int
+    scene: str
     success: bool
     attempt: Attempt
     views: Sequence[View]
@@ -67,8 +67,8 @@ def read_attempts(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[Labe
     readers = robot_episodes(
         stores,
         tasks=tasks,
-        wanted=lambda about: about.origin == "twin",
-        what="robot episode of the twin",
+        wanted=lambda about: about.origin != "imagined",
+        what="true robot episode",
     )
     return [read_attempt(reader) for reader in readers]
 
@@ -81,11 +81,11 @@ def read_attempt(reader: EpisodeReader) -> LabelledAttempt:
     """
     about = reader.attributes
     missing = {"action_commanded", OBJECT_POSES} - set(reader.streams)
-    if about.success is None or about.seed is None or missing or reader.num_steps != 1 + NUM_STEPS:
+    if about.success is None or missing or reader.num_steps != 1 + NUM_STEPS:
         raise InvalidInputError(
-            f"episode {about.episode_id!r}: success {about.success}, seed {about.seed}, "
-            f"{reader.num_steps} steps, without {sorted(missing)}; expected an episode of the twin "
-            f"with {1 + NUM_STEPS} steps, as `dextouch train data` records them"
+            f"episode {about.episode_id!r}: success {about.success}, {reader.num_steps} steps, "
+            f"without {sorted(missing)}; expected a known outcome, {1 + NUM_STEPS} steps and these "
+            "streams, as `dextouch train data` records them"
         )
     window = reader.window(0, reader.num_steps, cameras=())
     steps, images = reader.shown_steps(CAMERA)
@@ -110,7 +110,7 @@ def read_attempt(reader: EpisodeReader) -> LabelledAttempt:
         window.K_head,
     )
     return LabelledAttempt(
-        about.episode_id, about.instruction, about.seed, about.success, attempt, views
+        about.episode_id, about.instruction, scene_of(about), about.success, attempt, views
     )
 
 

@@ -14,11 +14,12 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from dextouch.episodes import split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import transform_from_pose
 from services.evaluation.calibration import Calibration, expected_calibration_error, fit_calibration
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
-from services.evaluation.demonstrations import instructions_of, split_by_seed
+from services.evaluation.demonstrations import instructions_of
 from services.evaluation.direct_data import LabelledAttempt, attempts_hash
 from services.evaluation.direct_judge import KIND, DirectJudge
 from services.evaluation.direct_network import (
@@ -95,7 +96,7 @@ def train_direct_judge(
     """
     torch.manual_seed(settings.seed)
     share = settings.development_share
-    training, apart = split_by_seed(items, held_out_share=share, salt="direct judge ")
+    training, apart = split_by_scene(items, held_out_share=share, salt="direct judge ")
     if len({item.success for item in training}) < 2:
         raise InvalidInputError(
             f"direct judge: all {len(training)} training episodes have the same outcome, expected "

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore, scene_fraction, scene_of
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Observation, RolloutDoubt, is_rollout, rollout_doubt
 from services.evaluation.demonstrations import CAMERA
@@ -19,20 +19,20 @@ NUM_SEEN_STEPS: Final = 3
 OBJECT_POSES: Final = "object_poses"
 # Share of an object's usual size. Start readers err by 4 to 7 % (`python -m benchmarks starts`).
 UNUSUAL_SIZE: Final = 0.1
-# Each training episode is cut at one early and one middle step, in turn of seeds. Early endings are
-# failures, since nothing was done yet; in the middle only the milestones are known.
+# Each training episode is cut at one early and one middle step, drawn by its scene. Early endings
+# are failures, since nothing was done yet; in the middle only the milestones are known.
 EARLY_ENDS: Final = (2, 8, 14)
 MIDDLE_ENDS: Final = (32, 48, 64)
 
 
-def early_step(seed: int) -> int:
-    """The step of `EARLY_ENDS` at which an episode of this seed is cut."""
-    return EARLY_ENDS[seed % len(EARLY_ENDS)]
+def early_step(scene: str) -> int:
+    """The step of `EARLY_ENDS` at which an episode of this scene is cut."""
+    return EARLY_ENDS[int(scene_fraction(scene, salt="early ") * len(EARLY_ENDS))]
 
 
-def middle_step(seed: int) -> int:
-    """The step of `MIDDLE_ENDS` at which an episode of this seed is cut."""
-    return MIDDLE_ENDS[seed // len(EARLY_ENDS) % len(MIDDLE_ENDS)]
+def middle_step(scene: str) -> int:
+    """The step of `MIDDLE_ENDS` at which an episode of this scene is cut."""
+    return MIDDLE_ENDS[int(scene_fraction(scene, salt="middle ") * len(MIDDLE_ENDS))]
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class EndingEpisode:
     episode_id: str
     task: str
     instruction: str
-    seed: int
+    scene: str
     success: bool
     start_digest: str
     last_step: int
@@ -140,12 +140,12 @@ class EndingEpisode:
     @property
     def early_step(self) -> int:
         """The step of `EARLY_ENDS` at which this episode is cut."""
-        return early_step(self.seed)
+        return early_step(self.scene)
 
     @property
     def middle_step(self) -> int:
         """The step of `MIDDLE_ENDS` at which this episode is cut."""
-        return middle_step(self.seed)
+        return middle_step(self.scene)
 
     def reached(self, milestones: Sequence[str], step: int) -> list[bool] | None:
         """Whether each milestone was reached by a step; None where that is unknown."""
@@ -160,14 +160,14 @@ def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:
     """Endings of one stored robot episode; only the steps shown are decoded.
 
     Raises:
-        InvalidInputError: the episode has no outcome, no seed, or too few steps.
+        InvalidInputError: the episode has no outcome, or too few steps.
     """
     about = reader.attributes
     last = reader.num_steps - 1
-    if about.success is None or about.seed is None or last <= MIDDLE_ENDS[-1]:
+    if about.success is None or last <= MIDDLE_ENDS[-1]:
         raise InvalidInputError(
-            f"episode {about.episode_id!r}: success {about.success}, seed {about.seed}, "
-            f"{last + 1} steps; expected both known, as in episodes of the twin, and more than "
+            f"episode {about.episode_id!r}: success {about.success}, {last + 1} steps; expected a "
+            "known outcome, as operators enter it after a take, and more than "
             f"{MIDDLE_ENDS[-1] + 1} steps"
         )
     first = reader.window(0, num_steps=1, cameras=(CAMERA,))
@@ -175,7 +175,7 @@ def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:
         about.episode_id,
         about.task,
         about.instruction,
-        about.seed,
+        scene_of(about),
         about.success,
         start_digest(first.images[CAMERA][0], first.tactile_kpa[0]),
         last,

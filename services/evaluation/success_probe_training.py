@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from dextouch.episodes import split_by_scene
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
-from services.evaluation.demonstrations import instructions_of, split_by_seed
+from services.evaluation.demonstrations import instructions_of
 from services.evaluation.endings import EndingEpisode, endings_hash, milestones_of
 from services.evaluation.judge_network import (
     ProbeBatch,
@@ -53,12 +54,12 @@ class ProbeSets:
         development: Sequence[EndingEpisode] = (),
         held_out: Sequence[EndingEpisode] = (),
     ) -> "ProbeSets":
-        """The given sets; missing ones are taken from a share of the seeds of `episodes`."""
+        """The given sets; missing ones are taken from a share of the scenes of `episodes`."""
         training, tested, calibrated = list(episodes), list(held_out), list(development)
         if not tested:
-            training, tested = split_by_seed(training, held_out_share=settings.held_out_share)
+            training, tested = split_by_scene(training, held_out_share=settings.held_out_share)
         if not calibrated:
-            training, calibrated = split_by_seed(
+            training, calibrated = split_by_scene(
                 training, held_out_share=settings.development_share, salt="development "
             )
         return cls(training, calibrated, tested)
@@ -99,8 +100,8 @@ def train_success_probe(
         episodes: true and imagined episodes with known success.
         settings: training settings.
         command: command to store in the checkpoint.
-        development: episodes to calibrate on; default: a share of the seeds of `episodes`.
-        held_out: episodes to evaluate on; default: a share of the seeds of `episodes`.
+        development: episodes to calibrate on; default: a share of the scenes of `episodes`.
+        held_out: episodes to evaluate on; default: a share of the scenes of `episodes`.
         jobs: processes, each of which trains one task at a time; the weights do not depend on it.
 
     Returns:

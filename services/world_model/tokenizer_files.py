@@ -35,8 +35,8 @@ class Reconstruction(FrozenModel):
 class TokenizerMetadata(FrozenModel):
     """Provenance and measured accuracy of a tokenizer.
 
-    `train_scenes` are task and seed of the episodes trained on, or the id of an episode without a
-    seed. `curve` begins with the untrained network and ends with the stored one.
+    `train_scenes` are the scenes of the episodes trained on (`dextouch.episodes.scene_of`). `curve`
+    begins with the untrained network and ends with the stored one.
     """
 
     format_version: int = 1

@@ -8,7 +8,7 @@ from typing import Final, Literal
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in
+from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, scene_of
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses
 from services.evaluation.demonstrations import CAMERA
@@ -32,14 +32,15 @@ class Moment:
 class CloningEpisode:
     """One robot episode: measured and commanded actions at every step, observations at some.
 
-    Both actions are relative to the measured poses of step 0, which are `anchor`. `moments` maps
-    steps to observations and includes step 0.
+    `commanded` are the measured ones where the episode has no commands. Both actions are relative
+    to the measured poses of step 0, which are `anchor`. `moments` maps steps to observations and
+    includes step 0.
     """
 
     episode_id: str
     task: str
     instruction: str
-    seed: int
+    scene: str
     success: bool
     anchor: AnchorPoses
     moments: Mapping[int, Moment]
@@ -61,13 +62,9 @@ def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
     """Read one successful robot episode; only images at decision steps are decoded.
 
     Raises:
-        InvalidInputError: no seed, or no image at a decision step.
+        InvalidInputError: no image at a decision step.
     """
     about = reader.attributes
-    if about.seed is None:
-        raise InvalidInputError(
-            f"episode {about.episode_id!r}: no seed, expected one, as in episodes of the twin"
-        )
     wanted = range(0, reader.num_steps, DECISION_STRIDE)
     missing = sorted(set(wanted) - set(reader.shown_steps(CAMERA)[0].tolist()))
     if missing:
@@ -81,7 +78,7 @@ def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
         about.episode_id,
         about.task,
         about.instruction,
-        about.seed,
+        scene_of(about),
         bool(about.success),
         first.anchor,
         {
@@ -92,8 +89,17 @@ def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
             for step in wanted
         },
         first.actions,
-        reader.read("action_commanded").values,
+        _commanded(reader, first.actions),
     )
+
+
+def _commanded(
+    reader: EpisodeReader, measured: Float64[np.ndarray, "steps 67"]
+) -> Float64[np.ndarray, "steps 67"]:
+    """Commands of every step; of robots that keep none, the poses that they reached."""
+    if "action_commanded" not in reader.streams:
+        return measured
+    return reader.read("action_commanded").values
 
 
 def read_cloning_episodes(

@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from dextouch.episodes import split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
-from services.evaluation.demonstrations import instructions_of, split_by_seed
+from services.evaluation.demonstrations import instructions_of
 from services.evaluation.optimization import optimized
 from services.evaluation.policies.behaviour_cloning import (
     KIND,
@@ -163,7 +164,7 @@ def train_cloned_policy(
     torch.manual_seed(settings.seed)
     tasks = tuple(sorted({item.task for item in episodes}))
     shape = CloningShape(tasks=tasks, image_size_px=episodes[0].moments[0].image.shape[0])
-    training, held_out = split_by_seed(episodes, held_out_share=settings.held_out_share)
+    training, held_out = split_by_scene(episodes, held_out_share=settings.held_out_share)
     learned, tested = decisions_of(training, shape), decisions_of(held_out, shape)
     network = shape.network()
     _fit_statistics(network, learned)

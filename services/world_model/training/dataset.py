@@ -51,8 +51,8 @@ class TrainingEpisode(Protocol):
         ...
 
     @property
-    def seed(self) -> int | None:
-        """Seed of the scene if the twin made the episode."""
+    def scene(self) -> str:
+        """Name of its scene, from `dextouch.episodes.scene_of`."""
         ...
 
     @property
@@ -90,7 +90,7 @@ class EpisodeArrays:
     episode_id: str
     task: str
     instruction: str
-    seed: int | None
+    scene: str
     images: UInt8[np.ndarray, "steps h w 3"]
     tactile_kpa: Float32[np.ndarray, "steps 2 320"]
     tactile_valid: Bool[np.ndarray, "steps 2"]

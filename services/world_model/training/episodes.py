@@ -7,7 +7,7 @@ from typing import Final, TypeVar
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, is_rejected
+from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, is_rejected, scene_of
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ActionKind, Domain
 from services.world_model.starts import CAMERA
@@ -86,7 +86,7 @@ def read_episode(reader: EpisodeReader) -> EpisodeArrays:
         episode_id=attributes.episode_id,
         task=attributes.task,
         instruction=attributes.instruction,
-        seed=attributes.seed,
+        scene=scene_of(attributes),
         images=measured.images[CAMERA],
         tactile_kpa=measured.tactile_kpa,
         tactile_valid=measured.tactile_valid,
@@ -108,25 +108,6 @@ def objects_of(
     if OBJECT_POSES not in reader.streams or not len(boxes_m):
         return None
     return poses_at(reader, t_ref_ns), boxes_m
-
-
-def split_by_hash(episodes: Sequence[E], *, heldout_percent: int) -> tuple[list[E], list[E]]:
-    """Split into training and held-out episodes by a hash of their content.
-
-    Raises:
-        InvalidInputError: either side would be empty.
-    """
-    trained: list[E] = []
-    heldout: list[E] = []
-    for episode in episodes:
-        bucket = int(episode.content_hash()[:8], 16) % 100
-        (heldout if bucket < heldout_percent else trained).append(episode)
-    if not trained or not heldout:
-        raise InvalidInputError(
-            f"split: got {len(trained)} training and {len(heldout)} held-out episodes of "
-            f"{len(episodes)}, expected at least one each; add episodes or a held-out store"
-        )
-    return trained, heldout
 
 
 def subset_by_hash(episodes: Sequence[E], count: int | None, *, what: str) -> list[E]:

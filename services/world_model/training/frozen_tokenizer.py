@@ -3,13 +3,12 @@
 from collections import Counter
 from collections.abc import Sequence
 
+from dextouch.episodes import scene_fraction
 from dextouch.errors import InvalidInputError
 from services.world_model.settings import TrainSettings
 from services.world_model.tokenizer_files import StoredTokenizer, read_tokenizer
 from services.world_model.training.dataset import TrainingEpisode
 from services.world_model.training.episodes import E
-from services.world_model.training.scene_episodes import place_of_name
-from services.world_model.training.tactile_hands import scene_of
 
 
 def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokenizer | None]:
@@ -49,9 +48,9 @@ def split_unseen(
     Raises:
         InvalidInputError: either side would be empty.
     """
-    sizes = Counter(scene_of(episode) for episode in episodes)
+    sizes = Counter(episode.scene for episode in episodes)
     heldout: set[str] = set()
-    for scene in sorted(sizes.keys() - set(stored.metadata.train_scenes), key=place_of_name):
+    for scene in sorted(sizes.keys() - set(stored.metadata.train_scenes), key=scene_fraction):
         if 100 * sum(sizes[one] for one in heldout) >= heldout_percent * len(episodes):
             break
         heldout.add(scene)
@@ -61,15 +60,15 @@ def split_unseen(
             "not seen, expected some; give a --heldout store"
         )
     return (
-        [episode for episode in episodes if scene_of(episode) not in heldout],
-        [episode for episode in episodes if scene_of(episode) in heldout],
+        [episode for episode in episodes if episode.scene not in heldout],
+        [episode for episode in episodes if episode.scene in heldout],
     )
 
 
 def check_unseen(heldout: Sequence[TrainingEpisode], stored: StoredTokenizer) -> None:
     """Raise if the tokenizer was trained on the scene of a held-out episode."""
     seen = set(stored.metadata.train_scenes)
-    both = [episode.episode_id for episode in heldout if scene_of(episode) in seen]
+    both = [episode.episode_id for episode in heldout if episode.scene in seen]
     if both:
         raise InvalidInputError(
             f"training: the tokenizer was trained on the scenes of {len(both)} held-out episodes "

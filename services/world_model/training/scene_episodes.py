@@ -5,17 +5,16 @@ outcome. Imagined episodes, truncated ones, those with an unknown outcome and th
 rejected in review are skipped and counted.
 """
 
-import hashlib
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 import structlog
 from jaxtyping import Float16, Float32, Float64, Int64, UInt8
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, is_rejected
-from dextouch.errors import ConflictError, InvalidInputError
+from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, is_rejected, scene_of
+from dextouch.errors import InvalidInputError
 from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
 from dextouch.schemas import ActionKind
 from services.world_model.starts import CAMERA
@@ -36,7 +35,8 @@ class SceneEpisode:
 
     episode_id: str
     task: str
-    seed: int
+    scene: str
+    seed: int | None
     success: bool
     object_names: tuple[str, ...]
     object_boxes_m: Float64[np.ndarray, "objects 6"]
@@ -50,11 +50,6 @@ class SceneEpisode:
     images: UInt8[np.ndarray, "shown h w 3"]
     image_steps: Int64[np.ndarray, " shown"]
     content_sha256: str
-
-    @property
-    def scene(self) -> tuple[str, int]:
-        """Task and seed; a split must not have them on both sides."""
-        return self.task, self.seed
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -101,31 +96,29 @@ def load_scene_episodes(
 def _unfit(reader: EpisodeReader) -> str | None:
     """Reason why an episode is not usable as ground truth, or None."""
     attributes = reader.attributes
-    if attributes.origin != "twin":
-        return f"origin {attributes.origin}"
+    if attributes.origin == "imagined":
+        return "origin imagined"
     if attributes.recovered:
         return "recovered after its writer died"
     if attributes.success is None:
         return "success unknown"
-    if attributes.seed is None:
-        return "seed unknown"
     missing = {"action", "tactile_left", "tactile_right", "object_poses"} - set(reader.streams)
     return f"without {', '.join(sorted(missing))}" if missing else None
 
 
 def read_scene_episode(reader: EpisodeReader) -> SceneEpisode:
-    """Read one episode of known success and seed.
+    """Read one episode of known success.
 
     Raises:
-        InvalidInputError: success or seed is unknown.
+        InvalidInputError: success is unknown.
         UnknownNameError: a stream is missing.
         CorruptDataError: damaged bytes.
     """
     attributes = reader.attributes
-    if attributes.success is None or attributes.seed is None:
+    if attributes.success is None:
         raise InvalidInputError(
-            f"episode {attributes.episode_id!r}: got success {attributes.success} and seed "
-            f"{attributes.seed}, expected both to be known"
+            f"episode {attributes.episode_id!r}: its outcome is unknown, expected success or "
+            "failure, as operators enter it after a take"
         )
     window = reader.window(0, reader.num_steps, cameras=())
     actions = window.actions
@@ -137,6 +130,7 @@ def read_scene_episode(reader: EpisodeReader) -> SceneEpisode:
     return SceneEpisode(
         episode_id=attributes.episode_id,
         task=attributes.task,
+        scene=scene_of(attributes),
         seed=attributes.seed,
         success=attributes.success,
         object_names=attributes.object_names,
@@ -173,51 +167,3 @@ def poses_at(reader: EpisodeReader, grid_ns: np.ndarray) -> Float32[np.ndarray, 
     Ts = transform_from_pose(data.values)
     each = [interpolate_poses(Ts[:, index], left, weight) for index in range(Ts.shape[1])]
     return pose_from_transform(np.stack(each, axis=1)).astype(np.float32)
-
-
-def place_of_scene(episode: SceneEpisode) -> float:
-    """Hash of task and seed as a number in 0 … 1; adding episodes does not change it."""
-    return place_of_name(f"{episode.task}/{episode.seed}")
-
-
-def place_of_name(scene: str) -> float:
-    """`place_of_scene` of a scene by its name, TASK/SEED."""
-    digest = hashlib.sha256(scene.encode()).digest()
-    return int.from_bytes(digest[:8], "big") / 2**64
-
-
-def split_by_scene(
-    episodes: Iterable[SceneEpisode], *, held_out_share: float
-) -> tuple[list[SceneEpisode], list[SceneEpisode]]:
-    """Training and held-out episodes; a task and seed is always on one side.
-
-    Raises:
-        InvalidInputError: a share outside 0 … 1, or an empty side.
-    """
-    training: list[SceneEpisode] = []
-    held_out: list[SceneEpisode] = []
-    for episode in episodes:
-        (held_out if place_of_scene(episode) < held_out_share else training).append(episode)
-    if not training or not held_out:
-        raise InvalidInputError(
-            f"split: got {len(training)} training and {len(held_out)} held-out episodes with a "
-            f"share of {held_out_share}, expected at least one each"
-        )
-    return training, held_out
-
-
-def refuse_shared_scenes(
-    training: Sequence[SceneEpisode], held_out: Sequence[SceneEpisode]
-) -> None:
-    """Reject a split with the same task and seed on both sides.
-
-    Raises:
-        ConflictError: scenes are shared; the first few are named.
-    """
-    shared = sorted({e.scene for e in training} & {e.scene for e in held_out})
-    if shared:
-        names = ", ".join(f"{task} seed {seed}" for task, seed in shared[:5])
-        raise ConflictError(
-            f"split: {len(shared)} scenes are both trained on and held out ({names}); evaluate on "
-            "other seeds"
-        )

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 
+from dextouch.episodes import split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Domain
 from services.world_model.checkpoints import Checkpoint, TrainingSet
@@ -17,7 +18,6 @@ from services.world_model.training.episodes import (
     E,
     check_rates,
     load_episodes,
-    split_by_hash,
     subset_by_hash,
 )
 from services.world_model.training.frozen_tokenizer import split_unseen
@@ -60,7 +60,7 @@ def _load_robot(
 
 def _split(episodes: Sequence[E], settings: TrainSettings) -> tuple[list[E], list[E]]:
     if settings.tokenizer is None:
-        return split_by_hash(episodes, heldout_percent=settings.heldout_percent)
+        return split_by_scene(episodes, held_out_share=settings.heldout_percent / 100)
     stored = read_tokenizer(settings.tokenizer)
     return split_unseen(episodes, stored, heldout_percent=settings.heldout_percent)
 
@@ -88,18 +88,18 @@ def check_not_learned(heldout: Sequence[TrainingEpisode], ancestor: Checkpoint) 
 
 
 def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode]) -> None:
-    """Raise if a held-out episode, or a seed of its task, is also trained on."""
+    """Raise if a held-out episode, or its scene, is also trained on."""
     prints = {episode.content_hash() for episode in trained}
-    seeds = {(e.task, e.seed) for e in trained if e.seed is not None}
+    scenes = {episode.scene for episode in trained}
     both = [
         episode.episode_id
         for episode in heldout
-        if episode.content_hash() in prints or (episode.task, episode.seed) in seeds
+        if episode.content_hash() in prints or episode.scene in scenes
     ]
     if both:
         raise InvalidInputError(
             f"training: {len(both)} held-out episodes are also trained on {both[:3]} (same content "
-            "or same task and seed); expected disjoint sets",
+            "or same scene); expected disjoint sets",
             episodes=both,
         )
 

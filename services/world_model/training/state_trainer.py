@@ -19,6 +19,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from dextouch.command_line import ProgressLines
+from dextouch.episodes import refuse_shared_scenes, scene_fraction, split_by_scene
 from dextouch.errors import InvalidInputError
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.configuration import DynamicsConfig
@@ -49,9 +50,6 @@ from services.world_model.training.scene_clips import scene_clips
 from services.world_model.training.scene_episodes import (
     SceneEpisode,
     load_scene_episodes,
-    place_of_scene,
-    refuse_shared_scenes,
-    split_by_scene,
 )
 from services.world_model.training.scene_table import (
     SceneTable,
@@ -238,7 +236,7 @@ def _labelled(episodes: list[SceneEpisode], settings: StateTrainSettings) -> lis
     """Mask of episodes whose object poses are trained on; equal for all takes of a scene."""
     # Training scenes lie above the held-out share.
     share = settings.heldout_share + (1 - settings.heldout_share) * settings.labelled_share
-    labelled = [place_of_scene(episode) <= share for episode in episodes]
+    labelled = [scene_fraction(episode.scene) <= share for episode in episodes]
     known = {episode.task for episode, yes in zip(episodes, labelled, strict=True) if yes}
     without = {episode.task for episode in episodes} - known
     if without:
@@ -250,10 +248,11 @@ def _labelled(episodes: list[SceneEpisode], settings: StateTrainSettings) -> lis
 
 
 def _seed_ranges(episodes: list[SceneEpisode]) -> dict[str, tuple[int, int]]:
-    """First and last seed of every task."""
+    """First and last seed of every task; episodes of people and real robots have none."""
     seeds: dict[str, list[int]] = {}
     for episode in episodes:
-        seeds.setdefault(episode.task, []).append(episode.seed)
+        if episode.seed is not None:
+            seeds.setdefault(episode.task, []).append(episode.seed)
     return {task: (min(found), max(found)) for task, found in sorted(seeds.items())}
 
 

@@ -53,7 +53,7 @@ class StoredEpisode:
     url: str
     episode_id: str
     task: str
-    seed: int | None
+    scene: str
     num_steps: int
     action_kinds: tuple[ActionKind, ...]
     content_sha256: str
@@ -125,7 +125,7 @@ def index_episodes(
                 url=url,
                 episode_id=episode_id,
                 task=arrays.task,
-                seed=arrays.seed,
+                scene=arrays.scene,
                 num_steps=len(arrays),
                 action_kinds=arrays.action_kinds,
                 content_sha256=fingerprint(arrays),

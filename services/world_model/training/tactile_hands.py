@@ -8,12 +8,9 @@ from itertools import chain
 import numpy as np
 from jaxtyping import Float32
 
-from dextouch.episodes import EpisodeStore, Split
+from dextouch.episodes import EpisodeStore, Split, scene_fraction, scene_of
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import EpisodeAttributes
-from services.world_model.training.dataset import TrainingEpisode
 from services.world_model.training.episodes import training_ids
-from services.world_model.training.scene_episodes import place_of_name
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ def load_hands(
             reader = store.open(episode_id)
             window = reader.window(0, reader.num_steps, cameras=())
             scene = scene_of(reader.attributes)
-            side = sides[place_of_name(scene) < heldout_share]
+            side = sides[scene_fraction(scene) < heldout_share]
             side.setdefault(scene, []).append(window.tactile_kpa[window.tactile_valid])
     if not all(sides):
         raise InvalidInputError(
@@ -57,8 +54,3 @@ def load_hands(
         for side in sides
     )
     return training, heldout
-
-
-def scene_of(episode: EpisodeAttributes | TrainingEpisode) -> str:
-    """Task and seed of an episode, or its id if it has no seed."""
-    return episode.episode_id if episode.seed is None else f"{episode.task}/{episode.seed}"

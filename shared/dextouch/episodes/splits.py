@@ -1,39 +1,112 @@
-"""Splits A, B and C of episodes by scene, the same in every store.
+"""Scenes of episodes, and splits that keep every scene on one side, the same in every store.
 
-As in the paper's protocol, world models are trained on some splits and imagine episodes of another.
-All episodes of one scene (task and seed) are in one split: those of people and robots, of every
-demonstrator, and what was imagined from them.
+All episodes of one scene (task and seed) belong together: those of people and robots, of every
+demonstrator, and what was imagined from them. As in the paper's protocol, world models are trained
+on some of the splits A, B and C and imagine episodes of another.
 """
 
 import hashlib
-from collections.abc import Collection
-from typing import Final, Literal, get_args
+from collections.abc import Collection, Iterable, Sequence
+from typing import Final, Literal, Protocol, TypeVar, get_args, runtime_checkable
 
+from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.schemas import EpisodeAttributes
 
 Split = Literal["A", "B", "C"]
 SPLITS: Final[tuple[Split, ...]] = get_args(Split)
 
 
-def split_of(attributes: EpisodeAttributes) -> Split:
-    """Split of an episode: a third of all scenes each, by a hash of task and seed.
+@runtime_checkable
+class InScene(Protocol):
+    """Anything that belongs to a scene."""
+
+    @property
+    def scene(self) -> str:
+        """Name of the scene, from `scene_of`."""
+
+
+InSceneT = TypeVar("InSceneT", bound=InScene)
+
+
+def scene_of(attributes: EpisodeAttributes) -> str:
+    """Name of an episode's scene, TASK/SEED.
 
     Without a seed (recordings of people and real robots), an episode is a scene of its own, which
-    it shares with episodes imagined from it.
+    it shares with episodes imagined from it: TASK/EPISODE.
     """
-    scene = attributes.seed if attributes.seed is not None else _first_episode(attributes)
-    return split_of_scene(attributes.task, scene)
+    seed = attributes.seed if attributes.seed is not None else _first_episode(attributes)
+    return f"{attributes.task}/{seed}"
+
+
+def split_of(attributes: EpisodeAttributes) -> Split:
+    """Split of an episode: a third of all scenes each, by a hash of the scene's name."""
+    return _split_of(scene_of(attributes))
 
 
 def split_of_scene(task: str, scene: int | str) -> Split:
     """Split of a task's scene, given by its seed."""
-    digest = hashlib.sha256(f"split/{task}/{scene}".encode()).digest()
-    return SPLITS[int.from_bytes(digest[:8], "big") % len(SPLITS)]
+    return _split_of(f"{task}/{scene}")
 
 
 def is_in(attributes: EpisodeAttributes, splits: Collection[Split]) -> bool:
     """Whether an episode is in one of these splits; all are if none is given."""
     return not splits or split_of(attributes) in splits
+
+
+def scene_fraction(scene: str, *, salt: str = "") -> float:
+    """A number in 0 … 1 for every scene, evenly spread over scenes: a hash of its name.
+
+    Args:
+        scene: name, from `scene_of`.
+        salt: another one gives other numbers.
+    """
+    digest = hashlib.sha256(f"{salt}{scene}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") / 2**64
+
+
+def split_by_scene(
+    items: Iterable[InSceneT], *, held_out_share: float, salt: str = ""
+) -> tuple[list[InSceneT], list[InSceneT]]:
+    """Training and held-out items; all of a scene are on one side, whatever else there is.
+
+    Args:
+        items: episodes, or what was made of them.
+        held_out_share: share of the scenes to hold out.
+        salt: another one holds out other scenes.
+
+    Raises:
+        InvalidInputError: an empty side.
+    """
+    training: list[InSceneT] = []
+    held_out: list[InSceneT] = []
+    for item in items:
+        is_held_out = scene_fraction(item.scene, salt=salt) < held_out_share
+        (held_out if is_held_out else training).append(item)
+    if not training or not held_out:
+        raise InvalidInputError(
+            f"split: got {len(training)} training and {len(held_out)} held-out episodes with a "
+            f"share of {held_out_share:g}, expected at least one each; record more scenes"
+        )
+    return training, held_out
+
+
+def refuse_shared_scenes(training: Sequence[InScene], held_out: Sequence[InScene]) -> None:
+    """Refuse a split with a scene on both sides.
+
+    Raises:
+        ConflictError: scenes are shared; the first few are named.
+    """
+    shared = sorted({item.scene for item in training} & {item.scene for item in held_out})
+    if shared:
+        raise ConflictError(
+            f"split: {len(shared)} scenes are both trained on and held out "
+            f"({', '.join(shared[:5])}); evaluate on other seeds"
+        )
+
+
+def _split_of(scene: str) -> Split:
+    digest = hashlib.sha256(f"split/{scene}".encode()).digest()
+    return SPLITS[int.from_bytes(digest[:8], "big") % len(SPLITS)]
 
 
 def _first_episode(attributes: EpisodeAttributes) -> str:

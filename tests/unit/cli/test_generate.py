@@ -112,8 +112,8 @@ def test_imagined_episodes_are_trained_on_only_when_asked(generate, truth, tmp_p
     imagined = EpisodeStore(tmp_path / "imagined")
     assert training_ids(imagined) == []
     assert len(training_ids(truth)) == 4
-    seeds = [one.seed for one in read_cloning_episodes(truth)]
-    assert sorted(seeds) == list(SEEDS)
+    scenes = [one.scene for one in read_cloning_episodes(truth)]
+    assert sorted(scenes) == [f"stand_bottle/{seed}" for seed in SEEDS]
     assert len(read_cloning_episodes(truth, imagined)) == 3
     assert len(read_cloning_episodes(truth, imagined, origin="imagined")) == 1
-    assert [one.seed for one in read_cloning_episodes(truth, splits=("B",))] == [5]
+    assert [one.scene for one in read_cloning_episodes(truth, splits=("B",))] == ["stand_bottle/5"]

@@ -1,10 +1,21 @@
-"""Splits of scenes: thirds that every store and every demonstrator share."""
+"""Scenes, and splits that every store and every demonstrator share."""
 
 from collections import Counter
+from dataclasses import dataclass
 
 import pytest
 
-from dextouch.episodes import SPLITS, is_in, split_of, split_of_scene
+from dextouch.episodes import (
+    SPLITS,
+    is_in,
+    refuse_shared_scenes,
+    scene_fraction,
+    scene_of,
+    split_by_scene,
+    split_of,
+    split_of_scene,
+)
+from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.schemas import LineageEntry
 
 # First 8 bytes modulo 3: 2, 0, 0, 2, 0, 1.
@@ -48,9 +59,45 @@ def test_without_a_seed_imagined_episodes_follow_their_source(about):
             LineageEntry(kind="checkpoint", id="model"),
         )
         changed = {"episode_id": f"imagined-{name}", "origin": "imagined", "lineage": lineage}
-        assert split_of(source.model_copy(update=changed)) == split_of(source)
+        imagined = source.model_copy(update=changed)
+        assert scene_of(imagined) == scene_of(source) == f"{source.task}/{name}"
+        assert split_of(imagined) == split_of(source)
 
 
 @pytest.mark.parametrize("splits", [(), SPLITS])
 def test_all_splits_hold_every_episode(about, splits):
     assert is_in(about, splits)
+
+
+@dataclass(frozen=True)
+class Take:
+    scene: str
+    number: int = 0
+
+
+def test_fractions_are_spread_evenly_and_depend_on_the_name_alone():
+    fractions = [scene_fraction(f"stand_bottle/{seed}") for seed in range(3000)]
+    # Of SHA-256("stand_bottle/0"), by `printf … | sha256sum`; it must never change.
+    assert fractions[0] == pytest.approx(int("4a2ba8d05b391083", 16) / 2**64)
+    deciles = Counter(int(10 * fraction) for fraction in fractions)
+    # 3000 draws with p = 1/10: five standard deviations are 82.
+    assert sorted(deciles) == list(range(10))
+    assert all(abs(count - 300) < 82 for count in deciles.values())
+    assert scene_fraction("stand_bottle/0", salt="other ") != fractions[0]
+
+
+def test_a_split_keeps_every_scene_on_one_side():
+    takes = [Take(f"stand_bottle/{seed}", number) for seed in range(60) for number in range(2)]
+    training, held_out = split_by_scene(takes, held_out_share=0.3)
+    assert len(training) + len(held_out) == 120
+    assert 20 <= len(held_out) <= 52
+    refuse_shared_scenes(training, held_out)
+    # Fewer or other episodes leave every scene where it was.
+    fewer, _ = split_by_scene(takes[::-4], held_out_share=0.3)
+    assert set(fewer) <= set(training)
+    with pytest.raises(ConflictError, match=training[0].scene):
+        refuse_shared_scenes(training, [training[0]])
+    # Another task with the same seed is another scene.
+    refuse_shared_scenes(training, [Take(training[0].scene.replace("stand_bottle", "other"))])
+    with pytest.raises(InvalidInputError, match="at least one each"):
+        split_by_scene(takes[:2], held_out_share=0.3)

@@ -24,7 +24,7 @@ def ending_episode(item: Demonstration) -> EndingEpisode:
         item.episode_id,
         item.task,
         item.instruction,
-        item.seed,
+        item.scene,
         item.success,
         item.start_digest,
         last,

@@ -218,7 +218,7 @@ def test_spatial_softmax_finds_the_peak():
 
 def test_demonstrations_that_are_all_alike_teach_nothing():
     one = episodes(range(1))[0]
-    alike = [toy.replace(one, seed=seed, episode_id=f"e{seed}") for seed in range(40)]
+    alike = [toy.replace(one, scene=f"reach/{seed}", episode_id=f"e{seed}") for seed in range(40)]
     settings = CloningSettings(num_training_steps=2)
     with pytest.raises(InvalidInputError, match="do not differ, expected several of each task"):
         train_cloned_policy(alike, settings, command="")

@@ -132,6 +132,20 @@ def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     assert json.loads(figures.read_text())["metrics"] == probe.metadata.metrics
 
 
+@pytest.mark.parametrize(
+    ("network", "trained"), [("probe", SuccessProbe), ("policy", BehaviourCloningPolicy)]
+)
+def test_what_a_station_recorded_can_be_trained_on(network, trained, tmp_path):
+    store = EpisodeStore(tmp_path / "recorded")
+    for item in toy.demonstrations(range(40), noise_m=0.03):
+        write(store, item, origin="recorded", seed=None)
+    output = tmp_path / "trained.safetensors"
+    flags = ["--episodes", str(store.root), "--output", str(output)]
+    training = ["--training.num-training-steps", "3", "--training.held-out-share", "0.4"]
+    assert run_command(["train", network, *flags, *training]) == 0
+    assert set(trained.load(output).metadata.training_episodes) <= set(store.list())
+
+
 def test_policies_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     output = tmp_path / "policy.safetensors"
     training = ["--training.num-training-steps", "4", "--training.held-out-share", "0.5"]

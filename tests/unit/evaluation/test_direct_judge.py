@@ -49,7 +49,7 @@ def _labelled(seed: int) -> LabelledAttempt:
     pose = np.array([[*place_m, 0.0, 1.0, 0, 0, 0]])
     success = bool(np.abs(error_m).max() < 0.04)
     view = View(attempt.image, T_CAMERA, pose)
-    return LabelledAttempt(f"reach-{seed}", "Touch it.", seed, success, attempt, [view])
+    return LabelledAttempt(f"reach-{seed}", "Touch it.", f"reach/{seed}", success, attempt, [view])
 
 
 def test_rays_meet_their_heights_by_hand():

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.stats import mannwhitneyu
 
+from dextouch.episodes import split_by_scene
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
-from services.evaluation.demonstrations import split_by_seed
 from services.evaluation.endings import endings_hash
 from services.evaluation.judge_network import ProbeShape
 from services.evaluation.success_probe import SuccessProbe
@@ -82,7 +82,7 @@ def test_a_start_never_stands_on_both_sides(demonstrations):
     twice = demonstrations + [
         toy.replace(d, episode_id=f"{d.episode_id}-b") for d in demonstrations
     ]
-    training, held_out = split_by_seed(twice, held_out_share=0.3)
+    training, held_out = split_by_scene(twice, held_out_share=0.3)
     assert len(training) + len(held_out) == len(twice)
     assert not {d.start_digest for d in training} & {d.start_digest for d in held_out}
 

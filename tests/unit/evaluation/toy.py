@@ -49,6 +49,10 @@ class Demonstration:
     commanded: np.ndarray
 
     @property
+    def scene(self) -> str:
+        return f"{self.task}/{self.seed}"
+
+    @property
     def num_steps(self) -> int:
         return len(self.measured)
 
@@ -118,7 +122,7 @@ def cloning_episode(item: Demonstration) -> CloningEpisode:
         step: Moment(item.images[step], item.tactile_kpa[step])
         for step in range(0, item.num_steps, DECISION_STRIDE)
     }
-    about = (item.episode_id, item.task, item.instruction, item.seed, item.success)
+    about = (item.episode_id, item.task, item.instruction, item.scene, item.success)
     return CloningEpisode(*about, ANCHOR, moments, item.measured, item.commanded)
 
 

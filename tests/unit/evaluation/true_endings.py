@@ -37,7 +37,7 @@ def main(store: str) -> None:
     np.savez_compressed(
         FILE,
         task=[e.task for e in episodes],
-        seed=[e.seed for e in episodes],
+        scene=[e.scene for e in episodes],
         success=[e.success for e in episodes],
         image=[e.final.images[-1] for e in episodes if e.final.images is not None],
         tactile_kpa=[e.final.tactile_kpa for e in episodes],

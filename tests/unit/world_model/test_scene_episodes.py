@@ -1,4 +1,4 @@
-"""Scene episodes of a store are what the twin recorded; a split keeps every scene on one side."""
+"""Scene episodes of a store are what the twin, or a station, recorded."""
 
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import ConflictError, InvalidInputError
+from dextouch.errors import InvalidInputError
 from dextouch.schemas import Review
 from services.twin.episodes import record, write_episode
 from services.twin.motions import Motion
@@ -15,11 +15,7 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
 from services.world_model.training.episodes import read_episode
-from services.world_model.training.scene_episodes import (
-    load_scene_episodes,
-    refuse_shared_scenes,
-    split_by_scene,
-)
+from services.world_model.training.scene_episodes import load_scene_episodes
 
 HEAD = ("camera_head",)
 LEAN = TakeOptions(images=HEAD, image_every=4, streams="training")
@@ -41,7 +37,7 @@ def truths():
         "unknown": {"success": None},
         "recovered": {"recovered": True},
         "imagined": {"origin": "imagined"},
-        "unseeded": {"seed": None},
+        "station": {"seed": None, "origin": "recorded"},
     }
     for name, changes in unfit.items():
         attributes = takes["push"].attributes.model_copy(update={"episode_id": name, **changes})
@@ -64,7 +60,9 @@ def loaded(truths, url):
 
 
 def test_only_whole_true_episodes_of_known_outcome_are_taken(loaded, url):
-    assert set(loaded) == {"script", "push", "human", "whole"}
+    assert set(loaded) == {"script", "push", "human", "whole", "station"}
+    # What a station records is a scene of its own.
+    assert (loaded["station"].scene, loaded["station"].seed) == ("stand_bottle/station", None)
     only = load_scene_episodes(url, tasks=["stand_bottle"])
     assert {e.task for e in only} == {"stand_bottle"}
 
@@ -108,7 +106,7 @@ def test_arrays_are_what_the_twin_recorded(truths, loaded, name):
 def test_facts_are_those_of_the_take(truths, loaded, name):
     facts, got = truths[name].attributes, loaded[name]
     assert (got.task, got.seed, got.success) == (facts.task, facts.seed, facts.success)
-    assert got.scene == (facts.task, facts.seed)
+    assert got.scene == f"{facts.task}/{facts.seed}"
     assert got.object_names == facts.object_names
     np.testing.assert_array_equal(got.object_boxes_m, np.array(facts.object_boxes_m))
 
@@ -134,21 +132,3 @@ def test_sparse_takes_are_refused_where_every_step_has_to_be_seen(truths, url):
     np.testing.assert_array_equal(
         read_episode(whole).images, truths["whole"].streams["camera_head"].values[::2]
     )
-
-
-def test_a_split_keeps_every_scene_on_one_side(loaded):
-    scenes = [replace(loaded["push"], seed=seed) for seed in range(60)]
-    twice = [replace(e, episode_id="again", success=True) for e in scenes]
-    training, held_out = split_by_scene([*scenes, *twice], held_out_share=0.3)
-    assert len(training) + len(held_out) == 120
-    assert 20 <= len(held_out) <= 52
-    refuse_shared_scenes(training, held_out)
-    # Fewer or other episodes leave every scene where it was.
-    fewer, _ = split_by_scene(scenes[::-2], held_out_share=0.3)
-    assert {e.seed for e in fewer} <= {e.seed for e in training}
-    with pytest.raises(ConflictError, match=f"stand_bottle seed {training[0].seed}"):
-        refuse_shared_scenes(training, [training[0]])
-    # Another task with the same seed is another scene.
-    refuse_shared_scenes(training, [replace(training[0], task="stack_bowls")])
-    with pytest.raises(InvalidInputError, match="at least one each"):
-        split_by_scene(scenes[:1], held_out_share=0.3)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from dextouch.episodes import split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
@@ -40,7 +41,7 @@ from services.world_model.training.reader_training import (
     reader_errors,
     train_reader,
 )
-from services.world_model.training.scene_episodes import SceneEpisode, split_by_scene
+from services.world_model.training.scene_episodes import SceneEpisode
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.state_trainer import _command, _labelled
@@ -70,7 +71,7 @@ def episode(seed, num_steps=NUM_STEPS):
     poses[:, 0, :3], poses[:, 0, 3] = block_m, 1.0
     steps = np.arange(0, num_steps, 4)
     return SceneEpisode(
-        episode_id=f"toy-{seed}", task="press", seed=seed, success=hits,
+        episode_id=f"toy-{seed}", task="press", scene=f"press/{seed}", seed=seed, success=hits,
         object_names=("block",), object_boxes_m=np.array([[0, 0, 0, 0.02, 0.02, 0.03]]),
         action_kind="commanded", actions=actions, measured_actions=actions, anchor=anchor,
         K_head=K_HEAD, tactile_kpa=tactile, object_poses=poses,
@@ -165,16 +166,18 @@ def test_object_poses_without_labels_are_never_looked_at(config):
 
 def test_all_takes_of_a_scene_are_labelled_or_none():
     takes = [
-        dataclasses.replace(episode(seed), episode_id=f"{take}-{seed}", seed=seed)
+        dataclasses.replace(
+            episode(seed), episode_id=f"{take}-{seed}", scene=f"stand_bottle/{seed}"
+        )
         for seed in range(100)
         for take in "ab"
     ]
     settings = TrainStateCommand(episodes=("takes",), labelled_share=0.3)
     training, _ = split_by_scene(takes, held_out_share=settings.heldout_share)
     known = _labelled(training, settings)
-    chosen = {e.seed for e, one in zip(training, known, strict=True) if one}
+    chosen = {e.scene for e, one in zip(training, known, strict=True) if one}
     assert sum(known) == 2 * len(chosen)
-    assert 0.15 < len(chosen) / len({e.seed for e in training}) < 0.45
+    assert 0.15 < len(chosen) / len({e.scene for e in training}) < 0.45
     with pytest.raises(InvalidInputError, match="--labelled-share"):
         _labelled(training, settings.model_copy(update={"labelled_share": 1e-6}))
 

@@ -83,8 +83,8 @@ def test_a_streamed_window_is_the_one_cut_in_memory(stored, in_memory, place):
 
 def test_an_indexed_episode_says_what_it_is(stored, in_memory):
     for ours, theirs in zip(stored, in_memory, strict=True):
-        assert (ours.episode_id, ours.task, ours.seed) == (
-            theirs.episode_id, theirs.task, theirs.seed,
+        assert (ours.episode_id, ours.task, ours.scene) == (
+            theirs.episode_id, theirs.task, theirs.scene,
         )  # fmt: skip
         assert len(ours) == len(theirs)
         assert set(ours.action_kinds) == {"measured", "commanded"}

@@ -115,8 +115,8 @@ def test_principal_axes_take_no_steps(settings):
 def test_the_world_model_keeps_the_tokenizer_frozen(settings, train_settings, toy_episodes, tokens):
     trained = train_tokenizer(settings)
     learned = set(trained.metadata.train_scenes)
-    unseen = [e for e in toy_episodes if f"{e.task}/{e.seed}" not in learned]
-    seen = [e for e in toy_episodes if f"{e.task}/{e.seed}" in learned]
+    unseen = [e for e in toy_episodes if e.scene not in learned]
+    seen = [e for e in toy_episodes if e.scene in learned]
     # Like flags: nothing but the form of the tokens is asked for, the file decides the rest.
     given = train_settings.network.model_dump(exclude_unset=True, exclude={"palm_channels"})
     network = NetworkConfig(**given, tactile_tokens=tokens)
@@ -197,10 +197,10 @@ def test_one_store_trains_both_and_other_scenes_are_held_out(settings, train_set
     )
     episodes, heldout = load_split(asked)
     # The two scenes that the tokenizer has not seen have a third of the episodes.
-    assert {f"push_box/{e.seed}" for e in heldout} == {"push_box/1", "push_box/4"}
-    assert {f"push_box/{e.seed}" for e in episodes} == set(trained.metadata.train_scenes)
+    assert {e.scene for e in heldout} == {"push_box/1", "push_box/4"}
+    assert {e.scene for e in episodes} == set(trained.metadata.train_scenes)
     _, fewer = load_split(asked.model_copy(update={"heldout_percent": 5}))
-    assert [e.seed for e in fewer] == [1]
+    assert [e.scene for e in fewer] == ["push_box/1"]
     with pytest.raises(InvalidInputError, match="give a --heldout store"):
         load_split(asked.model_copy(update={"splits": ("A",)}))
 

@@ -105,13 +105,13 @@ def test_training_from_a_store_splits_it_by_hash(toy_store, train_settings):
 
 def test_held_out_episodes_cannot_be_trained_on(toy_episodes, heldout, train_settings):
     check_disjoint(toy_episodes, heldout)
-    renamed = replace(toy_episodes[0], episode_id="new-name", seed=777)
+    renamed = replace(toy_episodes[0], episode_id="new-name", scene="push_box/777")
     with pytest.raises(InvalidInputError, match="new-name"):
         check_disjoint(toy_episodes, [*heldout, renamed])
-    # Another recording of the same task and seed is the same scene.
-    same_seed = replace(heldout[0], seed=toy_episodes[1].seed)
-    with pytest.raises(InvalidInputError, match="same task and seed"):
-        train_on(toy_episodes, [same_seed], train_settings)
+    # Another recording of the same scene.
+    same_scene = replace(heldout[0], scene=toy_episodes[1].scene)
+    with pytest.raises(InvalidInputError, match="same scene"):
+        train_on(toy_episodes, [same_scene], train_settings)
 
 
 def test_training_episodes_cannot_be_judged_on(tiny_model, toy_episodes):
