@@ -351,7 +351,7 @@ def _train_core(work: _Work, member: int) -> None:
     data = CoreData(table, touch_latents(codec, table), readings)
     on_step = _on_step(member, "core")
     seed = work.settings.seed * _SEED_STRIDE + member
-    initial = None if work.base is None else work.base.core(work.config, member)
+    initial = None if work.base is None else work.base.core(work.config, member, seed=seed)
     core = train_core(
         data, work.config, work.settings.core, seed=seed, on_step=on_step, initial=initial
     )

@@ -13,6 +13,8 @@ from services.world_model.state_checkpoints import StateCheckpoint, read_state_c
 
 # Weights of a reader that belong to its tasks.
 _OF_TASKS = {"task.weight", "height_mean"}
+# Weights of a core that predict success; the first rows of the first layer are the hidden state's.
+_SUCCESS = "success."
 
 
 class Base:
@@ -58,13 +60,29 @@ class Base:
         reader.load_state_dict(kept, strict=False)
         return reader
 
-    def core(self, config: DynamicsConfig, member: int) -> RecurrentCore:
-        """A member's core, in which only the weights that predict success can be trained."""
-        core, known = RecurrentCore(config), self.checkpoint.dynamics.core
-        kept = {name: value[member : member + 1] for name, value in known.named_parameters()}
+    def core(self, config: DynamicsConfig, member: int, *, seed: int) -> RecurrentCore:
+        """A member's core, in which only fresh weights that predict success can be trained.
+
+        They see predicted poses but not the hidden state: a few takes do not suffice to find what
+        it says about a new task.
+        """
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            core = RecurrentCore(config)
+        known = self.checkpoint.dynamics.core
+        kept = {
+            name: value[member : member + 1]
+            for name, value in known.named_parameters()
+            if not name.startswith(_SUCCESS)
+        }
         core.load_state_dict(kept, strict=False)
         core.lowest.copy_(known.lowest)
         core.highest.copy_(known.highest)
         core.requires_grad_(requires_grad=False)
         core.success.requires_grad_(requires_grad=True)
+        hidden = core.get_parameter(f"{_SUCCESS}0.weight")
+        from_hidden = torch.arange(config.width)
+        with torch.no_grad():
+            hidden[:, from_hidden] = 0.0
+        hidden.register_hook(lambda gradient: gradient.index_fill(1, from_hidden, 0.0))
         return core

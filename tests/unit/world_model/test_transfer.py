@@ -45,7 +45,7 @@ def test_shapes_are_the_bases_and_tasks_the_new_ones(base, config):
 
 def test_only_the_estimate_of_success_of_a_core_changes(base, config, table):
     data = CoreData(table, touch_latents(TouchCodec(config.touch_channels), table), {})
-    core = base.core(config, 1)
+    core = base.core(config, 1, seed=0)
     trained = train_core(
         data, config, CoreSettings(num_steps=5, batch=4), seed=0, initial=core
     ).state_dict()
@@ -54,6 +54,10 @@ def test_only_the_estimate_of_success_of_a_core_changes(base, config, table):
         name.partition(".")[0] for name, value in known if not torch.equal(trained[name], value[1:])
     }
     assert changed == {"success"}
+    # The estimate depends on predicted poses, not on the hidden state.
+    first = trained["success.0.weight"]
+    assert not first[:, : config.width].any()
+    assert first[:, config.width :].all(-1).any()
     torch.testing.assert_close(trained["boxes_m"][0, 0], table.boxes_m[0, 0])
 
 
@@ -68,6 +72,9 @@ def test_a_reader_starts_from_the_member_it_replaces(base, config, table):
 
 
 def test_new_weights_of_tasks_are_drawn_from_the_seed(base, config):
+    success = [base.core(config, 0, seed=seed).success[-1].weight for seed in (1, 1, 2)]
+    assert torch.equal(success[0], success[1])
+    assert not torch.equal(success[0], success[2])
     one, same, other = (base.reader(config, 0, seed=seed).task.weight for seed in (1, 1, 2))
     assert torch.equal(one, same)
     assert not torch.equal(one, other)
