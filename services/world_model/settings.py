@@ -269,6 +269,11 @@ class StateTrainSettings(FrozenModel):
         description="state model to start from, for new tasks: its cores, touch codec and renderer "
         "are kept, start readers and the estimate of success are trained",
     )
+    keep_readers: CliImplicitFlag[bool] = Field(
+        default=False,
+        description="with --base and the same tasks: keep its start readers, too, and train the "
+        "estimate of success alone",
+    )
     seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
     num_members: int = Field(default=3, ge=1, le=16, description="members of the ensemble")
     heldout_share: float = Field(default=0.08, gt=0, lt=1, description="share of held-out scenes")

@@ -19,7 +19,7 @@ from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.network import RendererNetwork
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 METADATA_KEY = "dextouch_state_model"
 _DYNAMICS, _RENDERER = "dynamics.", "renderer."
 

@@ -10,6 +10,7 @@ a rollout carries from one chunk to the next is bounded.
 """
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import torch
 from jaxtyping import Bool, Float32, Int64
@@ -41,6 +42,12 @@ _SLOT_WIDTH, _HAND_WIDTH = 64, 96
 _ABOUT_SIZE = 6 + 1 + 1 + 1 + 1 + 3
 # Joints, wrist axes, heights of the points at all looks, wrist velocity (twice scaled), side.
 _OWN_SIZE = 20 + 6 + len(LOOKS) * NUM_POINTS + 2 * 3 + 1
+# Of an object at the end: the above, axes, position, and way over the table and upwards.
+_END_SIZE = _ABOUT_SIZE + 6 + 3 + 2
+_PAIRS = tuple(combinations(range(MAX_OBJECTS), 2))
+# Of two objects: offset in the world and in either frame, two of them with their length over the
+# table or the plane of the frame, and the cosines between their axes.
+_PAIR_SIZE = 3 + 1 + 3 + 1 + 3 + 2
 # At first, objects move with no hand.
 _BY_ITSELF = 2.0
 
@@ -158,7 +165,7 @@ class RecurrentCore(nn.Module):
         self.pattern = linear(160, STEPS_PER_LATENT * NUM_PATTERNS)
         self.taxels = linear(NUM_PATTERNS, NUM_TAXELS)
         self.success = nn.Sequential(
-            linear(width + MAX_OBJECTS * (_ABOUT_SIZE + 6 + 3 + 3), 128), nn.GELU(),
+            linear(width + MAX_OBJECTS * _END_SIZE + len(_PAIRS) * _PAIR_SIZE, 128), nn.GELU(),
             nn.Dropout(0.2), linear(128, 1),
         )  # fmt: skip
         self.motion = linear(128, 3 + 3 + 6)
@@ -250,7 +257,7 @@ class RecurrentCore(nn.Module):
             )
             steps.append((hidden, hands, position, R_object, about))
         stacked = [torch.stack(parts, dim=1) for parts in zip(*steps, strict=True)]
-        future = self._decoded(stacked, there)
+        future = self._decoded(stacked, there, start.objects.position_m)
         objects = future.objects
         last = CoreState(
             hidden,
@@ -261,7 +268,12 @@ class RecurrentCore(nn.Module):
         )
         return future, last
 
-    def _decoded(self, steps: list[Tensor], there: Float32[Tensor, "batch objects"]) -> SceneFuture:
+    def _decoded(
+        self,
+        steps: list[Tensor],
+        there: Float32[Tensor, "batch objects"],
+        first_m: Float32[Tensor, "batch objects 3"],
+    ) -> SceneFuture:
         hidden, hands, position, R_object, about = steps
         axes = torch.stack([R_object[..., 2], R_object[..., 0]], dim=-2)
         empty = MAX_OBJECTS - position.shape[2]
@@ -275,7 +287,7 @@ class RecurrentCore(nn.Module):
         touch = self.touch(felt).unflatten(-1, (STEPS_PER_LATENT, self.config.touch_channels))
         pattern = self.pattern(felt).unflatten(-1, (STEPS_PER_LATENT, NUM_PATTERNS))
         present = there[:, None].expand(-1, hidden.shape[1], -1)
-        ends = _ending_features(position, axes, about, present)
+        ends = _ending_features(position, axes, about, present, position - first_m[:, None])
         return SceneFuture(
             ObjectPoses(position, axes, present),
             touch.transpose(2, 3),
@@ -334,8 +346,34 @@ def _ending_features(
     axes: Float32[Tensor, "batch latents objects 2 3"],
     about: Float32[Tensor, "batch latents objects size"],
     present: Float32[Tensor, "batch latents objects"],
+    way: Float32[Tensor, "batch latents objects 3"],
 ) -> Float32[Tensor, "batch latents features"]:
-    """Poses of all objects, and of each relative to the next one."""
-    apart = compressed(position - position.roll(1, dims=2)) * present.roll(1, dims=2)[..., None]
-    each = torch.cat([about, axes.flatten(3), compressed(position), apart], dim=-1)
-    return (each * present[..., None]).flatten(2)
+    """Poses of all objects, and of each pair relative to each other.
+
+    What a task asks for is mostly a distance or an angle between objects, in any direction. Given
+    as such, few takes teach it.
+    """
+    z, x = axes.unbind(-2)
+    R = torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
+    each = torch.cat([about, axes.flatten(3), compressed(position), _across_and_up(way)], dim=-1)
+    parts = [(each * present[..., None]).flatten(2)]
+    for a, b in _PAIRS:
+        apart = position[..., b, :] - position[..., a, :]
+        from_a, from_b = (
+            torch.einsum("bli,blij->blj", offset, R[..., index, :, :])
+            for offset, index in ((apart, a), (-apart, b))
+        )
+        cosines = [(one[..., a, :] * one[..., b, :]).sum(-1, keepdim=True) for one in (z, x)]
+        distances = [_with_length_across(apart), _with_length_across(from_a), compressed(from_b)]
+        there = present[..., a, None] * present[..., b, None]
+        parts.append(torch.cat([*distances, *cosines], dim=-1) * there)
+    return torch.cat(parts, dim=-1)
+
+
+def _across_and_up(offset_m: Float32[Tensor, "*batch 3"]) -> Float32[Tensor, "*batch 2"]:
+    across_m = offset_m[..., :2].norm(dim=-1, keepdim=True)
+    return compressed(torch.cat([across_m, offset_m[..., 2:]], dim=-1))
+
+
+def _with_length_across(offset_m: Float32[Tensor, "*batch 3"]) -> Float32[Tensor, "*batch 4"]:
+    return compressed(torch.cat([offset_m, offset_m[..., :2].norm(dim=-1, keepdim=True)], dim=-1))

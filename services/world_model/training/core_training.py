@@ -227,6 +227,10 @@ def core_loss(
     commands, start = batch.commands, batch.start
     future, _ = core(commands, start, core.first_state(start, commands[:1]))
     table, rows = data.table, batch.rows
+    weights = settings.weights
+    success = weights.success * _success_error(future.success, table.success[rows] * ~batch.is_held)
+    if not (weights.objects or weights.touch or weights.contact or weights.taxels):
+        return success
     true = _stand(table.objects_of_latents(rows, batch.start_step), batch.is_held)
     steps = table.steps_after(batch.start_step)
     moves = ~batch.is_held
@@ -238,10 +242,9 @@ def core_loss(
     few = slice(0, -(-len(rows) // _TAXEL_SHARE))
     felt = table.tactile_kpa[rows[few]][:, steps] >= CONTACT_THRESHOLD_KPA
     felt &= moves[few].view(-1, 1, 1, 1, 1)
-    success = table.success[rows] * moves
-    weights = settings.weights
     return (
-        weights.objects
+        success
+        + weights.objects
         * _object_error(future.objects, true, start.objects.present * table.labelled[rows, None])
         + weights.touch * (future.touch[:, 1:] - touch).square().sum(-1).mean()
         + weights.contact
@@ -250,7 +253,6 @@ def core_loss(
         * functional.binary_cross_entropy_with_logits(
             core.taxels(future.pattern[few, 1:]), felt.float()
         )
-        + weights.success * _success_error(future.success, success)
     )
 
 

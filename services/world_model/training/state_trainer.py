@@ -61,7 +61,7 @@ from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.transfer import Base
 
 # Increment when a change of training gives other weights for the same settings and data.
-READER_VERSION, CORE_VERSION, RENDERER_VERSION = 5, 7, 3
+READER_VERSION, CORE_VERSION, RENDERER_VERSION = 5, 8, 3
 # Largest number of episodes the renderer is trained on; it samples few of their images anyway.
 MAX_CLIPS = 1500
 _SEED_STRIDE = 1000
@@ -88,6 +88,8 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         InvalidInputError: no episodes, or episodes that do not fit together.
     """
     torch.set_num_threads(1)
+    if settings.base is None and settings.keep_readers:
+        raise InvalidInputError("train state: got --keep-readers without --base; add --base PATH")
     settings = _with_precision(settings)
     episodes = _episodes(settings)
     training, heldout = split_by_scene(episodes, held_out_share=settings.heldout_share)
@@ -96,9 +98,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     base = None if settings.base is None else Base(settings.base)
     if base is not None:
         config = base.configured(config)
-        about = base.checkpoint.metadata
-        kept = {"num_members": about.num_members, "renderer": about.renderer}
-        settings = settings.model_copy(update=kept)
+        settings = _with_base(base, config, settings)
     parts = settings.output.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
     data_hash = _data_hash(training)
@@ -140,7 +140,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         seed=settings.seed,
         training_cpu_s=round(cpu_s, 1),
         num_training_episodes=len(training),
-        training_seeds=_seed_ranges(training),
+        training_seeds=_seed_ranges(training, base),
         training_splits=settings.splits,
         data_hash=data_hash,
         metrics=measured.figures,
@@ -198,6 +198,27 @@ class _Work:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+def _with_base(
+    base: Base, config: DynamicsConfig, settings: StateTrainSettings
+) -> StateTrainSettings:
+    """Settings of a run that keeps the base's networks and trains no more of cores than success."""
+    if settings.keep_readers and not base.has_tasks_of(config):
+        raise InvalidInputError(
+            f"--keep-readers: the episodes have tasks {', '.join(config.tasks)}, expected the "
+            f"base's, {', '.join(base.checkpoint.metadata.dynamics.tasks)}; leave it out to train "
+            "start readers for other tasks"
+        )
+    about = base.checkpoint.metadata
+    nothing_else = dict.fromkeys(("objects", "touch", "contact", "taxels"), 0.0)
+    only_success = settings.core.weights.model_copy(update=nothing_else)
+    kept = {
+        "num_members": about.num_members,
+        "renderer": about.renderer,
+        "core": settings.core.model_copy(update={"weights": only_success}),
+    }
+    return settings.model_copy(update=kept)
+
+
 def _with_precision(settings: StateTrainSettings) -> StateTrainSettings:
     """Settings that name the precision: it is chosen once, and part of the readers' keys."""
     chosen = {"bfloat16": uses_bfloat16(setting=settings.reader.bfloat16)}
@@ -247,9 +268,10 @@ def _labelled(episodes: list[SceneEpisode], settings: StateTrainSettings) -> lis
     return labelled
 
 
-def _seed_ranges(episodes: list[SceneEpisode]) -> dict[str, tuple[int, int]]:
-    """First and last seed of every task; episodes of people and real robots have none."""
-    seeds: dict[str, list[int]] = {}
+def _seed_ranges(episodes: list[SceneEpisode], base: Base | None) -> dict[str, tuple[int, int]]:
+    """First and last seed of every task, the base's included; recordings have none."""
+    known = {} if base is None else base.checkpoint.metadata.training_seeds
+    seeds = {task: list(ends) for task, ends in known.items()}
     for episode in episodes:
         if episode.seed is not None:
             seeds.setdefault(episode.task, []).append(episode.seed)
@@ -266,7 +288,7 @@ def _train_parts(work: _Work) -> None:
     spawned = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(work.settings.jobs, spawned) as pool:
         orders = []
-        if work.settings.labelled_share == 1:
+        if work.settings.labelled_share == 1 and not work.settings.keep_readers:
             orders += [pool.submit(_train_reader, work, m) for m in members]
         orders += [pool.submit(_train_core, work, m) for m in members]
         if work.base is None and not work.renderer_file.exists():
@@ -375,7 +397,10 @@ def _assembled(work: _Work, codec: TouchCodec) -> tuple[DynamicsModel, RendererN
     cpu_s = 0.0
     cores = [RecurrentCore(work.config) for _ in range(work.settings.num_members)]
     for index, (reader, core) in enumerate(zip(dynamics.readers(), cores, strict=True)):
-        cpu_s += _load(reader, work.reader_file(index))
+        if work.base is not None and work.settings.keep_readers:
+            reader.load_state_dict(work.base.checkpoint.dynamics.readers()[index].state_dict())
+        else:
+            cpu_s += _load(reader, work.reader_file(index))
         cpu_s += _load(core, work.core_file(index))
     dynamics.core.load_state_dict(_together(cores))
     renderer = RendererNetwork(work.settings.renderer)

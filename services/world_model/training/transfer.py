@@ -50,6 +50,11 @@ class Base:
             )
         return own.model_copy(update={"tasks": config.tasks, "num_objects": config.num_objects})
 
+    def has_tasks_of(self, config: DynamicsConfig) -> bool:
+        """Whether the base has the same tasks and objects."""
+        own = self.checkpoint.metadata.dynamics
+        return (own.tasks, own.num_objects) == (config.tasks, config.num_objects)
+
     def reader(self, config: DynamicsConfig, member: int, *, seed: int) -> StartReader:
         """A member's reader with fresh weights for the tasks."""
         with torch.random.fork_rng(devices=[]):
@@ -63,8 +68,8 @@ class Base:
     def core(self, config: DynamicsConfig, member: int, *, seed: int) -> RecurrentCore:
         """A member's core, in which only fresh weights that predict success can be trained.
 
-        They see predicted poses but not the hidden state: a few takes do not suffice to find what
-        it says about a new task.
+        Of new tasks, they see predicted poses but not the hidden state: a few takes do not suffice
+        to find what it says about them.
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -80,9 +85,13 @@ class Base:
         core.highest.copy_(known.highest)
         core.requires_grad_(requires_grad=False)
         core.success.requires_grad_(requires_grad=True)
+        if self.has_tasks_of(config):
+            return core
         hidden = core.get_parameter(f"{_SUCCESS}0.weight")
         from_hidden = torch.arange(config.width)
         with torch.no_grad():
             hidden[:, from_hidden] = 0.0
-        hidden.register_hook(lambda gradient: gradient.index_fill(1, from_hidden, 0.0))
+        hidden.register_hook(  # type: ignore[no-untyped-call]
+            lambda gradient: gradient.index_fill(1, from_hidden, 0.0)
+        )
         return core

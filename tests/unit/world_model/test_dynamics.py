@@ -13,7 +13,7 @@ from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
-from services.world_model.dynamics.core import RecurrentCore, SceneStart
+from services.world_model.dynamics.core import RecurrentCore, SceneStart, _ending_features
 from services.world_model.dynamics.features import LOOKS, compressed, slot_features
 from services.world_model.dynamics.hand_motion import NUM_POINTS, hand_motion
 from services.world_model.dynamics.memory import (
@@ -499,3 +499,35 @@ def test_damaged_memories_are_refused(model, damage):
         arrays["start.task"] = np.array([[7], [7]])
     with pytest.raises((InvalidInputError, NonFiniteError)):
         memory_from_arrays(arrays, CONFIG, 2)
+
+
+def test_success_is_estimated_from_distances_and_angles_between_objects():
+    rng = np.random.default_rng(4)
+    Ts = [transform(Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.2, 0.2, 3)) for _ in "ab"]
+    # The third slot is empty.
+    Ts.append(np.eye(4))
+    position = torch.tensor(np.stack([T[:3, 3] for T in Ts])).float()[None, None]
+    axes = torch.tensor(np.stack([[T[:3, 2], T[:3, 0]] for T in Ts])).float()[None, None]
+    present = torch.tensor([1.0, 1.0, 0.0])[None, None]
+    way = torch.tensor([[0.03, 0.04, 0.1], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])[None, None]
+    about = torch.zeros(1, 1, 3, 13)
+    found = _ending_features(position, axes, about, present, way)[0, 0].numpy()
+
+    def scaled(*distances_m):
+        return np.arcsinh(np.array(distances_m) / 0.01) / 2
+
+    each = found[:72].reshape(3, 24)
+    np.testing.assert_allclose(each[0, 22:], scaled(0.05, 0.1), rtol=1e-6)
+    assert not each[2].any()
+    T_a_b = invert(Ts[0]) @ Ts[1]
+    apart, from_a = Ts[1][:3, 3] - Ts[0][:3, 3], T_a_b[:3, 3]
+    from_b = invert(T_a_b)[:3, 3]
+    expected = [
+        *scaled(*apart, np.hypot(*apart[:2])),
+        *scaled(*from_a, np.hypot(*from_a[:2])),
+        *scaled(*from_b),
+        T_a_b[2, 2],
+        T_a_b[0, 0],
+    ]
+    np.testing.assert_allclose(found[72 : 72 + 13], expected, atol=1e-5)
+    assert not found[72 + 13 :].any()

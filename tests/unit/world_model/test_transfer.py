@@ -1,16 +1,26 @@
 """A state model that starts from another one keeps its cores and learns the outcomes of a task."""
 
+import dataclasses
+
 import pytest
 import torch
 
 from dextouch.errors import InvalidInputError
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.touch_codec import TouchCodec
-from services.world_model.settings import CoreSettings, ReaderSettings
+from services.world_model.settings import CoreSettings, ReaderSettings, StateTrainSettings
 from services.world_model.state_checkpoints import write_state_checkpoint
 from services.world_model.training.core_training import CoreData, touch_latents, train_core
 from services.world_model.training.reader_training import train_reader
 from services.world_model.training.scene_table import scene_table
+from services.world_model.training.state_trainer import (
+    _assembled,
+    _keep,
+    _seed_ranges,
+    _with_base,
+    _Work,
+    train_state,
+)
 from services.world_model.training.transfer import Base
 from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.world_model.test_state_training import PX, episode
@@ -78,3 +88,46 @@ def test_new_weights_of_tasks_are_drawn_from_the_seed(base, config):
     one, same, other = (base.reader(config, 0, seed=seed).task.weight for seed in (1, 1, 2))
     assert torch.equal(one, same)
     assert not torch.equal(one, other)
+
+
+def test_of_the_same_tasks_the_estimate_sees_the_hidden_state_too(base):
+    own = base.checkpoint.metadata.dynamics
+    assert base.has_tasks_of(own)
+    core = base.core(own, 0, seed=0)
+    assert core.success[0].weight[:, : own.width].any()
+    assert [name for name, one in core.named_parameters() if one.requires_grad] == [
+        name for name, _ in core.named_parameters() if name.startswith("success.")
+    ]
+
+
+def test_readers_of_the_base_can_be_kept(base, config, tmp_path):
+    given = StateTrainSettings(episodes=("takes",), base=base._path, keep_readers=True)
+    with pytest.raises(InvalidInputError, match=r"have tasks press, expected the base's, stand_b"):
+        _with_base(base, config, given)
+    own = base.checkpoint.metadata.dynamics
+    settings = _with_base(base, own, given)
+    weights = settings.core.weights
+    assert (weights.objects, weights.touch, weights.contact, weights.taxels) == (0, 0, 0, 0)
+    assert (weights.success, settings.num_members) == (1, 2)
+    work = _Work(settings, own, tmp_path, "hash")
+    for member in range(2):
+        _keep(base.core(own, member, seed=7), work.core_file(member), 1.5)
+    dynamics, _, cpu_s = _assembled(work, TouchCodec(own.touch_channels))
+    assert cpu_s == 3.0
+    for old, new in zip(base.checkpoint.dynamics.readers(), dynamics.readers(), strict=True):
+        for name, value in old.state_dict().items():
+            assert torch.equal(new.state_dict()[name], value), name
+
+
+def test_without_a_base_no_readers_can_be_kept(tmp_path):
+    settings = StateTrainSettings(episodes=(str(tmp_path),), keep_readers=True)
+    with pytest.raises(InvalidInputError, match="add --base PATH"):
+        train_state(settings)
+
+
+def test_seeds_of_the_base_remain_known(base):
+    known = base.checkpoint.metadata.model_copy(update={"training_seeds": {"press": (3, 9)}})
+    other = Base(base._path)
+    other.checkpoint = dataclasses.replace(base.checkpoint, metadata=known)
+    assert _seed_ranges([episode(20), episode(21)], other) == {"press": (3, 21)}
+    assert _seed_ranges([episode(20), episode(21)], None) == {"press": (20, 21)}
