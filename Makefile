@@ -84,10 +84,12 @@ stress: $(VENV)/.dev     ## check every stage against numerical hazards; ARGS="-
 # Run again to resume after an interruption. The last step reports which bounds are met and which figures match docs/evaluator.json.
 reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's state model, success probe and cloned policies, and measure them, in runs/reproduce
 	$(BIN)/dextouch train data --store $(MADE)/train --count 800 --images 4 --varied 0.7 --resized 0.2
-	$(BIN)/dextouch train data --store $(MADE)/judge --first 1000 --count 200 --images 4 --varied 0.7 --resized 0.2
-	$(BIN)/dextouch train data --store $(MADE)/kinds --mix development --first 21000 --count 150 --images 4
+	$(BIN)/dextouch train data --store $(MADE)/judge --first 1000 --count 250 --images 4 --varied 0.7 --resized 0.4
+	$(BIN)/dextouch train data --store $(MADE)/kinds --mix development --first 21000 --count 180 --images 4 --resized 0.4
 	$(BIN)/dextouch train data --store $(MADE)/development --mix ladder --first 20000 --count 144 --images 4
-	$(BIN)/dextouch train state --episodes $(MADE)/train --output $(MADE)/state.safetensors --jobs 3
+	$(BIN)/dextouch train state --episodes $(MADE)/train --output $(MADE)/cores.safetensors --jobs 3
+	$(BIN)/dextouch train state --base $(MADE)/cores.safetensors --keep-readers --episodes $(MADE)/judge \
+		--core.num-steps 1200 --output $(MADE)/state.safetensors
 	$(BIN)/dextouch train imagined --episodes $(MADE)/judge --store $(MADE)/imagined \
 		--checkpoint $(MADE)/state.safetensors
 	$(BIN)/dextouch train imagined --episodes $(MADE)/train --seeds 0:100 --store $(MADE)/imagined \

@@ -13,7 +13,9 @@ from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT, DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore, SceneStart, own_features
+from services.world_model.dynamics.nested import combined, mapped
 from services.world_model.dynamics.objects import ObjectPoses
+from services.world_model.dynamics.start_reader import Reading
 from services.world_model.dynamics.touch_codec import TouchCodec
 from services.world_model.settings import CoreSettings
 from services.world_model.training.averaging import OnStep, train_averaged
@@ -21,8 +23,6 @@ from services.world_model.training.scene_table import SceneTable
 
 _UNIT_M = 0.05
 _FIT_EPISODES = 1000
-# Assumed of readers where no label says it.
-_READER_SD_M = 0.004
 # Largest standard deviation of the logarithm of a size.
 _SIZE_SD = 0.06
 # Weight of the outcome as predicted at every latent step, relative to that at the last.
@@ -41,13 +41,14 @@ class CoreData:
     """Training data of cores: episodes, touch latents and a reader's outputs.
 
     Cores start from true poses with noise, and know its size, as they know that of a reader's error
-    in a rollout. `readings` are a reader's objects by start step, for episodes without labels;
-    empty where all have them.
+    in a rollout. `readings` are a reader's by start step, which episodes without labels start from,
+    or all if `starts_read`; empty if none does.
     """
 
     table: SceneTable
     touch: Float16[Tensor, "episodes steps 2 channels"]
-    readings: Mapping[int, ObjectPoses]
+    readings: Mapping[int, Reading]
+    starts_read: bool = False
 
 
 @dataclass(frozen=True)
@@ -144,14 +145,14 @@ def _draw(
     commands = table.commands(rows, start_step, measured)
     held = chance(settings.held_fraction * (1 if start_step == 0 else _LATER_HELD))
     held &= _is_settled(table, rows, start_step) & table.labelled[rows]
-    objects, sd_m = _start_objects(data, rows, start_step, settings, generator)
+    start = _read_start(data, rows, start_step, settings, generator)
     return _Batch(
         rows=rows,
         start_step=start_step,
         start=SceneStart(
-            objects,
-            sd_m,
-            _read_size(table.size[rows], generator),
+            start.objects,
+            start.sd_m,
+            start.size,
             data.touch[rows, start_step].float(),
             table.pads_kpa[rows, start_step],
             table.task[rows],
@@ -171,14 +172,14 @@ def _is_settled(table: SceneTable, rows: Tensor, start_step: int) -> Bool[Tensor
     return free & (moved_m < _SETTLED_M)
 
 
-def _start_objects(
+def _read_start(
     data: CoreData,
     rows: Tensor,
     start_step: int,
     settings: CoreSettings,
     generator: torch.Generator,
-) -> tuple[ObjectPoses, Float32[Tensor, "batch objects"]]:
-    """True objects with noise, or a reader's where they are unknown; and their uncertainty.
+) -> Reading:
+    """True objects with noise, or a reader's where they are unknown or it shall be so.
 
     The noise of each object has its own standard deviation, of up to `pose_noise_m`.
     """
@@ -187,18 +188,19 @@ def _start_objects(
     shift = torch.randn(true.position_m.shape, generator=generator) * sd_m[..., None]
     shift[..., 2] *= 0.3
     turn = torch.randn(true.axes.shape, generator=generator) * sd_m[..., None, None] * 5.0
-    noisy = ObjectPoses(true.position_m + shift, true.axes + turn, true.present)
-    labelled = data.table.labelled[rows]
-    if bool(labelled.all()):
-        return noisy, sd_m
-    read = data.readings[start_step][rows]
-    known = labelled[:, None]
-    objects = ObjectPoses(
-        torch.where(known[..., None], noisy.position_m, read.position_m),
-        torch.where(known[..., None, None], noisy.axes, read.axes),
-        torch.where(known, noisy.present, read.present),
+    noisy = Reading(
+        ObjectPoses(true.position_m + shift, true.axes + turn, true.present),
+        sd_m,
+        _read_size(data.table.size[rows], generator),
     )
-    return objects, torch.where(known, sd_m, _READER_SD_M)
+    known = data.table.labelled[rows] & (not data.starts_read)
+    if bool(known.all()):
+        return noisy
+    read: Reading = mapped(data.readings[start_step], lambda values: values[rows])
+    return combined(
+        [noisy, read],
+        lambda pair: torch.where(known.view(-1, *[1] * (pair[0].ndim - 1)), pair[0], pair[1]),
+    )
 
 
 def _read_size(

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
+from services.world_model.dynamics.nested import combined
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import Reading, StartReader
 from services.world_model.rendering.precision import uses_bfloat16
@@ -130,22 +131,18 @@ def _error(
 
 
 @torch.no_grad()
-def read_objects(reader: StartReader, table: SceneTable, step: int) -> ObjectPoses:
-    """The reader's objects at one step of every episode."""
-    parts: list[ObjectPoses] = [
-        reader(table.first_steps(rows, torch.full_like(rows, step))).objects
+def read_step(reader: StartReader, table: SceneTable, step: int) -> Reading:
+    """What the reader makes of one step of every episode."""
+    parts: list[Reading] = [
+        reader(table.first_steps(rows, torch.full_like(rows, step)))
         for rows in torch.split(torch.arange(len(table)), _BATCH_OF_READING)
     ]
-    return ObjectPoses(
-        torch.cat([part.position_m for part in parts]),
-        torch.cat([part.axes for part in parts]),
-        torch.cat([part.present for part in parts]),
-    )
+    return combined(parts, torch.cat)
 
 
 def reader_errors(reader: StartReader, table: SceneTable, step: int) -> dict[str, ReaderError]:
     """Errors by task at one step of held-out episodes; tasks without objects are omitted."""
-    predicted, errors = read_objects(reader, table, step), {}
+    predicted, errors = read_step(reader, table, step).objects, {}
     rows = torch.arange(len(table))
     true = table.objects_at(rows, step)
     for index, task in enumerate(reader.config.tasks):

@@ -25,8 +25,7 @@ from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.dynamics.objects import ObjectPoses
-from services.world_model.dynamics.start_reader import StartReader
+from services.world_model.dynamics.start_reader import Reading, StartReader
 from services.world_model.dynamics.touch_codec import TouchCodec
 from services.world_model.recorded_commands import flags_of, last_name
 from services.world_model.rendering.network import RendererNetwork
@@ -45,7 +44,7 @@ from services.world_model.training.core_training import (
     touch_latents,
     train_core,
 )
-from services.world_model.training.reader_training import read_objects, train_reader
+from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_clips import scene_clips
 from services.world_model.training.scene_episodes import (
     SceneEpisode,
@@ -360,17 +359,16 @@ def _train_core(work: _Work, member: int) -> None:
     """Train a core; before it, the reader that it needs where episodes have no labels."""
     if work.core_file(member).exists():
         return
-    readings: dict[int, ObjectPoses] = {}
-    if work.settings.labelled_share < 1:
+    readings: dict[int, Reading] = {}
+    starts_read = work.settings.keep_readers
+    if work.settings.labelled_share < 1 and not starts_read:
         _train_reader(work, member)
     table, codec = _table(work)
-    if work.settings.labelled_share < 1:
-        reader = StartReader(work.config)
-        _load(reader, work.reader_file(member))
-        reader.eval()
-        readings = {step: read_objects(reader, table, step) for step in start_steps(table)}
     started_s = time.process_time()
-    data = CoreData(table, touch_latents(codec, table), readings)
+    if work.settings.labelled_share < 1 or starts_read:
+        reader = _finished_reader(work, member)
+        readings = {step: read_step(reader, table, step) for step in start_steps(table)}
+    data = CoreData(table, touch_latents(codec, table), readings, starts_read)
     on_step = _on_step(member, "core")
     seed = work.settings.seed * _SEED_STRIDE + member
     initial = None if work.base is None else work.base.core(work.config, member, seed=seed)
@@ -378,6 +376,14 @@ def _train_core(work: _Work, member: int) -> None:
         data, work.config, work.settings.core, seed=seed, on_step=on_step, initial=initial
     )
     _keep(core, work.core_file(member), time.process_time() - started_s)
+
+
+def _finished_reader(work: _Work, member: int) -> StartReader:
+    if work.base is not None and work.settings.keep_readers:
+        return work.base.checkpoint.dynamics.readers()[member].eval()
+    reader = StartReader(work.config)
+    _load(reader, work.reader_file(member))
+    return reader.eval()
 
 
 def _on_step(member: int, part: str) -> OnStep:

@@ -37,7 +37,7 @@ from services.world_model.training.core_training import (
     train_core,
 )
 from services.world_model.training.reader_training import (
-    read_objects,
+    read_step,
     reader_errors,
     train_reader,
 )
@@ -156,7 +156,7 @@ def test_object_poses_without_labels_are_never_looked_at(config):
         reader = train_reader(
             table, config, ReaderSettings(num_steps=5, batch=8, bfloat16=False), seed=0
         )
-        readings = {step: read_objects(reader, table, step) for step in start_steps(table)}
+        readings = {step: read_step(reader, table, step) for step in start_steps(table)}
         data = CoreData(table, touch_latents(TouchCodec(8), table), readings)
         core = train_core(data, config, settings, seed=0)
         trained.append([*reader.state_dict().values(), *core.state_dict().values()])
@@ -188,7 +188,7 @@ def test_cores_begin_anywhere_up_to_the_last_latent_step(config):
     starts = start_steps(table)
     assert starts == [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 76]
     torch.manual_seed(0)
-    blank = {step: read_objects(StartReader(config), table, step) for step in starts}
+    blank = {step: read_step(StartReader(config), table, step) for step in starts}
     data = CoreData(table, touch_latents(TouchCodec(8), table), blank)
     rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
     settings = CoreSettings(batch=2, first_fraction=0.5)

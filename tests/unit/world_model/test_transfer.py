@@ -10,8 +10,13 @@ from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.touch_codec import TouchCodec
 from services.world_model.settings import CoreSettings, ReaderSettings, StateTrainSettings
 from services.world_model.state_checkpoints import write_state_checkpoint
-from services.world_model.training.core_training import CoreData, touch_latents, train_core
-from services.world_model.training.reader_training import train_reader
+from services.world_model.training.core_training import (
+    CoreData,
+    _read_start,
+    touch_latents,
+    train_core,
+)
+from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_table import scene_table
 from services.world_model.training.state_trainer import (
     _assembled,
@@ -131,3 +136,18 @@ def test_seeds_of_the_base_remain_known(base):
     other.checkpoint = dataclasses.replace(base.checkpoint, metadata=known)
     assert _seed_ranges([episode(20), episode(21)], other) == {"press": (3, 21)}
     assert _seed_ranges([episode(20), episode(21)], None) == {"press": (20, 21)}
+
+
+def test_the_estimate_alone_is_trained_from_what_a_reader_reads(base, table):
+    reader = base.checkpoint.dynamics.readers()[0]
+    read = read_step(reader, table, 0)
+    touch = touch_latents(TouchCodec(base.checkpoint.metadata.dynamics.touch_channels), table)
+    rows, settings = torch.tensor([5, 2]), CoreSettings()
+    for starts_read in (True, False):
+        data = CoreData(table, touch, {0: read}, starts_read)
+        start = _read_start(data, rows, 0, settings, torch.Generator().manual_seed(0))
+        given = reader(table.first_steps(rows, torch.zeros_like(rows)))
+        is_read = torch.allclose(start.objects.position_m, given.objects.position_m)
+        assert is_read is starts_read
+        assert torch.allclose(start.sd_m, given.sd_m) is starts_read
+        assert torch.allclose(start.size, given.size) is starts_read
