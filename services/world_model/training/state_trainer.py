@@ -90,6 +90,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     if settings.base is None and settings.keep_readers:
         raise InvalidInputError("train state: got --keep-readers without --base; add --base PATH")
     settings = _with_precision(settings)
+    command = _command(settings)
     episodes = _episodes(settings)
     training, heldout = split_by_scene(episodes, held_out_share=settings.heldout_share)
     refuse_shared_scenes(training, heldout)
@@ -135,7 +136,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         )
         if base is None
         else base.checkpoint.metadata.bounds,
-        command=_command(settings),
+        command=command,
         seed=settings.seed,
         training_cpu_s=round(cpu_s, 1),
         num_training_episodes=len(training),
@@ -425,8 +426,9 @@ def _together(cores: Sequence[RecurrentCore]) -> dict[str, Tensor]:
 
 
 def _command(settings: StateTrainSettings) -> str:
-    """Command that repeats a run; stores are given by their last path component."""
-    left_out = {"output", "episodes", "jobs", "json_path"}
+    """Command that repeats a run; stores and the base are given by their last path component."""
+    left_out = {"output", "episodes", "base", "jobs", "json_path"}
     given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
     flags = [f"--episodes={last_name(url)}" for url in settings.episodes]
+    flags += [] if settings.base is None else [f"--base={settings.base.name}"]
     return " ".join(["dextouch train state", *flags, *flags_of(given)])

@@ -333,6 +333,7 @@ def test_the_command_in_a_checkpoint_can_be_typed_again():
     settings = TrainStateCommand(
         episodes=("file:///data/takes", "more"),
         tasks=("press",),
+        base=Path("/models/cores.safetensors"),
         core=CoreSettings(num_steps=7, weights=CoreLossWeights(touch=0.0)),
         json=Path("/somewhere/figures.json"),
     )
@@ -341,6 +342,7 @@ def test_the_command_in_a_checkpoint_can_be_typed_again():
     assert "/" not in command
     again = load_settings(TrainStateCommand, command.split()[3:])
     assert again.core.num_steps == 7
+    assert again.base == Path("cores.safetensors")
     assert again.core.weights.touch == 0.0
     assert again.tasks == ("press",)
 
