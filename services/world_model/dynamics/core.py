@@ -48,6 +48,9 @@ _PAIRS = tuple(combinations(range(MAX_OBJECTS), 2))
 # Of two objects: offset in the world and in either frame, two of them with their length over the
 # table or the plane of the frame, and the cosines between their axes.
 _PAIR_SIZE = 3 + 1 + 3 + 1 + 3 + 2
+# What does not depend on directions in the world: lengths across and up of an object's way, and
+# of a pair the heights, lengths across and cosines.
+_FREE_OF_OBJECT, _FREE_OF_PAIR = (_END_SIZE - 2, _END_SIZE - 1), (2, 3, 6, 7, 11, 12)
 # At first, objects move with no hand.
 _BY_ITSELF = 2.0
 
@@ -295,6 +298,23 @@ class RecurrentCore(nn.Module):
             pattern.transpose(2, 3),
             self.success(torch.cat([hidden, ends], dim=-1))[..., 0],
         )
+
+
+def direction_free_inputs(width: int) -> list[int]:
+    """Inputs of the estimate of success that are lengths, heights and angles.
+
+    Args:
+        width: of the hidden state, which comes first.
+    """
+    of_pairs = width + MAX_OBJECTS * _END_SIZE
+    of_objects = [
+        width + slot * _END_SIZE + index for slot in range(MAX_OBJECTS) for index in _FREE_OF_OBJECT
+    ]
+    return of_objects + [
+        of_pairs + pair * _PAIR_SIZE + index
+        for pair in range(len(_PAIRS))
+        for index in _FREE_OF_PAIR
+    ]
 
 
 def own_features(

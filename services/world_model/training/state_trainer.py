@@ -60,7 +60,7 @@ from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.transfer import Base
 
 # Increment when a change of training gives other weights for the same settings and data.
-READER_VERSION, CORE_VERSION, RENDERER_VERSION = 5, 8, 3
+READER_VERSION, CORE_VERSION, RENDERER_VERSION = 5, 9, 3
 # Largest number of episodes the renderer is trained on; it samples few of their images anyway.
 MAX_CLIPS = 1500
 _SEED_STRIDE = 1000

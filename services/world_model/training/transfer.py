@@ -7,13 +7,13 @@ import torch
 
 from dextouch.errors import InvalidInputError
 from services.world_model.dynamics.configuration import DynamicsConfig
-from services.world_model.dynamics.core import RecurrentCore
+from services.world_model.dynamics.core import RecurrentCore, direction_free_inputs
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.state_checkpoints import StateCheckpoint, read_state_checkpoint
 
 # Weights of a reader that belong to its tasks.
 _OF_TASKS = {"task.weight", "height_mean"}
-# Weights of a core that predict success; the first rows of the first layer are the hidden state's.
+# Weights of a core that predict success.
 _SUCCESS = "success."
 
 
@@ -68,8 +68,8 @@ class Base:
     def core(self, config: DynamicsConfig, member: int, *, seed: int) -> RecurrentCore:
         """A member's core, in which only fresh weights that predict success can be trained.
 
-        Of new tasks, they see predicted poses but not the hidden state: a few takes do not suffice
-        to find what it says about them.
+        Of new tasks, they see distances, heights and angles of predicted poses alone: a few takes
+        do not suffice to find which directions, or which units of the hidden state, do not matter.
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -87,11 +87,10 @@ class Base:
         core.success.requires_grad_(requires_grad=True)
         if self.has_tasks_of(config):
             return core
-        hidden = core.get_parameter(f"{_SUCCESS}0.weight")
-        from_hidden = torch.arange(config.width)
+        first = core.get_parameter(f"{_SUCCESS}0.weight")
+        used = torch.zeros(1, first.shape[1], 1)
+        used[:, direction_free_inputs(config.width)] = 1.0
         with torch.no_grad():
-            hidden[:, from_hidden] = 0.0
-        hidden.register_hook(  # type: ignore[no-untyped-call]
-            lambda gradient: gradient.index_fill(1, from_hidden, 0.0)
-        )
+            first *= used
+        first.register_hook(lambda gradient: gradient * used)  # type: ignore[no-untyped-call]
         return core

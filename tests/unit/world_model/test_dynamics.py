@@ -13,7 +13,12 @@ from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
-from services.world_model.dynamics.core import RecurrentCore, SceneStart, _ending_features
+from services.world_model.dynamics.core import (
+    RecurrentCore,
+    SceneStart,
+    _ending_features,
+    direction_free_inputs,
+)
 from services.world_model.dynamics.features import LOOKS, compressed, slot_features
 from services.world_model.dynamics.hand_motion import NUM_POINTS, hand_motion
 from services.world_model.dynamics.memory import (
@@ -531,3 +536,22 @@ def test_success_is_estimated_from_distances_and_angles_between_objects():
     ]
     np.testing.assert_allclose(found[72 : 72 + 13], expected, atol=1e-5)
     assert not found[72 + 13 :].any()
+
+
+def test_some_inputs_of_the_estimate_do_not_depend_on_directions():
+    rng = np.random.default_rng(5)
+    Rs = Rotation.random(3, rng=rng).as_matrix()
+    position, way = rng.uniform(-0.2, 0.2, (2, 3, 3))
+    turn = Rotation.from_euler("z", 1.1).as_matrix()
+
+    def features(R):
+        axes = np.stack([(R @ Rs)[..., 2], (R @ Rs)[..., 0]], axis=1)
+        moved = [torch.tensor(a).float()[None, None] for a in (position @ R.T, axes, way @ R.T)]
+        about, present = torch.zeros(1, 1, 3, 13), torch.ones(1, 1, 3)
+        return _ending_features(moved[0], moved[1], about, present, moved[2])[0, 0]
+
+    one, turned = features(np.eye(3)), features(turn)
+    free = direction_free_inputs(0)
+    torch.testing.assert_close(one[free], turned[free], atol=1e-5, rtol=0)
+    assert len(free) == 24
+    assert (one - turned).abs().gt(1e-2).sum() > 20
