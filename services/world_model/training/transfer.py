@@ -91,6 +91,6 @@ class Base:
         used = torch.zeros(1, first.shape[1], 1)
         used[:, direction_free_inputs(config.width)] = 1.0
         with torch.no_grad():
-            first *= used
+            first.mul_(used)
         first.register_hook(lambda gradient: gradient * used)  # type: ignore[no-untyped-call]
         return core
