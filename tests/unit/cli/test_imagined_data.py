@@ -31,7 +31,7 @@ from tests.contracts.test_world import untrained_state_checkpoint
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
-    """A store of one episode whose seed is shown to a judge at steps 8 and 48."""
+    """A store of one episode whose scene is shown to a judge at steps 8 and 64."""
     store = EpisodeStore(tmp_path_factory.mktemp("truth"))
     stage = Stage("stand_bottle", "robot", TwinSettings(image_height_px=32, image_width_px=32))
     write_episode(store, record(stage, 4, TakeOptions(images=("camera_head",))))
@@ -48,7 +48,7 @@ def checkpoint(tmp_path_factory):
 
 def test_judged_steps_are_three_at_every_end(truth):
     episode = truth.open(truth.list()[0])
-    assert judged_steps(episode) == {6, 7, 8, 46, 47, 48, 77, 78, 79, 80}
+    assert judged_steps(episode) == {6, 7, 8, 62, 63, 64, 77, 78, 79, 80}
 
 
 def test_a_judge_sees_what_it_would_have_seen_of_all_images(truth, checkpoint, tmp_path):
@@ -64,11 +64,11 @@ def test_a_judge_sees_what_it_would_have_seen_of_all_images(truth, checkpoint, t
     with served({"imagined": app}) as urls, RolloutClient(urls["imagined"]) as client:
         name = imagine_episode(source, client, WORLD, every)
     assert few.list() == every.list() == [name]
-    # Step 0, and the chunks of four that hold 6 … 8, 46 … 48 and 77 … 80.
+    # Step 0, and the chunks of four that hold 6 … 8, 62 … 64 and 77 … 80.
     shown = few.open(name).shown_steps("camera_head")[0]
-    assert shown.tolist() == [0, *range(5, 9), *range(45, 49), *range(77, 81)]
+    assert shown.tolist() == [0, *range(5, 9), *range(61, 65), *range(77, 81)]
     ours, theirs = (read_ending_episode(store.open(name)) for store in (few, every))
-    assert set(ours.endings) == set(theirs.endings) == {8, 48, 79, 80}
+    assert set(ours.endings) == set(theirs.endings) == {8, 64, 79, 80}
     for step, ending in ours.endings.items():
         wanted = theirs.endings[step]
         # Stored images are compressed together, so they are alike but not the same.
