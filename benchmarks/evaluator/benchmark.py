@@ -50,6 +50,11 @@ _QUICK_LEVELS_MM = (0.0, 10.0, 30.0)
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of this stage."""
+    _add_checkpoints(parser)
+    _add_rollouts(parser)
+
+
+def _add_checkpoints(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--world",
         action="append",
@@ -81,6 +86,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="evaluate every member of a world model's ensemble alone, as a training seed",
     )
+
+
+def _add_rollouts(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--kinds",
         default="development",

@@ -74,10 +74,10 @@ class TrainProbeSettings(CommandSettings):
         "fitted, to all of --episodes and --development",
     )
     development: tuple[str, ...] = Field(
-        default=(), description="stores to calibrate on (default: a share of the seeds)"
+        default=(), description="stores to calibrate on (default: a share of the scenes)"
     )
     held_out: tuple[str, ...] = Field(
-        default=(), description="stores to evaluate on (default: a fifth of the seeds)"
+        default=(), description="stores to evaluate on (default: a fifth of the scenes)"
     )
     output: Path = Field(
         default=Path("runs/evaluation/success_probe.safetensors"), description="checkpoint to write"

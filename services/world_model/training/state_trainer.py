@@ -19,7 +19,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from dextouch.command_line import ProgressLines
-from dextouch.episodes import refuse_shared_scenes, scene_fraction, split_by_scene
+from dextouch.episodes import SPLITS, Split, scene_fraction, split_by_scene
 from dextouch.errors import InvalidInputError
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.configuration import DynamicsConfig
@@ -93,7 +93,6 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     command = _command(settings)
     episodes = _episodes(settings)
     training, heldout = split_by_scene(episodes, held_out_share=settings.heldout_share)
-    refuse_shared_scenes(training, heldout)
     config = _config(episodes, settings)
     base = None if settings.base is None else Base(settings.base)
     if base is not None:
@@ -105,12 +104,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     # Before training, so that invalid episodes are found at once.
     heldout_table = scene_table(heldout, config)
     table = scene_table(training, config, labelled=_labelled(training, settings))
-    codec = TouchCodec(config.touch_channels)
-    if base is None:
-        touch_kpa = table.tactile_kpa[:, ::4].float().flatten(0, 2)
-        codec.fit(touch_kpa, peak_kpa=float(table.tactile_kpa.max()))
-    else:
-        codec.load_state_dict(base.checkpoint.dynamics.codec.state_dict())
+    codec = _codec(table, config, base)
     table_file = parts / "table.safetensors"
     save_file({**table.tensors(), **_prefixed(codec)}, table_file)
     del table
@@ -141,7 +135,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         training_cpu_s=round(cpu_s, 1),
         num_training_episodes=len(training),
         training_seeds=_seed_ranges(training, base),
-        training_splits=settings.splits,
+        training_splits=_splits(settings, base),
         data_hash=data_hash,
         metrics=measured.figures,
     )
@@ -276,6 +270,27 @@ def _seed_ranges(episodes: list[SceneEpisode], base: Base | None) -> dict[str, t
         if episode.seed is not None:
             seeds.setdefault(episode.task, []).append(episode.seed)
     return {task: (min(found), max(found)) for task, found in sorted(seeds.items())}
+
+
+def _splits(settings: StateTrainSettings, base: Base | None) -> tuple[Split, ...]:
+    """Splits that the run and its base were trained on; none means all."""
+    if base is None:
+        return settings.splits
+    known = base.checkpoint.metadata.training_splits
+    if not (settings.splits and known):
+        return ()
+    return tuple(split for split in SPLITS if split in {*settings.splits, *known})
+
+
+def _codec(table: SceneTable, config: DynamicsConfig, base: Base | None) -> TouchCodec:
+    """The base's touch codec, or one fitted to the training episodes."""
+    codec = TouchCodec(config.touch_channels)
+    if base is None:
+        touch_kpa = table.tactile_kpa[:, ::4].float().flatten(0, 2)
+        codec.fit(touch_kpa, peak_kpa=float(table.tactile_kpa.max()))
+    else:
+        codec.load_state_dict(base.checkpoint.dynamics.codec.state_dict())
+    return codec
 
 
 def _prefixed(codec: TouchCodec) -> dict[str, Tensor]:

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from dextouch.episodes.splits import SPLITS as SPLITS
     from dextouch.episodes.splits import Split as Split
     from dextouch.episodes.splits import is_in as is_in
-    from dextouch.episodes.splits import refuse_shared_scenes as refuse_shared_scenes
     from dextouch.episodes.splits import scene_fraction as scene_fraction
     from dextouch.episodes.splits import scene_of as scene_of
     from dextouch.episodes.splits import split_by_scene as split_by_scene

@@ -6,10 +6,10 @@ on some of the splits A, B and C and imagine episodes of another.
 """
 
 import hashlib
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from typing import Final, Literal, Protocol, TypeVar, get_args, runtime_checkable
 
-from dextouch.errors import ConflictError, InvalidInputError
+from dextouch.errors import InvalidInputError
 from dextouch.schemas import EpisodeAttributes
 
 Split = Literal["A", "B", "C"]
@@ -88,20 +88,6 @@ def split_by_scene(
             f"share of {held_out_share:g}, expected at least one each; record more scenes"
         )
     return training, held_out
-
-
-def refuse_shared_scenes(training: Sequence[InScene], held_out: Sequence[InScene]) -> None:
-    """Refuse a split with a scene on both sides.
-
-    Raises:
-        ConflictError: scenes are shared; the first few are named.
-    """
-    shared = sorted({item.scene for item in training} & {item.scene for item in held_out})
-    if shared:
-        raise ConflictError(
-            f"split: {len(shared)} scenes are both trained on and held out "
-            f"({', '.join(shared[:5])}); evaluate on other seeds"
-        )
 
 
 def _split_of(scene: str) -> Split:

@@ -161,6 +161,13 @@ def test_policies_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     assert finished.metadata.training_starts == early.metadata.training_starts
 
 
+def test_robots_without_commands_teach_the_poses_that_they_reached(tmp_path):
+    store, item = EpisodeStore(tmp_path), toy.demonstration("reach", 3)
+    write(store, item, without=["action_commanded"], origin="recorded", seed=None)
+    (episode,) = read_cloning_episodes(store)
+    np.testing.assert_allclose(episode.commanded, item.measured)
+
+
 def test_policies_learn_from_images_of_every_eighth_step(tmp_path):
     store = EpisodeStore(tmp_path)
     item = toy.demonstration("reach", 1)

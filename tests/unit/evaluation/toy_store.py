@@ -17,6 +17,7 @@ def write(
     item: toy.Demonstration,
     *,
     shown: Sequence[int] = range(toy.STEPS),
+    without: Sequence[str] = (),
     **changed: object,
 ) -> None:
     """A toy demonstration as an episode of the store, with images of some steps."""
@@ -39,7 +40,8 @@ def write(
     }
     built = EpisodeAttributes.model_validate(attributes | changed)
     with store.writer(kind="episode", attributes=built) as writer:
-        for name, (values, fields) in streams.items():
+        for name in [name for name in streams if name not in without]:
+            values, fields = streams[name]
             writer.add_stream(StreamDescriptor(name=name, nominal_rate_hz=15, **fields))
             steps = list(shown) if fields["kind"] == "image" else slice(None)
             writer.append(name, values=values[steps], t_ref_ns=GRID_NS[steps])

@@ -23,6 +23,7 @@ from services.world_model.training.state_trainer import (
     _assembled,
     _keep,
     _seed_ranges,
+    _splits,
     _with_base,
     _Work,
     train_state,
@@ -136,6 +137,12 @@ def test_seeds_of_the_base_remain_known(base):
     other.checkpoint = dataclasses.replace(base.checkpoint, metadata=known)
     assert _seed_ranges([episode(20), episode(21)], other) == {"press": (3, 21)}
     assert _seed_ranges([episode(20), episode(21)], None) == {"press": (20, 21)}
+    settings = StateTrainSettings(episodes=("takes",), splits=("C",))
+    # The base was trained on all splits.
+    assert (_splits(settings, other), _splits(settings, None)) == ((), ("C",))
+    known = known.model_copy(update={"training_splits": ("A",)})
+    other.checkpoint = dataclasses.replace(base.checkpoint, metadata=known)
+    assert _splits(settings, other) == ("A", "C")
 
 
 def test_the_estimate_alone_is_trained_from_what_a_reader_reads(base, table):
