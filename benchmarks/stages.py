@@ -83,6 +83,15 @@ STAGES = {
         "starts, and mean and worst of several training seeds. Results are kept in --keep, so an "
         "interrupted run resumes.",
     ),
+    "objects": StageEntry(
+        "benchmarks.objects",
+        "find objects by the markers on them, compared with the usual recipe",
+        "Renders takes of the twin whose objects carry ArUco markers, sharp and with blur and "
+        "noise, and compares the poses that alignment measures (all markers of an object, edges "
+        "fitted, the two solutions told apart) with those of the usual recipe (the largest marker, "
+        "corners refined by gradients) and with the truth: errors, share of images in which "
+        "objects were found, and time an image.",
+    ),
     "starts": StageEntry(
         "benchmarks.starts",
         "read starts under other cameras, amid episodes and with objects of other sizes",

@@ -19,7 +19,7 @@ from dextouch.episodes import EpisodeReader, EpisodeStore, disk_errors
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.free_text import printable
 from dextouch.hands.hand_files import load_hand
-from dextouch.schemas import json_ready
+from dextouch.schemas import json_ready, load_scene_objects
 from dextouch.serving import load_settings
 from services.alignment.jobs import AlignmentWorker, check_recording, episode_id_of
 from services.alignment.options import AlignmentOptions
@@ -40,6 +40,8 @@ PAGE_WIDTH = 110
 EPILOG = """examples:
   dextouch align run take-7 take-8           align two recordings in parallel
   dextouch align run --all --workers 2       align all recordings without an episode
+  dextouch align run --all --objects objects.json
+                                             with the poses of objects that have markers
   dextouch align report take-7               clock fits, retargeting errors, omitted parts
   dextouch align retarget take-7 --model hand.urdf --mapping hand.toml --to joints.npz
                                              joint angles of another robot hand
@@ -57,6 +59,8 @@ def main(argv: Sequence[str]) -> int:
     """
     settings = load_settings(AlignmentSettings, [])
     parsed = _parser(settings).parse_args(list(argv))
+    if getattr(parsed, "objects", None) is not None:
+        settings = settings.model_copy(update={"objects": parsed.objects})
     return COMMANDS[parsed.command](parsed, settings)
 
 
@@ -70,9 +74,15 @@ def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
     shared.add_argument(
         "--store", default=settings.store_url, metavar="URL", help="the store (%(default)s)"
     )
+    shared.add_argument(
+        "--objects",
+        type=Path,
+        metavar="FILE",
+        help="JSON file of the tasks' objects, whose poses are measured by markers or trackers",
+    )
     add_json(shared)
     commands = parser.add_subparsers(
-        dest="command", required=True, metavar="{run,report,retarget,serve}"
+        dest="command", required=True, metavar="{run,report,retarget,markers,serve}"
     )
     running = commands.add_parser(
         "run",
@@ -114,6 +124,15 @@ def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
         "--mapping", type=Path, required=True, metavar="FILE", help="TOML: fingers, joints, wrist"
     )
     other.add_argument("--to", type=Path, required=True, metavar="FILE", help="NPZ to write")
+    sheet = commands.add_parser(
+        "markers",
+        help="make a sheet of the objects' markers to print",
+        description="Write the markers of a file of objects as SVG in true size: print it at 100 % "
+        "and measure one side.",
+        epilog="example:\n  dextouch align markers --objects objects.json --to markers.svg",
+    )
+    sheet.add_argument("--objects", type=Path, required=True, metavar="FILE", help="of the objects")
+    sheet.add_argument("--to", type=Path, required=True, metavar="FILE", help="SVG to write")
     commands.add_parser("serve", help="run the HTTP service (serve --help lists its settings)")
     return parser
 
@@ -130,14 +149,14 @@ def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
         raise InvalidInputError("run: expected either ID … or --all; see run --help")
     wanted, refused = list(dict.fromkeys(parsed.recordings)), list[Outcome]()
     if parsed.all:
-        wanted, refused = not_aligned(EpisodeStore(parsed.store), settings.options)
+        wanted, refused = not_aligned(EpisodeStore(parsed.store), settings.wanted_options)
     console = Console(highlight=False, soft_wrap=True)
     reports, num_failed = [], 0
     with _bars(console, len(wanted)) as on_progress:
         outcomes = align_batch(
             parsed.store,
             wanted,
-            settings.options,
+            settings.wanted_options,
             num_workers=parsed.workers,
             on_progress=on_progress,
         )
@@ -178,7 +197,7 @@ def _bars(console: Console, num_recordings: int) -> Iterator[OnRecordingProgress
 
 
 def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
-    episode = _find_episode(EpisodeStore(parsed.store), parsed.id, settings.options)
+    episode = _find_episode(EpisodeStore(parsed.store), parsed.id, settings.wanted_options)
     recordings = [entry.id for entry in episode.attributes.lineage if entry.kind == "recording"]
     report = report_of(episode, recording_id=(recordings or [parsed.id])[-1], created=False)
     width = None if sys.stdout.isatty() else PAGE_WIDTH
@@ -189,7 +208,7 @@ def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
 
 def _retarget(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     hand = load_hand(parsed.model, parsed.mapping)
-    episode = _find_episode(EpisodeStore(parsed.store), parsed.id, settings.options)
+    episode = _find_episode(EpisodeStore(parsed.store), parsed.id, settings.wanted_options)
     name = f"keypoints_{hand.side}"
     if name not in episode.streams:
         raise NotFoundError(
@@ -224,6 +243,17 @@ def _retarget(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
         f"{parsed.to}: {len(hand.joint_names)} joints of the {hand.side} hand in "
         f"{len(solved)} samples, {solved.mean():.1%} solved"
     )
+    return 0
+
+
+def _markers(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
+    del settings
+    from services.alignment.marker_sheet import marker_sheet
+
+    page = marker_sheet(load_scene_objects(parsed.objects))
+    with disk_errors(f"write {parsed.to}"):
+        parsed.to.write_text(page, encoding="utf-8")
+    print(f"{parsed.to}: print at 100 %, then measure the side of one marker")
     return 0
 
 
@@ -288,4 +318,5 @@ COMMANDS: dict[str, Callable[[argparse.Namespace, AlignmentSettings], int]] = {
     "run": _run,
     "report": _report,
     "retarget": _retarget,
+    "markers": _markers,
 }

@@ -39,6 +39,7 @@ class JobRunner:
         self.jobs_folder = settings.jobs_folder or Path(store.root) / JOBS_FOLDER
         max_open = settings.num_workers + settings.max_waiting
         self.queue = JobQueue(max_open=max_open, max_kept=settings.max_kept)
+        self._options = settings.wanted_options
         self.metrics = AlignmentMetrics(self.queue)
         self._changed = asyncio.Condition(self.queue.lock)
         self._workers = [
@@ -120,7 +121,7 @@ class JobRunner:
             InvalidInputError: a recording lacks what every episode needs.
             LimitExceededError: too many are waiting.
         """
-        options = request.options or self._settings.options
+        options = request.options or self._options
         ids = await asyncio.to_thread(check_recordings, self._store, request.wanted, options)
         jobs = [
             AlignmentJob.new(alignment_id, recording_id, options)
@@ -139,7 +140,7 @@ class JobRunner:
             LimitExceededError: too many are waiting.
         """
         recording = await asyncio.to_thread(self._store.recording, recording_id)
-        options = self._settings.options
+        options = self._options
         job = AlignmentJob.new(episode_id_of(recording, options), recording_id, options)
         failed = job.ended("failed", error=error)
         async with self.queue.lock:

@@ -129,7 +129,8 @@ def check_recordings(
 
 def episode_id_of(recording: RecordingReader, options: AlignmentOptions) -> str:
     """The id of the episode that a recording becomes under these options."""
-    identity = f"{ALIGNMENT_VERSION} {recording.content_sha256} {options.model_dump_json()}"
+    mine = options.of_task(recording.attributes.task).model_dump_json()
+    identity = f"{ALIGNMENT_VERSION} {recording.content_sha256} {mine}"
     digest = hashlib.sha256(identity.encode()).hexdigest()[:12]
     return f"{recording.attributes.recording_id[:MAX_STEM]}-{digest}"
 

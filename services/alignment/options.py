@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
+from dextouch.schemas import SceneObjects
 
 WristChoice = Literal["tracked", "touch"]
 
@@ -12,7 +13,8 @@ WristChoice = Literal["tracked", "touch"]
 class AlignmentOptions(FrozenModel):
     """Options of one alignment; they are part of the episode's identity.
 
-    A `wrist` as tracked is not written, so that ids of episodes of earlier versions remain.
+    A `wrist` as tracked is not written, and nor are `objects` if there are none, so that ids of
+    episodes of earlier versions remain.
     """
 
     model_rate_hz: float = Field(default=15.0, gt=0, le=1000, description="rate of the model grid")
@@ -32,6 +34,18 @@ class AlignmentOptions(FrozenModel):
         description="poses of human wrists and fingertips: as tracked, or moved so that the "
         "robot's hand touches where the person's did",
     )
+
+    objects: SceneObjects | None = Field(
+        default=None,
+        exclude_if=lambda objects: objects is None,
+        description="objects of the tasks, whose poses become streams of the episodes",
+    )
+
+    def of_task(self, task: str) -> "AlignmentOptions":
+        """The options that matter to recordings of one task."""
+        if self.objects is None:
+            return self
+        return self.model_copy(update={"objects": self.objects.of_task(task)})
 
     @property
     def max_gap_ns(self) -> int:

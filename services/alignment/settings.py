@@ -1,11 +1,13 @@
 """Settings of the alignment service, from flags and DEXTOUCH_ALIGNMENT_… variables."""
 
 import os
+from functools import cached_property
 from pathlib import Path
 
 from pydantic import Field, SecretStr
 
 from dextouch.data_folder import data_folder, default_spool, default_store
+from dextouch.schemas import load_scene_objects
 from dextouch.serving import ServiceSettings, service_config
 from services.alignment.options import AlignmentOptions
 
@@ -35,6 +37,10 @@ class AlignmentSettings(ServiceSettings):
         default=None, description="folder of the jobs (default: .alignments in the store)"
     )
     options: AlignmentOptions = AlignmentOptions()
+    objects: Path | None = Field(
+        default=None,
+        description="JSON file of the tasks' objects, whose poses are measured (docs/objects.md)",
+    )
     num_workers: int = Field(
         default_factory=usable_cores,
         ge=1,
@@ -72,6 +78,17 @@ class AlignmentSettings(ServiceSettings):
         default_factory=lambda: data_folder() / "calibration",
         description="folder of the station's calibration",
     )
+
+    @cached_property
+    def wanted_options(self) -> AlignmentOptions:
+        """The options, with the objects of the file.
+
+        Raises:
+            NotFoundError, InvalidInputError: as `load_scene_objects`.
+        """
+        if self.objects is None:
+            return self.options
+        return self.options.model_copy(update={"objects": load_scene_objects(self.objects)})
 
     @property
     def period_s(self) -> float:

@@ -8,7 +8,7 @@ the clock of the simulated host is that of the simulation.
 
 import tempfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,7 +21,13 @@ from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import nearest_index
-from dextouch.schemas import EpisodeAttributes, Matrix, TakePrompt
+from dextouch.schemas import (
+    EpisodeAttributes,
+    Matrix,
+    SceneObjects,
+    TakePrompt,
+    object_stream,
+)
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mocks.pattern import pattern_streams
@@ -64,7 +70,7 @@ def device_options(options: TakeOptions) -> TakeOptions:
 def write_through_devices(
     store: EpisodeStore, truth: TruthEpisode, *, episode_id: str, options: TakeOptions
 ) -> None:
-    """Record a take of the twin with a mock station, align it and write the episode.
+    """Record a take of the twin with a mock station, align it and write it with the twin's labels.
 
     Equal takes give equal episodes. The recording itself is not kept.
 
@@ -79,6 +85,55 @@ def write_through_devices(
         InvalidInputError: the take could not be aligned.
         DeviceError: a mock device failed.
     """
+    aligned = _aligned(truth, ALIGNMENT, episode_id)
+    about = aligned.attributes
+    label = _label(truth.streams[LABELS], aligned.origin_ns, aligned.streams[0].t_ns)
+    attributes = _with_truth(about, truth.attributes, aligned.origin_ns)
+    _write(store, attributes, [label, *aligned.streams], options)
+
+
+def write_as_recorded(
+    store: EpisodeStore,
+    truth: TruthEpisode,
+    objects: SceneObjects,
+    *,
+    episode_id: str,
+    options: TakeOptions,
+) -> None:
+    """Record a take with a mock station and write what alignment makes of it, and nothing else.
+
+    Poses of objects are those of the markers in the images. Of the twin's truth the episode has
+    only the outcome, which an operator would see.
+
+    Args:
+        store: where the episode goes.
+        truth: recorded with `device_options`, by a stage that shows the markers.
+        objects: of the task, with their markers.
+        episode_id: of the new episode.
+        options: `streams` and `image_every` say what the episode has.
+
+    Raises:
+        ConflictError: the episode exists.
+        InvalidInputError: the take could not be aligned.
+        DeviceError: a mock device failed.
+    """
+    aligned = _aligned(truth, ALIGNMENT.model_copy(update={"objects": objects}), episode_id)
+    # The wall clock would differ each time.
+    attributes = aligned.attributes.model_copy(update={"created_at": None})
+    _write(store, attributes, aligned.streams, options)
+
+
+@dataclass(frozen=True)
+class _Aligned:
+    """An aligned take in memory; `origin_ns` is its time 0 on the axis of the truth."""
+
+    attributes: EpisodeAttributes
+    streams: list[AlignedStream]
+    origin_ns: int
+
+
+def _aligned(truth: TruthEpisode, alignment: AlignmentOptions, episode_id: str) -> _Aligned:
+    """Play a take through a mock station and align its recording."""
     about = truth.attributes
     if about.seed is None:
         raise InvalidInputError(f"device takes: {episode_id} has no seed; expected a twin's take")
@@ -99,20 +154,31 @@ def write_through_devices(
         local = EpisodeStore(folder / "store")
         commit_spool(local, take.spool_path, SpoolReader(take.spool_path).attributes)
         recording = local.recording(take.recording_id)
-        built = build_episode(recording, episode_id=episode_id, options=ALIGNMENT)
+        built = build_episode(recording, episode_id=episode_id, options=alignment)
         streams = [_in_memory(stream) for stream in built.streams]
         started_ns = recording.attributes.started_t_host_ns
     attributes = built.complete_attributes()
     if started_ns is None:
         raise InvalidInputError(f"device takes: {episode_id} has no start time; record it again")
     origin_ns = origin_in_truth_ns(take, started_t_host_ns=started_ns, quality=attributes.quality)
-    grid_ns = streams[0].t_ns
-    written = [_label(truth.streams[LABELS], origin_ns, grid_ns), *streams]
+    return _Aligned(attributes, streams, origin_ns)
+
+
+def _write(
+    store: EpisodeStore,
+    attributes: EpisodeAttributes,
+    streams: Sequence[AlignedStream],
+    options: TakeOptions,
+) -> None:
+    """Write those streams and images that the options ask for."""
+    written = list(streams)
     if options.streams == "training":
-        written = [one for one in written if one.descriptor.name in (*_TRAINED, *options.images)]
+        names = (*_TRAINED, *options.images, *map(object_stream, attributes.object_names))
+        written = [one for one in written if one.descriptor.name in names]
     if options.image_every is not None:
+        grid_ns = next(one.t_ns for one in streams if one.descriptor.name == "action")
         written = [_thinned(one, grid_ns, options.image_every) for one in written]
-    with store.writer(kind="episode", attributes=_with_truth(attributes, about, origin_ns)) as to:
+    with store.writer(kind="episode", attributes=attributes) as to:
         for one in written:
             to.add_stream(one.descriptor)
             to.append(one.descriptor.name, values=one.values, t_ref_ns=one.t_ns)

@@ -6,7 +6,9 @@ scene. `--mix` selects their shares. With `--policy` every episode is a rollout 
 the twin instead. Interrupted runs resume: existing episodes are kept.
 
 Human takes are recorded like those of a person: the twin's hands are played to mock devices, whose
-packets go through the drivers, the recorder and alignment to actions of the robot.
+packets go through the drivers, the recorder and alignment to actions of the robot. With
+`--path station`, robot takes are recorded so, too, and nothing but the outcome comes from the twin:
+the poses of objects are measured by markers on them, which the head camera sees.
 """
 
 import argparse
@@ -32,15 +34,17 @@ from dextouch.clients import Policy, PolicyStart
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, DeviceError, InvalidInputError, UnknownNameError
-from dextouch.schemas import RolloutStart
+from dextouch.schemas import RolloutStart, SceneObjects
 from dextouch.serving import configure_logging
 from services.evaluation.policies.asking import action_chunk, ask
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.progress import Progress
+from services.twin.bounding_boxes import object_boxes_m
 from services.twin.data_mix import MIXES, Mix, options_of
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TruthEpisode, episode_id, record, write_episode
 from services.twin.hands import DOMAINS, Domain
+from services.twin.markers import Markers, marked_objects
 from services.twin.settings import TwinSettings
 from services.twin.sizes import Sizes
 from services.twin.stage import Stage
@@ -51,9 +55,12 @@ from services.twin.world import TwinWorld
 CAMERAS = ("camera_head",)
 DEFAULT_MIX = "evaluator"
 MAX_LABEL = 32
+# Markers of 3 cm are 20 px wide in such images.
+_MARKED_IMAGE_PX: Final = 400
 _VARIED_DRAW, _SIZES_DRAW = 103, 104
-# How a take becomes an episode: written as it is, or by devices, drivers, recorder and alignment.
-TakePath = Literal["direct", "devices"]
+# How a take becomes an episode: written as it is; by devices, drivers, recorder and alignment, with
+# the twin's labels; or the same without them, objects being measured by the markers on them.
+TakePath = Literal["direct", "devices", "station"]
 TAKE_PATHS: Final[tuple[TakePath, ...]] = get_args(TakePath)
 
 Item = TypeVar("Item")
@@ -153,6 +160,19 @@ def stage_of(task: str, domain: Domain) -> Stage:
     return Stage(task, domain, TwinSettings())
 
 
+@lru_cache(maxsize=12)
+def marked_stage(task: str, domain: Domain) -> tuple[Stage, SceneObjects]:
+    """A stage with markers on its objects and a camera that can read them, and their places."""
+    px = _MARKED_IMAGE_PX
+    stage = Stage(task, domain, TwinSettings(image_height_px=px, image_width_px=px))
+    scene = stage.simulation.scene
+    objects = marked_objects(
+        task, scene.object_names, object_boxes_m(scene), scene.bodies.are_fixed
+    )
+    stage.rig.markers = Markers(objects)
+    return stage, objects
+
+
 @lru_cache(maxsize=1)
 def _world() -> TwinWorld:
     return TwinWorld(TwinSettings(cameras=CAMERAS))
@@ -215,10 +235,33 @@ def _write_by_devices(order: Order) -> TruthEpisode:
     return episode
 
 
+def _write_as_a_station(order: Order) -> TruthEpisode:
+    from services.cli.device_takes import device_options, write_as_recorded
+
+    stage, objects = marked_stage(order.task, order.domain)
+    options = replace(device_options(order.options), image_every=1)
+    episode = record(stage, order.seed, options)
+    write_as_recorded(
+        EpisodeStore(order.store),
+        episode,
+        objects,
+        episode_id=order.episode_id,
+        options=order.options,
+    )
+    return episode
+
+
+_WRITERS: Final[dict[TakePath, Callable[[Order], TruthEpisode]]] = {
+    "direct": _write_directly,
+    "devices": _write_by_devices,
+    "station": _write_as_a_station,
+}
+
+
 def make_episode(order: Order) -> Answer:
     """Record one episode and write it to its store."""
     try:
-        episode = _write_directly(order) if order.path == "direct" else _write_by_devices(order)
+        episode = _WRITERS[order.path](order)
     except ConflictError:
         return Answer(order.episode_id)
     except (InvalidInputError, DeviceError) as error:
@@ -258,6 +301,8 @@ def make_training_data(
             f"training data: got seeds {seeds}, tasks {scope.tasks}, domains {scope.domains} and "
             f"{num_jobs} jobs, expected at least one of each"
         )
+    if policy is not None and scope.path == "station":
+        raise InvalidInputError("training data: got a policy and --path station; it plays scripts")
     if policy is not None and scope.domains != ("robot",):
         raise InvalidInputError("training data: got a policy for human hands; it moves the robot's")
     target = EpisodeStore(store)
@@ -354,7 +399,10 @@ def _parser() -> argparse.ArgumentParser:
     tasks = f"tasks, or sets of tasks: {', '.join(TASK_SETS)} (default: {','.join(EVALUATED)})"
     add("--tasks", type=comma_separated, default=EVALUATED, metavar="A,B", help=tasks)
     add("--domains", type=comma_separated, default=("robot",), help="robot,human (robot)")
-    path = "write takes as they are, or by devices and alignment (robot: direct, human: devices)"
+    path = (
+        "write takes as they are, by devices and alignment with the twin's labels, or as a station "
+        "records them, with poses from markers (robot: direct, human: devices)"
+    )
     add("--path", choices=TAKE_PATHS, help=path)
     mixes = parser.add_mutually_exclusive_group()
     kinds = "kinds of takes (%(default)s)"

@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.episodes import EpisodeReader
+from dextouch.episodes import EpisodeReader, object_track
 from dextouch.hands.actions import poses_from_actions
 from services.evaluation.prediction_scenes import Scene
 from services.evaluation.scene_geometry import FAR_M, SceneGeometry
 from services.twin.scene_views import SceneViews
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
-from services.world_model.training.scene_episodes import poses_at
 
 
 class TwinGeometry:
@@ -24,11 +23,12 @@ class TwinGeometry:
     def added_to(self, scene: Scene, reader: EpisodeReader) -> Scene:
         """The scene with its geometry; unchanged if its episode is not of the twin."""
         about = reader.attributes
-        if about.origin != "twin" or "object_poses" not in reader.streams:
-            return scene
         window = reader.window(0, reader.num_steps, cameras=())
+        track = object_track(reader, window.t_ref_ns)
+        if about.origin != "twin" or track is None:
+            return scene
         poses = poses_from_actions(window.actions, window.anchor)
-        objects = poses_at(reader, window.t_ref_ns).astype(np.float64)
+        objects = track.poses.astype(np.float64)
         views = self._of_task(about.task, scene.truth.images.shape[1:3])
         steps = [scene.first_step + step for step in scene.truth.image_steps]
         seen = [views.of(poses, objects, step) for step in steps]

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, scene_of
+from dextouch.episodes import OBJECT_POSES, EpisodeReader, EpisodeStore, scene_of
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.direct_network import NUM_STEPS, Attempt
-from services.evaluation.endings import OBJECT_POSES
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 

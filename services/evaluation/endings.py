@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, scene_fraction, scene_of
+from dextouch.episodes import EpisodeReader, EpisodeStore, object_track, scene_fraction, scene_of
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Observation, RolloutDoubt, is_rollout, rollout_doubt
 from services.evaluation.demonstrations import CAMERA
@@ -16,7 +16,6 @@ from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 
 NUM_SEEN_STEPS: Final = 3
-OBJECT_POSES: Final = "object_poses"
 # Share of an object's usual size. Start readers err by 4 to 7 % (`python -m benchmarks starts`).
 UNUSUAL_SIZE: Final = 0.1
 # Each training episode is cut at one early and one middle step, drawn by its scene. Early endings
@@ -209,22 +208,21 @@ def _read_ending(reader: EpisodeReader, end: int) -> Ending:
         window.images[CAMERA] if are_near else None,
         window.tactile_kpa,
         reader.attributes.task,
-        _object_poses(reader, window.t_ref_ns, half_step_ns),
+        _object_poses(reader, window.t_ref_ns),
         reader.attributes.origin == "imagined",
     )
 
 
 def _object_poses(
-    reader: EpisodeReader, t_ref_ns: np.ndarray, half_step_ns: float
+    reader: EpisodeReader, t_ref_ns: np.ndarray
 ) -> Float32[np.ndarray, "3 objects 7"] | None:
-    if OBJECT_POSES not in reader.streams:
+    """Poses at these steps; NaN for objects that are not known at all of them."""
+    track = object_track(reader, t_ref_ns)
+    if track is None:
         return None
-    low, high = int(t_ref_ns[0] - half_step_ns), int(t_ref_ns[-1] + half_step_ns) + 1
-    stored = reader.read(OBJECT_POSES, low, high)
-    if len(stored) == 0:
-        return None
-    nearest = np.abs(stored.t_ref_ns[None, :] - t_ref_ns[:, None]).argmin(axis=1)
-    return np.asarray(stored.values[nearest], dtype=np.float32)
+    poses = track.poses.copy()
+    poses[:, ~np.all(track.known, axis=0)] = np.nan
+    return poses
 
 
 def read_ending_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[EndingEpisode]:

@@ -11,8 +11,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
-from dextouch.geometry import pinhole_matrix, transform, transform_from_pose
+from dextouch.geometry import invert, pinhole_matrix, transform, transform_from_pose
 from services.twin.appearance import Appearance
+from services.twin.markers import Markers
 from services.twin.scene import Scene
 from services.twin.simulation import Simulation
 
@@ -49,7 +50,10 @@ def _wrist_mount(palm_sign: float) -> Float64[np.ndarray, "4 4"]:
 
 
 class CameraRig:
-    """The three cameras of a scene; rays are computed once and rotated with the camera."""
+    """The three cameras of a scene; rays are computed once and rotated with the camera.
+
+    `appearance` is what the scene looks like, `markers` those that are glued to its objects.
+    """
 
     def __init__(self, scene: Scene, *, height_px: int, width_px: int) -> None:
         self._model = scene.model
@@ -57,6 +61,7 @@ class CameraRig:
         own_colours = np.array(scene.model.geom_rgba[:, :3], dtype=np.float64)
         self.own_appearance = self.appearance = Appearance.of(own_colours)
         self._table = scene.model.geom("table").id
+        self.markers: Markers | None = None
         self.mounts = [_wrist_mount(hand.palm_sign) for hand in scene.hands]
         self.K = {
             name: pinhole_matrix(width_px=width_px, height_px=height_px, fovy_rad=FOVY_RAD[name])
@@ -90,7 +95,16 @@ class CameraRig:
     def image(self, simulation: Simulation, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         """Render one camera; derived quantities of the simulation must be current."""
         eye_m, rays_world = self._cast(simulation, camera)
-        return self._shaded(eye_m, rays_world).reshape(*self.shape_px, 3)
+        image = self._shaded(eye_m, rays_world).reshape(*self.shape_px, 3)
+        if self.markers is not None:
+            range_m = np.where(self._geom_ids >= 0, self._distances, np.inf)
+            Ts_camera_object = invert(self.pose(simulation, camera)) @ transform_from_pose(
+                simulation.object_poses()
+            )
+            self.markers.draw(
+                image, range_m.reshape(self.shape_px), self.K[camera], Ts_camera_object
+            )
+        return image
 
     def cast(
         self, simulation: Simulation, camera: str

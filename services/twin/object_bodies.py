@@ -45,6 +45,9 @@ class ObjectBodies:
         self.is_free: Bool[np.ndarray, " objects"] = np.array(
             [self._is_free(*pair) for pair in zip(names, chains, strict=True)], dtype=bool
         )
+        self.are_fixed: Bool[np.ndarray, " objects"] = np.array(
+            [len(chain) == 1 and not free for chain, free in zip(chains, self.is_free, strict=True)]
+        )
         free_joints = model.body_jntadr[self.ids[self.is_free]]
         self._free_qpos = model.jnt_qposadr[free_joints][:, None] + np.arange(7)
         self._speed_dofs = [self._dofs(chain) for chain in chains]

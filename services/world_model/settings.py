@@ -278,6 +278,12 @@ class StateTrainSettings(FrozenModel):
     num_members: int = Field(default=3, ge=1, le=16, description="members of the ensemble")
     heldout_share: float = Field(default=0.08, gt=0, lt=1, description="share of held-out scenes")
     jobs: int = Field(default=2, ge=1, le=64, description="members trained in parallel")
+    image_px: int = Field(
+        default=64,
+        ge=16,
+        le=256,
+        description="side that the middle square of larger images is scaled to",
+    )
     labelled_share: float = Field(
         default=1.0,
         gt=0,

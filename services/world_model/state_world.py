@@ -117,7 +117,11 @@ class StateWorld:
             UnknownNameError: a task or action kind that the model was not trained on.
             InvalidInputError: missing or invalid observation, anchor or K_head.
         """
-        first = observed_start(start, tasks=self._description.tasks)
+        first = observed_start(
+            start,
+            tasks=self._description.tasks,
+            image_px=self._metadata.dynamics.image_px,
+        )
         self._check_start(start, first)
         motion = hand_motion(first.reached[None], first.anchor)
         memory = self._dynamics.begin(

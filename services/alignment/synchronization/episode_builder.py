@@ -20,6 +20,7 @@ from services.alignment.synchronization.grid_actions import (
     make_actions,
     place_streams,
 )
+from services.alignment.synchronization.object_streams import marker_streams, with_tracked_objects
 from services.alignment.synchronization.progress import OnProgress, progress_within
 from services.alignment.synchronization.recorded_streams import (
     Block,
@@ -85,19 +86,31 @@ def build_episode(
         ClockFitError: a stream whose stamps fit no clock.
     """
     check_complete(recording)
+    objects = options.of_task(recording.attributes.task).objects
     streams = {}
     for number, name in enumerate(recording.streams):
         on_progress(progress_within("dating", number / len(recording.streams), name))
         streams[name] = date_stream(recording, name)
+    streams = with_tracked_objects(streams, objects)
     stretch = _find_stretch(recording, streams, options, on_progress)
     on_progress(progress_within("retargeting", 0.0))
     source, gridded = recording.attributes, stretch.gridded
     actions = make_actions(gridded, source.domain, source.calibration, wrist=options.wrist)
+    inside_ns = (stretch.origin_ns, stretch.origin_ns + int(np.ptp(gridded.grid_ns)))
+    seen = marker_streams(
+        recording,
+        streams,
+        objects,
+        inside_ns,
+        max_gap_ns=options.max_gap_ns,
+        on_progress=on_progress,
+    )
     on_progress(progress_within("writing", 0.0))
     grid_ns = gridded.grid_ns - gridded.grid_ns[0]
     written = [
         *_action_streams(actions, grid_ns, options),
         *(cut_stream(one, stretch.origin_ns, int(grid_ns[-1])) for one in streams.values()),
+        *seen,
     ]
     quality = {
         "num_steps_refused": float(stretch.num_refused),
@@ -106,9 +119,12 @@ def build_episode(
         **actions.quality,
     }
     attributes = _episode_attributes(recording, episode_id, actions, streams, quality)
+    listed = () if objects is None else objects.tasks[source.task]
     more = {
         "model_rate_hz": options.model_rate_hz,
         "calibration": attributes.calibration | stretch.refused,
+        "object_names": tuple(one.name for one in listed),
+        "object_boxes_m": tuple(one.box_m for one in listed),
     }
     return BuiltEpisode(attributes.model_copy(update=more), tuple(written))
 

@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-Stage = Literal["dating", "placing", "retargeting", "writing"]
+Stage = Literal["dating", "placing", "retargeting", "objects", "writing"]
 # Where each stage begins, as a share of the whole; by the seconds of an hour's recording.
 STAGE_BEGINS: dict[Stage, float] = {
     "dating": 0.0,
     "placing": 0.35,
     "retargeting": 0.37,
+    "objects": 0.55,
     "writing": 0.55,
 }
 

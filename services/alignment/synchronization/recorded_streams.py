@@ -165,7 +165,7 @@ def date_stream(recording: RecordingReader, name: str) -> DatedStream:
                     missing=[BASE_NAME],
                 )
             descriptor = descriptor.model_copy(update={"frame": "world"})
-        convert = partial(_moved_poses, T_world_base=T_world_base, T_tracker_body=T_tracker_body)
+        convert = partial(moved_poses, T_world_base=T_world_base, T_tracker_body=T_tracker_body)
     return DatedStream(recording, descriptor, timing, convert)
 
 
@@ -223,7 +223,7 @@ def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:
     )
 
 
-def _moved_poses(
+def moved_poses(
     poses: np.ndarray, *, T_world_base: np.ndarray | None, T_tracker_body: np.ndarray | None
 ) -> np.ndarray:
     """Poses of the body in the world; NaN for invalid poses (not finite, zero quaternion)."""

@@ -19,7 +19,7 @@ from services.world_model.dynamics.start_reader import Reading
 from services.world_model.dynamics.touch_codec import TouchCodec
 from services.world_model.settings import CoreSettings
 from services.world_model.training.averaging import OnStep, train_averaged
-from services.world_model.training.scene_table import SceneTable
+from services.world_model.training.scene_table import MEASURED_ERROR_M, SceneTable
 
 _UNIT_M = 0.05
 _FIT_EPISODES = 1000
@@ -41,8 +41,8 @@ class CoreData:
     """Training data of cores: episodes, touch latents and a reader's outputs.
 
     Cores start from true poses with noise, and know its size, as they know that of a reader's error
-    in a rollout. `readings` are a reader's by start step, which episodes without labels start from,
-    or all if `starts_read`; empty if none does.
+    in a rollout. `readings` are a reader's by start step, which episodes start from whose objects
+    are not labelled or not known there, or all if `starts_read`; empty if none does.
     """
 
     table: SceneTable
@@ -136,7 +136,8 @@ def _draw(
     is_first = rng.random() < settings.first_fraction
     later = [step for step in start_steps(table) if step > 0]
     start_step = 0 if is_first or not later else _later_start(later, table.num_steps, rng)
-    rows = torch.randint(len(table), (settings.batch,), generator=generator)
+    long_enough = table.longer_than(start_step)
+    rows = long_enough[torch.randint(len(long_enough), (settings.batch,), generator=generator)]
 
     def chance(fraction: float) -> Bool[Tensor, " batch"]:
         return torch.rand(len(rows), generator=generator) < fraction
@@ -169,7 +170,9 @@ def _is_settled(table: SceneTable, rows: Tensor, start_step: int) -> Bool[Tensor
     before = max(0, start_step - STEPS_PER_LATENT)
     position_m = table.objects.position_m
     moved_m = (position_m[rows, start_step] - position_m[rows, before]).norm(dim=-1).amax(-1)
-    return free & (moved_m < _SETTLED_M)
+    error_m = torch.where(table.measured_objects[rows], MEASURED_ERROR_M, 0.0)
+    known = table.knows_all(start_step)[rows] & table.knows_all(before)[rows]
+    return free & known & (moved_m < _SETTLED_M + error_m)
 
 
 def _read_start(
@@ -193,7 +196,8 @@ def _read_start(
         sd_m,
         _read_size(data.table.size[rows], generator),
     )
-    known = data.table.labelled[rows] & (not data.starts_read)
+    known = data.table.labelled[rows] & data.table.knows_all(start_step)[rows]
+    known &= not data.starts_read
     if bool(known.all()):
         return noisy
     read: Reading = mapped(data.readings[start_step], lambda values: values[rows])
@@ -229,11 +233,16 @@ def core_loss(
     commands, start = batch.commands, batch.start
     future, _ = core(commands, start, core.first_state(start, commands[:1]))
     table, rows = data.table, batch.rows
+    within = table.within(rows, batch.start_step)
     weights = settings.weights
-    success = weights.success * _success_error(future.success, table.success[rows] * ~batch.is_held)
+    success = weights.success * _success_error(
+        future.success, table.success[rows] * ~batch.is_held, within
+    )
     if not (weights.objects or weights.touch or weights.contact or weights.taxels):
         return success
     true = _stand(table.objects_of_latents(rows, batch.start_step), batch.is_held)
+    known = start.objects.present[:, None] * table.labelled[rows, None, None]
+    known = known * table.known_of_latents(rows, batch.start_step)
     steps = table.steps_after(batch.start_step)
     moves = ~batch.is_held
     touch = data.touch[rows][:, steps].float()
@@ -244,27 +253,40 @@ def core_loss(
     few = slice(0, -(-len(rows) // _TAXEL_SHARE))
     felt = table.tactile_kpa[rows[few]][:, steps] >= CONTACT_THRESHOLD_KPA
     felt &= moves[few].view(-1, 1, 1, 1, 1)
+    contact_error = functional.binary_cross_entropy_with_logits(
+        future.contact[:, 1:], contact.float(), reduction="none"
+    )
+    taxel_error = functional.binary_cross_entropy_with_logits(
+        core.taxels(future.pattern[few, 1:]), felt.float(), reduction="none"
+    )
     return (
         success
-        + weights.objects
-        * _object_error(future.objects, true, start.objects.present * table.labelled[rows, None])
-        + weights.touch * (future.touch[:, 1:] - touch).square().sum(-1).mean()
-        + weights.contact
-        * functional.binary_cross_entropy_with_logits(future.contact[:, 1:], contact.float())
-        + weights.taxels
-        * functional.binary_cross_entropy_with_logits(
-            core.taxels(future.pattern[few, 1:]), felt.float()
-        )
+        + weights.objects * _object_error(future.objects, true, known)
+        + weights.touch * _mean_within((future.touch[:, 1:] - touch).square().sum(-1), within)
+        + weights.contact * _mean_within(contact_error, within)
+        + weights.taxels * _mean_within(taxel_error, within[few])
     )
 
 
-def _success_error(
-    log_odds: Float32[Tensor, "batch latents"], success: Float32[Tensor, " batch"]
+def _mean_within(
+    each: Float32[Tensor, "batch latents ..."], within: Bool[Tensor, "batch latents"]
 ) -> Float32[Tensor, ""]:
-    """Cross entropy of the outcome at the last latent step and, with less weight, at all."""
+    """Mean over the latent steps that lie within their episodes."""
+    by_latent = each.flatten(2).mean(-1)
+    return (by_latent * within).sum() / within.sum().clamp_min(1)
+
+
+def _success_error(
+    log_odds: Float32[Tensor, "batch latents_and_start"],
+    success: Float32[Tensor, " batch"],
+    within: Bool[Tensor, "batch latents"],
+) -> Float32[Tensor, ""]:
+    """Cross entropy of the outcome at an episode's last latent step and, with less weight, all."""
     goal = success[:, None].expand_as(log_odds)
     each = functional.binary_cross_entropy_with_logits(log_odds, goal, reduction="none")
-    return each[:, -1].mean() + _EARLY_SUCCESS * each.mean()
+    counted = torch.cat([torch.ones_like(within[:, :1]), within], dim=1)[:, -each.shape[1] :]
+    last = each.gather(1, counted.sum(1, keepdim=True) - 1)
+    return last.mean() + _EARLY_SUCCESS * (each * counted).sum() / counted.sum()
 
 
 def _stand(objects: ObjectPoses, held: Bool[Tensor, " batch"]) -> ObjectPoses:
@@ -276,10 +298,10 @@ def _stand(objects: ObjectPoses, held: Bool[Tensor, " batch"]) -> ObjectPoses:
 
 
 def _object_error(
-    predicted: ObjectPoses, true: ObjectPoses, seen: Float32[Tensor, "batch objects"]
+    predicted: ObjectPoses, true: ObjectPoses, known: Float32[Tensor, "batch latents objects"]
 ) -> Float32[Tensor, ""]:
-    """Errors of positions (twice) and axes of objects present now and seen at the start."""
-    weight = true.present * (seen > 0.5)[:, None]
+    """Errors of positions (twice) and axes of objects present now, known, and seen at the start."""
+    weight = true.present * (known > 0.5)
     position = functional.smooth_l1_loss(
         predicted.position_m / _UNIT_M, true.position_m / _UNIT_M, beta=0.2, reduction="none"
     ).sum(-1)

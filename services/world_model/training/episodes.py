@@ -2,20 +2,26 @@
 
 import hashlib
 from collections.abc import Collection, Sequence
-from typing import Final, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, is_rejected, scene_of
+from dextouch.episodes import (
+    EpisodeReader,
+    EpisodeStore,
+    Split,
+    is_in,
+    is_rejected,
+    object_track,
+    scene_of,
+)
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ActionKind, Domain
 from services.world_model.starts import CAMERA
 from services.world_model.training.dataset import EpisodeArrays, TrainingEpisode
-from services.world_model.training.scene_episodes import poses_at
 
 E = TypeVar("E", bound=TrainingEpisode)
-OBJECT_POSES: Final = "object_poses"
 
 
 def load_episodes(
@@ -105,9 +111,11 @@ def objects_of(
 ) -> tuple[Float32[np.ndarray, "steps objects 7"], Float64[np.ndarray, "objects 6"]] | None:
     """Poses of an episode's objects at given times and their boxes; None where unknown."""
     boxes_m = np.array(reader.attributes.object_boxes_m, dtype=np.float64).reshape(-1, 6)
-    if OBJECT_POSES not in reader.streams or not len(boxes_m):
+    track = object_track(reader, t_ref_ns)
+    # What is not known is not stated: a window's first step needs all of its objects.
+    if track is None or not len(boxes_m) or not track.known.all():
         return None
-    return poses_at(reader, t_ref_ns), boxes_m
+    return track.poses, boxes_m
 
 
 def subset_by_hash(episodes: Sequence[E], count: int | None, *, what: str) -> list[E]:

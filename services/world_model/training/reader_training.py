@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 from torch.nn import functional
 
@@ -69,7 +69,7 @@ def train_reader(
         rows = known[torch.randint(len(known), (settings.batch,), generator=generator)]
         amid = torch.tensor(later)[torch.randint(len(later), rows.shape, generator=generator)]
         is_first = torch.rand(rows.shape, generator=generator) < settings.first_fraction
-        steps = torch.where(is_first, 0, amid)
+        steps = torch.where(is_first | (amid >= table.length[rows]), 0, amid)
         return _loss(
             reader,
             (table, rows, steps),
@@ -86,6 +86,7 @@ def _fit_heights(reader: StartReader, table: SceneTable, config: DynamicsConfig)
         for slot in range(count):
             first = table.objects.position_m[:, 0, slot, 2]
             there = (table.task == task) & (table.objects.present[:, 0, slot] > 0) & table.labelled
+            there &= table.objects_known[:, 0, slot]
             if there.any():
                 reader.height_mean[task, slot] = first[there].median()
 
@@ -101,23 +102,30 @@ def _loss(
     first, true = table.first_steps(rows, steps), table.objects_at(rows, steps)
     image, first = as_another_camera(first, generator)
     guess, reading = reader.read(image, first, bfloat16=bfloat16)
-    size = table.size[rows]
-    return _error(reader, reading, true, size, first.task) + _GUESS_WEIGHT * _error(
-        reader, guess, true, size, first.task
+    size, known = table.size[rows], table.objects_known[rows, steps]
+    used = torch.arange(MAX_OBJECTS) < torch.tensor(reader.config.num_objects)[first.task][:, None]
+    used &= known
+    there = true.present * known
+    return _error(reading, true, size, used, there) + _GUESS_WEIGHT * _error(
+        guess, true, size, used, there
     )
 
 
 def _error(
-    reader: StartReader, reading: Reading, true: ObjectPoses, size: Tensor, task: Tensor
+    reading: Reading,
+    true: ObjectPoses,
+    size: Tensor,
+    used: Bool[Tensor, "batch objects"],
+    there: Float32[Tensor, "batch objects"],
 ) -> Float32[Tensor, ""]:
-    predicted, there = reading.objects, true.present
-    used = torch.arange(MAX_OBJECTS) < torch.tensor(reader.config.num_objects)[task][:, None]
+    """Errors of objects that are `there`, and of the presence of the slots that are `used`."""
+    predicted = reading.objects
     position = functional.smooth_l1_loss(
         predicted.position_m / _UNIT_M, true.position_m / _UNIT_M, beta=0.1, reduction="none"
     ).sum(-1)
     axes = (predicted.axes - true.axes).square().sum((-1, -2))
     presence = functional.binary_cross_entropy(
-        predicted.present.clamp(1e-4, 1 - 1e-4), there, reduction="none"
+        predicted.present.clamp(1e-4, 1 - 1e-4), true.present, reduction="none"
     )
     # Of a Gaussian on both axes of the table; the position is not trained by it.
     lateral_m = (predicted.position_m - true.position_m)[..., :2].detach().square().sum(-1)
@@ -127,7 +135,7 @@ def _error(
     each = position + axes + _SD_WEIGHT * surprise + _SIZE_WEIGHT * grown
     return (each * there).sum() / there.sum().clamp_min(1.0) + 0.3 * (
         presence * used
-    ).sum() / used.sum()
+    ).sum() / used.sum().clamp_min(1)
 
 
 @torch.no_grad()
@@ -147,13 +155,14 @@ def reader_errors(reader: StartReader, table: SceneTable, step: int) -> dict[str
     true = table.objects_at(rows, step)
     for index, task in enumerate(reader.config.tasks):
         of_task = table.task == index
-        there = (true.present > 0) & of_task[:, None]
+        known = table.objects_known[:, step] & of_task[:, None]
+        there = (true.present > 0) & known
         if not there.any():
             continue
         off_mm = 1e3 * (predicted.position_m - true.position_m)[there]
         lateral = off_mm[:, :2].norm(dim=-1)
         cosine = functional.normalize(predicted.axes[there][:, 0], dim=-1) * true.axes[there][:, 0]
-        used = (torch.arange(MAX_OBJECTS) < reader.config.num_objects[index]) & of_task[:, None]
+        used = (torch.arange(MAX_OBJECTS) < reader.config.num_objects[index]) & known
         right = (predicted.present > 0.5) == (true.present > 0)
         errors[task] = ReaderError(
             lateral_mm=float(lateral.median()),

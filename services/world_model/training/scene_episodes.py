@@ -1,8 +1,8 @@
-"""Ground-truth episodes of a store as arrays on the model grid, with their object poses.
+"""Labelled episodes of a store as arrays on the model grid, with their object poses.
 
-Training data of the state model: whole episodes with the pose of every object at every step and the
-outcome. Imagined episodes, truncated ones, those with an unknown outcome and those that were
-rejected in review are skipped and counted.
+Training data of the state model: whole episodes with the poses of their objects and the outcome,
+from the twin or measured at a station (docs/objects.md). Imagined episodes, truncated ones, those
+with an unknown outcome and those that were rejected in review are skipped and counted.
 """
 
 from collections import Counter
@@ -11,13 +11,21 @@ from dataclasses import dataclass
 
 import numpy as np
 import structlog
-from jaxtyping import Float16, Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float16, Float32, Float64, Int64, UInt8
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, is_rejected, scene_of
+from dextouch.episodes import (
+    EpisodeReader,
+    EpisodeStore,
+    Split,
+    has_object_poses,
+    is_in,
+    is_rejected,
+    object_track,
+    scene_of,
+)
 from dextouch.errors import InvalidInputError
-from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
 from dextouch.schemas import ActionKind
-from services.world_model.starts import CAMERA
+from services.world_model.starts import CAMERA, scaled_square
 
 logger = structlog.get_logger(__name__)
 
@@ -29,8 +37,9 @@ class SceneEpisode:
     `actions` are the commanded ones where the episode has them (see `action_kind`), and
     `measured_actions` the measured ones; both are relative to `anchor`, the poses of left wrist,
     right wrist and head camera. `tactile_kpa` is the mean over each step, `object_poses` are
-    x y z (m), qw qx qy qz in the world. `images` are the head camera images at the grid steps
-    `image_steps`.
+    x y z (m), qw qx qy qz in the world, `objects_known` the steps at which they are known, and
+    `objects_measured` says that they have the errors of a measurement. `images` are the head camera
+    images at the grid steps `image_steps`, and `K_head` (px) is of their size.
     """
 
     episode_id: str
@@ -47,6 +56,8 @@ class SceneEpisode:
     K_head: Float64[np.ndarray, "3 3"]
     tactile_kpa: Float16[np.ndarray, "steps 2 320"]
     object_poses: Float32[np.ndarray, "steps objects 7"]
+    objects_known: Bool[np.ndarray, "steps objects"]
+    objects_measured: bool
     images: UInt8[np.ndarray, "shown h w 3"]
     image_steps: Int64[np.ndarray, " shown"]
     content_sha256: str
@@ -56,9 +67,13 @@ class SceneEpisode:
 
 
 def load_scene_episodes(
-    url: str, *, tasks: Collection[str] | None = None, splits: Collection[Split] = ()
+    url: str,
+    *,
+    tasks: Collection[str] | None = None,
+    splits: Collection[Split] = (),
+    image_px: int | None = None,
 ) -> list[SceneEpisode]:
-    """Load the ground-truth episodes of a store, in the order of their ids.
+    """Load the labelled episodes of a store, in the order of their ids.
 
     The number of skipped episodes is logged by reason.
 
@@ -66,6 +81,8 @@ def load_scene_episodes(
         url: URL of the store.
         tasks: tasks to load; None for all.
         splits: splits of the scenes; empty for all.
+        image_px: side that the middle square of larger images is scaled to; None leaves images as
+            they are.
 
     Raises:
         InvalidInputError: no episode remains.
@@ -80,7 +97,7 @@ def load_scene_episodes(
             continue
         reason = "rejected in review" if is_rejected(store, about) else _unfit(reader)
         if reason is None:
-            taken.append(read_scene_episode(reader))
+            taken.append(read_scene_episode(reader, image_px=image_px))
         else:
             skipped[reason] += 1
     for reason, count in sorted(skipped.items()):
@@ -88,7 +105,8 @@ def load_scene_episodes(
     if not taken:
         raise InvalidInputError(
             f"scene episodes: the store {url} has none to train on (skipped: {dict(skipped)}); "
-            "record some with `dextouch train data`"
+            "episodes need an outcome, touch, actions, images and the poses of their objects "
+            "(docs/objects.md)"
         )
     return taken
 
@@ -102,15 +120,21 @@ def _unfit(reader: EpisodeReader) -> str | None:
         return "recovered after its writer died"
     if attributes.success is None:
         return "success unknown"
-    missing = {"action", "tactile_left", "tactile_right", "object_poses"} - set(reader.streams)
+    missing = {"action", "tactile_left", "tactile_right"} - set(reader.streams)
+    if not has_object_poses(reader):
+        missing.add("poses of the objects")
     return f"without {', '.join(sorted(missing))}" if missing else None
 
 
-def read_scene_episode(reader: EpisodeReader) -> SceneEpisode:
+def read_scene_episode(reader: EpisodeReader, *, image_px: int | None = None) -> SceneEpisode:
     """Read one episode of known success.
 
+    Args:
+        reader: the episode.
+        image_px: side that the middle square of larger images is scaled to.
+
     Raises:
-        InvalidInputError: success is unknown.
+        InvalidInputError: success is unknown, or there are no poses of the objects.
         UnknownNameError: a stream is missing.
         CorruptDataError: damaged bytes.
     """
@@ -126,6 +150,16 @@ def read_scene_episode(reader: EpisodeReader) -> SceneEpisode:
     if kind == "commanded":
         actions = reader.read("action_commanded").values.astype(np.float64)
     images, image_steps = _images(reader)
+    K_head = window.K_head
+    if image_px is not None and images.size:
+        side_px = min(image_px, *images.shape[1:3])
+        images, K_head = scaled_square(images, K_head, side_px)
+    track = object_track(reader, window.t_ref_ns)
+    if track is None:
+        raise InvalidInputError(
+            f"episode {attributes.episode_id!r}: has no poses of its objects; docs/objects.md says "
+            "how they are measured"
+        )
     boxes = np.array(attributes.object_boxes_m, dtype=np.float64).reshape(-1, 6)
     return SceneEpisode(
         episode_id=attributes.episode_id,
@@ -139,9 +173,11 @@ def read_scene_episode(reader: EpisodeReader) -> SceneEpisode:
         actions=actions,
         measured_actions=window.actions,
         anchor=np.stack(window.anchor.as_tuple()),
-        K_head=window.K_head,
+        K_head=K_head,
         tactile_kpa=window.tactile_kpa.astype(np.float16),
-        object_poses=poses_at(reader, window.t_ref_ns),
+        object_poses=track.poses,
+        objects_known=track.known,
+        objects_measured=track.is_measured,
         images=images,
         image_steps=image_steps,
         content_sha256=reader.content_sha256,
@@ -154,16 +190,3 @@ def _images(reader: EpisodeReader) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((0, 0, 0, 3), dtype=np.uint8), np.zeros(0, dtype=np.int64)
     steps, images = reader.shown_steps(CAMERA)
     return reader.images_at(CAMERA, images), steps
-
-
-def poses_at(reader: EpisodeReader, grid_ns: np.ndarray) -> Float32[np.ndarray, "steps objects 7"]:
-    """Poses at the grid steps, interpolated between the neighbouring samples."""
-    data = reader.read("object_poses")
-    if np.array_equal(data.t_ref_ns, grid_ns):
-        return data.values.astype(np.float32)
-    left = np.searchsorted(data.t_ref_ns, grid_ns, side="right").clip(1, len(data) - 1) - 1
-    span = data.t_ref_ns[left + 1] - data.t_ref_ns[left]
-    weight = np.clip((grid_ns - data.t_ref_ns[left]) / span, 0.0, 1.0)
-    Ts = transform_from_pose(data.values)
-    each = [interpolate_poses(Ts[:, index], left, weight) for index in range(Ts.shape[1])]
-    return pose_from_transform(np.stack(each, axis=1)).astype(np.float32)

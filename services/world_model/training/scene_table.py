@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float16, Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float16, Float32, Float64, Int64, Shaped, UInt8
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError
@@ -26,8 +26,10 @@ from services.world_model.dynamics.start_reader import FirstStep
 from services.world_model.dynamics.touch_codec import FREE_KPA
 from services.world_model.training.scene_episodes import SceneEpisode
 
-# Objects that never move farther than this are fixed.
+# Objects that never move farther than this are fixed; measured ones by more than their errors.
 _MOVED_M = 2e-3
+MEASURED_ERROR_M = 5e-3
+_MEASURED_MOVED_M = 4 * MEASURED_ERROR_M
 
 
 @dataclass(frozen=True)
@@ -50,13 +52,15 @@ class HandTable:
 
 @dataclass(frozen=True)
 class SceneTable:
-    """Episodes of one length on the model grid.
+    """Episodes on the model grid; shorter ones are filled up by their last step.
 
-    `images` are those of the steps `image_steps`; `in_contact` marks pads in contact; `sent` are
-    commanded hands where available and measured ones elsewhere, as given by `commanded`.
-    `labelled` marks episodes whose object poses are trained on; `boxes_m` are the usual boxes of
-    each task's objects in their frames (middle, half sizes), and `size` factors of their width and
-    height.
+    `length` is the number of an episode's own steps; `objects_known` are the steps at which the
+    pose of an object is known, and `measured_objects` marks episodes whose poses have the errors of
+    a measurement. `images` are those of the steps `image_steps`; `in_contact` marks pads in
+    contact; `sent` are commanded hands where available and measured ones elsewhere, as given by
+    `commanded`. `labelled` marks episodes whose object poses are trained on; `boxes_m` are the
+    usual boxes of each task's objects in their frames (middle, half sizes), and `size` factors of
+    their width and height.
     """
 
     sent: HandTable
@@ -73,6 +77,9 @@ class SceneTable:
     success: Float32[Tensor, " episodes"]
     task: Int64[Tensor, " episodes"]
     labelled: Bool[Tensor, " episodes"]
+    length: Int64[Tensor, " episodes"]
+    objects_known: Bool[Tensor, "episodes steps objects"]
+    measured_objects: Bool[Tensor, " episodes"]
     size: Float32[Tensor, "episodes objects 2"]
     boxes_m: Float32[Tensor, "tasks objects 6"]
 
@@ -81,14 +88,19 @@ class SceneTable:
 
     @property
     def num_steps(self) -> int:
-        """Steps of every episode, including the first one."""
+        """Steps of the longest episode, including the first one."""
         return self.tactile_kpa.shape[1]
 
     def movable(self) -> Float32[Tensor, "tasks objects"]:
         """1 for objects that move in some labelled episode of their task, 0 for fixed ones."""
-        position_m = self.objects.position_m
-        way_m = (position_m.amax(1) - position_m.amin(1)).norm(dim=-1)
-        moves = (way_m > _MOVED_M) & (self.objects.present.amin(1) > 0) & self.labelled[:, None]
+        known = self.objects_known
+        position_m, far = self.objects.position_m, torch.tensor(torch.inf)
+        highest = torch.where(known[..., None], position_m, -far).amax(1)
+        lowest = torch.where(known[..., None], position_m, far).amin(1)
+        way_m = (highest - lowest).norm(dim=-1)
+        least_m = torch.where(self.measured_objects, _MEASURED_MOVED_M, _MOVED_M)[:, None]
+        is_there = (self.objects.present > 0) | ~known
+        moves = known.any(1) & (way_m > least_m) & is_there.all(1) & self.labelled[:, None]
         found = torch.zeros(self.boxes_m.shape[:2])
         for task in range(len(found)):
             found[task] = moves[self.task == task].any(0).float()
@@ -115,6 +127,19 @@ class SceneTable:
             objects.position_m[rows, steps], objects.axes[rows, steps], objects.present[rows, steps]
         )
 
+    def knows_all(self, step: int) -> Bool[Tensor, " episodes"]:
+        """Episodes in which the poses of all objects are known at a step."""
+        return self.objects_known[:, step].all(-1)
+
+    def longer_than(self, step: int) -> Int64[Tensor, " rows"]:
+        """Episodes with a latent step after `step`."""
+        return torch.nonzero(self.length > step + STEPS_PER_LATENT)[:, 0]
+
+    def within(self, rows: Tensor, start: int) -> Bool[Tensor, "batch latents"]:
+        """Latent steps after `start` that lie within an episode."""
+        ends = torch.arange(start + STEPS_PER_LATENT, self.num_steps, STEPS_PER_LATENT)
+        return ends < self.length[rows, None]
+
     def objects_of_latents(self, rows: Tensor, start: int) -> ObjectPoses:
         """True objects at the start and at every latent step after it."""
         steps = torch.arange(start, self.num_steps, STEPS_PER_LATENT)
@@ -124,6 +149,11 @@ class SceneTable:
             objects.axes[rows][:, steps],
             objects.present[rows][:, steps],
         )
+
+    def known_of_latents(self, rows: Tensor, start: int) -> Bool[Tensor, "batch latents objects"]:
+        """Whether objects are known at the start and at every latent step after it."""
+        steps = torch.arange(start, self.num_steps, STEPS_PER_LATENT)
+        return self.objects_known[rows][:, steps]
 
     def commands(self, rows: Tensor, start: int, use_measured: Bool[Tensor, " batch"]) -> Commands:
         """Measured hands at `start`, then the sent (or measured) ones until the end."""
@@ -207,7 +237,7 @@ def vocabulary(episodes: Sequence[SceneEpisode]) -> tuple[tuple[str, ...], tuple
 def scene_table(
     episodes: Sequence[SceneEpisode], config: DynamicsConfig, *, labelled: Sequence[bool] = ()
 ) -> SceneTable:
-    """Build the tensors of episodes.
+    """Build the tensors of episodes; what is left over of a latent step at an end is cut off.
 
     Args:
         episodes: at least one.
@@ -215,17 +245,19 @@ def scene_table(
         labelled: for each episode, whether its object poses are trained on; default: all.
 
     Raises:
-        InvalidInputError: lengths or image steps differ, a length is not 1 + 4k, or a task or
-            image size is not in the configuration.
+        InvalidInputError: no image of the first step, none later that all episodes have, too short
+            an episode, or a task or image size that is not in the configuration.
     """
     _check(episodes, config)
+    lengths = [_whole(episode) for episode in episodes]
+    num_steps, shown = max(lengths), _shared_steps(episodes, lengths)
     sent, measured = [], []
     for episode in episodes:
         anchor = AnchorPoses(*episode.anchor)
-        measured.append(hand_motion(episode.measured_actions, anchor))
-        sent.append(hand_motion(episode.actions, anchor))
-    tactile = np.stack([episode.tactile_kpa for episode in episodes])
-    objects = [objects_from_poses(episode.object_poses) for episode in episodes]
+        measured.append(hand_motion(_filled(episode.measured_actions, episode, num_steps), anchor))
+        sent.append(hand_motion(_filled(episode.actions, episode, num_steps), anchor))
+    tactile = np.stack([_filled(e.tactile_kpa, e, num_steps) for e in episodes])
+    objects = [objects_from_poses(_filled(e.object_poses, e, num_steps)) for e in episodes]
     boxes_m = usual_boxes_m(episodes)
     return SceneTable(
         sent=HandTable.of(sent),
@@ -240,15 +272,63 @@ def scene_table(
         tactile_kpa=torch.from_numpy(tactile.astype(np.float16)),
         pads_kpa=torch.from_numpy(pad_means_kpa(tactile.astype(np.float32))),
         in_contact=torch.from_numpy(_pad_peaks_kpa(tactile) >= FREE_KPA),
-        images=torch.from_numpy(np.stack([episode.images for episode in episodes])),
-        image_steps=tuple(int(step) for step in episodes[0].image_steps),
+        images=torch.from_numpy(np.stack([_images(episode, shown) for episode in episodes])),
+        image_steps=tuple(shown),
         K_head=torch.from_numpy(np.stack([e.K_head for e in episodes]).astype(np.float32)),
         success=torch.tensor([float(episode.success) for episode in episodes]),
         task=torch.tensor([config.tasks.index(episode.task) for episode in episodes]),
         labelled=torch.tensor(list(labelled) or [True] * len(episodes)),
+        length=torch.tensor(lengths),
+        objects_known=torch.from_numpy(np.stack([_known(e, num_steps) for e in episodes])),
+        measured_objects=torch.tensor([episode.objects_measured for episode in episodes]),
         size=torch.from_numpy(np.stack([_size(e, boxes_m[e.task]) for e in episodes])),
         boxes_m=_padded(boxes_m, config),
     )
+
+
+def _whole(episode: SceneEpisode) -> int:
+    """Steps of an episode up to the end of its last whole latent step."""
+    return len(episode) - (len(episode) - 1) % STEPS_PER_LATENT
+
+
+def _filled(
+    values: Shaped[np.ndarray, "steps ..."], episode: SceneEpisode, num_steps: int
+) -> Shaped[np.ndarray, "filled ..."]:
+    """Values of an episode's steps, the last one repeated up to the length of the table."""
+    return values[np.arange(num_steps).clip(max=_whole(episode) - 1)]
+
+
+def _known(episode: SceneEpisode, num_steps: int) -> Bool[np.ndarray, "steps slots"]:
+    """Where poses are known: those of slots without an object always."""
+    known = np.ones((num_steps, MAX_OBJECTS), dtype=np.bool_)
+    count = episode.objects_known.shape[1]
+    known[:, :count] = _filled(episode.objects_known, episode, num_steps)
+    known[_whole(episode) :, :count] = False
+    return known
+
+
+def _shared_steps(episodes: Sequence[SceneEpisode], lengths: Sequence[int]) -> list[int]:
+    """Steps with an image in every episode that has them."""
+    shared = set.union(*(set(episode.image_steps.tolist()) for episode in episodes))
+    for episode, length in zip(episodes, lengths, strict=True):
+        own = set(episode.image_steps.tolist())
+        shared = {step for step in shared if step >= length or step in own}
+    steps = sorted(step for step in shared if step < max(lengths))
+    # Latent steps are all that readers and cores start from.
+    steps = [step for step in steps if step % STEPS_PER_LATENT == 0]
+    if steps[:1] != [0] or len(steps) < 2:
+        raise InvalidInputError(
+            f"training episodes: all have images of steps {steps[:4]} …, expected step 0 and a "
+            f"later multiple of {STEPS_PER_LATENT}; record with --images {STEPS_PER_LATENT} or a "
+            "divisor of it"
+        )
+    return steps
+
+
+def _images(episode: SceneEpisode, steps: Sequence[int]) -> UInt8[np.ndarray, "shown px px 3"]:
+    """Images of the given steps, the last one where an episode has ended."""
+    places = np.searchsorted(episode.image_steps, steps)
+    return episode.images[places.clip(max=len(episode.images) - 1)]
 
 
 def usual_boxes_m(episodes: Sequence[SceneEpisode]) -> dict[str, Float64[np.ndarray, "objects 6"]]:
@@ -295,14 +375,7 @@ def _pad_peaks_kpa(tactile_kpa: np.ndarray) -> np.ndarray:
 def _check(episodes: Sequence[SceneEpisode], config: DynamicsConfig) -> None:
     if not episodes:
         raise InvalidInputError("training episodes: got none, expected at least one")
-    first = episodes[0]
-    later = [step for step in first.image_steps[1:] if step % STEPS_PER_LATENT == 0]
-    if list(first.image_steps[:1]) != [0] or not later:
-        raise InvalidInputError(
-            f"episode {first.episode_id}: has images of steps {list(first.image_steps)[:4]} …, "
-            "expected step 0 and a later multiple of 4; record with --images 4"
-        )
-    num_steps, size = len(first.tactile_kpa), (config.image_px, config.image_px, 3)
+    size = (config.image_px, config.image_px, 3)
     for episode in episodes:
         if episode.task not in config.tasks or episode.object_poses.shape[1] > MAX_OBJECTS:
             raise InvalidInputError(
@@ -310,14 +383,9 @@ def _check(episodes: Sequence[SceneEpisode], config: DynamicsConfig) -> None:
                 f"{episode.object_poses.shape[1]} objects, expected one of {config.tasks} with at "
                 f"most {MAX_OBJECTS}"
             )
-        if len(episode.tactile_kpa) != num_steps or num_steps % STEPS_PER_LATENT != 1:
+        if _whole(episode) <= STEPS_PER_LATENT or episode.images.shape[1:] != size:
             raise InvalidInputError(
-                f"episode {episode.episode_id}: got {len(episode.tactile_kpa)} steps, expected "
-                f"1 + 4k and as many as {first.episode_id} ({num_steps})"
-            )
-        if episode.images.shape[1:] != size or list(episode.image_steps) != list(first.image_steps):
-            raise InvalidInputError(
-                f"episode {episode.episode_id}: images {episode.images.shape[1:]} of steps "
-                f"{list(episode.image_steps)[:4]} …, expected {size} and the steps of "
-                f"{first.episode_id}; record all with one --images setting"
+                f"episode {episode.episode_id}: {len(episode)} steps with images "
+                f"{episode.images.shape[1:]}, expected more than {STEPS_PER_LATENT} steps and "
+                f"images {size}"
             )

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from dextouch.metrics import tactile as tactile_metrics
@@ -80,18 +80,22 @@ def _chunk_figures(imagined: _Imagined, table: SceneTable, start: int) -> dict[s
     place = "" if start == 0 else f"from_{start}_"
     for index, first in enumerate(range(start, table.num_steps - 1, CHUNK_STEPS)):
         steps = slice(first + 1, first + 1 + CHUNK_STEPS)
-        true = table.tactile_kpa[:, steps].float().numpy()
+        end = min(first + CHUNK_STEPS, table.num_steps - 1)
+        # Of shorter episodes, chunks that go beyond their end are left out.
+        whole = table.length > end
+        if not whole.any():
+            break
+        true = table.tactile_kpa[whole, steps].float().numpy()
         said = slice(first - start, first - start + CHUNK_STEPS)
-        guesses = {"": imagined.tactile_kpa[:, said].numpy()}
+        guesses = {"": imagined.tactile_kpa[whole, said].numpy()}
         if start == 0:
-            before = table.tactile_kpa[:, first : first + 1].float().numpy()
+            before = table.tactile_kpa[whole, first : first + 1].float().numpy()
             guesses["_of_copy"] = np.broadcast_to(before, true.shape)
         for name, guess in guesses.items():
             chunk = f"{place}chunk_{index + 1}{name}"
             pair = {"predicted_kpa": guess, "true_kpa": true}
             figures[f"contact_f1_{chunk}"] = tactile_metrics.contact_f1(**pair)
             figures[f"tactile_mse_{chunk}"] = tactile_metrics.mse(**pair)
-        end = min(first + CHUNK_STEPS, table.num_steps - 1)
         off_mm, there = _object_errors(imagined.position_m[:, end - start - 1], table, start, end)
         if there.any():
             figures[f"object_mm_{place}chunk_{index + 1}"] = float(off_mm[there].median())
@@ -103,7 +107,9 @@ def _episode_figures(
 ) -> dict[str, float]:
     """Errors of objects at the end and of readers at the start, by task."""
     figures: dict[str, float] = {}
-    off_mm, there = _object_errors(imagined.position_m[:, -1], table, 0, table.num_steps - 1)
+    rows = torch.arange(len(table))
+    last = table.length - 1
+    off_mm, there = _object_errors(imagined.position_m[rows, last - 1], table, 0, last)
     for index, task in enumerate(dynamics.config.tasks):
         found = there & (table.task == index)[:, None]
         if found.any():
@@ -115,12 +121,16 @@ def _episode_figures(
 
 
 def _object_errors(
-    position_m: Float32[Tensor, "episodes objects 3"], table: SceneTable, start: int, step: int
+    position_m: Float32[Tensor, "episodes objects 3"],
+    table: SceneTable,
+    start: int,
+    step: int | Int64[Tensor, " episodes"],
 ) -> tuple[Tensor, Tensor]:
-    """Position errors in mm at a step, and which objects are present then and at the start."""
+    """Position errors in mm at a step, and which objects are known to be there at both steps."""
     rows = torch.arange(len(table))
     true = table.objects_at(rows, step)
     there = (true.present > 0) & (table.objects_at(rows, start).present > 0)
+    there &= table.objects_known[rows, step] & table.objects_known[:, start]
     return 1e3 * (position_m - true.position_m).norm(dim=-1), there
 
 

@@ -105,10 +105,13 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     heldout_table = scene_table(heldout, config)
     table = scene_table(training, config, labelled=_labelled(training, settings))
     codec = _codec(table, config, base)
+    reads_starts = settings.labelled_share < 1 or not all(
+        bool(table.knows_all(step).all()) for step in start_steps(table)
+    )
     table_file = parts / "table.safetensors"
     save_file({**table.tensors(), **_prefixed(codec)}, table_file)
     del table
-    work = _Work(settings, config, parts, data_hash)
+    work = _Work(settings, config, parts, data_hash, reads_starts)
     _train_parts(work)
     dynamics, renderer, cpu_s = _assembled(work, codec)
     measured = evaluate_dynamics(dynamics, heldout_table)
@@ -160,6 +163,8 @@ class _Work:
     config: DynamicsConfig
     parts: Path
     data_hash: str
+    # Whether some episodes start from what a reader sees, since their objects are not known there.
+    reads_starts: bool
 
     @cached_property
     def base(self) -> Base | None:
@@ -172,7 +177,7 @@ class _Work:
 
     def core_file(self, member: int) -> Path:
         """File of a member's finished core, which was trained with that member's reader."""
-        reader = () if self.settings.labelled_share == 1 else ("reader",)
+        reader = ("reader",) if self.reads_starts else ()
         key = self._key(CORE_VERSION, "width", *reader, "core")
         return self.parts / f"core-{key}-{member}.safetensors"
 
@@ -224,7 +229,10 @@ def _episodes(settings: StateTrainSettings) -> list[SceneEpisode]:
         episode
         for url in settings.episodes
         for episode in load_scene_episodes(
-            url, tasks=settings.tasks or None, splits=settings.splits
+            url,
+            tasks=settings.tasks or None,
+            splits=settings.splits,
+            image_px=settings.image_px,
         )
     ]
 
@@ -303,7 +311,7 @@ def _train_parts(work: _Work) -> None:
     spawned = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(work.settings.jobs, spawned) as pool:
         orders = []
-        if work.settings.labelled_share == 1 and not work.settings.keep_readers:
+        if not (work.reads_starts or work.settings.keep_readers):
             orders += [pool.submit(_train_reader, work, m) for m in members]
         orders += [pool.submit(_train_core, work, m) for m in members]
         if work.base is None and not work.renderer_file.exists():
@@ -377,11 +385,11 @@ def _train_core(work: _Work, member: int) -> None:
         return
     readings: dict[int, Reading] = {}
     starts_read = work.settings.keep_readers
-    if work.settings.labelled_share < 1 and not starts_read:
+    if work.reads_starts and not starts_read:
         _train_reader(work, member)
     table, codec = _table(work)
     started_s = time.process_time()
-    if work.settings.labelled_share < 1 or starts_read:
+    if work.reads_starts or starts_read:
         reader = _finished_reader(work, member)
         readings = {step: read_step(reader, table, step) for step in start_steps(table)}
     data = CoreData(table, touch_latents(codec, table), readings, starts_read)

@@ -121,6 +121,12 @@ if TYPE_CHECKING:
     from dextouch.schemas.rollouts import WorldDescription as WorldDescription
     from dextouch.schemas.rollouts import WorldKind as WorldKind
     from dextouch.schemas.rollouts import WorldList as WorldList
+    from dextouch.schemas.scene_objects import MarkerDictionary as MarkerDictionary
+    from dextouch.schemas.scene_objects import ObjectMarker as ObjectMarker
+    from dextouch.schemas.scene_objects import SceneObject as SceneObject
+    from dextouch.schemas.scene_objects import SceneObjects as SceneObjects
+    from dextouch.schemas.scene_objects import load_scene_objects as load_scene_objects
+    from dextouch.schemas.scene_objects import object_stream as object_stream
     from dextouch.schemas.station import CameraList as CameraList
     from dextouch.schemas.station import CameraLive as CameraLive
     from dextouch.schemas.station import CauseCode as CauseCode

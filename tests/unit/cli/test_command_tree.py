@@ -13,7 +13,7 @@ import pytest
 from services.cli import main
 
 COMMANDS = """
-align report, align retarget, align run, align serve,
+align markers, align report, align retarget, align run, align serve,
 checkpoint, completion, config example, config show, dashboard, demo,
 doctor, evaluate, evaluate prediction, export, generate, import,
 rate report, rate serve, reproduce, serve,
@@ -33,7 +33,7 @@ WITHOUT_JSON = {
     "align serve", "dashboard", "rate serve", "serve", "station serve", "store serve",
     "study serve", "twin serve",
     # These print a file.
-    "completion", "config example",
+    "align markers", "completion", "config example",
 }  # fmt: skip
 GROUPS = {
     "": tuple(name for name in main.COMMANDS if " " not in name),

@@ -13,7 +13,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
 from dextouch.serving import load_settings
-from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore, SceneStart
 from services.world_model.dynamics.features import SLOT_SIZE
 from services.world_model.dynamics.model import DynamicsModel
@@ -30,6 +30,7 @@ from services.world_model.training.core_training import (
     CoreData,
     _draw,
     _is_settled,
+    _read_start,
     core_loss,
     describe,
     start_steps,
@@ -75,6 +76,7 @@ def episode(seed, num_steps=NUM_STEPS):
         object_names=("block",), object_boxes_m=np.array([[0, 0, 0, 0.02, 0.02, 0.03]]),
         action_kind="commanded", actions=actions, measured_actions=actions, anchor=anchor,
         K_head=K_HEAD, tactile_kpa=tactile, object_poses=poses,
+        objects_known=np.ones(poses.shape[:2], dtype=bool), objects_measured=False,
         images=np.repeat(picture(block_m)[None], len(steps), axis=0), image_steps=steps,
         content_sha256=f"{seed:064x}",
     )  # fmt: skip
@@ -295,25 +297,155 @@ def test_commands_begin_where_hands_are_measured(config):
     assert len(sent) == 1 + (NUM_STEPS - 1 - 4) // 4
 
 
-@pytest.mark.parametrize("fault", ["length", "size", "steps", "task"])
-def test_episodes_that_do_not_fit_each_other_are_refused(config, fault):
+def shortened(one, num_steps):
+    """The first steps of an episode."""
+    shown = one.image_steps < num_steps
+    return dataclasses.replace(
+        one,
+        actions=one.actions[:num_steps],
+        measured_actions=one.measured_actions[:num_steps],
+        tactile_kpa=one.tactile_kpa[:num_steps],
+        object_poses=one.object_poses[:num_steps],
+        objects_known=one.objects_known[:num_steps],
+        images=one.images[shown],
+        image_steps=one.image_steps[shown],
+    )
+
+
+def test_shorter_episodes_are_filled_by_their_last_step(config):
+    long, short = episode(0), shortened(episode(1), NUM_STEPS - 6)
+    both = scene_table([long, short], config)
+    # Of NUM_STEPS - 6 steps, what is left over of a latent step is cut off.
+    assert both.length.tolist() == [NUM_STEPS, NUM_STEPS - 8]
+    last = NUM_STEPS - 9
+    assert not both.objects_known[1, last + 1 :, 0].any()
+    assert both.objects_known[1, : last + 1].all()
+    touch = both.tactile_kpa[1, last:]
+    assert (touch == touch[:1]).all()
+    assert both.longer_than(last - 4).tolist() == [0, 1]
+    assert both.longer_than(last).tolist() == [0]
+    assert both.within(torch.arange(2), 0).sum(1).tolist() == [
+        (NUM_STEPS - 1) // 4,
+        (NUM_STEPS - 9) // 4,
+    ]
+
+
+def test_a_core_learns_nothing_from_behind_an_episodes_end(config):
+    """Other touch, hands and poses there change neither the loss nor its gradient."""
+    table = scene_table([episode(0), shortened(episode(1), NUM_STEPS - 8)], config)
+    dynamics = DynamicsModel(config)
+    dynamics.codec.fit(table.tactile_kpa.float().flatten(0, 2))
+    behind = slice(NUM_STEPS - 8, None)
+    other = dataclasses.replace(
+        table,
+        tactile_kpa=_changed(table.tactile_kpa, behind, value=9.0),
+        in_contact=_changed(table.in_contact, behind, value=True),
+        objects=dataclasses.replace(
+            table.objects, position_m=_changed(table.objects.position_m, behind, value=0.4)
+        ),
+    )
+    settings = CoreSettings(batch=8)
+    losses = [_loss_of(core_data(dynamics, one), config, settings) for one in (table, other)]
+    assert losses[0] == losses[1]
+    inside = dataclasses.replace(
+        table, tactile_kpa=_changed(table.tactile_kpa, slice(NUM_STEPS - 12, None), value=9.0)
+    )
+    assert _loss_of(core_data(dynamics, inside), config, settings) != losses[0]
+
+
+def _changed(values, steps, *, value):
+    changed = values.clone()
+    changed[1, steps] = value
+    return changed
+
+
+def core_data(dynamics, table):
+    return CoreData(table, touch_latents(dynamics.codec, table), {})
+
+
+def _loss_of(data, config, settings):
+    torch.manual_seed(0)
+    core = RecurrentCore(config)
+    describe(core, data.table)
+    batch = _draw(data, settings, torch.Generator().manual_seed(1), np.random.default_rng(1))
+    return float(core_loss(core, data, batch, settings).detach())
+
+
+def test_unknown_poses_train_neither_readers_nor_cores(config):
+    one = episode(0)
+    hidden = one.objects_known.copy()
+    hidden[4:12] = False
+    astray = one.object_poses.copy()
+    astray[4:12, 0, :3] = [0.3, 0.3, 0.3]
+    tables = [
+        scene_table([dataclasses.replace(one, objects_known=hidden, object_poses=poses)], config)
+        for poses in (one.object_poses, astray)
+    ]
+    settings = ReaderSettings(num_steps=4, batch=8, bfloat16=False)
+    readers = [train_reader(table, config, settings, seed=0).state_dict() for table in tables]
+    assert all((readers[0][name] == readers[1][name]).all() for name in readers[0])
+    dynamics = DynamicsModel(config)
+    dynamics.codec.fit(tables[0].tactile_kpa.float().flatten(0, 2))
+    first = CoreSettings(batch=8, first_fraction=1.0)
+    losses = [_loss_of(core_data(dynamics, table), config, first) for table in tables]
+    assert losses[0] == losses[1]
+    assert [bool(tables[0].knows_all(step).all()) for step in (0, 4, 8, 12)] == [
+        True, False, False, True,
+    ]  # fmt: skip
+
+
+def test_a_core_starts_where_objects_are_unknown_from_what_the_reader_sees(reader, config):
+    one = episode(0)
+    hidden = one.objects_known.copy()
+    hidden[8] = False
+    table = scene_table([dataclasses.replace(one, objects_known=hidden)], config)
+    dynamics = DynamicsModel(config)
+    dynamics.codec.fit(table.tactile_kpa.float().flatten(0, 2))
+    readings = {step: read_step(reader, table, step) for step in start_steps(table)}
+    data = CoreData(table, touch_latents(dynamics.codec, table), readings)
+    rows = torch.zeros(3, dtype=torch.long)
+    read = _read_start(data, rows, 8, CoreSettings(), torch.Generator().manual_seed(0))
+    torch.testing.assert_close(read.objects.position_m[0], readings[8].objects.position_m[0])
+    known = _read_start(data, rows, 0, CoreSettings(), torch.Generator().manual_seed(0))
+    off_m = (known.objects.position_m[:, 0] - table.objects.position_m[0, 0, 0]).norm(dim=-1)
+    assert 0 < float(off_m.max()) < 0.1
+
+
+def test_measured_objects_move_when_they_move_by_more_than_their_error(config):
+    still, noisy = episode(0), episode(1)
+    shaken = noisy.object_poses.copy()
+    shaken[1::2, 0, 0] += 0.006
+    measured = dataclasses.replace(noisy, object_poses=shaken, objects_measured=True)
+    assert scene_table([still, measured], config).movable().tolist() == [[0.0] * MAX_OBJECTS]
+    carried = noisy.object_poses.copy()
+    carried[8:, 0, 0] += 0.05
+    moved = dataclasses.replace(measured, object_poses=carried)
+    assert scene_table([still, moved], config).movable()[0, 0] == 1.0
+
+
+@pytest.mark.parametrize("fault", ["size", "short", "task"])
+def test_episodes_that_do_not_fit_are_refused(config, fault):
     wrong = episode(1)
-    if fault == "length":
-        wrong = dataclasses.replace(
-            wrong,
-            actions=wrong.actions[:-4],
-            measured_actions=wrong.measured_actions[:-4],
-            tactile_kpa=wrong.tactile_kpa[:-4],
-            object_poses=wrong.object_poses[:-4],
-        )
-    elif fault == "size":
+    if fault == "size":
         wrong = dataclasses.replace(wrong, images=wrong.images[:, :16])
-    elif fault == "steps":
-        wrong = dataclasses.replace(wrong, image_steps=wrong.image_steps + 1)
+    elif fault == "short":
+        wrong = shortened(wrong, 4)
     else:
         wrong = dataclasses.replace(wrong, task="juggle")
     with pytest.raises(InvalidInputError, match="toy-1"):
         scene_table([episode(0), wrong], config)
+
+
+def test_images_of_steps_that_others_lack_are_not_used(config):
+    sparse = episode(1)
+    sparse = dataclasses.replace(
+        sparse, images=sparse.images[::2], image_steps=sparse.image_steps[::2]
+    )
+    shared = scene_table([episode(0), sparse], config)
+    assert list(shared.image_steps) == sparse.image_steps.tolist()
+    late = dataclasses.replace(sparse, image_steps=sparse.image_steps + 1)
+    with pytest.raises(InvalidInputError, match="expected step 0"):
+        scene_table([episode(0), late], config)
 
 
 def test_a_task_has_one_number_of_objects():
@@ -322,6 +454,7 @@ def test_a_task_has_one_number_of_objects():
         one,
         object_names=("block", "lid"),
         object_poses=np.repeat(one.object_poses, 2, axis=1),
+        objects_known=np.repeat(one.objects_known, 2, axis=1),
         object_boxes_m=np.repeat(one.object_boxes_m, 2, axis=0),
     )
     with pytest.raises(InvalidInputError, match="press"):

@@ -1,0 +1,260 @@
+"""Poses of objects from ArUco or AprilTag markers on them, as a camera of known pose sees them.
+
+The pose of a single square has two solutions that look almost alike when it is small or seen from
+the front (Schweighofer and Pinz, 2006; IPPE of Collins and Bartoli, 2014, gives both). The other
+markers of the object decide, or a clearly smaller error, or the pose that the object had in
+neighbouring images; where nothing decides, the object counts as not seen.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+from dextouch.geometry import invert, transform, transform_from_pose
+from dextouch.geometry.rotations import rotation_angle, rotation_from_vector, vector_from_rotation
+from dextouch.schemas import MarkerDictionary, SceneObject
+
+# Markers whose corners do not fit the pose within this, or this share of the marker's side, are
+# partly hidden, or of another size or place than stated. On rendered markers of 25 to 50 px right
+# poses had 0.05 to 0.6 px and those that were off by 10 cm 1.0 px.
+MAX_REPROJECTION_PX = 0.7
+MAX_REPROJECTION_SHARE = 0.015
+# One solution is taken for its smaller error alone if the other's is larger by this factor.
+_CLEAR_RATIO = 2.0
+# Otherwise the one that turned less since a neighbouring image, if by no more than this.
+_MAX_TURN_RAD = np.deg2rad(25.0)
+# Of the surroundings in which a marker's edges are fitted: as a share of its width, and enlarged.
+_MARGIN, _ZOOM = 0.35, 2
+# Images that far apart are not compared.
+_MAX_APART_NS = 1_000_000_000
+# A pose between two that are alike, but this far from both, is of a marker that was partly hidden.
+_JUMP_M, _JUMP_RAD, _JUMP_NS = 0.03, np.deg2rad(20.0), 300_000_000
+
+
+@dataclass(frozen=True)
+class CameraLens:
+    """A pinhole camera (K in px, pixel centres at half-integers) with distortion k1 k2 p1 p2 k3."""
+
+    K: Float64[np.ndarray, "3 3"]
+    distortion: Float64[np.ndarray, "5"]
+
+
+@dataclass(frozen=True)
+class TrackedObject:
+    """Where an object was seen.
+
+    `t_ns` are the times of the images that show it, `Ts_world_object` its poses there and
+    `reprojection_px` the RMS distance between corners as found and as predicted by the pose.
+    """
+
+    t_ns: Int64[np.ndarray, " n"]
+    Ts_world_object: Float64[np.ndarray, "n 4 4"]
+    reprojection_px: Float64[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    T_world_object: Float64[np.ndarray, "4 4"]
+    error_px: float
+
+
+class MarkerDetector:
+    """Finds markers of a dictionary in gray images, with unbiased corners.
+
+    Of OpenCV's ways to refine corners, only the lines that AprilTag's fits to the edges have no
+    bias: the corners of the others lie inside the marker, and with 30 to 40 px a side objects come
+    out 3 to 14 mm too far away. It searches whole images, which takes long where they are noisy, so
+    that it is given the surroundings of markers that were found without it.
+    """
+
+    def __init__(self, dictionary: MarkerDictionary) -> None:
+        kind = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+        self._coarse = cv2.aruco.ArucoDetector(kind)
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
+        self._fine = cv2.aruco.ArucoDetector(kind, parameters)
+
+    def find(self, gray: UInt8[np.ndarray, "h w"]) -> dict[int, list[Float64[np.ndarray, "4 2"]]]:
+        """Corners (px, the first pixel spans 0 … 1) of every marker, by its id.
+
+        Corners are in the order of OpenCV: upper left, upper right, lower right, lower left.
+        """
+        found: dict[int, list[np.ndarray]] = {}
+        for number, corners in _detected(self._coarse, gray):
+            refined = self._refined(gray, number, corners)
+            if refined is not None:
+                found.setdefault(number, []).append(refined)
+        return found
+
+    def _refined(
+        self, gray: np.ndarray, number: int, corners: Float64[np.ndarray, "4 2"]
+    ) -> Float64[np.ndarray, "4 2"] | None:
+        """The corners of a marker by the fit to its edges; None if that does not find it."""
+        margin_px = _MARGIN * np.ptp(corners, axis=0).max()
+        low = np.floor(corners.min(axis=0) - margin_px).clip(0).astype(int)
+        high = np.ceil(corners.max(axis=0) + margin_px).astype(int)
+        part = np.ascontiguousarray(gray[low[1] : high[1], low[0] : high[0]])
+        enlarged = cv2.resize(part, None, fx=_ZOOM, fy=_ZOOM, interpolation=cv2.INTER_CUBIC)
+        # Unlike OpenCV's other corners, these count from the corner of the first pixel.
+        near = [
+            fitted / _ZOOM + low
+            for other, fitted in _detected(self._fine, enlarged)
+            if other == number
+        ]
+        off_px = [np.linalg.norm(one - corners, axis=1).max() for one in near]
+        return near[int(np.argmin(off_px))] if off_px and min(off_px) < margin_px else None
+
+
+def _detected(
+    detector: cv2.aruco.ArucoDetector, gray: np.ndarray
+) -> list[tuple[int, Float64[np.ndarray, "4 2"]]]:
+    corners, ids, _ = detector.detectMarkers(gray)
+    # Without any marker, OpenCV gives None.
+    numbers = [] if not corners else [int(number) for number in np.ravel(ids)]
+    pixels = [one.reshape(4, 2).astype(np.float64) for one in corners]
+    return list(zip(numbers, pixels, strict=True))
+
+
+class MarkerTracker:
+    """Finds the objects of one task in the images of a camera."""
+
+    def __init__(
+        self, objects: Sequence[SceneObject], dictionary: MarkerDictionary, lens: CameraLens
+    ) -> None:
+        self._objects = [one for one in objects if one.markers]
+        self._lens = lens
+        self._markers = MarkerDetector(dictionary)
+        self._seen: dict[str, list[tuple[int, list[_Candidate]]]] = {
+            one.name: [] for one in self._objects
+        }
+
+    def add(
+        self,
+        t_ns: int,
+        image: UInt8[np.ndarray, "h w 3"],
+        T_world_camera: Float64[np.ndarray, "4 4"],
+    ) -> None:
+        """Look for the objects in one more image; images come in the order of their times."""
+        found = self._markers.find(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        for one in self._objects:
+            candidates = list(self._candidates(one, found))
+            if candidates:
+                placed = [
+                    _Candidate(T_world_camera @ c.T_world_object, c.error_px) for c in candidates
+                ]
+                self._seen[one.name].append((t_ns, placed))
+
+    def tracked(self) -> dict[str, TrackedObject]:
+        """Poses of every object that has markers, in the images added so far."""
+        return {name: _decided(seen) for name, seen in self._seen.items()}
+
+    def _candidates(
+        self, one: SceneObject, found: dict[int, list[np.ndarray]]
+    ) -> Iterator[_Candidate]:
+        """Poses in the camera that explain all of an object's markers, the best one first."""
+        # A marker that is there twice belongs to something else, too.
+        markers = [marker for marker in one.markers if len(found.get(marker.id, [])) == 1]
+        if not markers:
+            return
+        points_m = np.concatenate([_corners_m(m.size_m, np.array(m.pose)) for m in markers])
+        pixels = np.concatenate([found[marker.id][0] for marker in markers])
+        poses = []
+        for marker in markers:
+            T_marker_object = invert(transform_from_pose(np.array(marker.pose)))
+            flat = _flat_corners_m(marker.size_m)
+            number, turns, shifts, _ = cv2.solvePnPGeneric(
+                flat,
+                found[marker.id][0],
+                self._lens.K,
+                self._lens.distortion,
+                flags=cv2.SOLVEPNP_IPPE_SQUARE,
+            )
+            for turn, shift in zip(turns[:number], shifts[:number], strict=True):
+                T = transform(rotation_from_vector(turn.ravel()), shift.ravel()) @ T_marker_object
+                poses.append(self._refined(points_m, pixels, T))
+        poses.sort(key=lambda candidate: candidate.error_px)
+        if len(markers) > 1:
+            poses = poses[:1]
+        side_px = float(np.linalg.norm(np.diff(pixels.reshape(-1, 4, 2), axis=1), axis=-1).mean())
+        bound_px = max(MAX_REPROJECTION_PX, MAX_REPROJECTION_SHARE * side_px)
+        yield from (candidate for candidate in poses if candidate.error_px <= bound_px)
+
+    def _refined(self, points_m: np.ndarray, pixels: np.ndarray, T: np.ndarray) -> _Candidate:
+        """The pose of least squares near T, and its error."""
+        turn, shift = cv2.solvePnPRefineLM(
+            points_m,
+            pixels,
+            self._lens.K,
+            self._lens.distortion,
+            vector_from_rotation(T[:3, :3]).reshape(3, 1),
+            T[:3, 3].reshape(3, 1).copy(),
+        )
+        seen, _ = cv2.projectPoints(points_m, turn, shift, self._lens.K, self._lens.distortion)
+        error_px = float(np.sqrt(np.square(seen.reshape(-1, 2) - pixels).sum(1).mean()))
+        refined = transform(rotation_from_vector(turn.ravel()), shift.ravel())
+        in_front = (refined[2, :3] @ points_m.T + refined[2, 3]).min() > 0
+        return _Candidate(refined, error_px if in_front else np.inf)
+
+
+def _flat_corners_m(size_m: float) -> Float64[np.ndarray, "4 3"]:
+    """Corners of a marker in its own frame, in the order of OpenCV's IPPE_SQUARE and detector."""
+    half = 0.5 * size_m
+    return np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
+
+
+def _corners_m(size_m: float, pose: np.ndarray) -> Float64[np.ndarray, "4 3"]:
+    """Corners of a marker in the frame of its object."""
+    T = transform_from_pose(pose)
+    return _flat_corners_m(size_m) @ T[:3, :3].T + T[:3, 3]
+
+
+def _decided(seen: Sequence[tuple[int, list[_Candidate]]]) -> TrackedObject:
+    """One pose of each image, forwards from where it is certain, then backwards."""
+    chosen = [_certain(candidates) for _, candidates in seen]
+    for order in (range(1, len(seen)), range(len(seen) - 2, -1, -1)):
+        step = 1 if order.step > 0 else -1
+        for index in order:
+            near = chosen[index - step]
+            apart_ns = abs(seen[index][0] - seen[index - step][0])
+            if chosen[index] is None and near is not None and apart_ns <= _MAX_APART_NS:
+                chosen[index] = _nearest(seen[index][1], near)
+    taken = [(t_ns, one) for (t_ns, _), one in zip(seen, chosen, strict=True) if one is not None]
+    taken = [one for index, one in enumerate(taken) if not _jumps(taken, index)]
+    return TrackedObject(
+        np.array([t_ns for t_ns, _ in taken], dtype=np.int64),
+        np.array([one.T_world_object for _, one in taken]).reshape(-1, 4, 4),
+        np.array([one.error_px for _, one in taken]),
+    )
+
+
+def _jumps(taken: Sequence[tuple[int, _Candidate]], index: int) -> bool:
+    """Whether a pose is far from both of its neighbours, which are alike."""
+    if not 0 < index < len(taken) - 1 or taken[index + 1][0] - taken[index - 1][0] > _JUMP_NS:
+        return False
+    before, here, after = (one for _, one in taken[index - 1 : index + 2])
+    return _is_far(before, here) and _is_far(here, after) and not _is_far(before, after)
+
+
+def _is_far(a: _Candidate, b: _Candidate) -> bool:
+    way_m = np.linalg.norm(a.T_world_object[:3, 3] - b.T_world_object[:3, 3])
+    return bool(way_m > _JUMP_M or _turned_rad(a, b) > _JUMP_RAD)
+
+
+def _turned_rad(a: _Candidate, b: _Candidate) -> float:
+    return float(rotation_angle(a.T_world_object[:3, :3].T @ b.T_world_object[:3, :3]))
+
+
+def _certain(candidates: Sequence[_Candidate]) -> _Candidate | None:
+    best = candidates[0]
+    if len(candidates) == 1 or candidates[1].error_px >= _CLEAR_RATIO * best.error_px:
+        return best
+    return None
+
+
+def _nearest(candidates: Sequence[_Candidate], near: _Candidate) -> _Candidate | None:
+    turned_rad = [_turned_rad(near, one) for one in candidates]
+    best = int(np.argmin(turned_rad))
+    return candidates[best] if turned_rad[best] <= _MAX_TURN_RAD else None

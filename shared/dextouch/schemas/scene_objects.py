@@ -1,0 +1,132 @@
+"""Schema of the file that describes the objects of tasks, and what their poses are measured by."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, FiniteFloat, ValidationError, field_validator, model_validator
+
+from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.frozen_model import FrozenModel
+from dextouch.schemas.episodes import Box
+
+# Position x y z (m), then the quaternion w x y z.
+Pose = tuple[
+    FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat
+]
+MarkerDictionary = Literal[
+    "DICT_4X4_50", "DICT_5X5_250", "DICT_6X6_250", "DICT_APRILTAG_16h5", "DICT_APRILTAG_36h11"
+]
+MAX_FILE_BYTES = 1 << 20
+_UNIT = 1e-3
+
+
+def _is_turned(pose: Pose) -> Pose:
+    norm = sum(value**2 for value in pose[3:]) ** 0.5
+    if abs(norm - 1.0) > _UNIT:
+        raise ValueError(f"got a quaternion (w x y z) of length {norm:.4g}, expected 1")
+    return pose
+
+
+class ObjectMarker(FrozenModel):
+    """An ArUco or AprilTag marker on an object.
+
+    `size_m` is the side of its black square; `pose` is T_object_marker, with x to the right and y
+    upwards on the print and z out of it.
+    """
+
+    id: int = Field(ge=0, le=10_000)
+    size_m: FiniteFloat = Field(gt=0.002, le=1.0)
+    pose: Pose
+
+    _pose_is_turned = field_validator("pose")(_is_turned)
+
+
+class SceneObject(FrozenModel):
+    """One object of a task: its name, bounding box, and what measures its pose.
+
+    `box_m` are centre and half sizes in the object's own frame. The pose comes from the `markers`
+    as the head camera sees them or, if there are none, from the recorded stream `object_NAME` of a
+    tracker, which sits on the object at `tracker_pose`, T_tracker_object. An object that is `fixed`
+    stands still during a take: all sightings of its markers give one pose.
+    """
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,47}$")
+    box_m: Box
+    markers: tuple[ObjectMarker, ...] = Field(default=(), max_length=32)
+    tracker_pose: Pose | None = None
+    fixed: bool = False
+
+    _tracker_is_turned = field_validator("tracker_pose")(
+        lambda pose: None if pose is None else _is_turned(pose)
+    )
+
+    @model_validator(mode="after")
+    def _has_one_source(self) -> "SceneObject":
+        if self.markers and self.tracker_pose is not None:
+            raise ValueError(f"{self.name}: got markers and a tracker_pose, expected one of them")
+        if min(self.box_m[3:]) <= 0:
+            raise ValueError(
+                f"{self.name}: got box_m with half sizes {self.box_m[3:]}, expected positive ones"
+            )
+        return self
+
+    @property
+    def stream(self) -> str:
+        """Name of the stream of its pose."""
+        return object_stream(self.name)
+
+
+class SceneObjects(FrozenModel):
+    """Objects of every task, in the order of the world model's slots."""
+
+    dictionary: MarkerDictionary = Field(
+        default="DICT_4X4_50", description="OpenCV's dictionary of the markers"
+    )
+    tasks: dict[
+        Annotated[str, Field(min_length=1, max_length=128)],
+        Annotated[tuple[SceneObject, ...], Field(min_length=1, max_length=16)],
+    ] = Field(description="objects of each task, as JSON")
+
+    @model_validator(mode="after")
+    def _has_unique_names(self) -> "SceneObjects":
+        for task, objects in self.tasks.items():
+            names = [one.name for one in objects]
+            ids = [marker.id for one in objects for marker in one.markers]
+            for what, values in (("names", names), ("marker ids", ids)):
+                if len(set(values)) != len(values):
+                    raise ValueError(f"task {task!r}: got {what} {values}, expected different ones")
+        return self
+
+    def of_task(self, task: str) -> "SceneObjects | None":
+        """The objects of one task alone; None if the file does not have it."""
+        if task not in self.tasks:
+            return None
+        return self.model_copy(update={"tasks": {task: self.tasks[task]}})
+
+
+def object_stream(name: str) -> str:
+    """Name of the stream of the pose T_world_object of an object."""
+    return f"object_{name}"
+
+
+def load_scene_objects(path: Path) -> SceneObjects:
+    """Read the objects of a JSON file.
+
+    Raises:
+        NotFoundError: there is no such file.
+        InvalidInputError: not JSON, too large, or other fields than expected.
+    """
+    if not path.is_file():
+        raise NotFoundError(f"objects: there is no file {path}; docs/objects.md shows one")
+    if path.stat().st_size > MAX_FILE_BYTES:
+        raise InvalidInputError(
+            f"objects {path}: got {path.stat().st_size} bytes, expected at most {MAX_FILE_BYTES}"
+        )
+    try:
+        return SceneObjects.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise InvalidInputError(
+            f"objects {path}: {place}: {first['msg']}; docs/objects.md shows a file"
+        ) from error

@@ -1,0 +1,55 @@
+"""The file of objects: what is accepted, and what refusals say."""
+
+import json
+
+import pytest
+
+from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.schemas import load_scene_objects
+
+FLAT = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+
+
+def described(**changes):
+    cup = {
+        "name": "cup",
+        "box_m": [0, 0, 0, 0.04, 0.04, 0.05],
+        "markers": [{"id": 4, "size_m": 0.05, "pose": FLAT}],
+    }
+    return {"tasks": {"pour": [cup | changes]}}
+
+
+def load(tmp_path, content):
+    path = tmp_path / "objects.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return load_scene_objects(path)
+
+
+def test_a_file_gives_the_objects_of_each_task(tmp_path):
+    objects = load(tmp_path, described())
+    assert objects.tasks["pour"][0].stream == "object_cup"
+    assert objects.of_task("pour") == objects
+    assert objects.of_task("stir") is None
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("{", "JSON"),
+        (described(name="Cup!"), r"tasks\.pour\.0\.name"),
+        (described(box_m=[0, 0, 0, 0.04, 0.0, 0.05]), "positive"),
+        (described(markers=[{"id": 4, "size_m": 50, "pose": FLAT}]), "size_m"),
+        (described(markers=[{"id": 4, "size_m": 0.05, "pose": [0] * 7}]), "length 0"),
+        (described(tracker_pose=FLAT), "one of them"),
+        (described(markers=[{"id": 4, "size_m": 0.05, "pose": FLAT}] * 2), "different"),
+        (described(colour="red"), "colour"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_the_place(tmp_path, content, says):
+    with pytest.raises(InvalidInputError, match=says):
+        load(tmp_path, content)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(NotFoundError, match=r"nothing\.json"):
+        load_scene_objects(tmp_path / "nothing.json")
