@@ -94,11 +94,8 @@ def refuse_trained_episodes(
     """
     if is_state_checkpoint(checkpoint):
         metadata = read_state_checkpoint(checkpoint).metadata
-        about = {one: store.open(one).attributes for one in wanted}
         trained = [
-            one
-            for one, it in about.items()
-            if it.seed is not None and metadata.may_have_seen(it.task, it.seed)
+            one for one in wanted if metadata.may_have_seen_episode(store.open(one).attributes)
         ]
     else:
         prints = set(read_checkpoint(checkpoint).metadata.train_fingerprints)

@@ -77,7 +77,7 @@ def imagine_all(
 def judged_steps(episode: EpisodeReader) -> set[int]:
     """Steps of an episode whose images the success probe uses."""
     scene, last = scene_of(episode.attributes), episode.num_steps - 1
-    ends = (early_step(scene), middle_step(scene), last - 1, last)
+    ends = (early_step(scene, last), middle_step(scene, last), last - 1, last)
     return {step for end in ends for step in range(end - NUM_SEEN_STEPS + 1, end + 1)}
 
 

@@ -108,6 +108,10 @@ COMMANDS = {
     "evaluate prediction": Command(
         "measure predicted images and touch on held-out episodes", "cli.evaluate_prediction:main"
     ),
+    "evaluate recorded": Command(
+        "score policies from recorded first observations, and how far to trust it",
+        "cli.evaluate_recorded:main",
+    ),
     "study": Command(
         "score policies in several worlds, defined in a file and resumable",
         "cli.study.command:main",

@@ -72,7 +72,9 @@ def run_train_probe(arguments: list[str]) -> int:
 
     def read(urls: Sequence[str]) -> list[EndingEpisode]:
         stores = [EpisodeStore(url) for url in urls]
-        return read_ending_episodes(*stores, tasks=settings.tasks) if stores else []
+        if not stores:
+            return []
+        return read_ending_episodes(*stores, tasks=settings.tasks, splits=settings.splits)
 
     if settings.base is not None:
         if settings.held_out:

@@ -1,17 +1,26 @@
 """Endings of rollouts, true and imagined: input and training data of success probes."""
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, object_track, scene_fraction, scene_of
+from dextouch.episodes import (
+    EpisodeReader,
+    EpisodeStore,
+    Split,
+    is_in,
+    object_track,
+    scene_fraction,
+    scene_of,
+)
 from dextouch.errors import InvalidInputError
+from dextouch.images import scaled_square
 from dextouch.schemas import Observation, RolloutDoubt, is_rollout, rollout_doubt
-from services.evaluation.demonstrations import CAMERA
+from services.evaluation.demonstrations import CAMERA, MAX_IMAGE_PX
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 
@@ -22,16 +31,24 @@ UNUSUAL_SIZE: Final = 0.1
 # are failures, since nothing was done yet; in the middle only the milestones are known.
 EARLY_ENDS: Final = (2, 8, 14)
 MIDDLE_ENDS: Final = (32, 48, 64)
+# Last step of the episodes that these steps belong to; in others they lie as far along.
+_USUAL_END: Final = 80
+_SHORTEST: Final = 16
 
 
-def early_step(scene: str) -> int:
-    """The step of `EARLY_ENDS` at which an episode of this scene is cut."""
-    return EARLY_ENDS[int(scene_fraction(scene, salt="early ") * len(EARLY_ENDS))]
+def early_step(scene: str, last_step: int = _USUAL_END) -> int:
+    """The step of `EARLY_ENDS`, or as far along, at which an episode of this scene is cut."""
+    return _cut(EARLY_ENDS, scene_fraction(scene, salt="early "), last_step)
 
 
-def middle_step(scene: str) -> int:
-    """The step of `MIDDLE_ENDS` at which an episode of this scene is cut."""
-    return MIDDLE_ENDS[int(scene_fraction(scene, salt="middle ") * len(MIDDLE_ENDS))]
+def middle_step(scene: str, last_step: int = _USUAL_END) -> int:
+    """The step of `MIDDLE_ENDS`, or as far along, at which an episode of this scene is cut."""
+    return _cut(MIDDLE_ENDS, scene_fraction(scene, salt="middle "), last_step)
+
+
+def _cut(ends: tuple[int, ...], fraction: float, last_step: int) -> int:
+    usual = ends[int(fraction * len(ends))]
+    return max(NUM_SEEN_STEPS - 1, round(usual * last_step / _USUAL_END))
 
 
 @dataclass(frozen=True)
@@ -139,12 +156,12 @@ class EndingEpisode:
     @property
     def early_step(self) -> int:
         """The step of `EARLY_ENDS` at which this episode is cut."""
-        return early_step(self.scene)
+        return early_step(self.scene, self.last_step)
 
     @property
     def middle_step(self) -> int:
         """The step of `MIDDLE_ENDS` at which this episode is cut."""
-        return middle_step(self.scene)
+        return middle_step(self.scene, self.last_step)
 
     def reached(self, milestones: Sequence[str], step: int) -> list[bool] | None:
         """Whether each milestone was reached by a step; None where that is unknown."""
@@ -163,11 +180,11 @@ def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:
     """
     about = reader.attributes
     last = reader.num_steps - 1
-    if about.success is None or last <= MIDDLE_ENDS[-1]:
+    if about.success is None or last < _SHORTEST:
         raise InvalidInputError(
             f"episode {about.episode_id!r}: success {about.success}, {last + 1} steps; expected a "
             "known outcome, as operators enter it after a take, and more than "
-            f"{MIDDLE_ENDS[-1] + 1} steps"
+            f"{_SHORTEST} steps"
         )
     first = reader.window(0, num_steps=1, cameras=(CAMERA,))
     episode = EndingEpisode(
@@ -204,8 +221,10 @@ def _read_ending(reader: EpisodeReader, end: int) -> Ending:
     half_step_ns = 5e8 / reader.attributes.model_rate_hz
     # Where these steps were not rendered, the nearest images belong to other steps.
     are_near = bool((np.abs(window.image_dt_ns[CAMERA]) <= half_step_ns).all())
+    images = window.images[CAMERA]
+    side_px = min(MAX_IMAGE_PX, *images.shape[1:3])
     return Ending(
-        window.images[CAMERA] if are_near else None,
+        scaled_square(images, window.K_head, side_px)[0] if are_near else None,
         window.tactile_kpa,
         reader.attributes.task,
         _object_poses(reader, window.t_ref_ns),
@@ -225,18 +244,22 @@ def _object_poses(
     return poses
 
 
-def read_ending_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[EndingEpisode]:
+def read_ending_episodes(
+    *stores: EpisodeStore, tasks: Sequence[str] = (), splits: Collection[Split] = ()
+) -> list[EndingEpisode]:
     """Read all robot episodes of some stores with their endings.
 
     Args:
         stores: stores to read; true and imagined episodes may be mixed.
         tasks: tasks to read; empty for all.
+        splits: splits of their scenes; empty for all.
 
     Raises:
         NotFoundError: no such episode, or an empty store.
         ConflictError: two stores hold an episode of the same id.
     """
-    return [read_ending_episode(reader) for reader in robot_episodes(stores, tasks=tasks)]
+    readers = robot_episodes(stores, tasks=tasks, wanted=lambda about: is_in(about, splits))
+    return [read_ending_episode(reader) for reader in readers]
 
 
 def milestones_of(episodes: Iterable[EndingEpisode]) -> dict[str, tuple[str, ...]]:

@@ -83,6 +83,7 @@ class TrainProbeSettings(CommandSettings):
         default=Path("runs/evaluation/success_probe.safetensors"), description="checkpoint to write"
     )
     tasks: Tasks = ()
+    splits: Splits = ()
     jobs: int = Field(default=2, ge=1, le=64, description="tasks trained in parallel")
     training: ProbeSettings = Field(default=ProbeSettings(), description="training settings")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)

@@ -41,6 +41,6 @@ def refuse_training_starts(digests: Iterable[str], *, trained_on: Iterable[str],
     if shared:
         raise ConflictError(
             f"evaluation: {len(shared)} starts were trained on by {what}, first {shared[0][:12]}…; "
-            "choose seeds outside its training data",
+            "choose others, outside its training data",
             starts=shared,
         )

@@ -45,11 +45,9 @@ class StudyWorlds:
     @property
     def cameras(self) -> tuple[str, ...]:
         """Cameras that all worlds have and policies can see."""
-        others = [set(one.cameras) for one in self.descriptions.values()]
+        first, *others = self.descriptions.values()
         return tuple(
-            camera
-            for camera in self.descriptions[REAL].cameras
-            if all(camera in cameras for cameras in others)
+            camera for camera in first.cameras if all(camera in one.cameras for one in others)
         )
 
     @property

@@ -5,11 +5,18 @@ from collections.abc import Collection
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float64
 
 from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeReader, EpisodeStore, write_rollout
-from dextouch.errors import InvalidInputError
-from dextouch.schemas import LineageEntry, Observation, ReturnSelector, rollout_doubt
+from dextouch.schemas import (
+    ActionKind,
+    LineageEntry,
+    Observation,
+    ReturnSelector,
+    matrix_rows,
+    rollout_doubt,
+)
 
 CAMERA: Final = "camera_head"
 CHUNK_STEPS: Final = 16
@@ -24,16 +31,18 @@ def imagine_episode(
     *,
     image_steps: Collection[int] | None = None,
 ) -> str:
-    """Replay an episode's commanded actions in an imagined world and store the result.
+    """Replay an episode's actions in an imagined world and store the result.
 
-    The imagined episode starts from the source's first observation. Its `success` is that of the
+    The imagined episode starts from the source's first observation, as the world sees it: its
+    images have the world's size. Actions are the commanded ones, or those that were reached if the
+    robot keeps no commands. Its `success` is that of the
     *source*: the real outcome of the actions, and the label for training a success probe on
     imagined endings. Its lineage names the source and the world's digest. Object poses, if the
     world provides them, are the stream `object_poses`, from step 1 on; the world's doubt about the
     whole rollout, and its own estimate of success, are quality figures (`RolloutDoubt.to_quality`).
 
     Args:
-        source: a robot episode with head camera, touch and commanded actions.
+        source: a robot episode with head camera, touch and actions.
         client: of the service with the world.
         world: its name at the service.
         store: destination of the imagined episode.
@@ -45,20 +54,14 @@ def imagine_episode(
         Its id; equal source and world give an equal id, and an existing episode is kept.
 
     Raises:
-        InvalidInputError: a source without commanded actions.
-        UnknownNameError: no such world.
+        UnknownNameError: no such world, or a source without head camera.
     """
     digests = {description.name: description.digest for description in client.worlds()}
     attributes = source.attributes
     name = imagined_id(attributes.episode_id, digests.get(world, world))
     if store.exists(name):
         return name
-    if "action_commanded" not in source.streams:
-        raise InvalidInputError(
-            f"episode {attributes.episode_id!r}: has no commanded actions to replay in {world!r}"
-        )
-    commanded = source.read("action_commanded").values
-    seen = _played(source, commanded, client, world, image_steps)
+    seen, K_head, actions = _played(source, client, world, image_steps)
     lineage = (
         *attributes.lineage,
         LineageEntry(kind="episode", id=attributes.episode_id, sha256=source.content_sha256),
@@ -74,28 +77,34 @@ def imagine_episode(
             "event_times_s": {},
             "generator_command": None,
             "streams": (),
+            "K_head": matrix_rows(K_head),
             "quality": attributes.quality | rollout_doubt(seen).to_quality(),
         }
     )
-    write_rollout(store, imagined, seen, commanded)
+    write_rollout(store, imagined, seen, actions)
     return name
 
 
 def _played(
     source: EpisodeReader,
-    commanded: np.ndarray,
     client: RolloutClient,
     world: str,
     image_steps: Collection[int] | None,
-) -> list[Observation]:
-    """Observations of the world for an episode's commands, including the first one."""
+) -> tuple[list[Observation], Float64[np.ndarray, "3 3"], Float64[np.ndarray, "steps 67"]]:
+    """Observations of the world for an episode's actions, its camera, and these actions."""
     attributes = source.attributes
-    window = source.window(0, source.num_steps, cameras=(CAMERA,))
+    kind: ActionKind = "commanded" if "action_commanded" in source.streams else "measured"
+    window = source.window(0, source.num_steps, cameras=(CAMERA,), action_kind=kind)
+    actions = window.actions
+    if kind == "commanded":
+        # Relative to the measured poses of step 0, as they were sent.
+        actions = source.read("action_commanded").values
+    reached = source.window(0, 1, cameras=()).actions
     first = Observation(
         first_step=0,
         images={CAMERA: window.images[CAMERA][:1]},
         tactile_kpa=window.tactile_kpa[:1],
-        action_reached=window.actions[:1],
+        action_reached=reached,
         reached_is_measured=True,
     )
     with client.start(
@@ -104,17 +113,19 @@ def _played(
         seed=attributes.seed or 0,
         instruction=attributes.instruction,
         init=(first, window.anchor, window.K_head),
+        action_kind=kind,
     ) as rollout:
-        return [
-            first,
+        seen = [
+            rollout.observation,
             *(
                 rollout.step(
-                    commanded[begin:end],
+                    actions[begin:end],
                     selector=None if shown else ReturnSelector(cameras=()),
                 )
-                for begin, end, shown in _chunks(len(commanded), image_steps)
+                for begin, end, shown in _chunks(len(actions), image_steps)
             ),
         ]
+        return seen, rollout.K_head, actions
 
 
 def _chunks(num_steps: int, image_steps: Collection[int] | None) -> list[tuple[int, int, bool]]:

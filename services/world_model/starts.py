@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Float64, UInt8
-from torch.nn import functional
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
+from dextouch.images import scaled_square
 from dextouch.schemas import Observation, RolloutStart
 
 CAMERA: Final = "camera_head"
@@ -44,34 +43,6 @@ class ObservedStart:
             reached_is_measured=True,
             object_poses=object_poses,
         )
-
-
-def scaled_square(
-    images: UInt8[np.ndarray, "n h w 3"], K: Float64[np.ndarray, "3 3"], side_px: int
-) -> tuple[UInt8[np.ndarray, "n side side 3"], Float64[np.ndarray, "3 3"]]:
-    """The middle square of images, scaled to a side by averaging, and the camera's new matrix.
-
-    Images that have the side already are returned as they are.
-
-    Args:
-        images: of one camera.
-        K: of the camera (px), with pixel centres at half-integers.
-        side_px: wanted width and height.
-    """
-    height_px, width_px = images.shape[1:3]
-    if height_px == width_px == side_px:
-        return images, K
-    side = min(height_px, width_px)
-    top, left = (height_px - side) // 2, (width_px - side) // 2
-    square = torch.from_numpy(
-        np.ascontiguousarray(images[:, top : top + side, left : left + side]).transpose(0, 3, 1, 2)
-    )
-    scaled = [functional.adaptive_avg_pool2d(one.float(), side_px).round() for one in square]
-    moved = K.copy()
-    moved[0, 2] -= left
-    moved[1, 2] -= top
-    moved[:2] *= side_px / side
-    return torch.stack(scaled).byte().permute(0, 2, 3, 1).contiguous().numpy(), moved
 
 
 def observed_start(

@@ -1,12 +1,15 @@
 """Checkpoints of state models: dynamics, renderer and metadata in one safetensors file."""
 
+import hashlib
 from dataclasses import dataclass
+from operator import not_
 from pathlib import Path
 
 from pydantic import Field, model_validator
 
-from dextouch.episodes import Split, split_of_scene
+from dextouch.episodes import Split, scene_of, split_of_scene
 from dextouch.frozen_model import FrozenModel
+from dextouch.schemas import EpisodeAttributes
 from services.networks.weight_files import (
     half_weights,
     holds,
@@ -52,7 +55,8 @@ class StateMetadata(FrozenModel):
     """Provenance and measured accuracy of a state model, stored in its checkpoint.
 
     `training_seeds` are the first and last seed of every task, of the scenes in `training_splits`
-    (all splits if empty).
+    (all splits if empty); `training_scenes` are `scene_digest` of those without a seed, which a
+    station recorded.
     """
 
     format_version: int = FORMAT_VERSION
@@ -70,11 +74,18 @@ class StateMetadata(FrozenModel):
     num_training_episodes: int
     training_seeds: dict[str, tuple[int, int]]
     training_splits: tuple[Split, ...] = ()
+    training_scenes: tuple[str, ...] = Field(default=(), exclude_if=not_)
     data_hash: str
     metrics: dict[str, float] = Field(default={})
 
+    def may_have_seen_episode(self, about: EpisodeAttributes) -> bool:
+        """Whether the scene of an episode may be one of the training scenes."""
+        if about.seed is None:
+            return scene_digest(scene_of(about)) in self.training_scenes
+        return self.may_have_seen(about.task, about.seed)
+
     def may_have_seen(self, task: str, seed: int) -> bool:
-        """Whether a scene may be one of the training scenes."""
+        """Whether a scene of the twin may be one of the training scenes."""
         low, high = self.training_seeds.get(task, (0, -1))
         splits = self.training_splits
         return low <= seed <= high and (not splits or split_of_scene(task, seed) in splits)
@@ -92,6 +103,11 @@ class StateMetadata(FrozenModel):
                     f"boxes, expected {count} of each, six numbers a box"
                 )
         return self
+
+
+def scene_digest(scene: str) -> str:
+    """Short digest of a scene, as checkpoints list them."""
+    return hashlib.sha256(scene.encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""JPEG codec of still images: uint8 RGB [h, w, 3]."""
+"""Still images, uint8 RGB [h, w, 3]: their JPEG codec, and scaling to a smaller square."""
 
 import numpy as np
 import simplejpeg
-from jaxtyping import UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.errors import CorruptDataError, ShapeError
 
@@ -67,3 +67,41 @@ def check_jpeg(data: bytes, size_px: tuple[int, int], *, where: str = "image") -
         raise CorruptDataError(
             f"{where}: {len(data)} bytes are not a complete JPEG image ({error})"
         ) from error
+
+
+def scaled_square(
+    images: UInt8[np.ndarray, "n h w 3"], K: Float64[np.ndarray, "3 3"], side_px: int
+) -> tuple[UInt8[np.ndarray, "n side side 3"], Float64[np.ndarray, "3 3"]]:
+    """The middle square of images, each pixel the mean of the area that it covers, and its camera.
+
+    Images that have the side already are returned as they are.
+
+    Args:
+        images: of one camera.
+        K: of the camera (px), with pixel centres at half-integers.
+        side_px: wanted width and height.
+    """
+    height_px, width_px = images.shape[1:3]
+    if height_px == width_px == side_px:
+        return images, K
+    side = min(height_px, width_px)
+    top, left = (height_px - side) // 2, (width_px - side) // 2
+    share = _area_shares(side, side_px)
+    scaled = np.empty((len(images), side_px, side_px, 3), dtype=np.uint8)
+    for index, image in enumerate(images):
+        square = image[top : top + side, left : left + side].astype(np.float32)
+        rows = (share @ square.reshape(side, -1)).reshape(side_px, side, 3)
+        scaled[index] = (share @ rows).round()
+    moved = K.copy()
+    moved[0, 2] -= left
+    moved[1, 2] -= top
+    moved[:2] *= side_px / side
+    return scaled, moved
+
+
+def _area_shares(side: int, side_px: int) -> Float32[np.ndarray, "new old"]:
+    """Share of every old pixel in each new one, along one axis."""
+    edges = np.linspace(0.0, side, side_px + 1)
+    old = np.arange(side)
+    overlap = np.minimum(edges[1:, None], old + 1) - np.maximum(edges[:-1, None], old)
+    return (overlap.clip(0.0) * (side_px / side)).astype(np.float32)

@@ -11,7 +11,8 @@ from jaxtyping import Float32, Float64, UInt8
 from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, scene_of
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses
-from services.evaluation.demonstrations import CAMERA
+from dextouch.images import scaled_square
+from services.evaluation.demonstrations import CAMERA, MAX_IMAGE_PX
 from services.evaluation.policies.cloning_network import SLOT_STEPS
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
@@ -74,6 +75,12 @@ def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
             f"--images {DECISION_STRIDE}` or fewer"
         )
     first = reader.window(0, num_steps=reader.num_steps, cameras=())
+
+    def seen(step: int) -> UInt8[np.ndarray, "h w 3"]:
+        images = reader.window(step, num_steps=1, cameras=(CAMERA,)).images[CAMERA]
+        side_px = min(MAX_IMAGE_PX, *images.shape[1:3])
+        return scaled_square(images, first.K_head, side_px)[0][0]
+
     return CloningEpisode(
         about.episode_id,
         about.task,
@@ -81,13 +88,7 @@ def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
         scene_of(about),
         bool(about.success),
         first.anchor,
-        {
-            step: Moment(
-                reader.window(step, num_steps=1, cameras=(CAMERA,)).images[CAMERA][0],
-                first.tactile_kpa[step].copy(),
-            )
-            for step in wanted
-        },
+        {step: Moment(seen(step), first.tactile_kpa[step].copy()) for step in wanted},
         first.actions,
         _commanded(reader, first.actions),
     )

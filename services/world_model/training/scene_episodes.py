@@ -24,8 +24,9 @@ from dextouch.episodes import (
     scene_of,
 )
 from dextouch.errors import InvalidInputError
+from dextouch.images import scaled_square
 from dextouch.schemas import ActionKind
-from services.world_model.starts import CAMERA, scaled_square
+from services.world_model.starts import CAMERA
 
 logger = structlog.get_logger(__name__)
 

@@ -35,6 +35,7 @@ from services.world_model.settings import StateTrainSettings
 from services.world_model.state_checkpoints import (
     StateBounds,
     StateMetadata,
+    scene_digest,
     write_state_checkpoint,
 )
 from services.world_model.training.averaging import OnStep
@@ -139,6 +140,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         num_training_episodes=len(training),
         training_seeds=_seed_ranges(training, base),
         training_splits=_splits(settings, base),
+        training_scenes=_recorded_scenes(training, base),
         data_hash=data_hash,
         metrics=measured.figures,
     )
@@ -278,6 +280,13 @@ def _seed_ranges(episodes: list[SceneEpisode], base: Base | None) -> dict[str, t
         if episode.seed is not None:
             seeds.setdefault(episode.task, []).append(episode.seed)
     return {task: (min(found), max(found)) for task, found in sorted(seeds.items())}
+
+
+def _recorded_scenes(episodes: list[SceneEpisode], base: Base | None) -> tuple[str, ...]:
+    """Digests of the scenes without a seed, the base's included."""
+    known = set() if base is None else set(base.checkpoint.metadata.training_scenes)
+    own = {scene_digest(episode.scene) for episode in episodes if episode.seed is None}
+    return tuple(sorted(known | own))
 
 
 def _splits(settings: StateTrainSettings, base: Base | None) -> tuple[Split, ...]:

@@ -15,7 +15,7 @@ from services.cli import main
 COMMANDS = """
 align markers, align report, align retarget, align run, align serve,
 checkpoint, completion, config example, config show, dashboard, demo,
-doctor, evaluate, evaluate prediction, export, generate, import,
+doctor, evaluate, evaluate prediction, evaluate recorded, export, generate, import,
 rate report, rate serve, reproduce, serve,
 station calibrate camera, station calibrate glove, station calibrate hand-eye,
 station calibrate latency, station calibrate profile, station calibrate robot-base,

@@ -1,0 +1,290 @@
+"""Policies scored in a world model from the first observations of recorded takes.
+
+A lab without a simulation has takes of its robot, with outcomes that operators entered. Replayed in
+the world model, their actions show how far its verdicts can be trusted; policies that act from the
+same first observations are scored by the same judge.
+"""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.clients import Policy
+from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in
+from dextouch.errors import InvalidInputError
+from dextouch.schemas import Observation, WorldDescription
+from services.evaluation.demonstrations import CAMERA
+from services.evaluation.matched_starts import MatchedStart
+from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.progress import Progress
+from services.evaluation.robot_episodes import robot_episodes
+from services.evaluation.rollout_runner import RolloutRunner
+from services.evaluation.scores import Outcome, RolloutFailure, RolloutScore
+from services.evaluation.starts import refuse_training_starts
+from services.evaluation.statistics import area_under_roc, wilson_interval
+from services.evaluation.study_worlds import StudyWorlds, WorldAddress
+from services.evaluation.success_probe import SuccessProbe
+
+IMAGINED: Final = "imagined"
+# Name of the replayed actions among the policies.
+REPLAY: Final = "recorded actions"
+_DRAWS: Final = 1000
+# With fewer takes of either outcome, an area under the curve says little.
+LEAST_OF_EACH: Final = 5
+
+
+@dataclass(frozen=True)
+class RecordedTake:
+    """A take of known outcome: its first observation, and the actions of its later steps."""
+
+    episode_id: str
+    start: MatchedStart
+    success: bool
+    actions: Float64[np.ndarray, "steps 67"]
+
+
+def read_takes(
+    stores: Sequence[EpisodeStore],
+    *,
+    tasks: Sequence[str] = (),
+    splits: Collection[Split] = (),
+    most: int | None = None,
+) -> list[RecordedTake]:
+    """Robot episodes of known outcome, whatever recorded them; imagined ones are left out.
+
+    Args:
+        stores: stores to read.
+        tasks: tasks to read; empty for all.
+        splits: splits of their scenes; empty for all.
+        most: takes a task, the first by their ids; None for all.
+
+    Raises:
+        NotFoundError: there is none.
+        UnknownNameError: one without head camera.
+    """
+    readers = robot_episodes(
+        stores,
+        tasks=tasks,
+        wanted=lambda about: (
+            about.origin != "imagined" and about.success is not None and is_in(about, splits)
+        ),
+        what="robot episode of known outcome",
+    )
+    takes: list[RecordedTake] = []
+    counts: dict[str, int] = {}
+    for reader in readers:
+        task = reader.attributes.task
+        counts[task] = counts.get(task, 0) + 1
+        if most is None or counts[task] <= most:
+            takes.append(_read_take(reader, number=len(takes)))
+    return takes
+
+
+def _read_take(reader: EpisodeReader, *, number: int) -> RecordedTake:
+    about = reader.attributes
+    window = reader.window(0, 1, cameras=(CAMERA,))
+    first = Observation(
+        first_step=0,
+        images=window.images,
+        tactile_kpa=window.tactile_kpa,
+        action_reached=window.actions,
+        reached_is_measured=True,
+    )
+    start = MatchedStart(about.task, number, about.instruction, first, window.anchor, window.K_head)
+    name = "action_commanded" if "action_commanded" in reader.streams else "action"
+    actions = reader.read(name).values.astype(np.float64)[1:]
+    return RecordedTake(about.episode_id, start, bool(about.success), actions)
+
+
+@dataclass(frozen=True)
+class RecordedScores:
+    """Imagined rollouts from recorded takes: of their own actions, and of policies."""
+
+    takes: tuple[RecordedTake, ...]
+    outcomes: tuple[Outcome, ...]
+    policies: tuple[str, ...]
+
+    @property
+    def failures(self) -> list[RolloutFailure]:
+        """Rollouts that did not end."""
+        return [one for one in self.outcomes if isinstance(one, RolloutFailure)]
+
+    def scores(self, policy: str, task: str) -> list[RolloutScore]:
+        """Finished rollouts of a policy in a task."""
+        return [
+            one
+            for one in self.outcomes
+            if isinstance(one, RolloutScore) and (one.policy, one.task) == (policy, task)
+        ]
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Tasks, in the order of the takes."""
+        return tuple(dict.fromkeys(take.start.task for take in self.takes))
+
+    def trust(self, task: str) -> dict[str, Any]:
+        """How imagined verdicts of the recorded actions compare with their real outcomes.
+
+        `auc` is that of the probability of success, undecided rollouts included, with a bootstrap
+        interval over the takes; `wrong` is the share of wrong verdicts among the decided.
+        """
+        scores = self.scores(REPLAY, task)
+        real = np.array([self.takes[one.seed].success for one in scores])
+        decided = np.array([one.cannot_tell is None for one in scores], dtype=bool)
+        said = np.array([one.success for one in scores])
+        figures: dict[str, Any] = {"takes": len(scores), "decided": int(decided.sum())}
+        if not len(scores):
+            return figures
+        figures["real"] = float(real.mean())
+        if decided.any():
+            figures["imagined"] = float(said[decided].mean())
+            figures["wrong"] = float((said != real)[decided].mean())
+        if min(real.sum(), (~real).sum()) >= LEAST_OF_EACH:
+            probability = np.array([one.probability for one in scores])
+            figures["auc"] = area_under_roc(probability, real)
+            figures["auc_interval"] = _auc_interval(probability, real)
+        return figures
+
+    def policy_row(self, policy: str, task: str) -> dict[str, Any]:
+        """Imagined success of a policy among its decided rollouts, with its Wilson interval."""
+        scores = self.scores(policy, task)
+        decided = [one for one in scores if one.cannot_tell is None]
+        row: dict[str, Any] = {
+            "policy": policy,
+            "task": task,
+            "rollouts": len(scores),
+            "decided": len(decided),
+        }
+        if decided:
+            successes = sum(one.success for one in decided)
+            interval = wilson_interval(successes, len(decided))
+            row["imagined"] = successes / len(decided)
+            row["imagined_interval"] = [interval.low, interval.high]
+        return row
+
+    def to_report(self) -> dict[str, Any]:
+        """All figures and rollouts as plain JSON."""
+        return {
+            "trust": {task: self.trust(task) for task in self.tasks},
+            "policies": [
+                self.policy_row(policy, task) for task in self.tasks for policy in self.policies
+            ],
+            "takes": {take.start.seed: take.episode_id for take in self.takes},
+            "rollouts": [asdict(one) for one in self.outcomes if isinstance(one, RolloutScore)],
+            "failures": [asdict(one) for one in self.failures],
+        }
+
+
+def score_recorded(
+    takes: Sequence[RecordedTake],
+    policies: Mapping[str, Policy],
+    world: WorldAddress,
+    description: WorldDescription,
+    probe: SuccessProbe,
+    *,
+    trained_on: Mapping[str, Iterable[str]] | None = None,
+) -> RecordedScores:
+    """Replay every take in a world model, and let every policy act from its first observation.
+
+    Rollouts last as long as their takes, whole chunks of the world; a failed one is recorded as a
+    failure, and the others continue. `trained_on` maps trained components, beside the judge, to
+    digests of their training starts.
+
+    Raises:
+        ConflictError: a take was trained on.
+        InvalidInputError: a task that the world or the judge does not know, images of another size
+            than the judge's, or a take that is shorter than a chunk.
+    """
+    digests = [take.start.digest for take in takes]
+    judged = {"the success probe": probe.metadata.training_starts}
+    for what, trained in {**judged, **(trained_on or {})}.items():
+        refuse_training_starts(digests, trained_on=trained, what=what)
+    multiple = description.chunk_multiple
+    for take in takes:
+        task = take.start.task
+        if task not in description.tasks or task not in probe.metadata.settings["instructions"]:
+            raise InvalidInputError(
+                f"take {take.episode_id!r}: task {task!r} is not one of the world "
+                f"({', '.join(description.tasks)}) and of the judge "
+                f"({', '.join(probe.metadata.settings['instructions'])}); train both on it, or "
+                "choose --tasks"
+            )
+        if len(take.actions) < multiple:
+            raise InvalidInputError(
+                f"take {take.episode_id!r}: has {len(take.actions)} steps after the first, "
+                f"expected at least the {multiple} of a chunk"
+            )
+    if description.image_height_px != probe.shape.image_size_px:
+        raise InvalidInputError(
+            f"world {description.name!r}: draws images of {description.image_height_px} px, the "
+            f"judge sees images of {probe.shape.image_size_px} px; train the judge on what this "
+            "world imagined"
+        )
+    replay = ReplayPolicy({(take.start.task, take.start.seed): take.actions for take in takes})
+    actors: dict[str, Policy] = {REPLAY: replay, **policies}
+    worlds = StudyWorlds({IMAGINED: world}, {IMAGINED: description})
+    outcomes: list[Outcome] = []
+    with Progress("imagined rollouts", len(takes) * len(actors)) as progress:
+        for take in takes:
+            num_steps = len(take.actions) // multiple * multiple
+            runner = RolloutRunner(worlds, probe, num_steps)
+            for name, actor in actors.items():
+                outcomes.append(runner.outcome(take.start, actor, name, IMAGINED))
+                failed = sum(isinstance(one, RolloutFailure) for one in outcomes)
+                progress.advance(failed=float(failed))
+    return RecordedScores(tuple(takes), tuple(outcomes), tuple(policies))
+
+
+def _auc_interval(probability: np.ndarray, real: np.ndarray) -> list[float]:
+    """95 % bootstrap interval, with as many takes of each outcome in every draw."""
+    draw = np.random.default_rng(0)
+    good, bad = probability[real], probability[~real]
+    outcome = np.repeat([True, False], [len(good), len(bad)])
+    areas = [
+        area_under_roc(np.concatenate([draw.choice(good, len(good)), draw.choice(bad, len(bad))]),
+                       outcome)
+        for _ in range(_DRAWS)
+    ]  # fmt: skip
+    return [float(bound) for bound in np.quantile(areas, [0.025, 0.975])]
+
+
+def score_lines(scores: RecordedScores) -> list[str]:
+    """The result as text: first how far to trust it, then the policies."""
+    lines = [
+        "How far to trust it: recorded actions, judged in imagination, against their outcomes",
+        f"{'task':<18}{'takes':>6}{'real':>7}{'imagined':>10}{'decided':>9}{'wrong':>7}"
+        "   AUC (95 %)",
+    ]
+    for task in scores.tasks:
+        found = scores.trust(task)
+        area = "   too few takes of one outcome"
+        if "auc" in found:
+            low, high = found["auc_interval"]
+            area = f"   {found['auc']:.2f} ({low:.2f} … {high:.2f})"
+        cells = (_share(found, "real", 7), _share(found, "imagined", 10))
+        decided = f"{found['decided']}".rjust(9)
+        lines.append(
+            f"{task:<18}{found['takes']:>6}{cells[0]}{cells[1]}{decided}"
+            f"{_share(found, 'wrong', 7)}{area}"
+        )
+    if scores.policies:
+        lines += ["", "Policies from the same first observations: imagined success (95 %)"]
+    for task in scores.tasks:
+        for policy in scores.policies:
+            row = scores.policy_row(policy, task)
+            rate = "cannot tell"
+            if "imagined" in row:
+                low, high = row["imagined_interval"]
+                rate = f"{row['imagined']:.2f} ({low:.2f} … {high:.2f})"
+            lines.append(
+                f"{task:<18}{policy:<24}{rate:<24}of {row['decided']} decided, "
+                f"{row['rollouts']} rollouts"
+            )
+    return lines
+
+
+def _share(found: Mapping[str, Any], name: str, width: int) -> str:
+    return (f"{found[name]:.2f}" if name in found else "-").rjust(width)
