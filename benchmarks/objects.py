@@ -21,6 +21,7 @@ from dextouch.geometry import invert, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from dextouch.schemas import SceneObjects
 from services.alignment.marker_poses import CameraLens, MarkerTracker
+from services.alignment.marker_sheet import cells_of_markers
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.markers import Markers, marked_objects
 from services.twin.settings import TwinSettings
@@ -131,7 +132,7 @@ def _stage(task: str, side_px: int) -> tuple[Stage, SceneObjects]:
     scene = stage.simulation.scene
     boxes_m = object_boxes_m(scene)
     objects = marked_objects(task, scene.object_names, boxes_m, scene.bodies.are_fixed)
-    stage.rig.markers = Markers(objects)
+    stage.rig.markers = Markers(objects, cells_of_markers(objects))
     return stage, objects
 
 

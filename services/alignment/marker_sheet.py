@@ -6,9 +6,10 @@ from typing import Final
 
 import cv2
 import numpy as np
+from jaxtyping import Bool
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import ObjectMarker, SceneObjects
+from dextouch.schemas import MarkerDictionary, ObjectMarker, SceneObjects
 
 PAGE_MM: Final = (210.0, 297.0)
 # White around a marker, as a share of its side: detectors need about one cell of six.
@@ -32,12 +33,12 @@ def marker_sheet(objects: SceneObjects) -> str:
     }
     if not wanted:
         raise InvalidInputError("markers: the objects have none to print")
-    cells = _cell_count(objects)
+    cells = cells_of_markers(objects)
     places, height_mm = _places([marker.size_m for marker in wanted.values()])
     drawn = [
         part
         for ((name, _), marker), (x_mm, y_mm) in zip(wanted.items(), places, strict=True)
-        for part in _marker(objects, name, marker, x_mm, y_mm, cells)
+        for part in _marker(name, marker, x_mm, y_mm, cells[marker.id])
     ]
     width_mm = PAGE_MM[0]
     return "\n".join(
@@ -52,10 +53,20 @@ def marker_sheet(objects: SceneObjects) -> str:
     )
 
 
-def _cell_count(objects: SceneObjects) -> int:
-    """Cells of a marker along a side, the black border included."""
-    kind = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, objects.dictionary))
-    return int(kind.markerSize) + 2
+def marker_cells(dictionary: MarkerDictionary, marker_id: int) -> Bool[np.ndarray, "n n"]:
+    """Which cells of a marker are white, row by row from its upper left; the border is black."""
+    kind = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    return cv2.aruco.generateImageMarker(kind, marker_id, int(kind.markerSize) + 2) > 0
+
+
+def cells_of_markers(objects: SceneObjects) -> dict[int, Bool[np.ndarray, "n n"]]:
+    """`marker_cells` of every marker of the objects, by its id."""
+    return {
+        marker.id: marker_cells(objects.dictionary, marker.id)
+        for listed in objects.tasks.values()
+        for one in listed
+        for marker in one.markers
+    }
 
 
 def _places(sizes_m: list[float]) -> tuple[list[tuple[float, float]], float]:
@@ -80,11 +91,10 @@ def _places(sizes_m: list[float]) -> tuple[list[tuple[float, float]], float]:
 
 
 def _marker(
-    objects: SceneObjects, name: str, marker: ObjectMarker, x_mm: float, y_mm: float, cells: int
+    name: str, marker: ObjectMarker, x_mm: float, y_mm: float, is_white: Bool[np.ndarray, "n n"]
 ) -> Iterator[str]:
     side_mm = 1e3 * marker.size_m
-    cell_mm, margin_mm = side_mm / cells, side_mm * _MARGIN
-    kind = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, objects.dictionary))
+    cell_mm, margin_mm = side_mm / len(is_white), side_mm * _MARGIN
     whole_mm = side_mm + 2 * margin_mm
     yield (
         f'<rect x="{x_mm - margin_mm:.3f}" y="{y_mm - margin_mm:.3f}" width="{whole_mm:.3f}" '
@@ -92,8 +102,7 @@ def _marker(
         'stroke-dasharray="1 1"/>'
     )
     yield f'<rect x="{x_mm:.3f}" y="{y_mm:.3f}" width="{side_mm:.3f}" height="{side_mm:.3f}"/>'
-    picture = cv2.aruco.generateImageMarker(kind, marker.id, cells)
-    for row, column in np.argwhere(picture > 0).tolist():
+    for row, column in np.argwhere(is_white).tolist():
         yield (
             f'<rect x="{x_mm + column * cell_mm:.3f}" y="{y_mm + row * cell_mm:.3f}" '
             f'width="{cell_mm:.3f}" height="{cell_mm:.3f}" fill="white"/>'

@@ -36,6 +36,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, DeviceError, InvalidInputError, UnknownNameError
 from dextouch.schemas import RolloutStart, SceneObjects
 from dextouch.serving import configure_logging
+from services.alignment.marker_sheet import cells_of_markers
 from services.evaluation.policies.asking import action_chunk, ask
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.progress import Progress
@@ -169,7 +170,7 @@ def marked_stage(task: str, domain: Domain) -> tuple[Stage, SceneObjects]:
     objects = marked_objects(
         task, scene.object_names, object_boxes_m(scene), scene.bodies.are_fixed
     )
-    stage.rig.markers = Markers(objects)
+    stage.rig.markers = Markers(objects, cells_of_markers(objects))
     return stage, objects
 
 

@@ -3,11 +3,10 @@
 Every object has one on each side of its bounding box. They touch nothing: hands pass through them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
@@ -20,7 +19,6 @@ _SIZES_M: Final = (0.030, 0.055)
 # The white margin around it, as a share of its side on either side.
 _MARGIN: Final = 0.15
 _ABOVE_M: Final = 0.002
-_CELLS: Final = 6
 # Sub-pixels along each axis of a pixel.
 _FINE: Final = 3
 _WHITE, _BLACK = 0.95, 0.05
@@ -76,23 +74,27 @@ class _Print:
     object_index: int
     T_object_marker: Float64[np.ndarray, "4 4"]
     size_m: float
-    cells: Float64[np.ndarray, "6 6"]
+    cells: Float64[np.ndarray, "n n"]
 
 
 class Markers:
-    """The markers of a scene, drawn into images that show the scene without them."""
+    """The markers of a scene, drawn into images that show the scene without them.
 
-    def __init__(self, objects: SceneObjects) -> None:
+    Args:
+        objects: of one task.
+        is_white: cells of every marker, row by row from its upper left, by its id.
+    """
+
+    def __init__(
+        self, objects: SceneObjects, is_white: Mapping[int, Bool[np.ndarray, "n n"]]
+    ) -> None:
         (listed,) = objects.tasks.values()
-        kind = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, objects.dictionary))
         self._prints = [
             _Print(
                 index,
                 transform_from_pose(np.array(marker.pose)),
                 marker.size_m,
-                np.where(
-                    cv2.aruco.generateImageMarker(kind, marker.id, _CELLS) > 0, _WHITE, _BLACK
-                ),
+                np.where(is_white[marker.id], _WHITE, _BLACK),
             )
             for index, one in enumerate(listed)
             for marker in one.markers
@@ -152,10 +154,11 @@ def _draw(
 
 
 def _brightness(one: _Print, x: np.ndarray, y: np.ndarray) -> Float64[np.ndarray, "h w"]:
-    column = np.floor((x / one.size_m + 0.5) * _CELLS).astype(int)
-    row = np.floor((0.5 - y / one.size_m) * _CELLS).astype(int)
-    inside = (column >= 0) & (column < _CELLS) & (row >= 0) & (row < _CELLS)
-    last = _CELLS - 1
+    num_cells = len(one.cells)
+    column = np.floor((x / one.size_m + 0.5) * num_cells).astype(int)
+    row = np.floor((0.5 - y / one.size_m) * num_cells).astype(int)
+    inside = (column >= 0) & (column < num_cells) & (row >= 0) & (row < num_cells)
+    last = num_cells - 1
     return np.where(inside, one.cells[row.clip(0, last), column.clip(0, last)], _WHITE)
 
 

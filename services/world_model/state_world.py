@@ -103,6 +103,7 @@ class StateWorld:
             chunk_multiple=STEPS_PER_LATENT,
             max_chunk_steps=MAX_CHUNK_STEPS,
             object_names=self._metadata.object_names,
+            scales_images=True,
         )
 
     @property

@@ -6,7 +6,7 @@ An object has samples only where it was seen, so that gaps show where it was not
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -17,7 +17,6 @@ from dextouch.geometry import pose_from_transform, transform, transform_from_pos
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import SceneObject, SceneObjects
 from dextouch.streams import StreamDescriptor
-from services.alignment.marker_poses import CameraLens, MarkerTracker, TrackedObject
 from services.alignment.synchronization.progress import OnProgress, progress_within
 from services.alignment.synchronization.recorded_streams import (
     Block,
@@ -30,6 +29,9 @@ from services.alignment.synchronization.resampling import (
     poses_on_grid,
     stream_gap_ns,
 )
+
+if TYPE_CHECKING:
+    from services.alignment.marker_poses import TrackedObject
 
 CAMERA: Final = "camera_head"
 # Images that are decoded at once.
@@ -92,9 +94,11 @@ def marker_streams(
     listed = [one for one in _listed(objects) if one.markers]
     if objects is None or not listed:
         return []
+    from services.alignment.marker_poses import CameraLens, MarkerTracker
+
     camera = streams[CAMERA]
     period_ns = camera.descriptor.period_ns()
-    tracker = MarkerTracker(listed, objects.dictionary, _lens(recording))
+    tracker = MarkerTracker(listed, objects.dictionary, CameraLens(*_lens(recording)))
     wanted = np.flatnonzero(
         (camera.t_ns >= inside_ns[0] - period_ns) & (camera.t_ns <= inside_ns[1] + period_ns)
     )
@@ -122,10 +126,11 @@ def _listed(objects: SceneObjects | None) -> tuple[SceneObject, ...]:
     return () if objects is None else next(iter(objects.tasks.values()))
 
 
-def _lens(recording: RecordingReader) -> CameraLens:
+def _lens(recording: RecordingReader) -> tuple[np.ndarray, np.ndarray]:
+    """K and distortion of the head camera."""
     calibration = recording.attributes.calibration
     distortion = calibration.get("distortion_head", ((0.0,) * 5,))
-    return CameraLens(np.array(calibration["K_head"]), np.array(distortion[0]))
+    return np.array(calibration["K_head"]), np.array(distortion[0])
 
 
 def _camera_poses(
@@ -149,7 +154,7 @@ def _camera_poses(
 
 def _stream(
     one: SceneObject,
-    tracked: TrackedObject,
+    tracked: "TrackedObject",
     rate_hz: float,
     image_ns: Int64[np.ndarray, " images"],
 ) -> EpisodeStream:

@@ -1,6 +1,7 @@
 """Schemas of rollouts without arrays: worlds, requests to start and fork, progress and doubt."""
 
 from collections.abc import Mapping
+from operator import not_
 from typing import Final, Literal
 
 from pydantic import Field, model_validator
@@ -30,6 +31,8 @@ class WorldDescription(FrozenModel):
 
     `object_names` lists, by task, the objects whose poses are in its observations; empty for a
     world without object poses. Touch is zero in observations of a world that does not predict it.
+    If it `scales_images`, those of a start may have another size: the middle square is scaled to
+    the world's size, and the rollout's `K_head` is of the scaled image.
     """
 
     name: str
@@ -47,6 +50,7 @@ class WorldDescription(FrozenModel):
     knows_success: bool = False
     object_names: dict[str, tuple[str, ...]] = Field(default={})
     predicts_touch: bool = Field(default=True, exclude_if=bool)
+    scales_images: bool = Field(default=False, exclude_if=not_)
 
 
 class WorldList(FrozenModel):

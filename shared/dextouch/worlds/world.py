@@ -186,7 +186,8 @@ def check_start(start: RolloutStart, description: WorldDescription) -> RolloutSt
     images = start.observation.images
     wanted = {camera: images[camera] for camera in description.cameras if camera in images}
     observation = replace(start.observation, images=wanted)
-    _check_fits(observation, description, description.cameras, where="start")
+    size_px = None if description.scales_images else _size_px(description)
+    _check_fits(observation, size_px, description.cameras, where="start")
     return replace(start, observation=observation)
 
 
@@ -246,14 +247,14 @@ def check_answer(
             f"{num_steps} from {first_step}"
         )
     try:
-        _check_fits(observation, description, cameras, where=where)
+        _check_fits(observation, _size_px(description), cameras, where=where)
     except (ShapeError, DegenerateRotationError) as error:
         raise DexTouchError(error.message) from error
 
 
 def _check_fits(
     observation: Observation,
-    description: WorldDescription,
+    size_px: tuple[int, int] | None,
     cameras: tuple[str, ...],
     *,
     where: str,
@@ -263,9 +264,13 @@ def _check_fits(
         raise ShapeError(
             f"{where}: got images of {sorted(observation.images)}, expected of {sorted(cameras)}"
         )
-    expected = (description.image_height_px, description.image_width_px)
     for camera, images in observation.images.items():
-        if images.shape[1:3] != expected:
+        if size_px is not None and images.shape[1:3] != size_px:
             raise ShapeError(
-                f"{where}: images of {camera} are {images.shape[1:3]} px, expected {expected}"
+                f"{where}: images of {camera} are {images.shape[1:3]} px, expected {size_px}"
             )
+
+
+def _size_px(description: WorldDescription) -> tuple[int, int]:
+    """Height and width of a world's images."""
+    return description.image_height_px, description.image_width_px

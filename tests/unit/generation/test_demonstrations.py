@@ -7,7 +7,7 @@ import pytest
 
 from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError
+from dextouch.images import scaled_square
 from dextouch.schemas import EVERYTHING, Doubt
 from dextouch.worlds import CopyFirstWorld, SteppedRollout, WorldServiceSettings, create_world_app
 from services.cli.servers import served
@@ -121,6 +121,37 @@ def test_endings_of_a_true_episode_are_those_of_the_twin(sources):
     np.testing.assert_allclose(episode.final.object_poses[-1], truth, atol=1e-6)
 
 
-def test_an_episode_without_commands_is_refused(sources, client, tmp_path):
-    with pytest.raises(InvalidInputError, match="commanded"):
-        imagine_episode(sources[1], client, "copy-first", EpisodeStore(tmp_path))
+def test_an_episode_without_commands_replays_what_was_reached(sources, client, tmp_path):
+    source = sources[1]
+    assert "action_commanded" not in source.streams
+    imagined = EpisodeStore(tmp_path).open(
+        imagine_episode(source, client, "copy-first", EpisodeStore(tmp_path))
+    )
+    replayed = imagined.read("action_commanded").values
+    np.testing.assert_allclose(replayed, source.read("action").values, atol=1e-9)
+
+
+class _SmallWorld(CopyFirstWorld):
+    """Sees half of every side of its first image."""
+
+    @property
+    def description(self):
+        small = {"image_height_px": 32, "image_width_px": 32, "scales_images": True}
+        return super().description.model_copy(update=small)
+
+    def reset(self, start):
+        seen = start.observation
+        images, K_head = scaled_square(seen.images["camera_head"], start.K_head, 32)
+        small = replace(seen, images={"camera_head": images})
+        return super().reset(replace(start, observation=small, K_head=K_head))
+
+
+def test_images_and_camera_are_those_that_the_world_shows(sources, tmp_path):
+    app = create_world_app({"small": _SmallWorld(tasks=("stack_bowls",))}, WorldServiceSettings())
+    store = EpisodeStore(tmp_path)
+    with served({"worlds": app}) as urls, RolloutClient(urls["worlds"]) as client:
+        imagined = store.open(imagine_episode(sources[0], client, "small", store))
+    window = imagined.window(0, imagined.num_steps)
+    assert window.images["camera_head"].shape == (81, 32, 32, 3)
+    expected = scaled_square(np.zeros((1, 64, 64, 3), np.uint8), sources[0].window(0).K_head, 32)
+    np.testing.assert_allclose(window.K_head, expected[1])

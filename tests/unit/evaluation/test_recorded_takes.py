@@ -1,0 +1,136 @@
+"""Policies scored from recorded first observations, with the trust that replays earn."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from dextouch.clients.rollouts import RolloutClient
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.worlds import WorldServiceSettings, create_world_app
+from services.evaluation.policies.hold import HoldPolicy
+from services.evaluation.recorded_takes import REPLAY, read_takes, score_lines, score_recorded
+from services.evaluation.starts import start_digest
+from services.evaluation.study_worlds import WorldAddress
+from services.evaluation.success_probe import SuccessProbe
+from tests.unit.evaluation import toy, toy_store
+from tests.unit.worlds.running import served
+
+SEEDS = range(3000, 3012)
+
+
+class Remembering(toy.ToyWorld):
+    """Knows the target of every first observation, as a world that saw the image would."""
+
+    def __init__(self, name, targets, **options):
+        super().__init__(name, judge=False, **options)
+        self.targets = targets
+
+    def reset(self, start):
+        seen = start.observation
+        target = self.targets[start_digest(seen.images["camera_head"][0], seen.tactile_kpa[0])]
+        return dataclasses.replace(super().reset(start), state=toy.ToyState(target, 0, seen))
+
+
+@pytest.fixture(scope="module")
+def items():
+    """Half of the takes miss."""
+    return [toy.demonstration("reach", s, noise_m=0.0 if s % 2 else 0.09) for s in SEEDS]
+
+
+@pytest.fixture(scope="module")
+def store(items, tmp_path_factory):
+    store = EpisodeStore(tmp_path_factory.mktemp("takes"))
+    for item in items:
+        toy_store.write(store, item, seed=None, origin="recorded")
+    unknown = dataclasses.replace(items[0], episode_id="unknown", success=None)
+    toy_store.write(store, unknown, seed=None, origin="recorded")
+    toy_store.write(store, dataclasses.replace(items[1], episode_id="dreamt"), origin="imagined")
+    return store
+
+
+@pytest.fixture(scope="module")
+def client(items):
+    targets = {item.start_digest: toy.target_m(item.task, item.seed) for item in items}
+    worlds = {
+        "right": Remembering("right", targets),
+        "wrong": Remembering("wrong", targets, drift_m=0.06),
+    }
+    with served(create_world_app(worlds, WorldServiceSettings())) as url, RolloutClient(url) as it:
+        yield it
+
+
+@pytest.fixture(scope="module")
+def probe(trained_probe):
+    return SuccessProbe(trained_probe)
+
+
+def scored(store, client, probe, world, **options):
+    takes = read_takes([store])
+    (description,) = [one for one in client.worlds() if one.name == world]
+    address = WorldAddress(client, world)
+    return score_recorded(takes, {"hold": HoldPolicy()}, address, description, probe, **options)
+
+
+def test_takes_are_true_episodes_of_known_outcome(store, items):
+    takes = read_takes([store])
+    assert {take.episode_id for take in takes} == {item.episode_id for item in items}
+    by_id = {item.episode_id: item for item in items}
+    for take in takes:
+        item = by_id[take.episode_id]
+        assert take.success == item.success
+        np.testing.assert_allclose(take.actions, item.commanded[1:])
+    assert len(read_takes([store], most=4)) == 4
+    with pytest.raises(NotFoundError, match="known outcome"):
+        read_takes([store], tasks=["stir"])
+
+
+def test_a_right_world_earns_trust_and_a_wrong_one_does_not(store, client, probe, items):
+    right, wrong = (scored(store, client, probe, name) for name in ("right", "wrong"))
+    trusted, distrusted = right.trust("reach"), wrong.trust("reach")
+    assert trusted["takes"] == len(SEEDS)
+    assert trusted["real"] == np.mean([item.success for item in items])
+    assert trusted["auc"] > 0.95
+    assert trusted["auc_interval"][0] > 0.7
+    assert trusted["wrong"] < 0.15
+    assert distrusted["auc"] < 0.8
+    row = right.policy_row("hold", "reach")
+    assert row["rollouts"] == len(SEEDS)
+    assert row["imagined"] < 0.3
+    text = "\n".join(score_lines(right))
+    assert "reach" in text
+    assert "hold" in text
+    report = right.to_report()
+    assert len(report["rollouts"]) == 2 * len(SEEDS)
+    assert {one["policy"] for one in report["rollouts"]} == {REPLAY, "hold"}
+
+
+def test_with_few_takes_no_area_is_given(store, client, probe):
+    takes = read_takes([store], most=6)
+    (description,) = [one for one in client.worlds() if one.name == "right"]
+    few = score_recorded(takes, {}, WorldAddress(client, "right"), description, probe)
+    assert "auc" not in few.trust("reach")
+    assert "too few takes" in "\n".join(score_lines(few))
+
+
+def test_takes_that_were_trained_on_are_refused(store, client, probe):
+    first = read_takes([store])[0]
+    with pytest.raises(ConflictError, match="my policy"):
+        scored(store, client, probe, "right", trained_on={"my policy": [first.start.digest]})
+
+
+def test_tasks_and_images_must_fit_world_and_judge(store, client, probe):
+    takes = read_takes([store])
+    (description,) = [one for one in client.worlds() if one.name == "right"]
+    address = WorldAddress(client, "right")
+    other = description.model_copy(update={"tasks": ("stir",)})
+    with pytest.raises(InvalidInputError, match="'reach' is not one of the world"):
+        score_recorded(takes, {}, address, other, probe)
+    larger = description.model_copy(update={"image_height_px": 64})
+    with pytest.raises(InvalidInputError, match="images of 64 px"):
+        score_recorded(takes, {}, address, larger, probe)
+    short = [dataclasses.replace(takes[0], actions=takes[0].actions[:1])]
+    multiple = description.model_copy(update={"chunk_multiple": 4})
+    with pytest.raises(InvalidInputError, match="at least the 4"):
+        score_recorded(short, {}, address, multiple, probe)
