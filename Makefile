@@ -14,7 +14,7 @@ SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
 SCREENS ?= build/screens
-.PHONY: demo test check slow browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
+.PHONY: demo test check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -43,6 +43,9 @@ screens: $(VENV)/.dev    ## pictures of every screen of the dashboard in build/s
 
 slow: $(VENV)/.dev       ## the long tests
 	$(BIN)/python -m pytest -q -m slow
+
+from-recordings: $(VENV)/.dev   ## a lab's way without a simulation: record, train world model, judge and policy, score; docs/tutorials/from_recordings.md
+	$(BIN)/python -m pytest -q -s -m slow tests/integration/test_from_recordings.py
 
 browser: $(VENV)/.dev    ## all tests of the pages, in Chromium; apt-get install chromium
 	$(BIN)/python -m pytest -q -m "slow or not slow" tests/browser $(ARGS)

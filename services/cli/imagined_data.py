@@ -33,12 +33,14 @@ WORLD = "world_model"
 def chosen_episodes(
     store: EpisodeStore, tasks: Collection[str] | None, seeds: range | None
 ) -> list[str]:
-    """Ids of the episodes of these tasks and seeds; None takes all."""
+    """Ids of the robot episodes of these tasks and seeds; None takes all."""
     about = {episode_id: store.open(episode_id).attributes for episode_id in store.list()}
     return [
         episode_id
         for episode_id, one in about.items()
-        if (tasks is None or one.task in tasks) and (seeds is None or one.seed in seeds)
+        if one.domain == "robot"
+        and (tasks is None or one.task in tasks)
+        and (seeds is None or one.seed in seeds)
     ]
 
 

@@ -10,7 +10,14 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.policies.hold import HoldPolicy
-from services.evaluation.recorded_takes import REPLAY, read_takes, score_lines, score_recorded
+from services.evaluation.recorded_takes import (
+    REPLAY,
+    RecordedScores,
+    read_takes,
+    score_lines,
+    score_recorded,
+)
+from services.evaluation.scores import RolloutScore
 from services.evaluation.starts import start_digest
 from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_probe import SuccessProbe
@@ -104,6 +111,21 @@ def test_a_right_world_earns_trust_and_a_wrong_one_does_not(store, client, probe
     report = right.to_report()
     assert len(report["rollouts"]) == 2 * len(SEEDS)
     assert {one["policy"] for one in report["rollouts"]} == {REPLAY, "hold"}
+
+
+def test_undecided_replays_count_in_the_area_alone(store):
+    takes = tuple(read_takes([store]))
+    outcomes = tuple(
+        RolloutScore(
+            "imagined", REPLAY, "reach", take.start.seed, take.start.digest,
+            success=take.success if index % 3 else not take.success,
+            probability=0.9 if take.success else 0.1,
+            cannot_tell=None if index % 3 else "vague",
+        )
+        for index, take in enumerate(takes)
+    )  # fmt: skip
+    found = RecordedScores(takes, outcomes, ()).trust("reach")
+    assert (found["takes"], found["decided"], found["wrong"], found["auc"]) == (12, 8, 0.0, 1.0)
 
 
 def test_with_few_takes_no_area_is_given(store, client, probe):
