@@ -122,6 +122,8 @@ class JobRunner:
             LimitExceededError: too many are waiting.
         """
         options = request.options or self._options
+        if options.objects is None:
+            options = options.model_copy(update={"objects": self._options.objects})
         ids = await asyncio.to_thread(check_recordings, self._store, request.wanted, options)
         jobs = [
             AlignmentJob.new(alignment_id, recording_id, options)

@@ -26,7 +26,7 @@ def marker_sheet(objects: SceneObjects) -> str:
         InvalidInputError: there is no marker, or one is larger than the page.
     """
     wanted = {
-        (one.name, marker.id): marker
+        (one.name, marker.id, marker.size_m): marker
         for listed in objects.tasks.values()
         for one in listed
         for marker in one.markers
@@ -37,7 +37,7 @@ def marker_sheet(objects: SceneObjects) -> str:
     places, height_mm = _places([marker.size_m for marker in wanted.values()])
     drawn = [
         part
-        for ((name, _), marker), (x_mm, y_mm) in zip(wanted.items(), places, strict=True)
+        for ((name, *_), marker), (x_mm, y_mm) in zip(wanted.items(), places, strict=True)
         for part in _marker(name, marker, x_mm, y_mm, cells[marker.id])
     ]
     width_mm = PAGE_MM[0]

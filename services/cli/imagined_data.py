@@ -22,7 +22,7 @@ from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli.servers import served
 from services.cli.training_data import comma_separated, in_processes
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
-from services.generation.demonstrations import imagine_episode
+from services.generation.demonstrations import SHORT_CHUNK_STEPS, imagine_episode, whole_steps
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
@@ -78,7 +78,8 @@ def imagine_all(
 
 def judged_steps(episode: EpisodeReader) -> set[int]:
     """Steps of an episode whose images the success probe uses."""
-    scene, last = scene_of(episode.attributes), episode.num_steps - 1
+    scene = scene_of(episode.attributes)
+    last = whole_steps(episode.num_steps, SHORT_CHUNK_STEPS) - 1
     ends = (early_step(scene, last), middle_step(scene, last), last - 1, last)
     return {step for end in ends for step in range(end - NUM_SEEN_STEPS + 1, end + 1)}
 

@@ -51,10 +51,14 @@ def run_train_policy(arguments: list[str]) -> int:
     """Train the cloned policy and save it, optionally with an early checkpoint."""
     settings = load_settings(TrainPolicySettings, arguments)
     stores = [EpisodeStore(url) for url in settings.episodes]
-    episodes = read_cloning_episodes(*stores, tasks=settings.tasks, splits=settings.splits)
+    episodes = read_cloning_episodes(
+        *stores, tasks=settings.tasks, splits=settings.splits, image_px=settings.image_px
+    )
     if settings.imagined:
         generated = [EpisodeStore(url) for url in settings.imagined]
-        episodes += read_cloning_episodes(*generated, tasks=settings.tasks, origin="imagined")
+        episodes += read_cloning_episodes(
+            *generated, tasks=settings.tasks, image_px=settings.image_px, origin="imagined"
+        )
     trained = train_cloned_policy(
         episodes,
         settings.training,
@@ -74,7 +78,9 @@ def run_train_probe(arguments: list[str]) -> int:
         stores = [EpisodeStore(url) for url in urls]
         if not stores:
             return []
-        return read_ending_episodes(*stores, tasks=settings.tasks, splits=settings.splits)
+        return read_ending_episodes(
+            *stores, tasks=settings.tasks, splits=settings.splits, image_px=settings.image_px
+        )
 
     if settings.base is not None:
         if settings.held_out:

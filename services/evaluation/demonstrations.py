@@ -4,8 +4,6 @@ from collections.abc import Iterable
 from typing import Protocol, runtime_checkable
 
 CAMERA = "camera_head"
-# Networks of this service see no larger images; others are cut to their middle square and scaled.
-MAX_IMAGE_PX = 64
 
 
 @runtime_checkable

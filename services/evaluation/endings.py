@@ -20,9 +20,10 @@ from dextouch.episodes import (
 from dextouch.errors import InvalidInputError
 from dextouch.images import scaled_square
 from dextouch.schemas import Observation, RolloutDoubt, is_rollout, rollout_doubt
-from services.evaluation.demonstrations import CAMERA, MAX_IMAGE_PX
+from services.evaluation.demonstrations import CAMERA
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
+from services.networks.training_settings import USUAL_IMAGE_PX
 
 NUM_SEEN_STEPS: Final = 3
 # Share of an object's usual size. Start readers err by 4 to 7 % (`python -m benchmarks starts`).
@@ -172,8 +173,12 @@ class EndingEpisode:
         return [times.get(name, np.inf) <= now_s for name in milestones]
 
 
-def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:
+def read_ending_episode(reader: EpisodeReader, *, image_px: int = USUAL_IMAGE_PX) -> EndingEpisode:
     """Endings of one stored robot episode; only the steps shown are decoded.
+
+    Args:
+        reader: the episode.
+        image_px: side that the middle square of larger images is scaled to.
 
     Raises:
         InvalidInputError: the episode has no outcome, or too few steps.
@@ -203,7 +208,7 @@ def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:
         1 / about.model_rate_hz,
     )
     steps = (episode.early_step, episode.middle_step, last - 1, last)
-    endings = {step: _read_ending(reader, step) for step in steps}
+    endings = {step: _read_ending(reader, step, image_px) for step in steps}
     endings[last] = endings[last].with_doubt(RolloutDoubt.from_quality(about.quality))
     return EndingEpisode(**{**vars(episode), "endings": endings})
 
@@ -215,14 +220,14 @@ def _event_times(
     return times if times or not unknown_if_empty else None
 
 
-def _read_ending(reader: EpisodeReader, end: int) -> Ending:
+def _read_ending(reader: EpisodeReader, end: int, image_px: int) -> Ending:
     start = end - NUM_SEEN_STEPS + 1
     window = reader.window(start, num_steps=NUM_SEEN_STEPS, cameras=(CAMERA,))
     half_step_ns = 5e8 / reader.attributes.model_rate_hz
     # Where these steps were not rendered, the nearest images belong to other steps.
     are_near = bool((np.abs(window.image_dt_ns[CAMERA]) <= half_step_ns).all())
     images = window.images[CAMERA]
-    side_px = min(MAX_IMAGE_PX, *images.shape[1:3])
+    side_px = min(image_px, *images.shape[1:3])
     return Ending(
         scaled_square(images, window.K_head, side_px)[0] if are_near else None,
         window.tactile_kpa,
@@ -245,7 +250,10 @@ def _object_poses(
 
 
 def read_ending_episodes(
-    *stores: EpisodeStore, tasks: Sequence[str] = (), splits: Collection[Split] = ()
+    *stores: EpisodeStore,
+    tasks: Sequence[str] = (),
+    splits: Collection[Split] = (),
+    image_px: int = USUAL_IMAGE_PX,
 ) -> list[EndingEpisode]:
     """Read all robot episodes of some stores with their endings.
 
@@ -253,13 +261,14 @@ def read_ending_episodes(
         stores: stores to read; true and imagined episodes may be mixed.
         tasks: tasks to read; empty for all.
         splits: splits of their scenes; empty for all.
+        image_px: side that the middle square of larger images is scaled to.
 
     Raises:
         NotFoundError: no such episode, or an empty store.
         ConflictError: two stores hold an episode of the same id.
     """
     readers = robot_episodes(stores, tasks=tasks, wanted=lambda about: is_in(about, splits))
-    return [read_ending_episode(reader) for reader in readers]
+    return [read_ending_episode(reader, image_px=image_px) for reader in readers]
 
 
 def milestones_of(episodes: Iterable[EndingEpisode]) -> dict[str, tuple[str, ...]]:

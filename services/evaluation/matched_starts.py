@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from dextouch.clients import PolicyStart
 from dextouch.errors import DexTouchError
 from dextouch.hands.actions import AnchorPoses
-from dextouch.schemas import Observation
+from dextouch.schemas import ActionKind, Observation
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.scores import RolloutFailure
 from services.evaluation.starts import start_digest
@@ -17,7 +17,10 @@ from services.evaluation.study_worlds import WorldAddress
 
 @dataclass(frozen=True)
 class MatchedStart:
-    """A first observation of the real world from which every rollout starts."""
+    """A first observation of the real world from which every rollout starts.
+
+    `action_kind` is that of the actions that imagined worlds are sent.
+    """
 
     task: str
     seed: int
@@ -25,6 +28,7 @@ class MatchedStart:
     observation: Observation
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"]
+    action_kind: ActionKind = "commanded"
 
     @property
     def digest(self) -> str:

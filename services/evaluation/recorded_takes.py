@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from dextouch.clients import Policy
 from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in
 from dextouch.errors import InvalidInputError
+from dextouch.images import scaled_square
 from dextouch.schemas import Observation, WorldDescription
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.matched_starts import MatchedStart
@@ -23,10 +24,11 @@ from services.evaluation.progress import Progress
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.rollout_runner import RolloutRunner
 from services.evaluation.scores import Outcome, RolloutFailure, RolloutScore
-from services.evaluation.starts import refuse_training_starts
+from services.evaluation.starts import refuse_training_starts, start_digest
 from services.evaluation.statistics import area_under_roc, wilson_interval
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_probe import SuccessProbe
+from services.networks.training_settings import USUAL_IMAGE_PX
 
 IMAGINED: Final = "imagined"
 # Name of the replayed actions among the policies.
@@ -93,8 +95,17 @@ def _read_take(reader: EpisodeReader, *, number: int) -> RecordedTake:
         action_reached=window.actions,
         reached_is_measured=True,
     )
-    start = MatchedStart(about.task, number, about.instruction, first, window.anchor, window.K_head)
-    name = "action_commanded" if "action_commanded" in reader.streams else "action"
+    is_commanded = "action_commanded" in reader.streams
+    start = MatchedStart(
+        about.task,
+        number,
+        about.instruction,
+        first,
+        window.anchor,
+        window.K_head,
+        "commanded" if is_commanded else "measured",
+    )
+    name = "action_commanded" if is_commanded else "action"
     actions = reader.read(name).values.astype(np.float64)[1:]
     return RecordedTake(about.episode_id, start, bool(about.success), actions)
 
@@ -198,7 +209,7 @@ def score_recorded(
         InvalidInputError: a task that the world or the judge does not know, images of another size
             than the judge's, or a take that is shorter than a chunk.
     """
-    digests = [take.start.digest for take in takes]
+    digests = [digest for take in takes for digest in _digests(take.start)]
     judged = {"the success probe": probe.metadata.training_starts}
     for what, trained in {**judged, **(trained_on or {})}.items():
         refuse_training_starts(digests, trained_on=trained, what=what)
@@ -236,6 +247,18 @@ def score_recorded(
                 failed = sum(isinstance(one, RolloutFailure) for one in outcomes)
                 progress.advance(failed=float(failed))
     return RecordedScores(tuple(takes), tuple(outcomes), tuple(policies))
+
+
+def _digests(start: MatchedStart) -> tuple[str, ...]:
+    """Digests of a start: as recorded, and as a world that saw it shows it, which may be imagined.
+
+    Such worlds scale the image and take no negative pressure.
+    """
+    touch = start.observation.tactile_kpa[0]
+    images = start.observation.images[CAMERA]
+    side_px = min(USUAL_IMAGE_PX, *images.shape[1:3])
+    small = scaled_square(images, start.K_head, side_px)[0][0]
+    return start.digest, start_digest(small, np.maximum(touch, 0.0))
 
 
 def _auc_interval(probability: np.ndarray, real: np.ndarray) -> list[float]:

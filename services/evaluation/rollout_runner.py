@@ -1,7 +1,7 @@
 """One rollout of a policy in a world from a matched start, and its score."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -141,6 +141,7 @@ class RolloutRunner:
             seed=start.seed if is_real else (start.seed + repeat * _REPEAT_STRIDE) % MAX_SEED,
             instruction=start.instruction,
             init=None if is_real else (start.observation, start.anchor, start.K_head),
+            action_kind=start.action_kind,
         )
         if is_real and first_digest(rollout.observation) != start.digest:
             rollout.close()
@@ -159,7 +160,9 @@ class RolloutRunner:
         with self._begin(start, policy, world, repeat) as rollout:
             seen = [rollout.observation]
             commanded = [rollout.observation.action_reached[-1:]]
-            ask(actor.reset, start.for_policy(), where=f"{where}: reset")
+            # The world's images may be smaller than that of the start.
+            given = replace(start.for_policy(), K_head=rollout.K_head)
+            ask(actor.reset, given, where=f"{where}: reset")
             while (left := self.num_steps - rollout.info.last_step) > 0:
                 acting = f"{where}, chunk {rollout.info.next_chunk}: act"
                 answer = ask(actor.act, rollout.observation, where=acting)

@@ -11,7 +11,7 @@ from dextouch.command_line import JSON_HELP
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import CommandSettings, service_config
 from services.evaluation.training_settings import CloningSettings, DirectSettings, ProbeSettings
-from services.networks.training_settings import Splits, Stores, Tasks
+from services.networks.training_settings import USUAL_IMAGE_PX, ImagePx, Splits, Stores, Tasks
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 DEFAULT_POLICY = PRETRAINED / "behaviour_cloning.safetensors"
@@ -36,6 +36,7 @@ class TrainPolicySettings(CommandSettings):
     )
     tasks: Tasks = ()
     splits: Splits = ()
+    image_px: ImagePx = USUAL_IMAGE_PX
     imagined: tuple[str, ...] = Field(
         default=(), description="additional stores of imagined episodes; --splits does not apply"
     )
@@ -84,6 +85,7 @@ class TrainProbeSettings(CommandSettings):
     )
     tasks: Tasks = ()
     splits: Splits = ()
+    image_px: ImagePx = USUAL_IMAGE_PX
     jobs: int = Field(default=2, ge=1, le=64, description="tasks trained in parallel")
     training: ProbeSettings = Field(default=ProbeSettings(), description="training settings")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)

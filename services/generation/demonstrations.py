@@ -9,11 +9,13 @@ from jaxtyping import Float64
 
 from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeReader, EpisodeStore, write_rollout
+from dextouch.errors import UnknownNameError
 from dextouch.schemas import (
     ActionKind,
     LineageEntry,
     Observation,
     ReturnSelector,
+    WorldDescription,
     matrix_rows,
     rollout_doubt,
 )
@@ -34,7 +36,8 @@ def imagine_episode(
     """Replay an episode's actions in an imagined world and store the result.
 
     The imagined episode starts from the source's first observation, as the world sees it: its
-    images have the world's size. Actions are the commanded ones, or those that were reached if the
+    images have the world's size. Of its steps, what is left over of a chunk of the world at the end
+    is cut off. Actions are the commanded ones, or those that were reached if the
     robot keeps no commands. Its `success` is that of the
     *source*: the real outcome of the actions, and the label for training a success probe on
     imagined endings. Its lineage names the source and the world's digest. Object poses, if the
@@ -56,16 +59,18 @@ def imagine_episode(
     Raises:
         UnknownNameError: no such world, or a source without head camera.
     """
-    digests = {description.name: description.digest for description in client.worlds()}
-    attributes = source.attributes
-    name = imagined_id(attributes.episode_id, digests.get(world, world))
+    described = {description.name: description for description in client.worlds()}
+    if world not in described:
+        raise UnknownNameError("world", world, list(described))
+    description, attributes = described[world], source.attributes
+    name = imagined_id(attributes.episode_id, description.digest)
     if store.exists(name):
         return name
-    seen, K_head, actions = _played(source, client, world, image_steps)
+    seen, K_head, actions = _played(source, client, description, image_steps)
     lineage = (
         *attributes.lineage,
         LineageEntry(kind="episode", id=attributes.episode_id, sha256=source.content_sha256),
-        LineageEntry(kind="checkpoint", id=world, sha256=_sha256(digests.get(world, ""))),
+        LineageEntry(kind="checkpoint", id=world, sha256=_sha256(description.digest)),
     )
     imagined = attributes.model_copy(
         update={
@@ -88,7 +93,7 @@ def imagine_episode(
 def _played(
     source: EpisodeReader,
     client: RolloutClient,
-    world: str,
+    world: WorldDescription,
     image_steps: Collection[int] | None,
 ) -> tuple[list[Observation], Float64[np.ndarray, "3 3"], Float64[np.ndarray, "steps 67"]]:
     """Observations of the world for an episode's actions, its camera, and these actions."""
@@ -99,6 +104,7 @@ def _played(
     if kind == "commanded":
         # Relative to the measured poses of step 0, as they were sent.
         actions = source.read("action_commanded").values
+    actions = actions[: whole_steps(len(actions), world.chunk_multiple)]
     reached = source.window(0, 1, cameras=()).actions
     first = Observation(
         first_step=0,
@@ -108,7 +114,7 @@ def _played(
         reached_is_measured=True,
     )
     with client.start(
-        world=world,
+        world=world.name,
         task=attributes.task,
         seed=attributes.seed or 0,
         instruction=attributes.instruction,
@@ -126,6 +132,11 @@ def _played(
             ),
         ]
         return seen, rollout.K_head, actions
+
+
+def whole_steps(num_steps: int, chunk_multiple: int) -> int:
+    """Steps of an episode, the first included, up to the end of its last whole chunk."""
+    return num_steps - (num_steps - 1) % chunk_multiple
 
 
 def _chunks(num_steps: int, image_steps: Collection[int] | None) -> list[tuple[int, int, bool]]:

@@ -21,6 +21,18 @@ MaxGradientNorm = Annotated[float, Field(gt=0, description="norm that gradients 
 AverageDecay = Annotated[float, Field(ge=0, lt=1, description="decay of the averaged weights")]
 ImageNoise = Annotated[float, Field(ge=0, description="noise on training images in 0 … 1")]
 Brightness = Annotated[float, Field(ge=0, description="brightness variation of training images")]
+# Side of the images that networks see, unless it is chosen otherwise.
+USUAL_IMAGE_PX = 64
+ImagePx = Annotated[
+    int,
+    Field(
+        ge=16,
+        le=256,
+        multiple_of=8,
+        description="side that the middle square of larger images is scaled to; the same for world "
+        "model, judge and policies",
+    ),
+]
 Device = Annotated[str, Field(description="device of the weights, such as cpu or cuda")]
 Stores = Annotated[
     tuple[str, ...], Field(min_length=1, description="stores (folder or file:// URL)")

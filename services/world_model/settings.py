@@ -15,10 +15,12 @@ from dextouch.frozen_model import FrozenModel
 from dextouch.serving import CommandSettings, file_source, service_config
 from dextouch.worlds import WorldServiceSettings
 from services.networks.training_settings import (
+    USUAL_IMAGE_PX,
     AverageDecay,
     Batch,
     CpuBudget,
     Device,
+    ImagePx,
     LearningRate,
     MaxGradientNorm,
     MaxSteps,
@@ -278,12 +280,7 @@ class StateTrainSettings(FrozenModel):
     num_members: int = Field(default=3, ge=1, le=16, description="members of the ensemble")
     heldout_share: float = Field(default=0.08, gt=0, lt=1, description="share of held-out scenes")
     jobs: int = Field(default=2, ge=1, le=64, description="members trained in parallel")
-    image_px: int = Field(
-        default=64,
-        ge=16,
-        le=256,
-        description="side that the middle square of larger images is scaled to",
-    )
+    image_px: ImagePx = USUAL_IMAGE_PX
     labelled_share: float = Field(
         default=1.0,
         gt=0,

@@ -2,10 +2,12 @@
 
 import json
 
+import cv2
 import pytest
 
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.schemas import load_scene_objects
+from dextouch.schemas.scene_objects import DICTIONARY_SIZES
 
 FLAT = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 
@@ -43,6 +45,7 @@ def test_a_file_gives_the_objects_of_each_task(tmp_path):
         (described(tracker_pose=FLAT), "one of them"),
         (described(markers=[{"id": 4, "size_m": 0.05, "pose": FLAT}] * 2), "different"),
         (described(colour="red"), "colour"),
+        (described(name="poses"), "choose another"),
     ],
 )
 def test_a_wrong_file_is_refused_with_the_place(tmp_path, content, says):
@@ -53,3 +56,22 @@ def test_a_wrong_file_is_refused_with_the_place(tmp_path, content, says):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(NotFoundError, match=r"nothing\.json"):
         load_scene_objects(tmp_path / "nothing.json")
+
+
+@pytest.mark.parametrize(
+    ("dictionary", "first_unknown"), [("DICT_4X4_50", 50), ("DICT_APRILTAG_16h5", 30)]
+)
+def test_ids_are_those_of_the_dictionary(tmp_path, dictionary, first_unknown):
+    def numbered(number):
+        marker = {"id": number, "size_m": 0.05, "pose": FLAT}
+        return {"dictionary": dictionary, **described(markers=[marker])}
+
+    assert load(tmp_path, numbered(first_unknown - 1))
+    with pytest.raises(InvalidInputError, match=f"0 … {first_unknown - 1}"):
+        load(tmp_path, numbered(first_unknown))
+
+
+def test_sizes_of_dictionaries_are_those_of_opencv():
+    for name, size in DICTIONARY_SIZES.items():
+        kind = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+        assert len(kind.bytesList) == size

@@ -20,6 +20,7 @@ from dextouch.streams import StreamDescriptor
 from services.alignment.synchronization.progress import OnProgress, progress_within
 from services.alignment.synchronization.recorded_streams import (
     Block,
+    Conversion,
     DatedStream,
     EpisodeStream,
     moved_poses,
@@ -67,9 +68,13 @@ def with_tracked_objects(
             )
         elif one.tracker_pose is not None:
             T = transform_from_pose(np.array(one.tracker_pose))
-            convert = partial(moved_poses, T_world_base=None, T_tracker_body=T)
+            convert = partial(_moved_on, first=stream.convert, T_tracker_object=T)
             changed[one.stream] = replace(stream, convert=convert)
     return changed
+
+
+def _moved_on(poses: np.ndarray, *, first: Conversion, T_tracker_object: np.ndarray) -> np.ndarray:
+    return moved_poses(first(poses), T_world_base=None, T_tracker_body=T_tracker_object)
 
 
 def marker_streams(

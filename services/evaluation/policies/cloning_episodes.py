@@ -12,10 +12,11 @@ from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, scene_o
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.images import scaled_square
-from services.evaluation.demonstrations import CAMERA, MAX_IMAGE_PX
+from services.evaluation.demonstrations import CAMERA
 from services.evaluation.policies.cloning_network import SLOT_STEPS
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
+from services.networks.training_settings import USUAL_IMAGE_PX
 
 # Training uses every such step; an evaluation with chunks of 16 decides at every second of them.
 DECISION_STRIDE: Final = SLOT_STEPS
@@ -35,7 +36,7 @@ class CloningEpisode:
 
     `commanded` are the measured ones where the episode has no commands. Both actions are relative
     to the measured poses of step 0, which are `anchor`. `moments` maps steps to observations and
-    includes step 0.
+    includes step 0. `start_digest` is that of the first observation as recorded.
     """
 
     episode_id: str
@@ -47,20 +48,22 @@ class CloningEpisode:
     moments: Mapping[int, Moment]
     measured: Float64[np.ndarray, "steps 67"]
     commanded: Float64[np.ndarray, "steps 67"]
+    start_digest: str
 
     @property
     def num_steps(self) -> int:
         """Steps of the model grid, including the first one."""
         return len(self.measured)
 
-    @property
-    def start_digest(self) -> str:
-        """Digest of the first observation."""
-        return start_digest(self.moments[0].image, self.moments[0].tactile_kpa)
 
-
-def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
+def read_cloning_episode(
+    reader: EpisodeReader, *, image_px: int = USUAL_IMAGE_PX
+) -> CloningEpisode:
     """Read one successful robot episode; only images at decision steps are decoded.
+
+    Args:
+        reader: the episode.
+        image_px: side that the middle square of larger images is scaled to.
 
     Raises:
         InvalidInputError: no image at a decision step.
@@ -76,9 +79,12 @@ def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
         )
     first = reader.window(0, num_steps=reader.num_steps, cameras=())
 
+    def images_of(step: int) -> UInt8[np.ndarray, "1 h w 3"]:
+        return reader.window(step, num_steps=1, cameras=(CAMERA,)).images[CAMERA]
+
     def seen(step: int) -> UInt8[np.ndarray, "h w 3"]:
-        images = reader.window(step, num_steps=1, cameras=(CAMERA,)).images[CAMERA]
-        side_px = min(MAX_IMAGE_PX, *images.shape[1:3])
+        images = images_of(step)
+        side_px = min(image_px, *images.shape[1:3])
         return scaled_square(images, first.K_head, side_px)[0][0]
 
     return CloningEpisode(
@@ -91,6 +97,7 @@ def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
         {step: Moment(seen(step), first.tactile_kpa[step].copy()) for step in wanted},
         first.actions,
         _commanded(reader, first.actions),
+        start_digest(images_of(0)[0], first.tactile_kpa[0]),
     )
 
 
@@ -107,6 +114,7 @@ def read_cloning_episodes(
     *stores: EpisodeStore,
     tasks: Sequence[str] = (),
     splits: Collection[Split] = (),
+    image_px: int = USUAL_IMAGE_PX,
     origin: Literal["true", "imagined"] = "true",
 ) -> list[CloningEpisode]:
     """Read the successful robot episodes of some stores, store by store in the order of ids.
@@ -115,6 +123,7 @@ def read_cloning_episodes(
         stores: stores to read.
         tasks: tasks to read; empty for all.
         splits: splits of the scenes; empty for all.
+        image_px: side that the middle square of larger images is scaled to.
         origin: whether true episodes are read or imagined ones, never both.
 
     Raises:
@@ -131,7 +140,7 @@ def read_cloning_episodes(
         ),
         what=f"{origin} robot episode that succeeded",
     )
-    return [read_cloning_episode(reader) for reader in readers]
+    return [read_cloning_episode(reader, image_px=image_px) for reader in readers]
 
 
 def cloning_hash(episodes: Sequence[CloningEpisode]) -> str:

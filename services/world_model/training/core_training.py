@@ -120,12 +120,14 @@ def start_steps(table: SceneTable) -> list[int]:
     return [step for step in table.image_steps if step in wanted]
 
 
-def _later_start(later: list[int], num_steps: int, rng: np.random.Generator) -> int:
+def _later_start(later: list[int], table: SceneTable, rng: np.random.Generator) -> int:
     """Random start, with a probability proportional to the root of the remaining length.
 
-    Starts near the end teach little about persistence, but rollouts begin there, too.
+    Starts near the end teach little about persistence, but rollouts begin there, too. Starts that
+    few episodes have are as much rarer.
     """
-    weight = np.sqrt([num_steps - 1 - step for step in later])
+    remaining = np.sqrt([table.num_steps - 1 - step for step in later])
+    weight = remaining * [len(table.starts_at(step)) for step in later]
     return int(rng.choice(later, p=weight / weight.sum()))
 
 
@@ -134,10 +136,10 @@ def _draw(
 ) -> _Batch:
     table = data.table
     is_first = rng.random() < settings.first_fraction
-    later = [step for step in start_steps(table) if step > 0]
-    start_step = 0 if is_first or not later else _later_start(later, table.num_steps, rng)
-    long_enough = table.longer_than(start_step)
-    rows = long_enough[torch.randint(len(long_enough), (settings.batch,), generator=generator)]
+    later = [step for step in start_steps(table) if step > 0 and len(table.starts_at(step))]
+    start_step = 0 if is_first or not later else _later_start(later, table, rng)
+    able = table.starts_at(start_step)
+    rows = able[torch.randint(len(able), (settings.batch,), generator=generator)]
 
     def chance(fraction: float) -> Bool[Tensor, " batch"]:
         return torch.rand(len(rows), generator=generator) < fraction

@@ -64,12 +64,17 @@ def train_reader(
     _fit_heights(reader, table, config)
     later = [step for step in table.image_steps if step % 4 == 0 and step > 0]
     known = torch.nonzero(table.labelled)[:, 0]
+    # Later steps of each episode, in their order; further ones have no image or lie behind its end.
+    reached = (torch.tensor(later) < table.length[:, None]) & table.shown[:, _places(table, later)]
+    counts = reached.sum(1)
+    order = torch.argsort(~reached, dim=1, stable=True)
 
     def loss() -> Tensor:
         rows = known[torch.randint(len(known), (settings.batch,), generator=generator)]
-        amid = torch.tensor(later)[torch.randint(len(later), rows.shape, generator=generator)]
+        drawn = torch.randint(len(later), rows.shape, generator=generator)
+        amid = torch.tensor(later)[order[rows, drawn % counts[rows].clamp_min(1)]]
         is_first = torch.rand(rows.shape, generator=generator) < settings.first_fraction
-        steps = torch.where(is_first | (amid >= table.length[rows]), 0, amid)
+        steps = torch.where(is_first | (counts[rows] == 0), 0, amid)
         return _loss(
             reader,
             (table, rows, steps),
@@ -78,6 +83,11 @@ def train_reader(
         )
 
     return train_averaged(reader, loss, settings, weight_decay=_WEIGHT_DECAY, on_step=on_step)
+
+
+def _places(table: SceneTable, steps: list[int]) -> list[int]:
+    """Indices of steps among those with images."""
+    return [table.image_steps.index(step) for step in steps]
 
 
 def _fit_heights(reader: StartReader, table: SceneTable, config: DynamicsConfig) -> None:

@@ -21,11 +21,12 @@ from dextouch.episodes import (
     is_in,
     is_rejected,
     object_track,
+    recording_of,
     scene_of,
 )
 from dextouch.errors import InvalidInputError
 from dextouch.images import scaled_square
-from dextouch.schemas import ActionKind
+from dextouch.schemas import ActionKind, EpisodeAttributes
 from services.world_model.starts import CAMERA
 
 logger = structlog.get_logger(__name__)
@@ -91,6 +92,7 @@ def load_scene_episodes(
     store = EpisodeStore(url)
     taken: list[SceneEpisode] = []
     skipped: Counter[str] = Counter()
+    recordings: dict[str, str] = {}
     for episode_id in sorted(store.list()):
         reader = store.open(episode_id)
         about = reader.attributes
@@ -98,6 +100,7 @@ def load_scene_episodes(
             continue
         reason = "rejected in review" if is_rejected(store, about) else _unfit(reader)
         if reason is None:
+            _check_aligned_once(about, recordings)
             taken.append(read_scene_episode(reader, image_px=image_px))
         else:
             skipped[reason] += 1
@@ -112,6 +115,19 @@ def load_scene_episodes(
     return taken
 
 
+def _check_aligned_once(about: EpisodeAttributes, recordings: dict[str, str]) -> None:
+    """Refuse a second episode of one recording, as another file of objects gives."""
+    recording = recording_of(about) if about.origin == "recorded" else None
+    if recording is None:
+        return
+    other = recordings.setdefault(recording, about.episode_id)
+    if other != about.episode_id:
+        raise InvalidInputError(
+            f"episodes {other!r} and {about.episode_id!r}: are of one recording, aligned with "
+            "different options; expected one; delete the other with `dextouch store delete`"
+        )
+
+
 def _unfit(reader: EpisodeReader) -> str | None:
     """Reason why an episode is not usable as ground truth, or None."""
     attributes = reader.attributes
@@ -124,6 +140,8 @@ def _unfit(reader: EpisodeReader) -> str | None:
     missing = {"action", "tactile_left", "tactile_right"} - set(reader.streams)
     if not has_object_poses(reader):
         missing.add("poses of the objects")
+    if not missing and CAMERA in reader.streams and 0 not in reader.shown_steps(CAMERA)[0]:
+        missing.add("an image of its first step")
     return f"without {', '.join(sorted(missing))}" if missing else None
 
 

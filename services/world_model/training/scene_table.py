@@ -56,9 +56,9 @@ class SceneTable:
 
     `length` is the number of an episode's own steps; `objects_known` are the steps at which the
     pose of an object is known, and `measured_objects` marks episodes whose poses have the errors of
-    a measurement. `images` are those of the steps `image_steps`; `in_contact` marks pads in
-    contact; `sent` are commanded hands where available and measured ones elsewhere, as given by
-    `commanded`. `labelled` marks episodes whose object poses are trained on; `boxes_m` are the
+    a measurement. `images` are those of the steps `image_steps`, where `shown`; `in_contact` marks
+    pads in contact; `sent` are commanded hands where available and measured ones elsewhere, as
+    given by `commanded`. `labelled` marks episodes whose object poses are trained on; `boxes_m` are the
     usual boxes of each task's objects in their frames (middle, half sizes), and `size` factors of
     their width and height.
     """
@@ -72,6 +72,7 @@ class SceneTable:
     pads_kpa: Float32[Tensor, "episodes steps 12"]
     in_contact: Bool[Tensor, "episodes steps 12"]
     images: UInt8[Tensor, "episodes images px px 3"]
+    shown: Bool[Tensor, "episodes images"]
     image_steps: tuple[int, ...]
     K_head: Float32[Tensor, "episodes 3 3"]
     success: Float32[Tensor, " episodes"]
@@ -131,9 +132,10 @@ class SceneTable:
         """Episodes in which the poses of all objects are known at a step."""
         return self.objects_known[:, step].all(-1)
 
-    def longer_than(self, step: int) -> Int64[Tensor, " rows"]:
-        """Episodes with a latent step after `step`."""
-        return torch.nonzero(self.length > step + STEPS_PER_LATENT)[:, 0]
+    def starts_at(self, step: int) -> Int64[Tensor, " rows"]:
+        """Episodes with an image of `step` and a latent step after it."""
+        shown = self.shown[:, self.image_steps.index(step)]
+        return torch.nonzero(shown & (self.length > step + STEPS_PER_LATENT))[:, 0]
 
     def within(self, rows: Tensor, start: int) -> Bool[Tensor, "batch latents"]:
         """Latent steps after `start` that lie within an episode."""
@@ -225,6 +227,12 @@ def vocabulary(episodes: Sequence[SceneEpisode]) -> tuple[tuple[str, ...], tuple
     for episode in episodes:
         names.setdefault(episode.task, set()).add(episode.object_names)
     uneven = {task: sorted(found) for task, found in names.items() if len(found) > 1}
+    many = [name for name, (objects, *_) in names.items() if len(objects) > MAX_OBJECTS]
+    if many:
+        raise InvalidInputError(
+            f"training episodes: tasks {many} have more objects than {MAX_OBJECTS}, the slots of "
+            "the model; list those that matter to the outcome"
+        )
     if not names or uneven:
         raise InvalidInputError(
             f"training episodes: got {len(episodes)} episodes, tasks with several lists of "
@@ -250,7 +258,7 @@ def scene_table(
     """
     _check(episodes, config)
     lengths = [_whole(episode) for episode in episodes]
-    num_steps, shown = max(lengths), _shared_steps(episodes, lengths)
+    num_steps, steps = max(lengths), _image_steps(episodes, lengths)
     sent, measured = [], []
     for episode in episodes:
         anchor = AnchorPoses(*episode.anchor)
@@ -272,8 +280,9 @@ def scene_table(
         tactile_kpa=torch.from_numpy(tactile.astype(np.float16)),
         pads_kpa=torch.from_numpy(pad_means_kpa(tactile.astype(np.float32))),
         in_contact=torch.from_numpy(_pad_peaks_kpa(tactile) >= FREE_KPA),
-        images=torch.from_numpy(np.stack([_images(episode, shown) for episode in episodes])),
-        image_steps=tuple(shown),
+        images=torch.from_numpy(np.stack([_images(episode, steps) for episode in episodes])),
+        shown=torch.from_numpy(np.stack([np.isin(steps, e.image_steps) for e in episodes])),
+        image_steps=tuple(steps),
         K_head=torch.from_numpy(np.stack([e.K_head for e in episodes]).astype(np.float32)),
         success=torch.tensor([float(episode.success) for episode in episodes]),
         task=torch.tensor([config.tasks.index(episode.task) for episode in episodes]),
@@ -307,26 +316,32 @@ def _known(episode: SceneEpisode, num_steps: int) -> Bool[np.ndarray, "steps slo
     return known
 
 
-def _shared_steps(episodes: Sequence[SceneEpisode], lengths: Sequence[int]) -> list[int]:
-    """Steps with an image in every episode that has them."""
-    shared = set.union(*(set(episode.image_steps.tolist()) for episode in episodes))
+def _image_steps(episodes: Sequence[SceneEpisode], lengths: Sequence[int]) -> list[int]:
+    """Latent steps with an image in at least half of the episodes that have them."""
+    num_shown = np.zeros(max(lengths), dtype=np.int64)
+    num_long = np.zeros(max(lengths), dtype=np.int64)
     for episode, length in zip(episodes, lengths, strict=True):
-        own = set(episode.image_steps.tolist())
-        shared = {step for step in shared if step >= length or step in own}
-    steps = sorted(step for step in shared if step < max(lengths))
-    # Latent steps are all that readers and cores start from.
-    steps = [step for step in steps if step % STEPS_PER_LATENT == 0]
-    if steps[:1] != [0] or len(steps) < 2:
+        own = episode.image_steps
+        if not len(own) or own[0] != 0:
+            raise InvalidInputError(
+                f"episode {episode.episode_id}: has images of steps {own[:4].tolist()} …, expected "
+                "step 0 among them; record it again"
+            )
+        num_shown[own[own < length]] += 1
+        num_long[:length] += 1
+    common = np.flatnonzero(2 * num_shown >= num_long.clip(1))
+    steps = [step for step in common.tolist() if step % STEPS_PER_LATENT == 0]
+    if len(steps) < 2:
         raise InvalidInputError(
-            f"training episodes: all have images of steps {steps[:4]} …, expected step 0 and a "
-            f"later multiple of {STEPS_PER_LATENT}; record with --images {STEPS_PER_LATENT} or a "
-            "divisor of it"
+            f"training episodes: at least half have images of steps {common[:4].tolist()} …, "
+            f"expected step 0 and a later multiple of {STEPS_PER_LATENT}; record with --images "
+            f"{STEPS_PER_LATENT} or a divisor of it"
         )
     return steps
 
 
 def _images(episode: SceneEpisode, steps: Sequence[int]) -> UInt8[np.ndarray, "shown px px 3"]:
-    """Images of the given steps, the last one where an episode has ended."""
+    """Images of the given steps; of those that an episode lacks, the next one or the last."""
     places = np.searchsorted(episode.image_steps, steps)
     return episode.images[places.clip(max=len(episode.images) - 1)]
 

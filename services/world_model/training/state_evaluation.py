@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
+from dextouch.errors import InvalidInputError
 from dextouch.metrics import tactile as tactile_metrics
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT
 from services.world_model.dynamics.model import DynamicsModel
@@ -53,14 +54,20 @@ def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigure
     """Predict every episode from its first step and from later ones, and compare."""
     figures: dict[str, float] = {}
     disagreement_m, distance = [], []
+    if int(table.length.max()) <= CHUNK_STEPS:
+        raise InvalidInputError(
+            f"state model: the longest held-out episode has {int(table.length.max())} steps, "
+            f"expected more than the {CHUNK_STEPS} of a chunk"
+        )
     last_start = table.num_steps - 1 - STEPS_PER_LATENT
     for start in (s for s in STARTS if s in table.image_steps and s <= last_start):
         imagined = _imagined(dynamics, table, start)
         figures |= _chunk_figures(imagined, table, start)
         if start == 0:
             figures |= _episode_figures(imagined, table, dynamics)
-        disagreement_m.append(chunk_peaks(imagined.disagreement_m))
-        distance.append(chunk_peaks(imagined.distance))
+        within = table.within(torch.arange(len(table)), start)
+        disagreement_m.append(chunk_peaks(imagined.disagreement_m, within))
+        distance.append(chunk_peaks(imagined.distance, within))
     return StateFigures(
         {name: round(float(value), 4) for name, value in figures.items()},
         disagreement_m=float(torch.cat(disagreement_m).quantile(_BOUND_QUANTILE)),
@@ -69,10 +76,16 @@ def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigure
     )
 
 
-def chunk_peaks(latents: Float32[Tensor, "episodes latents"]) -> Float32[Tensor, " chunks"]:
-    """Maximum over the latent steps of each chunk of 16 steps, which rollouts compare."""
-    chunks = torch.split(latents, CHUNK_STEPS // STEPS_PER_LATENT, dim=1)
-    return torch.cat([chunk.amax(1) for chunk in chunks])
+def chunk_peaks(
+    latents: Float32[Tensor, "episodes latents"], within: Bool[Tensor, "episodes latents"]
+) -> Float32[Tensor, " chunks"]:
+    """Maximum over the latent steps of each chunk of 16 steps, which rollouts compare.
+
+    Chunks that reach beyond the end of an episode are left out.
+    """
+    size = CHUNK_STEPS // STEPS_PER_LATENT
+    pairs = zip(torch.split(latents, size, dim=1), torch.split(within, size, dim=1), strict=True)
+    return torch.cat([chunk.amax(1)[inside.all(1)] for chunk, inside in pairs])
 
 
 def _chunk_figures(imagined: _Imagined, table: SceneTable, start: int) -> dict[str, float]:

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from dextouch.command_line import ProgressLines
 from dextouch.episodes import SPLITS, Split, scene_fraction, split_by_scene
 from dextouch.errors import InvalidInputError
+from services.networks.training_settings import USUAL_IMAGE_PX
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore
@@ -191,8 +192,9 @@ class _Work:
 
     def _key(self, version: int, *names: str) -> str:
         """Digest of the data and of the settings that affect the weights."""
+        image = () if self.config.image_px == USUAL_IMAGE_PX else ("image_px",)
         chosen = self.settings.model_dump_json(
-            include={"seed", "heldout_share", "labelled_share", *names}
+            include={"seed", "heldout_share", "labelled_share", *image, *names}
         )
         base = "" if self.base is None else self.base.checkpoint.digest
         text = f"{version} {chosen} {self.data_hash} {base}"

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from dextouch.episodes.splits import SPLITS as SPLITS
     from dextouch.episodes.splits import Split as Split
     from dextouch.episodes.splits import is_in as is_in
+    from dextouch.episodes.splits import recording_of as recording_of
     from dextouch.episodes.splits import scene_fraction as scene_fraction
     from dextouch.episodes.splits import scene_of as scene_of
     from dextouch.episodes.splits import split_by_scene as split_by_scene

@@ -31,11 +31,21 @@ InSceneT = TypeVar("InSceneT", bound=InScene)
 def scene_of(attributes: EpisodeAttributes) -> str:
     """Name of an episode's scene, TASK/SEED.
 
-    Without a seed (recordings of people and real robots), an episode is a scene of its own, which
-    it shares with episodes imagined from it: TASK/EPISODE.
+    Without a seed (recordings of people and real robots), a recording is a scene of its own, which
+    it shares with all that is made of it: TASK/RECORDING, or TASK/EPISODE where none is known.
     """
-    seed = attributes.seed if attributes.seed is not None else _first_episode(attributes)
-    return f"{attributes.task}/{seed}"
+    if attributes.seed is not None:
+        return f"{attributes.task}/{attributes.seed}"
+    recording = recording_of(attributes)
+    return f"{attributes.task}/{recording or _first_episode(attributes)}"
+
+
+def recording_of(attributes: EpisodeAttributes) -> str | None:
+    """The recording that an episode was aligned from, by a digest of its content or its id."""
+    for entry in attributes.lineage:
+        if entry.kind == "recording":
+            return entry.id if entry.sha256 is None else entry.sha256[:16]
+    return None
 
 
 def split_of(attributes: EpisodeAttributes) -> Split:

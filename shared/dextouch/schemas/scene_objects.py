@@ -17,6 +17,15 @@ MarkerDictionary = Literal[
     "DICT_4X4_50", "DICT_5X5_250", "DICT_6X6_250", "DICT_APRILTAG_16h5", "DICT_APRILTAG_36h11"
 ]
 MAX_FILE_BYTES = 1 << 20
+# Slots of the state model and of the judge.
+MAX_OBJECTS = 3
+DICTIONARY_SIZES: dict[MarkerDictionary, int] = {
+    "DICT_4X4_50": 50,
+    "DICT_5X5_250": 250,
+    "DICT_6X6_250": 250,
+    "DICT_APRILTAG_16h5": 30,
+    "DICT_APRILTAG_36h11": 587,
+}
 _UNIT = 1e-3
 
 
@@ -70,6 +79,13 @@ class SceneObject(FrozenModel):
             )
         return self
 
+    @field_validator("name")
+    @classmethod
+    def _is_no_other_stream(cls, name: str) -> str:
+        if name == "poses":
+            raise ValueError("got 'poses', whose stream would be that of the twin; choose another")
+        return name
+
     @property
     def stream(self) -> str:
         """Name of the stream of its pose."""
@@ -84,7 +100,7 @@ class SceneObjects(FrozenModel):
     )
     tasks: dict[
         Annotated[str, Field(min_length=1, max_length=128)],
-        Annotated[tuple[SceneObject, ...], Field(min_length=1, max_length=16)],
+        Annotated[tuple[SceneObject, ...], Field(min_length=1, max_length=MAX_OBJECTS)],
     ] = Field(description="objects of each task, as JSON")
 
     @model_validator(mode="after")
@@ -95,6 +111,12 @@ class SceneObjects(FrozenModel):
             for what, values in (("names", names), ("marker ids", ids)):
                 if len(set(values)) != len(values):
                     raise ValueError(f"task {task!r}: got {what} {values}, expected different ones")
+            count = DICTIONARY_SIZES[self.dictionary]
+            if max(ids, default=0) >= count:
+                raise ValueError(
+                    f"task {task!r}: got marker id {max(ids)}, expected 0 … {count - 1} of "
+                    f"{self.dictionary}"
+                )
         return self
 
     def of_task(self, task: str) -> "SceneObjects | None":

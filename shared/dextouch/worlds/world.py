@@ -265,6 +265,8 @@ def _check_fits(
             f"{where}: got images of {sorted(observation.images)}, expected of {sorted(cameras)}"
         )
     for camera, images in observation.images.items():
+        if 0 in images.shape:
+            raise ShapeError(f"{where}: images of {camera} are empty, {images.shape}")
         if size_px is not None and images.shape[1:3] != size_px:
             raise ShapeError(
                 f"{where}: images of {camera} are {images.shape[1:3]} px, expected {size_px}"

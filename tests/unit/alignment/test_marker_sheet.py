@@ -52,6 +52,13 @@ def test_a_detector_finds_every_marker_in_its_size(dictionary):
         assert side_px / PX_PER_MM == pytest.approx(1e3 * sizes_m[number], abs=0.8)
 
 
+def test_markers_of_one_name_and_id_in_two_tasks_are_printed_in_both_sizes():
+    both = objects(0.05).tasks | {"stir": objects(0.03).tasks["pour"]}
+    svg = marker_sheet(SceneObjects(tasks=both))
+    assert "50 mm" in svg
+    assert "30 mm" in svg
+
+
 def test_what_does_not_fit_a_page_is_refused():
     with pytest.raises(InvalidInputError, match="400 mm"):
         marker_sheet(objects(0.4))

@@ -53,7 +53,6 @@ def test_without_a_seed_imagined_episodes_follow_their_source(about):
     for name in ("take-1", "take-2", "take-3", "take-4"):
         source = about.model_copy(update={"seed": None, "episode_id": name})
         lineage = (
-            LineageEntry(kind="recording", id="recording"),
             LineageEntry(kind="episode", id=name),
             LineageEntry(kind="checkpoint", id="model"),
         )
@@ -61,6 +60,24 @@ def test_without_a_seed_imagined_episodes_follow_their_source(about):
         imagined = source.model_copy(update=changed)
         assert scene_of(imagined) == scene_of(source) == f"{source.task}/{name}"
         assert split_of(imagined) == split_of(source)
+
+
+def test_all_that_is_made_of_a_recording_is_one_scene(about):
+    """Aligned again with other options, an episode has another id."""
+    recording = LineageEntry(kind="recording", id="take-7", sha256="ab" * 32)
+    first, again = (
+        about.model_copy(update={"seed": None, "episode_id": name, "lineage": (recording,)})
+        for name in ("take-7-1234", "take-7-5678")
+    )
+    source = LineageEntry(kind="episode", id="take-7-1234")
+    imagined = first.model_copy(
+        update={"episode_id": "new", "origin": "imagined", "lineage": (recording, source)}
+    )
+    scenes = {scene_of(one) for one in (first, again, imagined)}
+    assert scenes == {f"{about.task}/{'ab' * 8}"}
+    # Stations number their takes anew: ids alone may be equal.
+    other = recording.model_copy(update={"sha256": "cd" * 32})
+    assert scene_of(first.model_copy(update={"lineage": (other,)})) not in scenes
 
 
 @pytest.mark.parametrize("splits", [(), SPLITS])

@@ -8,11 +8,13 @@ import pytest
 from dextouch.clients.rollouts import RolloutClient
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.images import scaled_square
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.recorded_takes import (
     REPLAY,
     RecordedScores,
+    _digests,
     read_takes,
     score_lines,
     score_recorded,
@@ -140,6 +142,27 @@ def test_takes_that_were_trained_on_are_refused(store, client, probe):
     first = read_takes([store])[0]
     with pytest.raises(ConflictError, match="my policy"):
         scored(store, client, probe, "right", trained_on={"my policy": [first.start.digest]})
+
+
+def test_a_start_is_known_by_what_a_world_shows_of_it_too(store, client, probe):
+    """What was trained on imagined episodes alone has seen the scaled image."""
+    first = read_takes([store])[0].start.observation
+    large = np.repeat(np.repeat(first.images["camera_head"], 4, axis=1), 4, axis=2)
+    take = read_takes([store])[0]
+    seen = dataclasses.replace(first, images={"camera_head": large})
+    start = dataclasses.replace(take.start, observation=seen)
+    small = scaled_square(large, start.K_head, 64)[0][0]
+    digests = _digests(start)
+    assert digests[0] == start.digest
+    assert digests[1] == start_digest(small, np.maximum(first.tactile_kpa[0], 0))
+
+
+def test_robots_without_commands_replay_what_was_reached(tmp_path, items):
+    store = EpisodeStore(tmp_path)
+    toy_store.write(store, items[0], without=["action_commanded"], seed=None, origin="recorded")
+    (take,) = read_takes([store])
+    assert take.start.action_kind == "measured"
+    np.testing.assert_allclose(take.actions, items[0].measured[1:])
 
 
 def test_tasks_and_images_must_fit_world_and_judge(store, client, probe):

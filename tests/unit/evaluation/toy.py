@@ -123,7 +123,8 @@ def cloning_episode(item: Demonstration) -> CloningEpisode:
         for step in range(0, item.num_steps, DECISION_STRIDE)
     }
     about = (item.episode_id, item.task, item.instruction, item.scene, item.success)
-    return CloningEpisode(*about, ANCHOR, moments, item.measured, item.commanded)
+    actions = (item.measured, item.commanded)
+    return CloningEpisode(*about, ANCHOR, moments, *actions, item.start_digest)
 
 
 @dataclass(frozen=True)

@@ -155,3 +155,30 @@ def test_images_and_camera_are_those_that_the_world_shows(sources, tmp_path):
     assert window.images["camera_head"].shape == (81, 32, 32, 3)
     expected = scaled_square(np.zeros((1, 64, 64, 3), np.uint8), sources[0].window(0).K_head, 32)
     np.testing.assert_allclose(window.K_head, expected[1])
+
+
+class _Coarse(CopyFirstWorld):
+    """Takes chunks of eight steps."""
+
+    @property
+    def description(self):
+        return super().description.model_copy(update={"chunk_multiple": 8, "max_chunk_steps": 16})
+
+
+def test_what_is_left_over_of_a_chunk_is_cut_off(tmp_path):
+    stage = Stage("stack_bowls", "robot", TwinSettings())
+    truth = record(stage, 3, TakeOptions(images=("camera_head",), streams="training"))
+    short = {
+        name: replace(stream, t_ref_ns=stream.t_ref_ns[kept], values=stream.values[kept])
+        for name, stream in truth.streams.items()
+        for kept in [stream.t_ref_ns <= round(70e9 / 15)]
+    }
+    source = EpisodeStore(tmp_path / "true")
+    write_episode(source, replace(truth, streams=short))
+    (name,) = source.list()
+    assert source.open(name).num_steps == 71
+    app = create_world_app({"coarse": _Coarse(tasks=("stack_bowls",))}, WorldServiceSettings())
+    target = EpisodeStore(tmp_path / "imagined")
+    with served({"worlds": app}) as urls, RolloutClient(urls["worlds"]) as client:
+        imagined = target.open(imagine_episode(source.open(name), client, "coarse", target))
+    assert imagined.num_steps == 65

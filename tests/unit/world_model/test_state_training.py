@@ -30,6 +30,7 @@ from services.world_model.training.core_training import (
     CoreData,
     _draw,
     _is_settled,
+    _later_start,
     _read_start,
     core_loss,
     describe,
@@ -322,8 +323,8 @@ def test_shorter_episodes_are_filled_by_their_last_step(config):
     assert both.objects_known[1, : last + 1].all()
     touch = both.tactile_kpa[1, last:]
     assert (touch == touch[:1]).all()
-    assert both.longer_than(last - 4).tolist() == [0, 1]
-    assert both.longer_than(last).tolist() == [0]
+    assert both.starts_at(last - 4).tolist() == [0, 1]
+    assert both.starts_at(last).tolist() == [0]
     assert both.within(torch.arange(2), 0).sum(1).tolist() == [
         (NUM_STEPS - 1) // 4,
         (NUM_STEPS - 9) // 4,
@@ -436,16 +437,29 @@ def test_episodes_that_do_not_fit_are_refused(config, fault):
         scene_table([episode(0), wrong], config)
 
 
-def test_images_of_steps_that_others_lack_are_not_used(config):
+def test_steps_count_with_images_in_half_of_the_episodes(config):
     sparse = episode(1)
     sparse = dataclasses.replace(
         sparse, images=sparse.images[::2], image_steps=sparse.image_steps[::2]
     )
-    shared = scene_table([episode(0), sparse], config)
-    assert list(shared.image_steps) == sparse.image_steps.tolist()
+    table = scene_table([episode(0), episode(2), sparse], config)
+    assert list(table.image_steps) == episode(0).image_steps.tolist()
+    assert table.shown[2].tolist() == [step in sparse.image_steps for step in table.image_steps]
+    assert table.starts_at(4).tolist() == [0, 1]
+    mostly = scene_table([episode(0), *[dataclasses.replace(sparse) for _ in range(2)]], config)
+    assert list(mostly.image_steps) == sparse.image_steps.tolist()
     late = dataclasses.replace(sparse, image_steps=sparse.image_steps + 1)
-    with pytest.raises(InvalidInputError, match="expected step 0"):
+    with pytest.raises(InvalidInputError, match=r"toy-1.*expected step 0"):
         scene_table([episode(0), late], config)
+
+
+def test_starts_that_few_episodes_reach_are_rare(config):
+    short = [shortened(episode(seed), 9) for seed in range(1, 20)]
+    table = scene_table([episode(0), *short], config)
+    rng = np.random.default_rng(0)
+    drawn = Counter(_later_start([4, 8], table, rng) for _ in range(400))
+    # Step 4 has 20 episodes and 12 steps left, step 8 one episode and 8 steps.
+    assert drawn[8] / 400 == pytest.approx(np.sqrt(8) / (np.sqrt(8) + 20 * np.sqrt(12)), abs=0.03)
 
 
 def test_a_task_has_one_number_of_objects():
