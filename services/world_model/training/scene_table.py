@@ -58,9 +58,9 @@ class SceneTable:
     pose of an object is known, and `measured_objects` marks episodes whose poses have the errors of
     a measurement. `images` are those of the steps `image_steps`, where `shown`; `in_contact` marks
     pads in contact; `sent` are commanded hands where available and measured ones elsewhere, as
-    given by `commanded`. `labelled` marks episodes whose object poses are trained on; `boxes_m` are the
-    usual boxes of each task's objects in their frames (middle, half sizes), and `size` factors of
-    their width and height.
+    given by `commanded`. `labelled` marks episodes whose object poses are trained on; `boxes_m` are
+    the usual boxes of each task's objects in their frames (middle, half sizes), and `size` factors
+    of their width and height.
     """
 
     sent: HandTable
