@@ -98,8 +98,13 @@ def refuse_trained_episodes(
             one for one in wanted if metadata.may_have_seen_episode(store.open(one).attributes)
         ]
     else:
-        prints = set(read_checkpoint(checkpoint).metadata.train_fingerprints)
-        trained = [one for one in wanted if fingerprint(read_episode(store.open(one))) in prints]
+        about = read_checkpoint(checkpoint).metadata
+        prints, px = set(about.train_fingerprints), about.network.image_px
+        trained = [
+            one
+            for one in wanted
+            if fingerprint(read_episode(store.open(one), image_px=px)) in prints
+        ]
     if trained:
         raise ConflictError(
             f"{command}: {checkpoint.name} was trained on the scenes of {len(trained)} of "

@@ -18,7 +18,7 @@ from dextouch.episodes import (
     scene_of,
 )
 from dextouch.errors import InvalidInputError
-from dextouch.images import scaled_square
+from dextouch.images import square_of_at_most
 from dextouch.schemas import Observation, RolloutDoubt, is_rollout, rollout_doubt
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.robot_episodes import robot_episodes
@@ -226,10 +226,9 @@ def _read_ending(reader: EpisodeReader, end: int, image_px: int) -> Ending:
     half_step_ns = 5e8 / reader.attributes.model_rate_hz
     # Where these steps were not rendered, the nearest images belong to other steps.
     are_near = bool((np.abs(window.image_dt_ns[CAMERA]) <= half_step_ns).all())
-    images = window.images[CAMERA]
-    side_px = min(image_px, *images.shape[1:3])
+    images, _ = square_of_at_most(window.images[CAMERA], window.K_head, image_px)
     return Ending(
-        scaled_square(images, window.K_head, side_px)[0] if are_near else None,
+        images if are_near else None,
         window.tactile_kpa,
         reader.attributes.task,
         _object_poses(reader, window.t_ref_ns),

@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from dextouch.clients import Policy
 from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in
 from dextouch.errors import InvalidInputError
-from dextouch.images import scaled_square
+from dextouch.images import square_of_at_most
 from dextouch.schemas import Observation, WorldDescription
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.matched_starts import MatchedStart
@@ -256,8 +256,7 @@ def _digests(start: MatchedStart) -> tuple[str, ...]:
     """
     touch = start.observation.tactile_kpa[0]
     images = start.observation.images[CAMERA]
-    side_px = min(USUAL_IMAGE_PX, *images.shape[1:3])
-    small = scaled_square(images, start.K_head, side_px)[0][0]
+    small = square_of_at_most(images, start.K_head, USUAL_IMAGE_PX)[0][0]
     return start.digest, start_digest(small, np.maximum(touch, 0.0))
 
 

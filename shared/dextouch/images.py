@@ -99,6 +99,18 @@ def scaled_square(
     return scaled, moved
 
 
+def square_of_at_most(
+    images: UInt8[np.ndarray, "n h w 3"], K: Float64[np.ndarray, "3 3"], side_px: int | None
+) -> tuple[UInt8[np.ndarray, "n new_h new_w 3"], Float64[np.ndarray, "3 3"]]:
+    """The middle square of images, scaled if it is larger than a side; None leaves them.
+
+    As `scaled_square`, but small images are not enlarged.
+    """
+    if side_px is None or not images.size:
+        return images, K
+    return scaled_square(images, K, min(side_px, *images.shape[1:3]))
+
+
 def _area_shares(side: int, side_px: int) -> Float32[np.ndarray, "new old"]:
     """Share of every old pixel in each new one, along one axis."""
     edges = np.linspace(0.0, side, side_px + 1)

@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64, UInt8
 from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, scene_of
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses
-from dextouch.images import scaled_square
+from dextouch.images import square_of_at_most
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.policies.cloning_network import SLOT_STEPS
 from services.evaluation.robot_episodes import robot_episodes
@@ -83,9 +83,7 @@ def read_cloning_episode(
         return reader.window(step, num_steps=1, cameras=(CAMERA,)).images[CAMERA]
 
     def seen(step: int) -> UInt8[np.ndarray, "h w 3"]:
-        images = images_of(step)
-        side_px = min(image_px, *images.shape[1:3])
-        return scaled_square(images, first.K_head, side_px)[0][0]
+        return square_of_at_most(images_of(step), first.K_head, image_px)[0][0]
 
     return CloningEpisode(
         about.episode_id,

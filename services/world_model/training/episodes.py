@@ -17,6 +17,7 @@ from dextouch.episodes import (
     scene_of,
 )
 from dextouch.errors import InvalidInputError
+from dextouch.images import square_of_at_most
 from dextouch.schemas import ActionKind, Domain
 from services.world_model.starts import CAMERA
 from services.world_model.training.dataset import EpisodeArrays, TrainingEpisode
@@ -25,16 +26,23 @@ E = TypeVar("E", bound=TrainingEpisode)
 
 
 def load_episodes(
-    url: str, *, splits: Collection[Split] = (), domain: Domain | None = None
+    url: str,
+    *,
+    splits: Collection[Split] = (),
+    domain: Domain | None = None,
+    image_px: int | None = None,
 ) -> list[EpisodeArrays]:
     """Episodes of a store, read once into memory: those of the given splits and domain.
+
+    The middle square of images that are larger than `image_px` is scaled to it.
 
     Raises:
         InvalidInputError: the store is empty, mixes model rates, or lacks the image of a step.
         UnknownNameError: an episode without the head camera.
     """
     store = EpisodeStore(url)
-    episodes = [read_episode(store.open(one)) for one in training_ids(store, splits, domain)]
+    ids = training_ids(store, splits, domain)
+    episodes = [read_episode(store.open(one), image_px=image_px) for one in ids]
     check_rates({episode.model_rate_hz for episode in episodes}, url)
     return episodes
 
@@ -73,8 +81,10 @@ def check_rates(rates_hz: set[float], url: str) -> None:
         )
 
 
-def read_episode(reader: EpisodeReader) -> EpisodeArrays:
+def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> EpisodeArrays:
     """Read a whole episode as a single window for each kind of action.
+
+    The middle square of images that are larger than `image_px` is scaled to it.
 
     Raises:
         InvalidInputError: the image of a step is missing.
@@ -87,18 +97,19 @@ def read_episode(reader: EpisodeReader) -> EpisodeArrays:
         sent = reader.window(0, reader.num_steps, cameras=(), action_kind="commanded")
         actions["commanded"] = sent.actions
     attributes = reader.attributes
+    images, K_head = square_of_at_most(measured.images[CAMERA], measured.K_head, image_px)
     poses, boxes_m = objects_of(reader, measured.t_ref_ns) or (None, None)
     return EpisodeArrays(
         episode_id=attributes.episode_id,
         task=attributes.task,
         instruction=attributes.instruction,
         scene=scene_of(attributes),
-        images=measured.images[CAMERA],
+        images=images,
         tactile_kpa=measured.tactile_kpa,
         tactile_valid=measured.tactile_valid,
         actions=actions,
         anchor=measured.anchor,
-        K_head=measured.K_head,
+        K_head=K_head,
         model_rate_hz=attributes.model_rate_hz,
         domain=attributes.domain,
         object_poses=poses,

@@ -25,7 +25,7 @@ from dextouch.episodes import (
     scene_of,
 )
 from dextouch.errors import InvalidInputError
-from dextouch.images import scaled_square
+from dextouch.images import square_of_at_most
 from dextouch.schemas import ActionKind, EpisodeAttributes
 from services.world_model.starts import CAMERA
 
@@ -169,10 +169,7 @@ def read_scene_episode(reader: EpisodeReader, *, image_px: int | None = None) ->
     if kind == "commanded":
         actions = reader.read("action_commanded").values.astype(np.float64)
     images, image_steps = _images(reader)
-    K_head = window.K_head
-    if image_px is not None and images.size:
-        side_px = min(image_px, *images.shape[1:3])
-        images, K_head = scaled_square(images, K_head, side_px)
+    images, K_head = square_of_at_most(images, window.K_head, image_px)
     track = object_track(reader, window.t_ref_ns)
     if track is None:
         raise InvalidInputError(

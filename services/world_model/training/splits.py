@@ -45,16 +45,16 @@ def _load_robot(
     settings: TrainSettings,
 ) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
     domain: Domain | None = "robot" if settings.human else None
-    url, splits = settings.episodes, settings.splits
+    url, splits, px = settings.episodes, settings.splits, settings.network.image_px
     if settings.streaming:
-        stored = index_episodes(url, splits=splits, domain=domain)
+        stored = index_episodes(url, splits=splits, domain=domain, image_px=px)
         if settings.heldout is not None:
-            return stored, load_episodes(settings.heldout, domain=domain)
+            return stored, load_episodes(settings.heldout, domain=domain, image_px=px)
         trained, heldout = _split(stored, settings)
         return trained, [episode.load() for episode in heldout]
-    episodes = load_episodes(url, splits=splits, domain=domain)
+    episodes = load_episodes(url, splits=splits, domain=domain, image_px=px)
     if settings.heldout is not None:
-        return episodes, load_episodes(settings.heldout, domain=domain)
+        return episodes, load_episodes(settings.heldout, domain=domain, image_px=px)
     return _split(episodes, settings)
 
 
@@ -71,7 +71,8 @@ def _load_human(settings: TrainSettings) -> Sequence[TrainingEpisode]:
     read = index_episodes if settings.streaming else load_episodes
     found: list[TrainingEpisode] = []
     for url in settings.human:
-        found += read(url, splits=settings.splits, domain="human")
+        px = settings.network.image_px
+        found += read(url, splits=settings.splits, domain="human", image_px=px)
     return subset_by_hash(found, settings.human_episodes, what="human")
 
 

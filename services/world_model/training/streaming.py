@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from dextouch.episodes import EpisodeReader, EpisodeStore, Split
 from dextouch.hands.actions import poses_from_actions, reanchor
+from dextouch.images import square_of_at_most
 from dextouch.schemas import ActionKind, Domain
 from services.world_model.network.contact_geometry import SeenObjects
 from services.world_model.network.inputs import PredictionRequest
@@ -59,6 +60,7 @@ class StoredEpisode:
     content_sha256: str
     domain: Domain
     model_rate_hz: float
+    image_px: int | None = None
 
     def __len__(self) -> int:
         return self.num_steps
@@ -69,7 +71,7 @@ class StoredEpisode:
 
     def load(self) -> EpisodeArrays:
         """Load the whole episode."""
-        return read_episode(_reader(self.url, self.episode_id))
+        return read_episode(_reader(self.url, self.episode_id), image_px=self.image_px)
 
     def cut(self, place: Place) -> Window:
         """Read the window at a place in this episode.
@@ -86,7 +88,7 @@ class StoredEpisode:
         if place.from_command and place.action_kind == "commanded":
             anchor = poses_from_actions(actions[:1], anchor).anchor(0)
             actions = reanchor(actions, 0)
-        images = read.images[CAMERA]
+        images, K_head = square_of_at_most(read.images[CAMERA], read.K_head, self.image_px)
         reader = _reader(self.url, self.episode_id)
         known = objects_of(reader, read.t_ref_ns[:1])
         objects = None if known is None else SeenObjects(known[0][0].astype(np.float64), known[1])
@@ -97,18 +99,23 @@ class StoredEpisode:
             action_kind=place.action_kind,
             instruction=read.instruction,
             anchor=anchor,
-            K_head=read.K_head,
+            K_head=K_head,
             objects=objects,
         )
         return Window(request, images, read.tactile_kpa, read.tactile_valid)
 
 
 def index_episodes(
-    url: str, *, splits: Collection[Split] = (), domain: Domain | None = None
+    url: str,
+    *,
+    splits: Collection[Split] = (),
+    domain: Domain | None = None,
+    image_px: int | None = None,
 ) -> list[StoredEpisode]:
     """Index the episodes of a store, except imagined ones; each is read once to be hashed.
 
-    Only those of the given splits and domain are indexed.
+    Only those of the given splits and domain are indexed. The middle square of images that are
+    larger than `image_px` is scaled to it.
 
     Raises:
         InvalidInputError: the store is empty, mixes model rates, or lacks the image of a step.
@@ -119,7 +126,7 @@ def index_episodes(
     episodes: list[StoredEpisode] = []
     for episode_id in training_ids(EpisodeStore(url), splits, domain):
         # Uses the cached readers, so that processes forked later inherit them open.
-        arrays = read_episode(_reader(url, episode_id))
+        arrays = read_episode(_reader(url, episode_id), image_px=image_px)
         episodes.append(
             StoredEpisode(
                 url=url,
@@ -131,6 +138,7 @@ def index_episodes(
                 content_sha256=fingerprint(arrays),
                 domain=arrays.domain,
                 model_rate_hz=arrays.model_rate_hz,
+                image_px=image_px,
             )
         )
     check_rates({episode.model_rate_hz for episode in episodes}, url)

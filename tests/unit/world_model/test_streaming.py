@@ -200,3 +200,18 @@ def test_the_command_line_streams(toy_store, tmp_path, capsys):
     assert " --streaming " in command
     assert " --network.image-px=32" in command
     capsys.readouterr()
+
+
+def test_larger_images_are_scaled_in_memory_and_from_disk_alike(url, in_memory):
+    """A camera of a station has more pixels than a network's image."""
+    large = in_memory[0]
+    side = large.images.shape[1] // 2
+    loaded = load_episodes(url, image_px=side)[0]
+    stored = index_episodes(url, image_px=side)[0]
+    assert loaded.images.shape == (len(large), side, side, 3)
+    assert loaded.content_hash() == stored.content_hash() != large.content_hash()
+    np.testing.assert_allclose(loaded.K_head[:2], large.K_head[:2] / 2)
+    place = Place(0, 3, 5)
+    from_disk, cut = stored.cut(place), loaded.cut(place)
+    np.testing.assert_array_equal(from_disk.images, cut.images)
+    np.testing.assert_array_equal(from_disk.request.K_head, cut.request.K_head)
