@@ -118,8 +118,8 @@ def write_as_recorded(
         DeviceError: a mock device failed.
     """
     aligned = _aligned(truth, ALIGNMENT.model_copy(update={"objects": objects}), episode_id)
-    # The wall clock would differ each time.
-    attributes = aligned.attributes.model_copy(update={"created_at": None})
+    # The recording is not kept, and the wall clock would differ each time.
+    attributes = aligned.attributes.model_copy(update={"created_at": None, "lineage": ()})
     _write(store, attributes, aligned.streams, options)
 
 

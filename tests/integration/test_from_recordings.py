@@ -24,7 +24,7 @@ def test_policies_are_scored_from_recordings_alone(tmp_path, monkeypatch, capsys
             run_command(words)
     takes = EpisodeStore("runs/takes")
     ids = takes.list()
-    assert len(ids) == 20
+    assert len(ids) == 30
     for episode_id in ids:
         reader = takes.open(episode_id)
         about = reader.attributes
