@@ -36,7 +36,6 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, DeviceError, InvalidInputError, UnknownNameError
 from dextouch.schemas import RolloutStart, SceneObjects
 from dextouch.serving import configure_logging
-from services.alignment.marker_sheet import cells_of_markers
 from services.evaluation.policies.asking import action_chunk, ask
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.progress import Progress
@@ -164,6 +163,9 @@ def stage_of(task: str, domain: Domain) -> Stage:
 @lru_cache(maxsize=12)
 def marked_stage(task: str, domain: Domain) -> tuple[Stage, SceneObjects]:
     """A stage with markers on its objects and a camera that can read them, and their places."""
+    # Needs OpenCV, which recording without a station does not.
+    from services.alignment.marker_sheet import cells_of_markers
+
     px = _MARKED_IMAGE_PX
     stage = Stage(task, domain, TwinSettings(image_height_px=px, image_width_px=px))
     scene = stage.simulation.scene
