@@ -86,6 +86,7 @@ class StateWorld:
                 f"{', '.join(sorted(map(str, others)))}, expected float32"
             )
         self._dynamics = checkpoint.dynamics
+        self._dynamics.trace()
         self._renderer = Renderer(checkpoint.renderer)
         self._metadata, self._digest = checkpoint.metadata, checkpoint.digest
         config = self._metadata.dynamics

@@ -26,7 +26,8 @@ class Commands:
     joints_rad: Float32[Tensor, "batch latents 2 20"]
 
     def __len__(self) -> int:
-        return self.points_m.shape[1]
+        # A tensor while a trace is made.
+        return int(self.points_m.shape[1])
 
     def __getitem__(self, latents: slice) -> "Commands":
         """Select latent steps."""

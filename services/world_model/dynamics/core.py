@@ -191,6 +191,10 @@ class RecurrentCore(nn.Module):
         beyond = (own - self.highest).clamp_min(0.0) + (self.lowest - own).clamp_min(0.0)
         return beyond.mean((2, 3))
 
+    def used_slots(self, task: Int64[Tensor, " batch"]) -> int:
+        """Largest number of objects of the entries of a batch."""
+        return max(self.config.num_objects[index] for index in task.tolist())
+
     def first_state(self, start: SceneStart, standing: Commands) -> CoreState:
         """The state before the first step, with the measured hands as one latent step."""
         known = [
@@ -218,7 +222,7 @@ class RecurrentCore(nn.Module):
         """
         # Slots that no entry of the batch uses need no computation.
         counts = torch.tensor(self.config.num_objects)[start.task]
-        used = int(counts.max())
+        used = self.used_slots(start.task)
         there = start.objects.present * (torch.arange(MAX_OBJECTS) < counts[:, None])
         present = there[:, :used]
         first_m = start.objects.position_m[:, :used]

@@ -4,6 +4,7 @@
 for the next commands. The only state kept between chunks is a `SceneMemory`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +28,7 @@ from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import FirstStep, Reading, StartReader
 from services.world_model.dynamics.stillness import REST_LATENTS, stillness
 from services.world_model.dynamics.touch_codec import FREE_KPA, TouchCodec
+from services.world_model.dynamics.traces import Traced
 
 # Objects with a lower presence probability count as absent.
 PRESENCE_THRESHOLD = 0.5
@@ -97,6 +99,11 @@ class DynamicsModel(nn.Module):
         self.codec = TouchCodec(config.touch_channels)
         self.eyes = nn.ModuleList(StartReader(config) for _ in range(num_members))
         self.core = RecurrentCore(config, num_members)
+        self._predict: Callable[..., tuple[CoreState, _Run]] = self._predicted
+
+    def trace(self) -> None:
+        """Compute chunks by traces from now on; the weights must not change any more."""
+        self._predict = Traced(self, self._predicted, self._kind_of)
 
     @torch.no_grad()
     def begin(
@@ -164,18 +171,18 @@ class DynamicsModel(nn.Module):
         self, memory: SceneMemory, commands: Commands, at_rest: Bool[Tensor, " batch"]
     ) -> tuple[SceneMemory, "_Run"]:
         """Advance by latent steps during which the same entries are at rest."""
-        # The wrists are where they were commanded to be, for all members.
-        distance = self.core.distance(commands, memory.state.wrist_m[0])
-        resting = _resting(memory, distance)
         if bool(at_rest.all()):
-            return memory, resting
-        members = self.core.members
-        before = folded(memory.state)
-        future, state = self.core(commands.repeated(members), folded(memory.start), before)
-        run = _chosen(at_rest, resting, self._imagined(memory, future, distance))
+            # The wrists are where they were commanded to be, for all members.
+            return memory, _resting(memory, self.core.distance(commands, memory.state.wrist_m[0]))
+        state, run = self._predict(commands, memory.start, memory.state, memory.poses)
+        if bool(at_rest.any()):
+            run = _chosen(at_rest, _resting(memory, run.distance), run)
+            members, before = self.core.members, folded(memory.state)
+            changed = folded(state).where(~at_rest.repeat(members), before)
+            state = unfolded(changed, members)
         following = replace(
             memory,
-            state=unfolded(state.where(~at_rest.repeat(members), before), members),
+            state=state,
             poses=run.poses[:, -1],
             disagreement_m=run.disagreement_m[:, -1],
             tactile_kpa=run.tactile_kpa[:, -1],
@@ -183,16 +190,32 @@ class DynamicsModel(nn.Module):
         )
         return following, run
 
+    def _predicted(
+        self, commands: Commands, start: SceneStart, state: CoreState, poses: ObjectPoses
+    ) -> tuple[CoreState, "_Run"]:
+        """What all members predict: their states after the commands, and what they say together."""
+        members = self.core.members
+        future, after = self.core(commands.repeated(members), folded(start), folded(state))
+        run = self._imagined(poses, future, self.core.distance(commands, state.wrist_m[0]))
+        return unfolded(after, members), run
+
+    def _kind_of(
+        self, commands: Commands, start: SceneStart, state: CoreState, poses: ObjectPoses
+    ) -> tuple[int, int, int]:
+        """Latent steps, entries of the batch, and the slots that some entry uses."""
+        del state, poses
+        return len(commands), start.task.shape[1], self.core.used_slots(start.task[0])
+
     def readers(self) -> list[StartReader]:
         """The start reader of every member."""
         return [reader for reader in self.eyes if isinstance(reader, StartReader)]
 
-    def _imagined(self, memory: SceneMemory, future: SceneFuture, distance: Tensor) -> "_Run":
+    def _imagined(self, poses: ObjectPoses, future: SceneFuture, distance: Tensor) -> "_Run":
         members = self.core.members
         each = unfolded(future, members)
         taxels = self.core.taxels(future.pattern).view(*each.pattern.shape[:-1], -1)
         return _Run(
-            poses=_between(memory.poses, mean_poses(each.objects)),
+            poses=_between(poses, mean_poses(each.objects)),
             tactile_kpa=self.decode_touch(each.touch.mean(0), taxels.mean(0)).flatten(1, 2),
             disagreement_m=_spread_m(each.objects),
             distance=distance,
