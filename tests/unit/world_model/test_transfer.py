@@ -115,7 +115,7 @@ def test_readers_of_the_base_can_be_kept(base, config, tmp_path):
     weights = settings.core.weights
     assert (weights.objects, weights.touch, weights.contact, weights.taxels) == (0, 0, 0, 0)
     assert (weights.success, settings.num_members) == (1, 2)
-    work = _Work(settings, own, tmp_path, "hash")
+    work = _Work(settings, own, tmp_path, "hash", reads_starts=False)
     for member in range(2):
         _keep(base.core(own, member, seed=7), work.core_file(member), 1.5)
     dynamics, _, cpu_s = _assembled(work, TouchCodec(own.touch_channels))
