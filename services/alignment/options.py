@@ -34,7 +34,6 @@ class AlignmentOptions(FrozenModel):
         description="poses of human wrists and fingertips: as tracked, or moved so that the "
         "robot's hand touches where the person's did",
     )
-
     objects: SceneObjects | None = Field(
         default=None,
         exclude_if=lambda objects: objects is None,

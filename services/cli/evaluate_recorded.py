@@ -18,7 +18,7 @@ import torch
 from dextouch.clients import Policy, RolloutClient
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import SPLITS, EpisodeStore
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.serving import configure_logging
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli.generate import refuse_trained_episodes
@@ -28,7 +28,7 @@ from services.cli.training_data import comma_separated
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.policies.outside import PolicySource
-from services.evaluation.recorded_takes import read_takes, score_lines, score_recorded
+from services.evaluation.recorded_takes import REPLAY, read_takes, score_lines, score_recorded
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_probe import SuccessProbe
@@ -96,16 +96,20 @@ def _policies(options: argparse.Namespace) -> dict[str, Policy]:
 
     Raises:
         InvalidInputError: two policies of one name, or one that does not load.
+        UnknownNameError: arguments of a policy that is not given.
     """
     policies: dict[str, Policy] = {}
 
     def add(name: str, policy: Policy) -> None:
-        if name in policies:
+        if name in policies or name == REPLAY:
             raise InvalidInputError(f"policies: {name!r} is given twice; rename one, NAME=…")
         policies[name] = policy
 
-    for text in options.policy:
-        source = PolicySource.parse(text)
+    sources = [PolicySource.parse(text) for text in options.policy]
+    names = [source.name for source in sources]
+    if unknown := sorted(set(options.policy_arguments) - set(names)):
+        raise UnknownNameError("policy of --policy-arguments", unknown[0], names)
+    for source in sources:
         add(source.name, source.load(options.policy_arguments.get(source.name, {})))
     for name, path in options.cloned:
         add(name, BehaviourCloningPolicy.load(path))

@@ -10,7 +10,7 @@ STAGE_BEGINS: dict[Stage, float] = {
     "placing": 0.35,
     "retargeting": 0.37,
     "objects": 0.55,
-    "writing": 0.55,
+    "writing": 0.7,
 }
 
 

@@ -17,7 +17,7 @@ MarkerDictionary = Literal[
     "DICT_4X4_50", "DICT_5X5_250", "DICT_6X6_250", "DICT_APRILTAG_16h5", "DICT_APRILTAG_36h11"
 ]
 MAX_FILE_BYTES = 1 << 20
-# Slots of the state model and of the judge.
+# Objects of a task: slots of the state model and of the judge, where unused ones are masked.
 MAX_OBJECTS = 3
 DICTIONARY_SIZES: dict[MarkerDictionary, int] = {
     "DICT_4X4_50": 50,
