@@ -37,12 +37,12 @@ def imagine_episode(
 
     The imagined episode starts from the source's first observation, as the world sees it: its
     images have the world's size. Of its steps, what is left over of a chunk of the world at the end
-    is cut off. Actions are the commanded ones, or those that were reached if the
-    robot keeps no commands. Its `success` is that of the
-    *source*: the real outcome of the actions, and the label for training a success probe on
-    imagined endings. Its lineage names the source and the world's digest. Object poses, if the
-    world provides them, are the stream `object_poses`, from step 1 on; the world's doubt about the
-    whole rollout, and its own estimate of success, are quality figures (`RolloutDoubt.to_quality`).
+    is cut off. Actions are the commanded ones, or those that were reached if the robot keeps no
+    commands. Its `success` is that of the *source*: the real outcome of the actions, and the label
+    for training a success probe on imagined endings. Its lineage names the source and the world's
+    digest. Object poses, if the world provides them, are the stream `object_poses`, from step 1 on;
+    the world's doubt about the whole rollout, and its own estimate of success, are quality figures
+    (`RolloutDoubt.to_quality`).
 
     Args:
         source: a robot episode with head camera, touch and actions.
@@ -99,18 +99,14 @@ def _played(
     """Observations of the world for an episode's actions, its camera, and these actions."""
     attributes = source.attributes
     kind: ActionKind = "commanded" if "action_commanded" in source.streams else "measured"
-    window = source.window(0, source.num_steps, cameras=(CAMERA,), action_kind=kind)
-    actions = window.actions
-    if kind == "commanded":
-        # Relative to the measured poses of step 0, as they were sent.
-        actions = source.read("action_commanded").values
-    actions = actions[: whole_steps(len(actions), world.chunk_multiple)]
-    reached = source.window(0, 1, cameras=()).actions
+    sent = source.read("action_commanded" if kind == "commanded" else "action").values
+    actions = sent[: whole_steps(len(sent), world.chunk_multiple)]
+    window = source.window(0, 1, cameras=(CAMERA,))
     first = Observation(
         first_step=0,
-        images={CAMERA: window.images[CAMERA][:1]},
-        tactile_kpa=window.tactile_kpa[:1],
-        action_reached=reached,
+        images=window.images,
+        tactile_kpa=window.tactile_kpa,
+        action_reached=window.actions,
         reached_is_measured=True,
     )
     with client.start(

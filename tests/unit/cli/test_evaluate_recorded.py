@@ -1,0 +1,45 @@
+"""`dextouch evaluate recorded`: the policies that it takes, and what it refuses at once."""
+
+import pytest
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
+from services.cli import evaluate_recorded, main
+from services.evaluation.recorded_takes import REPLAY
+
+HOLD = "services.evaluation.policies.hold:HoldPolicy"
+
+
+def policies(*words):
+    parsed = evaluate_recorded._parser().parse_args(["--episodes", "takes", *words])
+    return evaluate_recorded._policies(parsed)
+
+
+def test_policies_have_the_names_that_they_are_given():
+    assert list(policies("--policy", f"mine={HOLD}", "--hold")) == ["mine", "hold"]
+
+
+@pytest.mark.parametrize("name", ["hold", REPLAY])
+def test_two_policies_of_one_name_are_refused(name):
+    with pytest.raises(InvalidInputError, match=f"'{name}' is given twice"):
+        policies("--policy", f"{name}={HOLD}", "--hold", "--policy", f"{name}={HOLD}")
+
+
+def test_arguments_of_an_unknown_policy_are_refused():
+    with pytest.raises(UnknownNameError, match="yours"):
+        policies("--policy", f"mine={HOLD}", "--policy-arguments", '{"yours": {}}')
+
+
+@pytest.mark.parametrize("wrong", [["--policy-arguments", "[1]"], ["--cloned", "no-name"]])
+def test_malformed_words_are_refused(wrong, capsys):
+    with pytest.raises(SystemExit):
+        policies(*wrong)
+    assert "expected" in capsys.readouterr().err
+
+
+def test_a_store_without_takes_is_refused(tmp_path, capsys):
+    EpisodeStore(tmp_path)
+    with pytest.raises(NotFoundError, match="has no episode"):
+        evaluate_recorded.main(["--episodes", str(tmp_path)])
+    assert main.main(["evaluate", "recorded", "--episodes", str(tmp_path)]) == 3
+    assert "has no episode" in capsys.readouterr().err
