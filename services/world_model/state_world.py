@@ -112,6 +112,7 @@ class StateWorld:
         """Capabilities and limits of this world."""
         return self._description
 
+    @torch.inference_mode()
     def reset(self, start: RolloutStart) -> StartedRollout[StateRollout]:
         """Find the objects of one observed step and start a rollout.
 
@@ -183,6 +184,7 @@ class StateWorld:
         chunks = np.asarray(actions)[None]
         return self.step_batch([state], chunks, seeds=[seed], selectors=[selector])[0]
 
+    @torch.inference_mode()
     def step_batch(
         self,
         states: Sequence[StateRollout],
@@ -344,9 +346,9 @@ class StateWorld:
 
     def _poses(self, objects: ObjectPoses, task: str) -> Float32[np.ndarray, "n objects 7"]:
         """Poses of the task's objects; absent ones lie below the table."""
-        count = len(self._metadata.object_names[task])
-        poses = poses_from_objects(objects).astype(np.float32)[..., :count, :]
-        there = objects.present.numpy()[..., :count] > PRESENCE_THRESHOLD
+        used = objects.slots(len(self._metadata.object_names[task]))
+        poses = poses_from_objects(used).astype(np.float32)
+        there = used.present.numpy() > PRESENCE_THRESHOLD
         return np.where(there[..., None], poses, ABSENT_POSE)
 
     def snapshot(self, state: StateRollout) -> bytes:

@@ -1,15 +1,13 @@
 """Hand and head camera motion in the world for given actions; the input of the core."""
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, AnchorPoses, poses_from_actions
-from dextouch.hands.robot_hand import RobotHand
-from dextouch.tactile.layout import SIDES
+from dextouch.hands.robot_hand import chain_points_of_both_m
 
 # Of each hand: the wrist, five fingertips, five PIP joints, and the middle of the palm.
 NUM_POINTS: Final = 12
@@ -42,11 +40,6 @@ class HandMotion:
         )
 
 
-@cache
-def _hand(side: str) -> RobotHand:
-    return RobotHand(side)
-
-
 def hand_motion(
     actions: Float64[np.ndarray, "n 67"], anchor: AnchorPoses, *, validated: bool = False
 ) -> HandMotion:
@@ -63,9 +56,7 @@ def hand_motion(
     poses = poses_from_actions(actions, anchor, validated=validated)
     Ts = np.stack([poses.Ts_world_wrist_left, poses.Ts_world_wrist_right], axis=1)
     joints = np.stack([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1)
-    chains = np.stack(
-        [_hand(side).chain_points_m(joints[:, index]) for index, side in enumerate(SIDES)], axis=1
-    )
+    chains = chain_points_of_both_m(joints)
     knuckles, pips, tips = chains[..., 0, :], chains[..., 1, :], chains[..., 3, :]
     palm = 0.5 * knuckles[:, :, 1:].mean(axis=2, keepdims=True)
     R = Ts[..., :3, :3]

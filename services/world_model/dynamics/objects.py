@@ -39,6 +39,14 @@ class ObjectPoses:
         """Index the batch."""
         return ObjectPoses(self.position_m[index], self.axes[index], self.present[index])
 
+    def slots(self, count: int) -> "ObjectPoses":
+        """The first slots."""
+        return ObjectPoses(
+            self.position_m[..., :count, :],
+            self.axes[..., :count, :, :],
+            self.present[..., :count],
+        )
+
 
 def objects_from_poses(poses: Shaped[np.ndarray, "*batch objects 7"]) -> ObjectPoses:
     """Fill slots with known poses (x y z in metres, qw qx qy qz); further slots stay empty."""

@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from dextouch.geometry import apply, invert
-from services.world_model.network.pose_raster import hand_points_m
+from dextouch.hands.robot_hand import chain_points_of_both_m
 from services.world_model.rendering.scene_states import SceneStates
 
-SIDES = ("left", "right")
 MIN_DEPTH_M = 0.05
 # Radii of drawn bones and forearms, and the length of the forearm drawn behind the wrist.
 _BONE_RADIUS_M, _FOREARM_RADIUS_M, _FOREARM_M = 0.008, 0.024, 0.06
@@ -85,13 +84,10 @@ def _ribbons() -> _Ribbons:
 
 def base_points_world(states: SceneStates) -> Float64[np.ndarray, "n 2 22 3"]:
     """Wrist, four points per finger and a point on the forearm, for both hands."""
-    hands = []
-    for index, side in enumerate(SIDES):
-        points = hand_points_m(states.joints_rad[:, index], side=side)
-        forearm = np.broadcast_to([0.0, 0.0, _FOREARM_M], (len(states), 1, 3))
-        points = np.concatenate([points, forearm], axis=1)
-        hands.append(apply(states.Ts_world_wrist[:, index], points))
-    return np.stack(hands, axis=1)
+    points = np.zeros((len(states), 2, 22, 3))
+    points[:, :, 1:_FOREARM_END] = chain_points_of_both_m(states.joints_rad).reshape(-1, 2, 20, 3)
+    points[:, :, _FOREARM_END, 2] = _FOREARM_M
+    return apply(states.Ts_world_wrist, points)
 
 
 def project_hands(

@@ -10,12 +10,13 @@ the right palm faces +y, the left -y.
 import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
 from dextouch.geometry import transform
@@ -58,6 +59,58 @@ class FingerTable(NamedTuple):
     points: tuple[int, int, int]
 
 
+@dataclass(frozen=True)
+class _Chains:
+    """Hinges of the fingers of one hand or, with a further first axis, of several alike.
+
+    Fingers are padded to the longest one; `is_joint` is the mask of existing hinges. `points` are
+    indices of hinges, as those of a `FingerTable`.
+    """
+
+    is_joint: Bool[np.ndarray, "*hands fingers hinges"]
+    offsets: Float64[np.ndarray, "*hands fingers hinges 4 4"]
+    axes: Float64[np.ndarray, "*hands fingers hinges 3"]
+    tips_m: Float64[np.ndarray, "*hands fingers 3"]
+    points: Int64[np.ndarray, "fingers 3"]
+
+    @classmethod
+    def of(cls, fingers: Sequence[FingerTable]) -> "_Chains":
+        counts = np.array([len(finger.joints) for finger in fingers])
+        is_joint = np.asarray(np.arange(counts.max()) < counts[:, None])
+        rows = [row for finger in fingers for row in finger.joints]
+        R = rotation_from_quaternion(np.array([row.q_wxyz for row in rows]))
+        offsets = np.tile(np.eye(4), (*is_joint.shape, 1, 1))
+        offsets[is_joint] = transform(R, np.array([row.position_m for row in rows]))
+        axes = np.zeros((*is_joint.shape, 3))
+        axes[is_joint] = [row.axis for row in rows]
+        tips_m = np.array([finger.tip_m for finger in fingers])
+        return cls(is_joint, offsets, axes, tips_m, np.array([each.points for each in fingers]))
+
+    def frames(
+        self, angles_rad: Float64[np.ndarray, "time *hands fingers hinges"]
+    ) -> Float64[np.ndarray, "time *hands fingers hinges 4 4"]:
+        """T_wrist_joint of every hinge after its rotation; padding repeats the last frame."""
+        turns = transform(rotation_from_vector(angles_rad[..., None] * self.axes), np.zeros(3))
+        frames = np.empty(turns.shape)
+        T_wrist_parent = np.broadcast_to(np.eye(4), frames[..., 0, :, :].shape)
+        for hinge in range(frames.shape[-3]):
+            T_parent_hinge = self.offsets[..., hinge, :, :]
+            T_wrist_parent = T_wrist_parent @ T_parent_hinge @ turns[..., hinge, :, :]
+            frames[..., hinge, :, :] = T_wrist_parent
+        return frames
+
+    def points_m(
+        self, frames: Float64[np.ndarray, "time *hands fingers hinges 4 4"]
+    ) -> Float64[np.ndarray, "time *hands fingers 4 3"]:
+        """Knuckle, PIP, DIP and tip of every finger."""
+        # Padded with the last frame, so that index -1 is valid for all fingers.
+        last = frames[..., -1, :, :]
+        tips_m = (last[..., :3, :3] @ self.tips_m[..., None])[..., 0] + last[..., :3, 3]
+        fingers = np.arange(len(self.points))[:, None]
+        origins_m = frames[..., :3, 3][..., fingers, self.points, :]
+        return np.concatenate([origins_m, tips_m[..., None, :]], axis=-2)
+
+
 class HandModel:
     """A hand of 1 to 5 fingers with 1 to 6 hinges each.
 
@@ -89,15 +142,7 @@ class HandModel:
         rows = [row for finger in fingers for row in finger.joints]
         self.joint_names = tuple(row.name for row in rows)
         self.lower_rad, self.upper_rad = np.array([row.limits_rad for row in rows]).T.copy()
-        counts = np.array([len(finger.joints) for finger in fingers])
-        # Tables of [fingers, hinges] are padded; this is the mask of existing hinges.
-        self._is_joint: Bool[np.ndarray, "fingers hinges"]
-        self._is_joint = np.asarray(np.arange(counts.max()) < counts[:, None])
-        R = rotation_from_quaternion(np.array([row.q_wxyz for row in rows]))
-        self._offsets = np.tile(np.eye(4), (*self._is_joint.shape, 1, 1))
-        self._offsets[self._is_joint] = transform(R, np.array([row.position_m for row in rows]))
-        self._axes = np.zeros((*self._is_joint.shape, 3))
-        self._axes[self._is_joint] = [row.axis for row in rows]
+        self._chains = _Chains.of(fingers)
 
     @property
     def fingers(self) -> tuple[FingerTable, ...]:
@@ -124,16 +169,10 @@ class HandModel:
             raise ShapeError(f"joint angles: got shape {q.shape}, expected [T, {count}]")
         if not np.isfinite(q).all():
             raise NonFiniteError(f"joint angles of the {self.side} hand hold NaN or infinity")
-        num_fingers, num_hinges = self._is_joint.shape
-        angles = np.zeros((len(q), num_fingers, num_hinges))
-        angles[:, self._is_joint] = q
-        turns = transform(rotation_from_vector(angles[..., None] * self._axes), np.zeros(3))
-        frames = np.empty((len(q), num_fingers, num_hinges, 4, 4))
-        T_wrist_parent = np.broadcast_to(np.eye(4), (len(q), num_fingers, 4, 4))
-        for joint in range(num_hinges):
-            T_wrist_parent = T_wrist_parent @ self._offsets[:, joint] @ turns[:, :, joint]
-            frames[:, :, joint] = T_wrist_parent
-        return frames
+        is_joint = self._chains.is_joint
+        angles_rad = np.zeros((len(q), *is_joint.shape))
+        angles_rad[:, is_joint] = q
+        return self._chains.frames(angles_rad)
 
     def chain_points_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time fingers 4 3"]:
         """Knuckle, PIP, DIP and tip of every finger in wrist coordinates, metres.
@@ -141,14 +180,7 @@ class HandModel:
         The knuckle is the base of the first phalanx: for the Wuji hand the origin of the abduction
         frame (thumb: of the second CMC frame).
         """
-        frames = self.joint_frames(joints_rad)
-        # Padded with the last frame, so that index -1 is valid for all fingers.
-        last = frames[:, :, -1]
-        tips_m = np.array([finger.tip_m for finger in self.fingers])
-        tip_points = (last[..., :3, :3] @ tips_m[:, :, None])[..., 0] + last[..., :3, 3]
-        fingers = np.arange(len(self.fingers))[:, None]
-        points = frames[..., :3, 3][:, fingers, [finger.points for finger in self.fingers]]
-        return np.concatenate([points, tip_points[:, :, None]], axis=2)
+        return self._chains.points_m(self.joint_frames(joints_rad))
 
     def fingertips_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time fingers 3"]:
         """Fingertips in wrist coordinates, metres, for joint angles [T, J]."""
@@ -172,6 +204,29 @@ class RobotHand(HandModel):
 
     def __init__(self, side: str) -> None:
         super().__init__(side, _wuji_hand_2().get(side, ()), name=f"Wuji Hand 2 {side}")
+
+
+def chain_points_of_both_m(joints_rad: np.ndarray) -> Float64[np.ndarray, "time 2 5 4 3"]:
+    """`RobotHand.chain_points_m` of the left and the right hand, in little more time than of one.
+
+    Args:
+        joints_rad: [T, 2, 20] finite joint angles, left before right.
+    """
+    chains = _both_hands()
+    angles_rad = np.asarray(joints_rad, dtype=np.float64).reshape(-1, *chains.axes.shape[:-1])
+    return chains.points_m(chains.frames(angles_rad))
+
+
+@cache
+def _both_hands() -> _Chains:
+    hands = [_Chains.of(_wuji_hand_2()[side]) for side in SIDES]
+    return _Chains(
+        np.stack([hand.is_joint for hand in hands]),
+        np.stack([hand.offsets for hand in hands]),
+        np.stack([hand.axes for hand in hands]),
+        np.stack([hand.tips_m for hand in hands]),
+        hands[0].points,
+    )
 
 
 @cache

@@ -6,7 +6,7 @@ import pytest
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
 from dextouch.geometry.rotations import rotation_from_quaternion, rotation_from_vector
 from dextouch.hands import CHAINS, FingerTable, JointRow
-from dextouch.hands.robot_hand import HandModel, RobotHand
+from dextouch.hands.robot_hand import HandModel, RobotHand, chain_points_of_both_m
 from services.twin.hands import HumanHand
 
 
@@ -139,3 +139,12 @@ def with_first(**changes):
 def test_tables_that_are_no_hand_are_refused(fingers, error, message):
     with pytest.raises(error, match=message):
         HandModel("left", fingers, name="broken")
+
+
+@pytest.mark.parametrize("num_steps", [1, 16])
+def test_both_hands_together_are_each_alone(num_steps):
+    joints_rad = np.random.default_rng(5).uniform(-0.5, 1.5, (num_steps, 2, 20))
+    together = chain_points_of_both_m(joints_rad)
+    for index, side in enumerate(("left", "right")):
+        alone = RobotHand(side).chain_points_m(joints_rad[:, index])
+        np.testing.assert_array_equal(together[:, index], alone)

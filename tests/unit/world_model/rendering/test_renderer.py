@@ -124,6 +124,21 @@ def test_alone_or_in_company_an_image_is_the_same(small, image, still, uses_bflo
     np.testing.assert_array_equal(again, together)
 
 
+@pytest.mark.parametrize("uses_bfloat16", [False, True])
+def test_a_trace_of_single_images_gives_the_same_bytes(small, image, still, uses_bfloat16):
+    rng = np.random.default_rng(1)
+    renderer = Renderer(network(small), uses_bfloat16=uses_bfloat16)
+    for _ in range(7):
+        moved = turned(shifted(still, objects_m=rng.normal(size=3) * 0.02), rng.normal(size=3) / 30)
+        # The first calls of a renderer are not traced.
+        expected = Renderer(network(small), uses_bfloat16=uses_bfloat16)
+        np.testing.assert_array_equal(
+            renderer.draw(image, K, still, [moved], BOXES_M),
+            expected.draw(image, K, still, [moved], BOXES_M),
+        )
+    assert renderer._paint._traces
+
+
 def test_an_empty_slot_changes_nothing(renderer, image, still):
     moved = shifted(still, objects_m=(0.03, 0.01, 0.0))
 
