@@ -75,7 +75,9 @@ class _Chains:
 
     @classmethod
     def of(cls, fingers: Sequence[FingerTable]) -> "_Chains":
+        """The hinges of one hand."""
         counts = np.array([len(finger.joints) for finger in fingers])
+        is_joint: Bool[np.ndarray, "fingers hinges"]
         is_joint = np.asarray(np.arange(counts.max()) < counts[:, None])
         rows = [row for finger in fingers for row in finger.joints]
         R = rotation_from_quaternion(np.array([row.q_wxyz for row in rows]))
