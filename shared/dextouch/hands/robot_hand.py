@@ -77,13 +77,12 @@ class _Chains:
     def of(cls, fingers: Sequence[FingerTable]) -> "_Chains":
         """The hinges of one hand."""
         counts = np.array([len(finger.joints) for finger in fingers])
-        is_joint: Bool[np.ndarray, "fingers hinges"]
-        is_joint = np.asarray(np.arange(counts.max()) < counts[:, None])
+        is_joint = np.arange(counts.max()) < counts[:, np.newaxis]
         rows = [row for finger in fingers for row in finger.joints]
         R = rotation_from_quaternion(np.array([row.q_wxyz for row in rows]))
-        offsets = np.tile(np.eye(4), (*is_joint.shape, 1, 1))
+        offsets = np.tile(np.eye(4), (len(counts), counts.max(), 1, 1))
         offsets[is_joint] = transform(R, np.array([row.position_m for row in rows]))
-        axes = np.zeros((*is_joint.shape, 3))
+        axes = np.zeros((len(counts), counts.max(), 3))
         axes[is_joint] = [row.axis for row in rows]
         tips_m = np.array([finger.tip_m for finger in fingers])
         return cls(is_joint, offsets, axes, tips_m, np.array([each.points for each in fingers]))
@@ -95,7 +94,7 @@ class _Chains:
         turns = transform(rotation_from_vector(angles_rad[..., None] * self.axes), np.zeros(3))
         frames = np.empty(turns.shape)
         T_wrist_parent = np.broadcast_to(np.eye(4), frames[..., 0, :, :].shape)
-        for hinge in range(frames.shape[-3]):
+        for hinge in range(self.axes.shape[-2]):
             T_parent_hinge = self.offsets[..., hinge, :, :]
             T_wrist_parent = T_wrist_parent @ T_parent_hinge @ turns[..., hinge, :, :]
             frames[..., hinge, :, :] = T_wrist_parent
