@@ -158,8 +158,9 @@ def _state_costs(world: "StateWorld", num_rounds: int, bar: Bar) -> dict[str, Fi
     """Milliseconds per chunk of the state model, with one demonstration of each of its tasks."""
     tasks = [task for task in TASK_NAMES if task in world.description.tasks]
     episodes = held_out(tasks, [FIRST_SEED], world.description.image_height_px)
-    # Choice of precision, and memory of the first images.
-    imagine_together(world, episodes, 1, EVERYTHING)
+    # Choice of precision, memory of the first images, and traces.
+    for selector in SELECTORS.values():
+        imagine_together(world, episodes, 1, selector)
     return _costs(world, episodes, STATE_BATCHES, num_rounds, bar)
 
 
