@@ -291,8 +291,8 @@ class Experiments:
         """Adapted world models, and a study of policies in them and in the twin."""
         worlds = {
             f"{world} {seed}": self._adapted(world, seed)
-            for seed in self.seeds
             for world in ADAPTED
+            for seed in self.seeds
         }
         for name, model in worlds.items():
             world, _, seed = name.partition(" ")

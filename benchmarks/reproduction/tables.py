@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -430,14 +431,13 @@ def _paper_page(title: str, table: Mapping[str, Any]) -> Page:
 
 def data_table(folder: Path, steps: Sequence[Step]) -> ResultTable:
     """Episodes that the models of some steps were trained on; seeds with the same are one row."""
-    rows = dict.fromkeys(
-        (models, *sets)
-        for step in steps
-        for made in step.makes
-        for text in notes_of(folder / step.name / made).values()
-        if (sets := _trained_on(json.loads(text)))
-        for models in ("/".join(p for p in step.name.split("/") if not p.startswith("seed-")),)
-    )
+    rows: dict[tuple[str, ...], None] = {}
+    for step in steps:
+        models = re.sub(r"/seed-\d+", "", step.name)
+        for made in step.makes:
+            for text in notes_of(folder / step.name / made).values():
+                if sets := _trained_on(json.loads(text)):
+                    rows[models, *sets] = None
     title = "Data, with the first digits of the SHA-256 of the episodes' content"
     return ResultTable(title, ("models", "training data", "held out"), [*rows], num_text_columns=3)
 

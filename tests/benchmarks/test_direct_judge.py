@@ -201,19 +201,27 @@ def test_a_quick_run_writes_a_judge_that_the_evaluator_opens(tmp_path, monkeypat
         judge.probability(start_of(one, task="lift"), one.actions[1:])
 
 
+def pressed_or_elsewhere(seed: int) -> SceneEpisode:
+    """The hand comes down at a random place; a block is under it, or at another such place."""
+    one, other = episode(2 * seed), episode(2 * seed + 1)
+    if seed % 2:
+        return one
+    return replace(one, images=other.images, object_poses=other.object_poses, success=False)
+
+
 @pytest.mark.slow
-def test_a_trained_judge_tells_hits_from_misses(tmp_path):
-    """The hand comes down on the block, or 17 cm beside it, wherever the block is."""
+def test_a_trained_judge_tells_where_the_block_is(tmp_path):
     torch.set_num_threads(1)
     settings = JudgeSettings(
-        reader_steps=250, num_steps=200, max_cpu_s=60.0, batch_size=32, development_share=0.2
+        reader_steps=250, num_steps=300, max_cpu_s=60.0, batch_size=32, development_share=0.2
     )
-    episodes = [episode(seed) for seed in range(150)]
+    episodes = [pressed_or_elsewhere(seed) for seed in range(200)]
     checkpoint = train_direct_judge(episodes, (), settings, command="test")
     path = tmp_path / "direct.safetensors"
     save_checkpoint(path, checkpoint)
     judge = DirectJudge.load(path)
-    tested = [episode(seed) for seed in range(1000, 1060)]
+    tested = [pressed_or_elsewhere(seed) for seed in range(1000, 1080)]
     told = [judge.probability(start_of(one), one.actions[1:]) for one in tested]
-    assert area_under_roc(np.array(told), np.array([one.success for one in tested])) > 0.9
-    assert checkpoint.metadata.metrics["development_auc_press"] > 0.9
+    # By the commands alone, both outcomes are alike: 0.5.
+    assert area_under_roc(np.array(told), np.array([one.success for one in tested])) > 0.8
+    assert checkpoint.metadata.metrics["development_auc_press"] > 0.8

@@ -131,11 +131,17 @@ def test_an_interrupted_run_stops_its_command_and_resumes_in_its_folder(tmp_path
     slow.write_text(
         textwrap.dedent(
             """
-            import os, time, pathlib as p
+            import signal, sys, time, pathlib as p
+
+            def stop(*_):
+                p.Path("a/stopped").touch()
+                sys.exit(1)
+
             if p.Path("a/partial").exists():
                 p.Path("a/made").touch()
             else:
-                p.Path("a/partial").write_text(str(os.getpid()))
+                signal.signal(signal.SIGTERM, stop)
+                p.Path("a/partial").touch()
                 time.sleep(600)
             """
         )
@@ -156,14 +162,14 @@ def test_an_interrupted_run_stops_its_command_and_resumes_in_its_folder(tmp_path
     partial = tmp_path / "a" / "partial"
     with subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as child:
         deadline_s = time.monotonic() + 60
-        while not (partial.exists() and partial.read_text()) and time.monotonic() < deadline_s:
+        while not partial.exists() and time.monotonic() < deadline_s:
             time.sleep(0.02)
         child.send_signal(signal.SIGINT)
         try:
             assert child.wait(60) != 0
         finally:
             child.kill()
-    assert not Path(f"/proc/{partial.read_text()}").exists()
+    assert (tmp_path / "a" / "stopped").exists()
     assert subprocess.run(arguments, timeout=60, check=False, capture_output=True).returncode == 0
     assert (tmp_path / "a" / "made").exists()
 
