@@ -15,7 +15,7 @@ export OMP_NUM_THREADS ?= 1
 
 SCREENS ?= build/screens
 .PHONY: demo test check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
-	reproduce-checkpoints
+	reproduce reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
 $(VENV)/.runtime: pyproject.toml constraints.txt
@@ -83,6 +83,9 @@ bench: $(VENV)/.dev      ## measure time and error of each stage; STAGE=clocks A
 
 stress: $(VENV)/.dev     ## check every stage against numerical hazards; ARGS="--quick", or names of stages
 	$(BIN)/python -m benchmarks stress $(ARGS)
+
+reproduce: $(VENV)/.runtime   ## the paper's tables in miniature, in runs/reproduction; some hours; ARGS="design --list"; docs/reproduction.md
+	$(BIN)/python -m benchmarks reproduction $(ARGS)
 
 # Run again to resume after an interruption. The last step reports which bounds are met and which figures match docs/evaluator.json.
 reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's state model, success probe and cloned policies, and measure them, in runs/reproduce

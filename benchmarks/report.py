@@ -76,13 +76,14 @@ def show(report: StageReport, console: Console) -> None:
 
 
 def to_markdown(report: StageReport) -> str:
-    """The report as Markdown for the documentation: machine, versions and tables."""
+    """The report as Markdown for the documentation: machine, versions, tables and notes."""
     about = ", ".join(f"{name} {value}" for name, value in report.machine.items())
     parts = [f"Machine: {about}.\n"]
     for table in (*report.tables, _acceptance(report)):
         lines = [table.columns, ("---",) * len(table.columns), *table.rows]
         parts.append(f"**{table.title}**\n")
         parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n")
+    parts += [f"Note: {note}\n" for note in report.notes]
     return "\n".join(parts)
 
 

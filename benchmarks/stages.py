@@ -83,6 +83,15 @@ STAGES = {
         "starts, and mean and worst of several training seeds. Results are kept in --keep, so an "
         "interrupted run resumes.",
     ),
+    "direct-judge": StageEntry(
+        "benchmarks.direct_judge",
+        "train the evaluator's baseline, which imagines nothing",
+        "Trains a judge that predicts success from the first observation and the commands alone, "
+        "on the true robot episodes of some stores: a start reader like the world model's on the "
+        "poses of objects, then a recurrent network on outcomes. A share of the scenes is held out "
+        "for early stopping, calibration and the reported metrics. `python -m benchmarks evaluator "
+        "--direct` compares imagined endings with it (docs/evaluation.md).",
+    ),
     "objects": StageEntry(
         "benchmarks.objects",
         "find objects by the markers on them, compared with the usual recipe",
@@ -185,6 +194,15 @@ STAGES = {
         "bfloat16, compared with repeating the first step; then times it by requested images and "
         "batch size, and likewise the state model. Reports processor time per chunk and errors of "
         "images and touch over whole rollouts.",
+    ),
+    "reproduction": StageEntry(
+        "benchmarks.reproduction.benchmark",
+        "reproduce the paper's tables in miniature, in the twin",
+        "Records data in the twin, trains world models, adapts them, evaluates and trains "
+        "policies, and writes the tables beside the paper's numbers (docs/reproduction.md). Every "
+        "step is a dextouch command. A stopped run is continued by the same command; steps that "
+        "are done are not run again unless their commands changed. Exits with status 1 if a step "
+        "fails, also without --check; --quick has very small sizes, to try the steps.",
     ),
     "stress": StageEntry(
         "benchmarks.stress.benchmark",

@@ -7,10 +7,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from benchmarks.direct_judge import DirectJudge
 from benchmarks.evaluator.plan import Trained
 from dextouch.errors import InvalidInputError
 from dextouch.worlds import BatchWorld
-from services.evaluation.direct_judge import DirectJudge
 from services.evaluation.success_probe import SuccessProbe
 from services.world_model.world import open_world
 
@@ -68,7 +68,7 @@ def refuse_unequal_rivals(members: Sequence[Member]) -> None:
     Raises:
         InvalidInputError: direct judges, or worlds without touch, of different tasks.
     """
-    refuse_unequal_tasks("--direct", [m.direct.shape.tasks for m in members if m.direct])
+    refuse_unequal_tasks("--direct", [m.direct.metadata.tasks for m in members if m.direct])
     worlds = [m.untouched.description.tasks for m in members if m.untouched]
     refuse_unequal_tasks("--without-touch", worlds)
 

@@ -30,7 +30,6 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions
 from dextouch.schemas import RolloutDoubt, RolloutStart
 from dextouch.worlds import BatchWorld
-from services.evaluation.direct_network import Attempt
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.success_probe import DECISION_THRESHOLD
 from services.twin.bounding_boxes import object_boxes_m
@@ -194,16 +193,7 @@ class PolicyRollout:
         """Verdict of the direct judge, given the first observation and the twin's commands."""
         if member.direct is None:
             raise InvalidInputError("evaluator: no direct judge was given; name one by --direct")
-        seen, first = self._started.observation, self._started
-        attempt = Attempt(
-            self._task,
-            self._first_image,
-            seen.tactile_kpa[0],
-            self.real.actions,
-            first.anchor,
-            first.K_head,
-        )
-        probability = float(member.direct.probabilities([attempt])[0])
+        probability = member.direct.probability(self._first, self.real.actions)
         return {"probability": probability, "likely_success": probability >= DECISION_THRESHOLD}
 
 

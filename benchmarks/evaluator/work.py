@@ -91,7 +91,7 @@ class Study:
         if mistake_of(policy) is not None:
             return VERDICTS
         kinds = [*NEEDED, "verdict without touch"]
-        if member.direct is not None and task in member.direct.shape.tasks:
+        if member.direct is not None and task in member.direct.metadata.tasks:
             kinds.append("direct verdict")
         if policy in self.plan.scripts:
             kinds += _OF_SCRIPTS

@@ -42,7 +42,6 @@ SECTIONS: Final = {
     "evaluation_run": "evaluation.settings:RunSettings",
     "evaluation_train_policy": "evaluation.settings:TrainPolicySettings",
     "evaluation_train_probe": "evaluation.settings:TrainProbeSettings",
-    "evaluation_train_direct_judge": "evaluation.settings:TrainDirectSettings",
     "world_model_show": "world_model.settings:ShowCommand",
     "world_model_train": "world_model.settings:TrainCommand",
     "world_model_train_state": "world_model.settings:TrainStateCommand",

@@ -89,10 +89,6 @@ COMMANDS = {
         "train the success probe on true and imagined episodes",
         "evaluation.command_line:run_train_probe",
     ),
-    "train direct-judge": Command(
-        "train the success probe's baseline, which imagines nothing",
-        "evaluation.command_line:run_train_direct_judge",
-    ),
     "generate": Command(
         "generate demonstrations from the actions of recorded ones", "cli.generate:main"
     ),
@@ -118,9 +114,6 @@ COMMANDS = {
     ),
     "study serve": Command(
         "serve the results of studies to the dashboard", "evaluation.studies.app:main"
-    ),
-    "reproduce": Command(
-        "reproduce the paper's tables in miniature, in the twin", "cli.reproduce.command:main"
     ),
     "rate": Command("score rollouts by human raters, and measure their agreement"),
     "rate serve": Command(

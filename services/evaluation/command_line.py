@@ -15,8 +15,6 @@ from dextouch.free_text import printable
 from dextouch.serving import load_settings
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
-from services.evaluation.direct_data import read_attempts
-from services.evaluation.direct_training import train_direct_judge
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.cloning_episodes import read_cloning_episodes
@@ -32,7 +30,6 @@ from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.settings import (
     RunSettings,
     ServedWorld,
-    TrainDirectSettings,
     TrainPolicySettings,
     TrainProbeSettings,
     command_line,
@@ -103,16 +100,6 @@ def run_train_probe(arguments: list[str]) -> int:
         held_out=read(settings.held_out),
         jobs=settings.jobs,
     )
-    return _keep(checkpoint, settings.output, settings.json_path)
-
-
-def run_train_direct_judge(arguments: list[str]) -> int:
-    """Train the direct judge and save it."""
-    settings = load_settings(TrainDirectSettings, arguments)
-    stores = [EpisodeStore(url) for url in settings.episodes]
-    items = read_attempts(*stores, tasks=settings.tasks)
-    command = command_line("direct-judge", arguments)
-    checkpoint = train_direct_judge(items, settings.training, command=command)
     return _keep(checkpoint, settings.output, settings.json_path)
 
 

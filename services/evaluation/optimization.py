@@ -1,4 +1,4 @@
-"""Training loop of the policy, the success probe and the direct judge, with a progress bar."""
+"""Training loop of networks of the evaluation, with a progress bar."""
 
 from collections.abc import Callable, Iterator
 from typing import Protocol, runtime_checkable

@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 from dextouch.command_line import JSON_HELP
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import CommandSettings, service_config
-from services.evaluation.training_settings import CloningSettings, DirectSettings, ProbeSettings
+from services.evaluation.training_settings import CloningSettings, ProbeSettings
 from services.networks.training_settings import USUAL_IMAGE_PX, ImagePx, Splits, Stores, Tasks
 
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -88,24 +88,6 @@ class TrainProbeSettings(CommandSettings):
     image_px: ImagePx = USUAL_IMAGE_PX
     jobs: int = Field(default=2, ge=1, le=64, description="tasks trained in parallel")
     training: ProbeSettings = Field(default=ProbeSettings(), description="training settings")
-    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
-
-
-class TrainDirectSettings(CommandSettings):
-    """Train a baseline that predicts success from first observations and commands alone.
-
-    Example:
-      dextouch train direct-judge --episodes runs/episodes --output runs/direct.safetensors
-    """
-
-    model_config = service_config("evaluation_train_direct_judge", "dextouch train direct-judge")
-
-    episodes: Stores
-    output: Path = Field(
-        default=Path("runs/evaluation/direct_judge.safetensors"), description="checkpoint to write"
-    )
-    tasks: Tasks = ()
-    training: DirectSettings = Field(default=DirectSettings(), description="training settings")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 

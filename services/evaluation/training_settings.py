@@ -101,24 +101,3 @@ class ProbeSettings(FrozenModel):
         le=0.5,
         description="distance from 0.5 beyond which probe and world contradict each other",
     )
-
-
-class DirectSettings(FrozenModel):
-    """Training settings of a direct judge; the finder gets `finder_share` of the time."""
-
-    seed: Seed = 0
-    max_cpu_s: CpuBudget = 600.0
-    finder_share: float = Field(
-        default=0.6, gt=0, lt=1, description="share of the time for the object finder"
-    )
-    num_finder_steps: int = Field(default=6000, ge=1, description="largest number of finder steps")
-    num_judge_steps: int = Field(default=6000, ge=1, description="largest number of judge steps")
-    batch_size: Batch = Field(default=64, ge=2)
-    learning_rate: LearningRate = 2e-3
-    weight_decay: WeightDecay = 2e-2
-    bfloat16: bool = Field(default=False, description="convolve in bfloat16: twice as fast on AMX")
-    image_noise: ImageNoise = 0.01
-    brightness: Brightness = 0.03
-    development_share: float = Field(
-        default=0.1, gt=0, lt=1, description="share of seeds to calibrate on"
-    )

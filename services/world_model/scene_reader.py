@@ -7,10 +7,9 @@ import torch
 
 from dextouch.errors import UnknownNameError
 from services.world_model.dynamics.hand_motion import hand_motion
-from services.world_model.dynamics.model import mean_poses, pad_means_kpa
+from services.world_model.dynamics.model import first_steps, mean_poses
 from services.world_model.dynamics.nested import stacked
 from services.world_model.dynamics.objects import BOX_AXES, poses_from_objects
-from services.world_model.dynamics.start_reader import FirstStep
 from services.world_model.network.contact_geometry import SeenObjects
 from services.world_model.network.inputs import PredictionRequest
 from services.world_model.state_checkpoints import StateCheckpoint
@@ -41,14 +40,12 @@ class SceneReader:
         if unknown:
             raise UnknownNameError("task of the start readers", unknown[0], list(self.tasks))
         hands = [hand_motion(request.actions[:1], request.anchor) for request in requests]
-        touch = np.stack([request.first_tactile_kpa for request in requests])
-        first = FirstStep(
-            torch.from_numpy(np.stack([request.first_image for request in requests])),
-            torch.from_numpy(np.stack([request.K_head for request in requests])).float(),
-            torch.from_numpy(np.concatenate([one.Ts_world_camera for one in hands])).float(),
-            torch.from_numpy(np.concatenate([one.points_m for one in hands])),
-            torch.from_numpy(pad_means_kpa(touch)),
-            torch.tensor([self.tasks.index(task) for task in tasks]),
+        first = first_steps(
+            [request.first_image for request in requests],
+            [request.K_head for request in requests],
+            [request.first_tactile_kpa for request in requests],
+            hands,
+            [self.tasks.index(task) for task in tasks],
         )
         readings = [reader(first) for reader in self._readers]
         poses = poses_from_objects(mean_poses(stacked([one.objects for one in readings])))

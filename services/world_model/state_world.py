@@ -39,12 +39,11 @@ from services.world_model.dynamics.memory import (
 from services.world_model.dynamics.model import (
     PRESENCE_THRESHOLD,
     ImaginedSteps,
+    first_steps,
     mean_size,
     mean_start,
-    pad_means_kpa,
 )
 from services.world_model.dynamics.objects import BOX_AXES, ObjectPoses, poses_from_objects
-from services.world_model.dynamics.start_reader import FirstStep
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import (
     ACTION_KINDS,
@@ -128,13 +127,12 @@ class StateWorld:
         self._check_start(start, first)
         motion = hand_motion(first.reached[None], first.anchor)
         memory = self._dynamics.begin(
-            FirstStep(
-                torch.from_numpy(first.image)[None],
-                torch.from_numpy(first.K_head).float()[None],
-                torch.from_numpy(motion.Ts_world_camera).float(),
-                torch.from_numpy(motion.points_m),
-                torch.from_numpy(pad_means_kpa(first.tactile_kpa))[None],
-                torch.tensor([self._description.tasks.index(start.task)]),
+            first_steps(
+                [first.image],
+                [first.K_head],
+                [first.tactile_kpa],
+                [motion],
+                [self._description.tasks.index(start.task)],
             ),
             torch.from_numpy(first.tactile_kpa)[None],
             Commands.standing([motion]),

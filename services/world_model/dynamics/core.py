@@ -41,7 +41,7 @@ _SLOT_WIDTH, _HAND_WIDTH = 64, 96
 # Of an object: size (6), movability, presence, uncertainty, height, and way from the start (3).
 _ABOUT_SIZE = 6 + 1 + 1 + 1 + 1 + 3
 # Joints, wrist axes, heights of the points at all looks, wrist velocity (twice scaled), side.
-_OWN_SIZE = 20 + 6 + len(LOOKS) * NUM_POINTS + 2 * 3 + 1
+OWN_SIZE = 20 + 6 + len(LOOKS) * NUM_POINTS + 2 * 3 + 1
 # Of an object at the end: the above, axes, position, and way over the table and upwards.
 _END_SIZE = _ABOUT_SIZE + 6 + 3 + 2
 _PAIRS = tuple(combinations(range(MAX_OBJECTS), 2))
@@ -141,13 +141,13 @@ class RecurrentCore(nn.Module):
         tasks = len(config.tasks)
         self.register_buffer("boxes_m", torch.zeros(tasks, MAX_OBJECTS, 6))
         self.register_buffer("movable", torch.zeros(tasks, MAX_OBJECTS))
-        self.register_buffer("lowest", torch.full((_OWN_SIZE,), -10.0))
-        self.register_buffer("highest", torch.full((_OWN_SIZE,), 10.0))
+        self.register_buffer("lowest", torch.full((OWN_SIZE,), -10.0))
+        self.register_buffer("highest", torch.full((OWN_SIZE,), 10.0))
         self.slot = nn.Sequential(
             linear(SLOT_SIZE + _ABOUT_SIZE, 128), nn.GELU(),
             linear(128, _SLOT_WIDTH), nn.GELU(),
         )  # fmt: skip
-        self.hand = nn.Sequential(linear(_SLOT_WIDTH + _OWN_SIZE, _HAND_WIDTH), nn.GELU())
+        self.hand = nn.Sequential(linear(_SLOT_WIDTH + OWN_SIZE, _HAND_WIDTH), nn.GELU())
         self.mix = nn.Sequential(
             linear(_SIDES * _HAND_WIDTH + 1, width), MemberNorm(members, width), nn.GELU()
         )

@@ -4,12 +4,12 @@
 for the next commands. The only state kept between chunks is a `SceneMemory`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from torch import Tensor, nn
 
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
@@ -23,6 +23,7 @@ from services.world_model.dynamics.core import (
     SceneFuture,
     SceneStart,
 )
+from services.world_model.dynamics.hand_motion import HandMotion
 from services.world_model.dynamics.nested import folded, stacked, unfolded
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import FirstStep, Reading, StartReader
@@ -42,6 +43,24 @@ def pad_means_kpa(tactile_kpa: Float32[np.ndarray, "*batch 2 320"]) -> np.ndarra
     tips, palm = split_pads(tactile_kpa)
     pads = np.concatenate([tips.mean((-1, -2)), palm.mean((-1, -2))[..., None]], axis=-1)
     return pads.reshape(*pads.shape[:-2], NUM_PADS)
+
+
+def first_steps(
+    images: Sequence[UInt8[np.ndarray, "px px 3"]],
+    Ks_head: Sequence[Float64[np.ndarray, "3 3"]],
+    tactile_kpa: Sequence[Float32[np.ndarray, "2 320"]],
+    hands: Sequence[HandMotion],
+    tasks: Sequence[int],
+) -> FirstStep:
+    """A batch of observed steps as inputs of the readers; `hands` are of one step each."""
+    return FirstStep(
+        torch.from_numpy(np.stack(images)),
+        torch.from_numpy(np.stack(Ks_head)).float(),
+        torch.from_numpy(np.concatenate([one.Ts_world_camera for one in hands])).float(),
+        torch.from_numpy(np.concatenate([one.points_m for one in hands])),
+        torch.from_numpy(pad_means_kpa(np.stack(tactile_kpa))),
+        torch.tensor(tasks),
+    )
 
 
 @dataclass(frozen=True)

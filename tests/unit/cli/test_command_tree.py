@@ -16,14 +16,14 @@ COMMANDS = """
 align markers, align report, align retarget, align run, align serve,
 checkpoint, completion, config example, config show, dashboard, demo,
 doctor, evaluate, evaluate prediction, evaluate recorded, export, generate, import,
-rate report, rate serve, reproduce, serve,
+rate report, rate serve, serve,
 station calibrate camera, station calibrate glove, station calibrate hand-eye,
 station calibrate latency, station calibrate profile, station calibrate robot-base,
 station calibrate show, station calibrate wrist, station enrol, station serve,
 store delete, store deletions, store enrol, store list, store migrate, store purge,
 store repair, store restore, store revoke, store serve, store show, store stations, store verify,
 study report, study run, study serve,
-train adapt, train data, train direct-judge, train distill, train imagined, train policy,
+train adapt, train data, train distill, train imagined, train policy,
 train probe, train state, train tokenizer, train world-model,
 twin record, twin serve, up
 """

@@ -8,20 +8,21 @@ import subprocess
 import sys
 import textwrap
 import time
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from dextouch.errors import ConflictError, NotFoundError
+from benchmarks.command import stage_parser
+from benchmarks.reproduction import benchmark
+from benchmarks.reproduction.experiments import ADAPTED, QUICK, TABLES, Experiments, Sizes
+from benchmarks.reproduction.steps import Step, run
+from benchmarks.reproduction.tables import METRICS, Measured, Page, Row, data_table, make_pages
+from dextouch.errors import NotFoundError
 from services.cli.main import find_command, main
-from services.cli.reproduce.experiments import ADAPTED, TABLES, Experiments
-from services.cli.reproduce.pages import Measured, Page, Row
-from services.cli.reproduce.provenance import data_of
-from services.cli.reproduce.sizes import QUICK, Sizes
-from services.cli.reproduce.steps import Runner, Step
-from services.cli.reproduce.tables import METRICS, make_pages
 from services.evaluation.scores import ClosedLoopReport, RolloutScore
 from services.evaluation.studies.definition import read_definition
 from services.twin.tasks.registry import DOWNSTREAM
@@ -39,8 +40,7 @@ PROGRAM = (
 
 
 def a_step(name, word=None, needs=(), exits=(0,)):
-    words = (f"{name}/made", word or name)
-    return Step(name, words, ("made",), needs, exits=exits)
+    return Step(name, f"{name}/made {word or name}", ("made",), needs, exits=exits)
 
 
 def ran(folder: Path) -> list[str]:
@@ -50,78 +50,126 @@ def ran(folder: Path) -> list[str]:
     return words
 
 
-def run(folder, *steps, jobs=1):
-    return Runner(folder, steps, PROGRAM).run(jobs)
+def run_them(folder, *steps, jobs=1):
+    return run(steps, folder, jobs, PROGRAM)
 
 
 def test_steps_run_once_in_the_order_of_their_needs(tmp_path):
-    steps = (a_step("a"), a_step("b/1", needs=("a",)), a_step("c", needs=("b/1",)))
-    assert run(tmp_path, *steps) == []
+    first = a_step("a")
+    second = a_step("b/1", needs=(first,))
+    steps = (a_step("c", needs=(second,)), second, first)
+    assert run_them(tmp_path, *steps) == []
     assert ran(tmp_path) == ["a", "b/1", "c"]
-    assert run(tmp_path, *steps) == []
+    assert run_them(tmp_path, *steps) == []
     assert ran(tmp_path) == []
 
 
+def test_steps_that_do_not_need_each_other_run_at_once(tmp_path):
+    """Each waits for the file of the other."""
+    program = (
+        sys.executable,
+        "-c",
+        "import sys, time, pathlib as p\n"
+        "made, other = sys.argv[1:]\n"
+        "p.Path(made).touch()\n"
+        "while not p.Path(other).exists(): time.sleep(0.01)\n",
+    )
+    steps = (Step("a", "a/made b/made", ("made",)), Step("b", "b/made a/made", ("made",)))
+    assert run(steps, tmp_path, 2, program) == []
+
+
+def test_a_receipt_says_what_was_run_and_how_long(tmp_path):
+    step = a_step("a")
+    assert step.receipt(tmp_path) is None
+    run_them(tmp_path, step)
+    receipt = step.receipt(tmp_path)
+    assert receipt["command"] == "dextouch a/made a"
+    # A Python process takes more than a millisecond, and this one no minute.
+    assert 0.001 < receipt["cpu_s"] < 60
+    assert 0.001 < receipt["wall_s"] < 60
+    assert replace(step, command="other").receipt(tmp_path) is None
+
+
 def test_a_changed_command_repeats_what_depends_on_it_without_the_old_results(tmp_path):
-    run(tmp_path, a_step("a"), a_step("b", needs=("a",)), a_step("c"))
+    first = a_step("a")
+    run_them(tmp_path, first, a_step("b", needs=(first,)), a_step("c"))
     ran(tmp_path)
     (tmp_path / "b" / "left over").write_text("from before")
-    run(tmp_path, a_step("a", "other"), a_step("b", needs=("a",)), a_step("c"))
+    first = a_step("a", "other")
+    run_them(tmp_path, first, a_step("b", needs=(first,)), a_step("c"))
     assert ran(tmp_path) == ["other", "b"]
     assert not (tmp_path / "b" / "left over").exists()
 
 
 def test_a_step_whose_result_is_gone_is_repeated(tmp_path):
-    run(tmp_path, a_step("a"))
+    run_them(tmp_path, a_step("a"))
     ran(tmp_path)
     (tmp_path / "a" / "made").unlink()
-    run(tmp_path, a_step("a"))
+    run_them(tmp_path, a_step("a"))
     assert ran(tmp_path) == ["a"]
 
 
 def test_steps_that_need_a_failed_one_do_not_run_and_others_do(tmp_path, capsys):
-    steps = (a_step("a", "bad"), a_step("b", needs=("a",)), a_step("c"))
-    assert run(tmp_path, *steps) == ["a"]
+    bad = a_step("a", "bad")
+    assert run_them(tmp_path, bad, a_step("b", needs=(bad,)), a_step("c")) == ["a"]
     assert ran(tmp_path) == ["bad", "c"]
     assert "a: FAILED; the end of" in capsys.readouterr().out
 
 
+def test_a_step_without_its_result_has_failed(tmp_path):
+    step = replace(a_step("a"), makes=("made", "never made"))
+    assert run_them(tmp_path, step) == ["a"]
+
+
 def test_an_allowed_exit_status_counts_as_done(tmp_path):
-    assert run(tmp_path, a_step("a", "lenient", exits=(0, 1))) == []
-
-
-def test_a_need_must_come_before(tmp_path):
-    with pytest.raises(ConflictError, match="after those that it needs"):
-        Runner(tmp_path, (a_step("b", needs=("a",)), a_step("a")))
+    assert run_them(tmp_path, a_step("a", "lenient", exits=(0, 1))) == []
 
 
 def test_an_interrupted_run_stops_its_command_and_resumes_in_its_folder(tmp_path):
     """The parent gets SIGINT while the command sleeps; what the command left is there again."""
+    slow = tmp_path / "slow.py"
+    slow.write_text(
+        textwrap.dedent(
+            """
+            import signal, sys, time, pathlib as p
+
+            def stop(*_):
+                p.Path("a/stopped").touch()
+                sys.exit(1)
+
+            if p.Path("a/partial").exists():
+                p.Path("a/made").touch()
+            else:
+                signal.signal(signal.SIGTERM, stop)
+                p.Path("a/partial").touch()
+                time.sleep(600)
+            """
+        )
+    )
     script = textwrap.dedent(
         """
         import signal
         import sys
         from pathlib import Path
-        from services.cli.reproduce.steps import Runner, Step
+        from benchmarks.reproduction.steps import Step, run
         # Shells let commands in the background ignore it.
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        slow = ("import time, pathlib as p\\n"
-                "if p.Path('a/partial').exists(): p.Path('a/made').touch()\\n"
-                "else:\\n p.Path('a/partial').touch()\\n time.sleep(600)\\n")
-        step = Step("a", ("-c", slow), ("made",))
-        Runner(Path(sys.argv[1]), (step,), (sys.executable,)).run(1)
+        folder = Path(sys.argv[1])
+        run((Step("a", str(folder / "slow.py"), ("made",)),), folder, 1, (sys.executable,))
         """
     )
     arguments = [sys.executable, "-c", script, str(tmp_path)]
+    partial = tmp_path / "a" / "partial"
     with subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as child:
         deadline_s = time.monotonic() + 60
-        while not (tmp_path / "a" / "partial").exists() and time.monotonic() < deadline_s:
+        while not partial.exists() and time.monotonic() < deadline_s:
             time.sleep(0.02)
         child.send_signal(signal.SIGINT)
         try:
             assert child.wait(60) != 0
         finally:
             child.kill()
+    assert (tmp_path / "a" / "stopped").exists()
     assert subprocess.run(arguments, timeout=60, check=False, capture_output=True).returncode == 0
     assert (tmp_path / "a" / "made").exists()
 
@@ -129,10 +177,10 @@ def test_an_interrupted_run_stops_its_command_and_resumes_in_its_folder(tmp_path
 def test_every_step_is_a_command_of_ours_with_flags_that_it_has(capsys):
     flags: dict[str, set[str]] = {}
     for step in Experiments(Sizes(), (0, 1)).steps(TABLES):
-        find_command(step.words)
-        names = re.match(r"[a-z]+( [a-z][a-z-]+)*(?= -| [^ ]*/)", " ".join(step.words))
-        name = names[0]
-        flags.setdefault(name, set()).update(word for word in step.words if word.startswith("--"))
+        words = step.command.split()
+        find_command(words)
+        name = re.match(r"[a-z]+( [a-z][a-z-]+)*(?= -| [^ ]*/)", step.command)[0]
+        flags.setdefault(name, set()).update(word for word in words if word.startswith("--"))
     for name, given in flags.items():
         with pytest.raises(SystemExit):
             main([*name.split(), "--help"])
@@ -191,9 +239,11 @@ def test_differences_are_taken_seed_by_seed():
         {"a": 19.5},
         higher_is_better=True,
     )
-    text = Page("T", (row,), "a").markdown()
-    assert "(paper 19.5)" in text
-    assert "| PSNR ↑ | +1.0000 ± 0.0000 |" in text
+    table, differences = Page("T", (row,), "a").tables()
+    assert table.rows[0][1].endswith("(paper 19.5)")
+    assert differences.title == "T: difference from a, seed by seed"
+    assert differences.columns == ("", "b")
+    assert differences.rows == [("PSNR ↑", "+1.0000 ± 0.0000")]
 
 
 def test_a_prediction_table_reads_the_figures_of_its_steps(tmp_path):
@@ -212,13 +262,15 @@ def test_a_prediction_table_reads_the_figures_of_its_steps(tmp_path):
     assert psnr.cells["Cross-Attn"].mean == pytest.approx(21.5)
     assert psnr.paper["Robot-only"] == pytest.approx(23.473)
     assert page.to_json()["rows"][1]["values"]["V-only"] == [None, None]
-    text = page.markdown()
-    assert "| SSIM" not in text
-    assert "Not available: SSIM, LPIPS, Aesthetic Quality" in text
-    (line,) = [line for line in text.splitlines() if line.startswith("| PSNR ↑ | 20.5")]
-    assert line.endswith("| 18.25 | n/a | n/a |")
+    shown = {row[0]: row for row in page.tables()[0].rows}
+    assert "SSIM ↑" not in shown
+    (note,) = page.notes()
+    assert "not available: SSIM, LPIPS, Aesthetic Quality" in note
+    assert shown["PSNR ↑"][1].startswith("20.5")
+    assert shown["PSNR ↑"][-3:] == ("18.25", "n/a", "n/a")
     assert page.to_json()["rows"][0]["references"]["copy"] == pytest.approx(18.25)
-    assert "| PSNR, other actions ↓ | 17.0000 ± 0.0000 |" in text
+    # The base has 22 and 23 by seed, and 3 less than 22 with another take's actions in both.
+    assert shown["PSNR, other actions ↓"][1] == "17.0000 ± 0.0000"
 
 
 def test_a_table_of_two_policies_says_that_these_are_no_correlation(tmp_path):
@@ -240,10 +292,11 @@ def test_a_table_of_two_policies_says_that_these_are_no_correlation(tmp_path):
     study = ClosedLoopReport(tuple(scores), tuple(worlds), ("first", "second")).to_report()
     (tmp_path / "evaluator/study").mkdir(parents=True)
     (tmp_path / "evaluator/study/result.json").write_text(json.dumps(study))
-    text = "\n".join(page.markdown() for page in make_pages(tmp_path, experiments, "evaluator"))
-    rows = [line for line in text.splitlines() if line.startswith("| Pearson, ")]
-    assert sum("undefined (2 policies)" in row for row in rows) == len(DOWNSTREAM)
-    assert not any("1.0" in row or "| 1 " in row for row in rows)
+    pages = make_pages(tmp_path, experiments, "evaluator")
+    shown = [row for page in pages for table in page.tables() for row in table.rows]
+    rows = [cells for name, *cells in shown if name.startswith("Pearson, ")]
+    assert sum("undefined (2 policies)" in row[0] for row in rows) == len(DOWNSTREAM)
+    assert not any(cell.startswith(("1 ", "1.0")) or cell == "1" for row in rows for cell in row)
 
 
 def test_the_table_of_options_has_those_that_are_measured(tmp_path):
@@ -271,15 +324,79 @@ def test_data_are_named_once_for_all_seeds(tmp_path):
         {"domain": "robot", "tasks": {"stir": 7}, "data_hash": "d" * 64, "checkpoint": "an older"},
     ]
     notes = {"data_hash": "e" * 64, "sets": [{"heldout": False} | one for one in sets]}
-    steps = [Step(f"scaling/1x/seed-{seed}/model", (), ("m.safetensors",)) for seed in (0, 1)]
-    for step in steps:
+    steps = [Step(f"scaling/1x/seed-{seed}/model", "", ("m.safetensors",)) for seed in (0, 1)]
+    steps.append(Step("policy", "", ("p.safetensors", "result.json")))
+    for step, content in zip(steps, (notes, notes, {"data_hash": "f" * 64}), strict=True):
         (tmp_path / step.name).mkdir(parents=True)
-        save_file(
-            {"weight": np.zeros(1, np.float32)},
-            tmp_path / step.name / "m.safetensors",
-            {"dextouch_world_model": json.dumps(notes)},
-        )
-    (row,) = data_of(tmp_path, steps)
-    assert row.models == "scaling/1x/model"
-    assert row.trained == (f"8 robot ({'a' * 12})", f"9 human ({'b' * 12})")
-    assert row.heldout == (f"2 robot ({'c' * 12})",)
+        weights = {"weight": np.zeros(1, np.float32)}
+        save_file(weights, tmp_path / step.name / step.makes[0], {"about": json.dumps(content)})
+    of_model, of_policy = data_table(tmp_path, steps).rows
+    trained = f"8 robot ({'a' * 12}), 9 human ({'b' * 12})"
+    assert of_model == ("scaling/1x/model", trained, f"2 robot ({'c' * 12})")
+    assert of_policy == ("policy", "f" * 12, "")
+
+
+def measured(*arguments, **changed):
+    parser = stage_parser("reproduction")
+    benchmark.add_options(parser)
+    options = parser.parse_args(list(arguments))
+    vars(options).update(changed)
+    return benchmark.measure(options, Path(), lambda *_: nullcontext(lambda _: None))
+
+
+def test_the_list_says_which_steps_are_done(tmp_path):
+    report = measured("tokenizer", "--quick", "--seeds", "4", "--list", "--keep", str(tmp_path))
+    (steps,) = report.tables
+    assert [row[:2] for row in steps.rows] == [
+        ("data/robot", "missing"),
+        ("tokenizer/split_hands/seed-4", "missing"),
+        ("tokenizer/grid/seed-4", "missing"),
+    ]
+    assert all(row[2].startswith("dextouch train ") for row in steps.rows)
+    assert report.is_met
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_step_that_fails_leaves_its_table_out(tmp_path, monkeypatch):
+    def fail(steps, folder, num_jobs):
+        folder.mkdir(exist_ok=True)
+        return [steps[0].name]
+
+    monkeypatch.setattr(benchmark, "run", fail)
+    report = measured("tokenizer", "--quick", "--keep", str(tmp_path / "kept"))
+    assert not report.is_met
+    assert any(note.startswith("tokenizer: no table; ") for note in report.notes)
+    assert "no table" in (tmp_path / "kept/tables.md").read_text()
+    kept = json.loads((tmp_path / "kept/tables.json").read_text())
+    assert kept["steps"][0] == {"step": "data/robot"}
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--seeds", "1,1"], "different numbers"),
+        (["--sizes", "{"], "JSON object"),
+        (["--sizes", '{"num_starts": 0}'], "num_starts"),
+        (["--sizes", '{"num_stars": 4}'], "num_stars"),
+        (["nothing"], "tokenizer"),
+    ],
+)
+def test_wrong_options_are_refused(words, says, capsys):
+    with pytest.raises(SystemExit):
+        measured(*words)
+    assert says in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_quick_run_makes_a_table(tmp_path):
+    """The real commands: data and tokenizers, which take seconds."""
+    sizes = '{"tokenizer_cpu_s": 2}'
+    report = measured("tokenizer", "--sizes", sizes, "--seeds", "0", "--keep", str(tmp_path))
+    assert report.is_met
+    table = report.tables[0]
+    assert table.columns == ("", "Split-Hands", "Grid")
+    errors = [float(cell) for row in table.rows[:2] for cell in row[1:]]
+    assert all(error > 0 for error in errors)
+    # Everything is done: nothing runs again.
+    again = measured("tokenizer", "--sizes", sizes, "--seeds", "0", "--keep", str(tmp_path))
+    assert again.data["steps"] == report.data["steps"]

@@ -1,1 +1,0 @@
-"""The paper's tables in miniature: their steps, a resumable runner, and the pages it writes."""
