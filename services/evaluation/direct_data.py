@@ -7,12 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.episodes import OBJECT_POSES, EpisodeReader, EpisodeStore, scene_of
+from dextouch.episodes import (
+    OBJECT_POSES,
+    EpisodeReader,
+    EpisodeStore,
+    scene_of,
+    select_episodes,
+)
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.direct_network import NUM_STEPS, Attempt
-from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 
 # Object poses are learned from the images at these steps.
@@ -63,13 +68,7 @@ def read_attempts(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[Labe
         InvalidInputError: an episode with an unknown outcome, another length or no object
             poses.
     """
-    readers = robot_episodes(
-        stores,
-        tasks=tasks,
-        wanted=lambda about: about.origin != "imagined",
-        what="true robot episode",
-    )
-    return [read_attempt(reader) for reader in readers]
+    return [read_attempt(reader) for reader in select_episodes(stores, domain="robot", tasks=tasks)]
 
 
 def read_attempt(reader: EpisodeReader) -> LabelledAttempt:
