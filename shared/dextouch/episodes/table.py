@@ -18,7 +18,7 @@ from dextouch.episodes.format import KINDS
 from dextouch.episodes.needs import ACTIONS, OUTCOME, Need
 from dextouch.episodes.object_poses import ObjectTrack, object_track
 from dextouch.episodes.reader import HEAD_CAMERA, OWN_IMAGE_SHARE, EpisodeReader
-from dextouch.episodes.splits import Split, is_in, recording_of, scene_of
+from dextouch.episodes.splits import Split, is_in, recording_of, scene_of, split_of
 from dextouch.episodes.store import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.hands.actions import AnchorPoses
@@ -104,8 +104,10 @@ def select_episodes(
     for reason, count in unfit.items():
         logger.warning("skipped_episodes", reason=reason, count=count)
     if not chosen.names:
+        asked = f"{domain or 'human or robot'} episode of {', '.join(tasks) or 'any task'}"
+        asked += f" in splits {', '.join(splits)}" if splits else ""
         raise NotFoundError(
-            f"episodes: none of those in {', '.join(store.url for store in stores)} is fit: "
+            f"no {asked} that can be used in {', '.join(store.url for store in stores)}, only "
             f"{', '.join(f'{n} {why}' for why, n in (passed_over + unfit).items())}; record some "
             "at a station, or in the twin by `dextouch train data`"
         )
@@ -122,10 +124,10 @@ def _other(
     if domain not in {None, about.domain}:
         return f"of {'people' if about.domain == 'human' else 'robots'}"
     if tasks and about.task not in tasks:
-        return f"of tasks other than {', '.join(tasks)}"
+        return f"of task {about.task!r}"
     if origins and about.origin not in origins:
-        return f"{about.origin}"
-    return None if is_in(about, splits) else f"of splits other than {', '.join(splits)}"
+        return f"of origin {about.origin!r}"
+    return None if is_in(about, splits) else f"of split {split_of(about)}"
 
 
 class _Chosen:
