@@ -8,7 +8,6 @@ model's start reader and inputs, and a recurrent network that is told the outcom
 
 import argparse
 import copy
-import hashlib
 import shlex
 import time
 from collections.abc import Iterable, Sequence
@@ -26,7 +25,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
-from dextouch.episodes import EpisodeStore, split_by_scene
+from dextouch.episodes import EpisodeGrid, EpisodeStore, data_hash, select_episodes, split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import RolloutStart
 from services.evaluation.calibration import (
@@ -43,7 +42,6 @@ from services.evaluation.checkpoints import (
     save_checkpoint,
 )
 from services.evaluation.optimization import optimized
-from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 from services.evaluation.statistics import area_under_roc
 from services.evaluation.success_probe_figures import MIN_OUTCOMES
@@ -60,8 +58,8 @@ from services.world_model.dynamics.start_reader import TASK_WIDTH, FirstStep, Re
 from services.world_model.settings import ReaderSettings
 from services.world_model.starts import CAMERA, observed_start
 from services.world_model.training.reader_training import read_step, train_reader
-from services.world_model.training.scene_episodes import SceneEpisode, read_scene_episode
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
+from services.world_model.training.state_trainer import PREDICTED
 
 KIND: Final = "direct-judge-2"
 # Stores of `make reproduce-checkpoints`, from which the committed state model was trained.
@@ -220,29 +218,23 @@ class JudgeSettings:
 
 def read_takes(
     urls: Iterable[str], *, tasks: Sequence[str] = ()
-) -> tuple[list[SceneEpisode], set[str]]:
+) -> tuple[list[EpisodeGrid], set[str]]:
     """True robot episodes of some stores, and the digests of their first observations.
 
     Raises:
-        NotFoundError: no such episode, or an empty store.
-        ConflictError: two stores hold an episode of the same id.
-        InvalidInputError: an episode without an outcome, or without poses of its objects.
+        NotFoundError, ConflictError: as `select_episodes`.
     """
     episodes, starts = [], set()
-    for reader in robot_episodes(
-        [EpisodeStore(url) for url in urls],
-        tasks=tasks,
-        wanted=lambda about: about.origin != "imagined",
-        what="true robot episode",
-    ):
-        first = reader.window(0, num_steps=1, cameras=(CAMERA,))
+    stores = [EpisodeStore(url) for url in urls]
+    for reader in select_episodes(stores, domain="robot", tasks=tasks, needs=PREDICTED):
+        first = EpisodeGrid(reader).observation()
         starts.add(start_digest(first.images[CAMERA][0], first.tactile_kpa[0]))
-        episodes.append(read_scene_episode(reader, image_px=USUAL_IMAGE_PX))
+        episodes.append(EpisodeGrid(reader, USUAL_IMAGE_PX))
     return episodes, starts
 
 
 def train_direct_judge(
-    episodes: Sequence[SceneEpisode],
+    episodes: Sequence[EpisodeGrid],
     starts: Iterable[str],
     settings: JudgeSettings,
     *,
@@ -270,7 +262,7 @@ def train_direct_judge(
         )
     tasks, num_objects = vocabulary(training)
     config = DynamicsConfig(
-        tasks=tasks, num_objects=num_objects, image_px=training[0].images.shape[1]
+        tasks=tasks, num_objects=num_objects, image_px=training[0].image_size_px[0]
     )
     learned = scene_table(training, config)
     checked = scene_table([one for one in apart if one.task in tasks], config)
@@ -293,12 +285,11 @@ def train_direct_judge(
     for task, sigma in zip(tasks, sigma_m, strict=True):
         metrics[f"reader_sigma_mm_{task}"] = 1e3 * float(sigma[:, :2].max())
     calibration, measured = _calibrated(_log_odds(network, tested), checked, tasks)
-    contents = "\n".join(sorted(one.content_sha256 for one in episodes))
     metadata = CheckpointMetadata(
         kind=KIND,
         command=command,
         seed=settings.seed,
-        data_hash=hashlib.sha256(contents.encode()).hexdigest(),
+        data_hash=data_hash(one.content_sha256 for one in episodes),
         tasks=tasks,
         training_episodes=tuple(one.episode_id for one in episodes),
         training_starts=tuple(sorted(starts)),

@@ -196,6 +196,7 @@ def _episode() -> EpisodeArrays:
         anchor=start.anchor,
         K_head=start.K_head,
         model_rate_hz=15.0,
+        content_sha256="0" * 64,
     )
 
 

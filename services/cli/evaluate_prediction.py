@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from dextouch.command_line import CommandParser, add_json, write_result
-from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.errors import NotFoundError, UnknownNameError
+from dextouch.episodes import EpisodeReader, EpisodeStore, needs, select_episodes
+from dextouch.errors import UnknownNameError
 from services.cli.generate import refuse_trained_episodes
 from services.cli.training_data import comma_separated
 from services.cli.twin_geometry import TwinGeometry
@@ -58,7 +58,9 @@ def main(arguments: Sequence[str]) -> int:
             raise UnknownNameError(kind, unknown[0], list(known))
     store, path = EpisodeStore(options.episodes), options.checkpoint or default_checkpoint()
     world = open_world(path, sampling_steps=options.sampling_steps, needs_touch=False)
-    wanted = _episodes(store, options.tasks, world.description.tasks)
+    tasks = options.tasks or world.description.tasks
+    readers = select_episodes([store], domain="robot", tasks=tasks, needs=(needs.IMAGES,))
+    wanted = [reader.item_id for reader in readers]
     refuse_trained_episodes(store, wanted, path, command="evaluate prediction")
     result: dict[str, Any] = {"checkpoint": path.name, "digest": world.description.digest}
     measured = [metrics[name] for name in chosen]
@@ -79,27 +81,6 @@ def main(arguments: Sequence[str]) -> int:
         )
     write_result(options.json, result, allow_nan=False)
     return 0
-
-
-def _episodes(store: EpisodeStore, tasks: Sequence[str], known: Sequence[str]) -> list[str]:
-    """Ids of the robot episodes of some tasks (default: all that the model knows).
-
-    Raises:
-        NotFoundError: there is none.
-    """
-    about = {one: store.open(one).attributes for one in sorted(store.list())}
-    wanted = [
-        one
-        for one, it in about.items()
-        if it.domain == "robot" and it.origin != "imagined" and it.task in (tasks or known)
-    ]
-    if not wanted:
-        there = sorted({it.task for it in about.values() if it.domain == "robot"})
-        raise NotFoundError(
-            f"evaluate prediction: no robot episode of {', '.join(tasks or known)} in the store, "
-            f"which has those of {', '.join(there) or 'no task'}"
-        )
-    return wanted
 
 
 def _table(found: PredictionResult, metrics: Mapping[str, Metric]) -> str:

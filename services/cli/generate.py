@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from dextouch.command_line import write_result
-from dextouch.episodes import SPLITS, EpisodeReader, EpisodeStore, is_in
-from dextouch.errors import ConflictError, NotFoundError
+from dextouch.episodes import HEAD_CAMERA, SPLITS, EpisodeReader, EpisodeStore, needs
+from dextouch.errors import ConflictError
 from services.cli.imagined_data import chosen_episodes, imagination_parser, imagine, positive
 from services.evaluation.reporting import PredictionPicture, ReportPictures, write_report
-from services.generation.demonstrations import CAMERA
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.training.dataset import fingerprint
@@ -64,21 +63,16 @@ def chosen_sources(store: EpisodeStore, options: argparse.Namespace) -> list[str
     Raises:
         NotFoundError: there is none.
     """
+    chosen = chosen_episodes(
+        store,
+        options.tasks,
+        options.seeds,
+        splits=(options.split,) if options.split else (),
+        also=() if options.with_failures else (needs.OUTCOME, needs.SUCCESS),
+    )
     by_task: dict[str, list[str]] = {}
-    for episode_id in sorted(chosen_episodes(store, options.tasks or None, options.seeds)):
-        about = store.open(episode_id).attributes
-        if (
-            about.domain == "robot"
-            and about.origin != "imagined"
-            and (about.success or options.with_failures)
-            and is_in(about, (options.split,) if options.split else ())
-        ):
-            by_task.setdefault(about.task, []).append(episode_id)
-    if not by_task:
-        raise NotFoundError(
-            f"generate: no robot episode of the requested tasks, seeds and split in "
-            f"{options.episodes}; record some with `dextouch train data`"
-        )
+    for about in chosen:
+        by_task.setdefault(about.task, []).append(about.episode_id)
     longest = max(map(len, by_task.values()))
     in_turn = [ids[k] for k in range(longest) for ids in by_task.values() if k < len(ids)]
     return in_turn[: options.count]
@@ -117,14 +111,14 @@ def _picture(source: EpisodeStore, imagined: EpisodeReader) -> PredictionPicture
     about = imagined.attributes
     (true_id,) = {one.id for one in about.lineage if one.kind == "episode"}
     truth, steps = source.open(true_id), imagined.num_steps
-    true = truth.window(0, steps, cameras=(CAMERA,))
-    predicted = imagined.window(0, steps, cameras=(CAMERA,))
+    true = truth.window(0, steps, cameras=(HEAD_CAMERA,))
+    predicted = imagined.window(0, steps, cameras=(HEAD_CAMERA,))
     shown = np.unique(np.linspace(0, steps - 1, _NUM_MOMENTS).round().astype(int))
     return PredictionPicture(
         f"{about.task}: {true_id}",
         shown / about.model_rate_hz,
-        true.images[CAMERA][shown],
-        predicted.images[CAMERA][shown],
+        true.images[HEAD_CAMERA][shown],
+        predicted.images[HEAD_CAMERA][shown],
         true.tactile_kpa[shown],
         predicted.tactile_kpa[shown],
     )

@@ -16,7 +16,15 @@ from rich.progress import track
 
 from dextouch.clients import RolloutClient
 from dextouch.command_line import CommandParser, add_json, write_result
-from dextouch.episodes import EpisodeReader, EpisodeStore, scene_of
+from dextouch.episodes import (
+    EpisodeReader,
+    EpisodeStore,
+    Split,
+    needs,
+    scene_of,
+    select_episodes,
+)
+from dextouch.schemas import EpisodeAttributes
 from dextouch.serving import configure_logging
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli.servers import served
@@ -31,17 +39,29 @@ WORLD = "world_model"
 
 
 def chosen_episodes(
-    store: EpisodeStore, tasks: Collection[str] | None, seeds: range | None
-) -> list[str]:
-    """Ids of the robot episodes of these tasks and seeds; None takes all."""
-    about = {episode_id: store.open(episode_id).attributes for episode_id in store.list()}
-    return [
-        episode_id
-        for episode_id, one in about.items()
-        if one.domain == "robot"
-        and (tasks is None or one.task in tasks)
-        and (seeds is None or one.seed in seeds)
-    ]
+    store: EpisodeStore,
+    tasks: Collection[str] | None,
+    seeds: range | None,
+    *,
+    splits: Collection[Split] = (),
+    also: Sequence[needs.Need] = (),
+) -> list[EpisodeAttributes]:
+    """True robot episodes of these tasks and seeds that can be imagined; None takes all.
+
+    Raises:
+        NotFoundError: there is none.
+    """
+    in_seeds = needs.Need(
+        "of other seeds",
+        "choose other --seeds",
+        lambda reader: seeds is None or reader.attributes.seed in seeds,
+        is_choice=True,
+    )
+    wanted = (in_seeds, needs.IMAGES, *also)
+    readers = select_episodes(
+        [store], domain="robot", tasks=tasks or (), splits=splits, needs=wanted
+    )
+    return [reader.attributes for reader in readers]
 
 
 def imagine_all(
@@ -136,7 +156,8 @@ def main(argv: Sequence[str]) -> int:
         epilog="example:\n  dextouch train imagined --episodes runs/episodes --store runs/imagined",
     )
     options = parser.parse_args(list(argv))
-    wanted = chosen_episodes(EpisodeStore(options.episodes), options.tasks or None, options.seeds)
+    chosen = chosen_episodes(EpisodeStore(options.episodes), options.tasks, options.seeds)
+    wanted = [about.episode_id for about in chosen]
     count = len(imagine(options, wanted, only_judged=True))
     print(f"{count} imagined")
     write_result(options.json, {"imagined": count})

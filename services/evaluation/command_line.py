@@ -9,7 +9,7 @@ from typing import Any
 
 from dextouch.clients import Policy, RolloutClient
 from dextouch.command_line import write_result
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, select_episodes
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.free_text import printable
 from dextouch.serving import load_settings
@@ -26,7 +26,6 @@ from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import ReportPictures, write_report
 from services.evaluation.reporting.sections import failure_rows, figure, undecided_note
 from services.evaluation.results import ResultLog
-from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.settings import (
     RunSettings,
     ServedWorld,
@@ -54,7 +53,7 @@ def run_train_policy(arguments: list[str]) -> int:
     if settings.imagined:
         generated = [EpisodeStore(url) for url in settings.imagined]
         episodes += read_cloning_episodes(
-            *generated, tasks=settings.tasks, image_px=settings.image_px, origin="imagined"
+            *generated, tasks=settings.tasks, image_px=settings.image_px, imagined=True
         )
     trained = train_cloned_policy(
         episodes,
@@ -165,8 +164,10 @@ def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str,
         )
     policies = {s.name: s.load(settings.policy_arguments.get(s.name, {})) for s in sources}
     for name, url in settings.scripts.items():
-        episodes = robot_episodes([EpisodeStore(url)], tasks=settings.tasks)
-        policies[name] = ReplayPolicy.of(episodes)
+        found = select_episodes(
+            [EpisodeStore(url)], domain="robot", tasks=settings.tasks, origins=()
+        )
+        policies[name] = ReplayPolicy.of(found)
     trained_on: dict[str, Sequence[str]] = {}
     if "behaviour-cloning" in settings.builtin:
         cloned = BehaviourCloningPolicy.load(settings.cloned_policy)

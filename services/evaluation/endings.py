@@ -1,6 +1,5 @@
 """Endings of rollouts, true and imagined: input and training data of success probes."""
 
-import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -9,19 +8,18 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from dextouch.episodes import (
+    EpisodeGrid,
     EpisodeReader,
     EpisodeStore,
     Split,
-    is_in,
+    needs,
     object_track,
     scene_fraction,
-    scene_of,
+    select_episodes,
 )
 from dextouch.errors import InvalidInputError
-from dextouch.images import square_of_at_most
 from dextouch.schemas import Observation, RolloutDoubt, is_rollout, rollout_doubt
 from services.evaluation.demonstrations import CAMERA
-from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 from services.networks.training_settings import USUAL_IMAGE_PX
 
@@ -34,7 +32,8 @@ EARLY_ENDS: Final = (2, 8, 14)
 MIDDLE_ENDS: Final = (32, 48, 64)
 # Last step of the episodes that these steps belong to; in others they lie as far along.
 _USUAL_END: Final = 80
-_SHORTEST: Final = 16
+# What an episode of a judge must have.
+JUDGED: Final = (needs.WHOLE, needs.OUTCOME, needs.longer_than(16), needs.IMAGES)
 
 
 def early_step(scene: str, last_step: int = _USUAL_END) -> int:
@@ -141,6 +140,7 @@ class EndingEpisode:
     start_digest: str
     last_step: int
     endings: Mapping[int, Ending]
+    content_sha256: str
     event_times_s: Mapping[str, float] | None = None
     step_s: float = 1 / 15
 
@@ -177,62 +177,46 @@ def read_ending_episode(reader: EpisodeReader, *, image_px: int = USUAL_IMAGE_PX
     """Endings of one stored robot episode; only the steps shown are decoded.
 
     Args:
-        reader: the episode.
+        reader: the episode; it must have what is `JUDGED`.
         image_px: side that the middle square of larger images is scaled to.
 
     Raises:
-        InvalidInputError: the episode has no outcome, or too few steps.
+        InvalidInputError: the outcome is unknown.
     """
-    about = reader.attributes
-    last = reader.num_steps - 1
-    if about.success is None or last < _SHORTEST:
-        raise InvalidInputError(
-            f"episode {about.episode_id!r}: success {about.success}, {last + 1} steps; expected a "
-            "known outcome, as operators enter it after a take, and more than "
-            f"{_SHORTEST} steps"
-        )
-    first = reader.window(0, num_steps=1, cameras=(CAMERA,))
-    episode = EndingEpisode(
+    grid, about = EpisodeGrid(reader, image_px), reader.attributes
+    last, touch_kpa = len(grid) - 1, grid.touch()[0]
+    ends = (early_step(grid.scene, last), middle_step(grid.scene, last), last - 1, last)
+    endings = {end: _read_ending(grid, touch_kpa, end) for end in ends}
+    endings[last] = endings[last].with_doubt(RolloutDoubt.from_quality(about.quality))
+    times = about.event_times_s
+    # None noted in a true failure means none reached.
+    is_known = times or not (about.success or about.origin == "imagined" or is_rollout(about))
+    return EndingEpisode(
         about.episode_id,
         about.task,
         about.instruction,
-        scene_of(about),
-        about.success,
-        start_digest(first.images[CAMERA][0], first.tactile_kpa[0]),
+        grid.scene,
+        grid.success,
+        start_digest(EpisodeGrid(reader).images([0])[0], touch_kpa[0]),
         last,
-        {},
-        _event_times(
-            about.event_times_s,
-            unknown_if_empty=about.success or about.origin == "imagined" or is_rollout(about),
-        ),
+        endings,
+        grid.content_sha256,
+        times if is_known else None,
         1 / about.model_rate_hz,
     )
-    steps = (episode.early_step, episode.middle_step, last - 1, last)
-    endings = {step: _read_ending(reader, step, image_px) for step in steps}
-    endings[last] = endings[last].with_doubt(RolloutDoubt.from_quality(about.quality))
-    return EndingEpisode(**{**vars(episode), "endings": endings})
 
 
-def _event_times(
-    times: Mapping[str, float], *, unknown_if_empty: bool
-) -> Mapping[str, float] | None:
-    """Event times; none noted in a true failure means none reached, otherwise it is unknown."""
-    return times if times or not unknown_if_empty else None
-
-
-def _read_ending(reader: EpisodeReader, end: int, image_px: int) -> Ending:
-    start = end - NUM_SEEN_STEPS + 1
-    window = reader.window(start, num_steps=NUM_SEEN_STEPS, cameras=(CAMERA,))
-    half_step_ns = 5e8 / reader.attributes.model_rate_hz
-    # Where these steps were not rendered, the nearest images belong to other steps.
-    are_near = bool((np.abs(window.image_dt_ns[CAMERA]) <= half_step_ns).all())
-    images, _ = square_of_at_most(window.images[CAMERA], window.K_head, image_px)
+def _read_ending(
+    grid: EpisodeGrid, touch_kpa: Float32[np.ndarray, "steps 2 320"], end: int
+) -> Ending:
+    steps = slice(end - NUM_SEEN_STEPS + 1, end + 1)
     return Ending(
-        images if are_near else None,
-        window.tactile_kpa,
-        reader.attributes.task,
-        _object_poses(reader, window.t_ref_ns),
-        reader.attributes.origin == "imagined",
+        # Where these steps were not rendered, the nearest images are of others.
+        grid.own_images(range(steps.start, steps.stop)),
+        touch_kpa[steps].copy(),
+        grid.task,
+        _object_poses(grid.reader, grid.t_ref_ns[steps]),
+        grid.about.origin == "imagined",
     )
 
 
@@ -254,7 +238,7 @@ def read_ending_episodes(
     splits: Collection[Split] = (),
     image_px: int = USUAL_IMAGE_PX,
 ) -> list[EndingEpisode]:
-    """Read all robot episodes of some stores with their endings.
+    """Read the robot episodes of some stores that can be judged, with their endings.
 
     Args:
         stores: stores to read; true and imagined episodes may be mixed.
@@ -263,10 +247,11 @@ def read_ending_episodes(
         image_px: side that the middle square of larger images is scaled to.
 
     Raises:
-        NotFoundError: no such episode, or an empty store.
-        ConflictError: two stores hold an episode of the same id.
+        NotFoundError, ConflictError: as `select_episodes`.
     """
-    readers = robot_episodes(stores, tasks=tasks, wanted=lambda about: is_in(about, splits))
+    readers = select_episodes(
+        stores, domain="robot", tasks=tasks, splits=splits, origins=(), needs=JUDGED
+    )
     return [read_ending_episode(reader, image_px=image_px) for reader in readers]
 
 
@@ -280,18 +265,3 @@ def milestones_of(episodes: Iterable[EndingEpisode]) -> dict[str, tuple[str, ...
         task: tuple(sorted(known, key=lambda name: (float(np.median(known[name])), name)))
         for task, known in times.items()
     }
-
-
-def endings_hash(episodes: Iterable[EndingEpisode]) -> str:
-    """SHA-256 of all training data, in the order of the episode ids."""
-    digest = hashlib.sha256()
-    for item in sorted(episodes, key=lambda e: e.episode_id):
-        digest.update(repr((item.episode_id, item.task, item.success)).encode())
-        digest.update(repr(sorted((item.event_times_s or {}).items())).encode())
-        for step, ending in sorted(item.endings.items()):
-            digest.update(str(step).encode())
-            if (told := (ending.doubted, ending.success_probability)) != (None, None):
-                digest.update(repr(told).encode())
-            for array in (ending.images, ending.tactile_kpa, ending.object_poses):
-                digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()

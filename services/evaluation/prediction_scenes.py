@@ -7,15 +7,15 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.episodes import EpisodeReader
+from dextouch.episodes import EpisodeGrid, EpisodeReader
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import CAMERA_HEAD, AnchorPoses, poses_from_actions
-from dextouch.schemas import ActionKind, Observation, ReturnSelector, RolloutStart
+from dextouch.schemas import Observation, ReturnSelector, RolloutStart
 from dextouch.worlds import ReconstructingWorld, World
 from services.evaluation.camera_warp import warp_over_table
+from services.evaluation.demonstrations import CAMERA
 from services.evaluation.scene_geometry import SceneGeometry
 
-CAMERA: Final = "camera_head"
 CHUNK_STEPS: Final = 16
 _NO_IMAGE = ReturnSelector(cameras=())
 _LAST_STEP = ReturnSelector(cameras=(CAMERA,), steps="last")
@@ -75,24 +75,19 @@ def read_rollout(reader: EpisodeReader, *, image_every: int = CHUNK_STEPS) -> Sc
             f"prediction: episode {reader.attributes.episode_id!r} has {reader.num_steps} steps, "
             f"expected at least {CHUNK_STEPS + 1}"
         )
-    return _read(reader, 0, num_steps, image_every=image_every)
+    return _read(EpisodeGrid(reader), 0, num_steps, image_every=image_every)
 
 
 def read_windows(reader: EpisodeReader) -> list[Scene]:
     """An episode as consecutive scenes of one chunk, each from the true step before it."""
-    starts = range(0, reader.num_steps - CHUNK_STEPS, CHUNK_STEPS)
-    return [_read(reader, start, CHUNK_STEPS, image_every=1) for start in starts]
+    grid = EpisodeGrid(reader)
+    starts = range(0, len(grid) - CHUNK_STEPS, CHUNK_STEPS)
+    return [_read(grid, start, CHUNK_STEPS, image_every=1) for start in starts]
 
 
-def _read(reader: EpisodeReader, first_step: int, num_steps: int, *, image_every: int) -> Scene:
-    about = reader.attributes
-    measured = reader.window(first_step, num_steps + 1, cameras=(CAMERA,))
-    actions, kind = measured.actions, _action_kind(reader)
-    if kind == "commanded":
-        actions = reader.window(
-            first_step, num_steps + 1, cameras=(), action_kind="commanded"
-        ).actions
-    own = {int(step) - first_step for step in reader.shown_steps(CAMERA)[0]}
+def _read(grid: EpisodeGrid, first_step: int, num_steps: int, *, image_every: int) -> Scene:
+    about, reader, kind = grid.about, grid.reader, grid.action_kind
+    own = {int(step) - first_step for step in grid.image_steps}
     shown = tuple(step for step in range(1, num_steps + 1) if step % image_every == 0)
     shown = tuple(step for step in shown if step in own)
     if 0 not in own or not shown:
@@ -100,28 +95,19 @@ def _read(reader: EpisodeReader, first_step: int, num_steps: int, *, image_every
             f"prediction: episode {about.episode_id!r} has no image of step {first_step} or of "
             f"those predicted from it; record it with images (`dextouch train data --images 1`)"
         )
-    first = Observation(
-        first_step=0,
-        images={CAMERA: measured.images[CAMERA][:1]},
-        tactile_kpa=measured.tactile_kpa[:1],
-        action_reached=measured.actions[:1],
-        reached_is_measured=True,
-    )
     start = RolloutStart(
         about.task,
         about.seed or 0,
         about.instruction,
         kind,
-        observation=first,
-        anchor=measured.anchor,
-        K_head=measured.K_head,
+        observation=grid.observation(first_step),
+        anchor=reader.anchor(first_step),
+        K_head=grid.K_head,
     )
-    truth = Future(measured.images[CAMERA][list(shown)], measured.tactile_kpa[1:], shown)
-    return Scene(about.episode_id, start, actions[1:], truth, about.model_rate_hz, first_step)
-
-
-def _action_kind(reader: EpisodeReader) -> ActionKind:
-    return "commanded" if "action_commanded" in reader.streams else "measured"
+    touch_kpa, _ = reader.touch(first_step + 1, num_steps)
+    truth = Future(grid.images([first_step + step for step in shown]), touch_kpa, shown)
+    actions = reader.actions(first_step, num_steps + 1, kind=kind)[1:]
+    return Scene(about.episode_id, start, actions, truth, about.model_rate_hz, first_step)
 
 
 def imagine(world: World[Any], scene: Scene, actions: Float64[np.ndarray, "steps 67"]) -> Future:

@@ -13,15 +13,21 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.clients import Policy
-from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in
+from dextouch.episodes import (
+    EpisodeGrid,
+    EpisodeReader,
+    EpisodeStore,
+    Split,
+    needs,
+    select_episodes,
+)
 from dextouch.errors import InvalidInputError
 from dextouch.images import square_of_at_most
-from dextouch.schemas import Observation, WorldDescription
+from dextouch.schemas import WorldDescription
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.matched_starts import MatchedStart
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.progress import Progress
-from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.rollout_runner import RolloutRunner
 from services.evaluation.scores import Outcome, RolloutFailure, RolloutScore
 from services.evaluation.starts import refuse_training_starts, start_digest
@@ -31,6 +37,8 @@ from services.evaluation.success_probe import SuccessProbe
 from services.networks.training_settings import USUAL_IMAGE_PX
 
 IMAGINED: Final = "imagined"
+# What a take must have to be replayed.
+REPLAYED: Final = (needs.WHOLE, needs.OUTCOME, needs.IMAGES)
 # Name of the replayed actions among the policies.
 REPLAY: Final = "recorded actions"
 _DRAWS: Final = 1000
@@ -64,17 +72,9 @@ def read_takes(
         most: takes a task, the first by their ids; None for all.
 
     Raises:
-        NotFoundError: there is none.
-        UnknownNameError: one without head camera.
+        NotFoundError, ConflictError: as `select_episodes`.
     """
-    readers = robot_episodes(
-        stores,
-        tasks=tasks,
-        wanted=lambda about: (
-            about.origin != "imagined" and about.success is not None and is_in(about, splits)
-        ),
-        what="robot episode of known outcome",
-    )
+    readers = select_episodes(stores, domain="robot", tasks=tasks, splits=splits, needs=REPLAYED)
     takes: list[RecordedTake] = []
     counts: dict[str, int] = {}
     for reader in readers:
@@ -86,28 +86,17 @@ def read_takes(
 
 
 def _read_take(reader: EpisodeReader, *, number: int) -> RecordedTake:
-    about = reader.attributes
-    window = reader.window(0, 1, cameras=(CAMERA,))
-    first = Observation(
-        first_step=0,
-        images=window.images,
-        tactile_kpa=window.tactile_kpa,
-        action_reached=window.actions,
-        reached_is_measured=True,
-    )
-    is_commanded = "action_commanded" in reader.streams
+    grid, about = EpisodeGrid(reader), reader.attributes
     start = MatchedStart(
         about.task,
         number,
         about.instruction,
-        first,
-        window.anchor,
-        window.K_head,
-        "commanded" if is_commanded else "measured",
+        grid.observation(),
+        grid.anchor,
+        grid.K_head,
+        grid.action_kind,
     )
-    name = "action_commanded" if is_commanded else "action"
-    actions = reader.read(name).values.astype(np.float64)[1:]
-    return RecordedTake(about.episode_id, start, bool(about.success), actions)
+    return RecordedTake(about.episode_id, start, grid.success, grid.sent[1:])
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dextouch.episodes import split_by_scene
+from dextouch.episodes import data_hash, split_by_scene
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
 from services.evaluation.demonstrations import instructions_of
-from services.evaluation.endings import EndingEpisode, endings_hash, milestones_of
+from services.evaluation.endings import EndingEpisode, milestones_of
 from services.evaluation.judge_network import (
     ProbeBatch,
     ProbeNetwork,
@@ -171,7 +171,7 @@ def _metadata(
         kind=KIND,
         command=command,
         seed=settings.seed,
-        data_hash=endings_hash(everything),
+        data_hash=data_hash((e.content_sha256 for e in everything), image_px=shape.image_size_px),
         tasks=shape.tasks,
         training_episodes=tuple(e.episode_id for e in (*sets.training, *sets.development)),
         training_starts=sets.training_starts,

@@ -8,10 +8,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.clients import RolloutClient
-from dextouch.episodes import EpisodeReader, EpisodeStore, write_rollout
+from dextouch.episodes import EpisodeGrid, EpisodeReader, EpisodeStore, write_rollout
 from dextouch.errors import UnknownNameError
 from dextouch.schemas import (
-    ActionKind,
     LineageEntry,
     Observation,
     ReturnSelector,
@@ -20,7 +19,6 @@ from dextouch.schemas import (
     rollout_doubt,
 )
 
-CAMERA: Final = "camera_head"
 CHUNK_STEPS: Final = 16
 SHORT_CHUNK_STEPS: Final = 4
 
@@ -97,25 +95,15 @@ def _played(
     image_steps: Collection[int] | None,
 ) -> tuple[list[Observation], Float64[np.ndarray, "3 3"], Float64[np.ndarray, "steps 67"]]:
     """Observations of the world for an episode's actions, its camera, and these actions."""
-    attributes = source.attributes
-    kind: ActionKind = "commanded" if "action_commanded" in source.streams else "measured"
-    sent = source.read("action_commanded" if kind == "commanded" else "action").values
-    actions = sent[: whole_steps(len(sent), world.chunk_multiple)]
-    window = source.window(0, 1, cameras=(CAMERA,))
-    first = Observation(
-        first_step=0,
-        images=window.images,
-        tactile_kpa=window.tactile_kpa,
-        action_reached=window.actions,
-        reached_is_measured=True,
-    )
+    attributes, grid = source.attributes, EpisodeGrid(source)
+    actions = grid.sent[: whole_steps(len(grid), world.chunk_multiple)]
     with client.start(
         world=world.name,
         task=attributes.task,
         seed=attributes.seed or 0,
         instruction=attributes.instruction,
-        init=(first, window.anchor, window.K_head),
-        action_kind=kind,
+        init=(grid.observation(), grid.anchor, grid.K_head),
+        action_kind=grid.action_kind,
     ) as rollout:
         seen = [
             rollout.observation,

@@ -21,7 +21,6 @@ from benchmarks.direct_judge import (
 )
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
-from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import Observation, Review, RolloutStart
 from services.evaluation.calibration import Calibration
 from services.evaluation.checkpoints import save_checkpoint
@@ -33,32 +32,32 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
 from services.world_model.dynamics.configuration import DynamicsConfig
-from services.world_model.training.scene_episodes import SceneEpisode
 from services.world_model.training.scene_table import scene_table
 from tests.unit.world_model.test_state_training import NUM_STEPS, PX, episode
+from tests.unit.world_model.toy_grid import ToyGrid, changed
 
 CONFIG = DynamicsConfig(tasks=("press",), num_objects=(1,), image_px=PX)
 LEAN = TakeOptions(images=("camera_head",), image_every=4, streams="training")
 
 
-def start_of(one: SceneEpisode, **changed) -> RolloutStart:
+def start_of(one: ToyGrid, **changes) -> RolloutStart:
     """The first step of an episode as a rollout's start, as the evaluator has it."""
     observation = Observation(
         first_step=0,
-        images={"camera_head": one.images[:1]},
-        tactile_kpa=one.tactile_kpa[:1].astype(np.float32),
-        action_reached=one.measured_actions[:1],
+        images={"camera_head": one.images([0])},
+        tactile_kpa=one.tactile_kpa[:1],
+        action_reached=one.measured[:1],
         reached_is_measured=True,
     )
     start = RolloutStart(
         one.task,
-        one.seed,
+        one.about.seed,
         "Press it.",
         observation=observation,
-        anchor=AnchorPoses(*one.anchor),
+        anchor=one.anchor,
         K_head=one.K_head,
     )
-    return replace(start, **changed)
+    return replace(start, **changes)
 
 
 @pytest.fixture(scope="module")
@@ -153,9 +152,10 @@ def test_true_robot_takes_are_read_also_those_of_stations(store):
     names = {takes[name].attributes.episode_id for name in ("script", "push", "station")}
     assert set(by_id) == names
     station, push = by_id["station"], by_id[takes["push"].attributes.episode_id]
-    assert station.objects_measured
-    assert bool(station.objects_known.all())
-    np.testing.assert_allclose(station.object_poses[..., :3], push.object_poses[..., :3], atol=1e-4)
+    assert station.objects.is_measured
+    assert bool(station.objects.known.all())
+    ours, theirs = station.objects.poses, push.objects.poses
+    np.testing.assert_allclose(ours[..., :3], theirs[..., :3], atol=1e-4)
     # Digests are of the observations as recorded, which the evaluator compares.
     streams = takes["script"].streams
     assert not streams["tactile_left"].values[0].any()
@@ -166,7 +166,7 @@ def test_true_robot_takes_are_read_also_those_of_stations(store):
 
 
 def test_an_empty_store_is_refused(tmp_path):
-    with pytest.raises(NotFoundError, match="no episode"):
+    with pytest.raises(NotFoundError, match="has none"):
         read_takes([str(EpisodeStore(tmp_path).root)])
 
 
@@ -196,17 +196,17 @@ def test_a_quick_run_writes_a_judge_that_the_evaluator_opens(tmp_path, monkeypat
     odds = odds_of(judge._network, one).double().numpy()
     fitted = judge.metadata.settings["calibration"].get("press", {})
     expected = float(Calibration.model_validate(fitted).probabilities(odds)[0])
-    assert judge.probability(start_of(one), one.actions[1:]) == pytest.approx(expected, abs=1e-6)
+    assert judge.probability(start_of(one), one.sent[1:]) == pytest.approx(expected, abs=1e-6)
     with pytest.raises(UnknownNameError, match="press"):
-        judge.probability(start_of(one, task="lift"), one.actions[1:])
+        judge.probability(start_of(one, task="lift"), one.sent[1:])
 
 
-def pressed_or_elsewhere(seed: int) -> SceneEpisode:
+def pressed_or_elsewhere(seed: int) -> ToyGrid:
     """The hand comes down at a random place; a block is under it, or at another such place."""
     one, other = episode(2 * seed), episode(2 * seed + 1)
     if seed % 2:
         return one
-    return replace(one, images=other.images, object_poses=other.object_poses, success=False)
+    return changed(one, pictures=other.pictures, poses=other.objects.poses, success=False)
 
 
 @pytest.mark.slow
@@ -221,7 +221,7 @@ def test_a_trained_judge_tells_where_the_block_is(tmp_path):
     save_checkpoint(path, checkpoint)
     judge = DirectJudge.load(path)
     tested = [pressed_or_elsewhere(seed) for seed in range(1000, 1080)]
-    told = [judge.probability(start_of(one), one.actions[1:]) for one in tested]
+    told = [judge.probability(start_of(one), one.sent[1:]) for one in tested]
     # By the commands alone, both outcomes are alike: 0.5.
     assert area_under_roc(np.array(told), np.array([one.success for one in tested])) > 0.8
     assert checkpoint.metadata.metrics["development_auc_press"] > 0.8

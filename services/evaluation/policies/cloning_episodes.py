@@ -1,25 +1,31 @@
 """Training episodes of behaviour cloning: successful robot episodes at decision steps only."""
 
-import hashlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, Split, is_in, scene_of
-from dextouch.errors import InvalidInputError
+from dextouch.episodes import (
+    TRUE_ORIGINS,
+    EpisodeGrid,
+    EpisodeReader,
+    EpisodeStore,
+    Split,
+    needs,
+    select_episodes,
+)
 from dextouch.hands.actions import AnchorPoses
-from dextouch.images import square_of_at_most
-from services.evaluation.demonstrations import CAMERA
+from dextouch.schemas import Origin
 from services.evaluation.policies.cloning_network import SLOT_STEPS
-from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 from services.networks.training_settings import USUAL_IMAGE_PX
 
 # Training uses every such step; an evaluation with chunks of 16 decides at every second of them.
 DECISION_STRIDE: Final = SLOT_STEPS
+# What an episode of a cloned policy must have.
+IMITATED: Final = (needs.WHOLE, needs.OUTCOME, needs.SUCCESS, needs.image_every(DECISION_STRIDE))
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,7 @@ class CloningEpisode:
     measured: Float64[np.ndarray, "steps 67"]
     commanded: Float64[np.ndarray, "steps 67"]
     start_digest: str
+    content_sha256: str
 
     @property
     def num_steps(self) -> int:
@@ -59,53 +66,34 @@ class CloningEpisode:
 def read_cloning_episode(
     reader: EpisodeReader, *, image_px: int = USUAL_IMAGE_PX
 ) -> CloningEpisode:
-    """Read one successful robot episode; only images at decision steps are decoded.
+    """Read one robot episode; only images at decision steps are decoded.
 
     Args:
-        reader: the episode.
+        reader: the episode; it must have what is `IMITATED`.
         image_px: side that the middle square of larger images is scaled to.
 
     Raises:
-        InvalidInputError: no image at a decision step.
+        InvalidInputError: the outcome is unknown.
     """
-    about = reader.attributes
-    wanted = range(0, reader.num_steps, DECISION_STRIDE)
-    missing = sorted(set(wanted) - set(reader.shown_steps(CAMERA)[0].tolist()))
-    if missing:
-        raise InvalidInputError(
-            f"episode {about.episode_id!r}: no image of {CAMERA!r} at step {missing[0]}, expected "
-            f"one at least every {DECISION_STRIDE} steps; record it with `dextouch train data "
-            f"--images {DECISION_STRIDE}` or fewer"
-        )
-    first = reader.window(0, num_steps=reader.num_steps, cameras=())
-
-    def images_of(step: int) -> UInt8[np.ndarray, "1 h w 3"]:
-        return reader.window(step, num_steps=1, cameras=(CAMERA,)).images[CAMERA]
-
-    def seen(step: int) -> UInt8[np.ndarray, "h w 3"]:
-        return square_of_at_most(images_of(step), first.K_head, image_px)[0][0]
-
+    grid, about = EpisodeGrid(reader, image_px), reader.attributes
+    steps = range(0, len(grid), DECISION_STRIDE)
+    touch_kpa, _ = grid.touch()
     return CloningEpisode(
         about.episode_id,
         about.task,
         about.instruction,
-        scene_of(about),
-        bool(about.success),
-        first.anchor,
-        {step: Moment(seen(step), first.tactile_kpa[step].copy()) for step in wanted},
-        first.actions,
-        _commanded(reader, first.actions),
-        start_digest(images_of(0)[0], first.tactile_kpa[0]),
+        grid.scene,
+        grid.success,
+        grid.anchor,
+        {
+            step: Moment(image, touch_kpa[step].copy())
+            for step, image in zip(steps, grid.images(steps), strict=True)
+        },
+        grid.measured,
+        grid.sent,
+        start_digest(EpisodeGrid(reader).images([0])[0], touch_kpa[0]),
+        grid.content_sha256,
     )
-
-
-def _commanded(
-    reader: EpisodeReader, measured: Float64[np.ndarray, "steps 67"]
-) -> Float64[np.ndarray, "steps 67"]:
-    """Commands of every step; of robots that keep none, the poses that they reached."""
-    if "action_commanded" not in reader.streams:
-        return measured
-    return reader.read("action_commanded").values
 
 
 def read_cloning_episodes(
@@ -113,7 +101,7 @@ def read_cloning_episodes(
     tasks: Sequence[str] = (),
     splits: Collection[Split] = (),
     image_px: int = USUAL_IMAGE_PX,
-    origin: Literal["true", "imagined"] = "true",
+    imagined: bool = False,
 ) -> list[CloningEpisode]:
     """Read the successful robot episodes of some stores, store by store in the order of ids.
 
@@ -122,33 +110,13 @@ def read_cloning_episodes(
         tasks: tasks to read; empty for all.
         splits: splits of the scenes; empty for all.
         image_px: side that the middle square of larger images is scaled to.
-        origin: whether true episodes are read or imagined ones, never both.
+        imagined: whether imagined episodes are read instead of true ones.
 
     Raises:
-        NotFoundError: no such episode, or an empty store.
-        ConflictError: two stores hold an episode of the same id.
+        NotFoundError, ConflictError: as `select_episodes`.
     """
-    readers = robot_episodes(
-        stores,
-        tasks=tasks,
-        wanted=lambda about: (
-            bool(about.success)
-            and (about.origin == "imagined") == (origin == "imagined")
-            and is_in(about, splits)
-        ),
-        what=f"{origin} robot episode that succeeded",
+    origins: Collection[Origin] = ("imagined",) if imagined else TRUE_ORIGINS
+    readers = select_episodes(
+        stores, domain="robot", tasks=tasks, splits=splits, origins=origins, needs=IMITATED
     )
     return [read_cloning_episode(reader, image_px=image_px) for reader in readers]
-
-
-def cloning_hash(episodes: Sequence[CloningEpisode]) -> str:
-    """SHA-256 of all training data, in the order of the episode ids."""
-    digest = hashlib.sha256()
-    for item in sorted(episodes, key=lambda e: e.episode_id):
-        digest.update(repr((item.episode_id, item.task, item.instruction, item.success)).encode())
-        for moment in (item.moments[step] for step in sorted(item.moments)):
-            digest.update(np.ascontiguousarray(moment.image).tobytes())
-            digest.update(np.ascontiguousarray(moment.tactile_kpa).tobytes())
-        for array in (item.measured, item.commanded, *vars(item.anchor).values()):
-            digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()

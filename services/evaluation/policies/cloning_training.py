@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from dextouch.episodes import split_by_scene
+from dextouch.episodes import data_hash, split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
@@ -24,7 +24,6 @@ from services.evaluation.policies.behaviour_cloning import (
 from services.evaluation.policies.cloning_episodes import (
     DECISION_STRIDE,
     CloningEpisode,
-    cloning_hash,
 )
 from services.evaluation.policies.cloning_network import (
     CHUNK_STEPS,
@@ -174,7 +173,9 @@ def train_cloned_policy(
             kind=KIND,
             command=command,
             seed=settings.seed,
-            data_hash=cloning_hash(episodes),
+            data_hash=data_hash(
+                (item.content_sha256 for item in episodes), image_px=shape.image_size_px
+            ),
             tasks=tasks,
             training_episodes=tuple(item.episode_id for item in training),
             training_starts=tuple(sorted({item.start_digest for item in training})),

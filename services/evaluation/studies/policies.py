@@ -6,13 +6,12 @@ from copy import copy
 from pathlib import Path
 
 from dextouch.clients import Policy
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, select_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.colour_servo import ColourServo
 from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import ReplayPolicy
-from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.settings import DEFAULT_POLICY
 from services.evaluation.studies.definition import PolicyChoice, StudyDefinition
 
@@ -43,10 +42,9 @@ class PolicyFactory:
             if choice.script is not None:
                 self._replays[name] = demonstrator(choice.script)
             if choice.replay is not None:
-                store = EpisodeStore(choice.replay)
-                self._replays[name] = ReplayPolicy.of(
-                    robot_episodes([store], tasks=definition.tasks)
-                )
+                stores, tasks = [EpisodeStore(choice.replay)], definition.tasks
+                found = select_episodes(stores, domain="robot", tasks=tasks, origins=())
+                self._replays[name] = ReplayPolicy.of(found)
 
     def load(self) -> dict[str, Policy]:
         """All policies by name, each with a state of its own."""

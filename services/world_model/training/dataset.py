@@ -70,8 +70,13 @@ class TrainingEpisode(Protocol):
         """Available kinds of actions."""
         ...
 
-    def content_hash(self) -> str:
-        """`fingerprint` of the content."""
+    @property
+    def content_sha256(self) -> str:
+        """Digest of what the store holds of it, for `dextouch.episodes.data_hash`."""
+        ...
+
+    def fingerprint(self) -> str:
+        """`fingerprint` of its arrays."""
         ...
 
     def __len__(self) -> int:
@@ -98,6 +103,7 @@ class EpisodeArrays:
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"]
     model_rate_hz: float
+    content_sha256: str
     domain: Domain = "robot"
     object_poses: Float32[np.ndarray, "steps objects 7"] | None = None
     boxes_m: Float64[np.ndarray, "objects 6"] | None = None
@@ -116,8 +122,8 @@ class EpisodeArrays:
         """Available kinds of actions."""
         return tuple(self.actions)
 
-    def content_hash(self) -> str:
-        """`fingerprint` of the content."""
+    def fingerprint(self) -> str:
+        """`fingerprint` of its arrays."""
         return fingerprint(self)
 
     def cut(self, place: Place) -> "Window":
@@ -152,7 +158,10 @@ class WindowBatch:
 
 
 def fingerprint(episode: EpisodeArrays) -> str:
-    """SHA-256 of observations and actions; identifies equal data under another name."""
+    """SHA-256 of observations and actions; identifies equal data under another name.
+
+    Checkpoints list those of their training episodes, so that none of them is held out later.
+    """
     digest = hashlib.sha256()
     digest.update(np.ascontiguousarray(episode.images).tobytes())
     digest.update(np.ascontiguousarray(episode.tactile_kpa, dtype="<f4").tobytes())
@@ -163,11 +172,6 @@ def fingerprint(episode: EpisodeArrays) -> str:
         rounded = episode.actions[kind].round(6) + 0.0
         digest.update(np.ascontiguousarray(rounded, dtype="<f8").tobytes())
     return digest.hexdigest()
-
-
-def combined_hash(fingerprints: Sequence[str]) -> str:
-    """Order-independent hash of a set of episodes."""
-    return hashlib.sha256("\n".join(sorted(fingerprints)).encode()).hexdigest()
 
 
 def cut_window(

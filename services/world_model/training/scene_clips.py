@@ -3,39 +3,42 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
+from dextouch.episodes import EpisodeGrid
 from dextouch.hands.actions import (
     JOINTS_LEFT,
     JOINTS_RIGHT,
-    AnchorPoses,
     poses_from_actions,
 )
 from services.world_model.dynamics.objects import MAX_DISTANCE_M
 from services.world_model.rendering.clips import SceneClip
 from services.world_model.rendering.scene_states import SceneStates
-from services.world_model.training.scene_episodes import SceneEpisode
 
 
-def scene_clips(episodes: Sequence[SceneEpisode]) -> list[SceneClip]:
+def scene_clips(episodes: Sequence[EpisodeGrid]) -> list[SceneClip]:
     """Clips of the images of which all objects are known, where an episode has two or more."""
     clips = []
     for episode in episodes:
-        shown = np.flatnonzero(episode.objects_known[episode.image_steps].all(axis=1))
-        if len(shown) > 1 and len(episode.object_boxes_m):
-            clips.append(_clip(episode, shown))
+        if (track := episode.objects) is None or not len(episode.boxes_m):
+            continue
+        steps = episode.image_steps[track.known[episode.image_steps].all(axis=1)]
+        if len(steps) > 1:
+            clips.append(_clip(episode, steps, track.poses[steps].astype(np.float64)))
     return clips
 
 
-def _clip(episode: SceneEpisode, shown: Int64[np.ndarray, " n"]) -> SceneClip:
-    steps = episode.image_steps[shown]
-    actions = episode.measured_actions[steps]
-    hands = poses_from_actions(actions, AnchorPoses(*episode.anchor))
+def _clip(
+    episode: EpisodeGrid,
+    steps: Int64[np.ndarray, " n"],
+    poses: Float64[np.ndarray, "n objects 7"],
+) -> SceneClip:
+    actions = episode.measured[steps]
+    hands = poses_from_actions(actions, episode.anchor)
     wrists = (hands.Ts_world_wrist_left, hands.Ts_world_wrist_right)
-    poses = episode.object_poses[steps].astype(np.float64)
     return SceneClip(
         steps=steps,
-        images=episode.images[shown],
+        images=episode.images(steps),
         states=SceneStates(
             Ts_world_camera=hands.Ts_world_camera_head,
             Ts_world_wrist=np.stack(wrists, axis=1),
@@ -44,5 +47,5 @@ def _clip(episode: SceneEpisode, shown: Int64[np.ndarray, " n"]) -> SceneClip:
             object_present=np.linalg.norm(poses[..., :3], axis=-1) <= MAX_DISTANCE_M,
         ),
         K_head=episode.K_head,
-        boxes_m=episode.object_boxes_m,
+        boxes_m=episode.boxes_m,
     )

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float16, Float32, Float64, Int64, Shaped, UInt8
 from torch import Tensor
 
+from dextouch.episodes import EpisodeGrid, ObjectTrack
 from dextouch.errors import InvalidInputError
-from dextouch.hands.actions import AnchorPoses
 from dextouch.tactile.layout import split_pads
 from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import (
@@ -24,7 +24,6 @@ from services.world_model.dynamics.model import pad_means_kpa
 from services.world_model.dynamics.objects import SIZE_RANGE, ObjectPoses, objects_from_poses
 from services.world_model.dynamics.start_reader import FirstStep
 from services.world_model.dynamics.touch_codec import FREE_KPA
-from services.world_model.training.scene_episodes import SceneEpisode
 
 # Objects that never move farther than this are fixed; measured ones by more than their errors.
 _MOVED_M = 2e-3
@@ -217,7 +216,7 @@ class SceneTable:
         )
 
 
-def vocabulary(episodes: Sequence[SceneEpisode]) -> tuple[tuple[str, ...], tuple[int, ...]]:
+def vocabulary(episodes: Sequence[EpisodeGrid]) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """Tasks in alphabetical order with the number of objects of each.
 
     Raises:
@@ -225,7 +224,7 @@ def vocabulary(episodes: Sequence[SceneEpisode]) -> tuple[tuple[str, ...], tuple
     """
     names: dict[str, set[tuple[str, ...]]] = {}
     for episode in episodes:
-        names.setdefault(episode.task, set()).add(episode.object_names)
+        names.setdefault(episode.task, set()).add(episode.about.object_names)
     uneven = {task: sorted(found) for task, found in names.items() if len(found) > 1}
     many = [name for name, (objects, *_) in names.items() if len(objects) > MAX_OBJECTS]
     if many:
@@ -243,7 +242,7 @@ def vocabulary(episodes: Sequence[SceneEpisode]) -> tuple[tuple[str, ...], tuple
 
 
 def scene_table(
-    episodes: Sequence[SceneEpisode], config: DynamicsConfig, *, labelled: Sequence[bool] = ()
+    episodes: Sequence[EpisodeGrid], config: DynamicsConfig, *, labelled: Sequence[bool] = ()
 ) -> SceneTable:
     """Build the tensors of episodes; what is left over of a latent step at an end is cut off.
 
@@ -256,16 +255,17 @@ def scene_table(
         InvalidInputError: no image of the first step, none later that all episodes have, too short
             an episode, or a task or image size that is not in the configuration.
     """
-    _check(episodes, config)
+    tracks = _checked_tracks(episodes, config)
     lengths = [_whole(episode) for episode in episodes]
     num_steps, steps = max(lengths), _image_steps(episodes, lengths)
     sent, measured = [], []
-    for episode in episodes:
-        anchor = AnchorPoses(*episode.anchor)
-        measured.append(hand_motion(_filled(episode.measured_actions, episode, num_steps), anchor))
-        sent.append(hand_motion(_filled(episode.actions, episode, num_steps), anchor))
-    tactile = np.stack([_filled(e.tactile_kpa, e, num_steps) for e in episodes])
-    objects = [objects_from_poses(_filled(e.object_poses, e, num_steps)) for e in episodes]
+    for one in episodes:
+        measured.append(hand_motion(_filled(one.measured, one, num_steps), one.anchor))
+        sent.append(hand_motion(_filled(one.sent, one, num_steps), one.anchor))
+    tactile = np.stack([_filled(e.touch()[0].astype(np.float16), e, num_steps) for e in episodes])
+    tracked = list(zip(episodes, tracks, strict=True))
+    objects = [objects_from_poses(_filled(track.poses, e, num_steps)) for e, track in tracked]
+    known = np.stack([_known(e, track, num_steps) for e, track in tracked])
     boxes_m = usual_boxes_m(episodes)
     return SceneTable(
         sent=HandTable.of(sent),
@@ -277,7 +277,7 @@ def scene_table(
             torch.stack([each.axes for each in objects]),
             torch.stack([each.present for each in objects]),
         ),
-        tactile_kpa=torch.from_numpy(tactile.astype(np.float16)),
+        tactile_kpa=torch.from_numpy(tactile),
         pads_kpa=torch.from_numpy(pad_means_kpa(tactile.astype(np.float32))),
         in_contact=torch.from_numpy(_pad_peaks_kpa(tactile) >= FREE_KPA),
         images=torch.from_numpy(np.stack([_images(episode, steps) for episode in episodes])),
@@ -288,35 +288,37 @@ def scene_table(
         task=torch.tensor([config.tasks.index(episode.task) for episode in episodes]),
         labelled=torch.tensor(list(labelled) or [True] * len(episodes)),
         length=torch.tensor(lengths),
-        objects_known=torch.from_numpy(np.stack([_known(e, num_steps) for e in episodes])),
-        measured_objects=torch.tensor([episode.objects_measured for episode in episodes]),
+        objects_known=torch.from_numpy(known),
+        measured_objects=torch.tensor([track.is_measured for track in tracks]),
         size=torch.from_numpy(np.stack([_size(e, boxes_m[e.task]) for e in episodes])),
         boxes_m=_padded(boxes_m, config),
     )
 
 
-def _whole(episode: SceneEpisode) -> int:
+def _whole(episode: EpisodeGrid) -> int:
     """Steps of an episode up to the end of its last whole latent step."""
     return len(episode) - (len(episode) - 1) % STEPS_PER_LATENT
 
 
 def _filled(
-    values: Shaped[np.ndarray, "steps ..."], episode: SceneEpisode, num_steps: int
+    values: Shaped[np.ndarray, "steps ..."], episode: EpisodeGrid, num_steps: int
 ) -> Shaped[np.ndarray, "filled ..."]:
     """Values of an episode's steps, the last one repeated up to the length of the table."""
     return values[np.arange(num_steps).clip(max=_whole(episode) - 1)]
 
 
-def _known(episode: SceneEpisode, num_steps: int) -> Bool[np.ndarray, "steps slots"]:
+def _known(
+    episode: EpisodeGrid, track: ObjectTrack, num_steps: int
+) -> Bool[np.ndarray, "steps slots"]:
     """Where poses are known: those of slots without an object always."""
     known = np.ones((num_steps, MAX_OBJECTS), dtype=np.bool_)
-    count = episode.objects_known.shape[1]
-    known[:, :count] = _filled(episode.objects_known, episode, num_steps)
+    count = track.known.shape[1]
+    known[:, :count] = _filled(track.known, episode, num_steps)
     known[_whole(episode) :, :count] = False
     return known
 
 
-def _image_steps(episodes: Sequence[SceneEpisode], lengths: Sequence[int]) -> list[int]:
+def _image_steps(episodes: Sequence[EpisodeGrid], lengths: Sequence[int]) -> list[int]:
     """Latent steps with an image in at least half of the episodes that have them."""
     num_shown = np.zeros(max(lengths), dtype=np.int64)
     num_long = np.zeros(max(lengths), dtype=np.int64)
@@ -340,18 +342,18 @@ def _image_steps(episodes: Sequence[SceneEpisode], lengths: Sequence[int]) -> li
     return steps
 
 
-def _images(episode: SceneEpisode, steps: Sequence[int]) -> UInt8[np.ndarray, "shown px px 3"]:
+def _images(episode: EpisodeGrid, steps: Sequence[int]) -> UInt8[np.ndarray, "shown px px 3"]:
     """Images of the given steps; of those that an episode lacks, the next one or the last."""
     places = np.searchsorted(episode.image_steps, steps)
-    return episode.images[places.clip(max=len(episode.images) - 1)]
+    return episode.images(episode.image_steps[places.clip(max=len(episode.image_steps) - 1)])
 
 
-def usual_boxes_m(episodes: Sequence[SceneEpisode]) -> dict[str, Float64[np.ndarray, "objects 6"]]:
+def usual_boxes_m(episodes: Sequence[EpisodeGrid]) -> dict[str, Float64[np.ndarray, "objects 6"]]:
     """Boxes of each task's objects (middle, half sizes, in their frames), medians over episodes."""
     by_task: dict[str, list[np.ndarray]] = {episode.task: [] for episode in episodes}
     for episode in episodes:
-        if len(episode.object_boxes_m):
-            by_task[episode.task].append(episode.object_boxes_m)
+        if len(episode.boxes_m):
+            by_task[episode.task].append(episode.boxes_m)
     return {
         task: np.median(boxes, axis=0) if boxes else np.zeros((0, 6))
         for task, boxes in by_task.items()
@@ -359,15 +361,15 @@ def usual_boxes_m(episodes: Sequence[SceneEpisode]) -> dict[str, Float64[np.ndar
 
 
 def _size(
-    episode: SceneEpisode, usual_m: Float64[np.ndarray, "objects 6"]
+    episode: EpisodeGrid, usual_m: Float64[np.ndarray, "objects 6"]
 ) -> Float32[np.ndarray, "slots 2"]:
     """Width and height of an episode's objects relative to the usual ones; 1 in empty slots."""
     size = np.ones((MAX_OBJECTS, 2), dtype=np.float32)
-    if not len(episode.object_boxes_m):
+    if not len(episode.boxes_m):
         return size
     across, height = (slice(3, 5), slice(5, 6))
     for column, part in enumerate((across, height)):
-        factors = episode.object_boxes_m[:, part].mean(1) / usual_m[:, part].mean(1).clip(1e-6)
+        factors = episode.boxes_m[:, part].mean(1) / usual_m[:, part].mean(1).clip(1e-6)
         size[: len(factors), column] = factors.clip(*SIZE_RANGE)
     return size
 
@@ -387,20 +389,25 @@ def _pad_peaks_kpa(tactile_kpa: np.ndarray) -> np.ndarray:
     return peaks.reshape(*peaks.shape[:-2], NUM_PADS)
 
 
-def _check(episodes: Sequence[SceneEpisode], config: DynamicsConfig) -> None:
+def _checked_tracks(episodes: Sequence[EpisodeGrid], config: DynamicsConfig) -> list[ObjectTrack]:
+    """Object poses of the episodes, if these fit the configuration."""
     if not episodes:
         raise InvalidInputError("training episodes: got none, expected at least one")
-    size = (config.image_px, config.image_px, 3)
+    size_px = (config.image_px, config.image_px)
+    tracks = []
     for episode in episodes:
-        if episode.task not in config.tasks or episode.object_poses.shape[1] > MAX_OBJECTS:
+        track = episode.objects
+        if track is None or episode.task not in config.tasks or track.poses.shape[1] > MAX_OBJECTS:
             raise InvalidInputError(
                 f"episode {episode.episode_id}: task {episode.task!r} with "
-                f"{episode.object_poses.shape[1]} objects, expected one of {config.tasks} with at "
-                f"most {MAX_OBJECTS}"
+                f"{'unknown' if track is None else track.poses.shape[1]} objects, expected one of "
+                f"{config.tasks} with at most {MAX_OBJECTS}"
             )
-        if _whole(episode) <= STEPS_PER_LATENT or episode.images.shape[1:] != size:
+        if _whole(episode) <= STEPS_PER_LATENT or episode.image_size_px != size_px:
             raise InvalidInputError(
-                f"episode {episode.episode_id}: {len(episode)} steps with images "
-                f"{episode.images.shape[1:]}, expected more than {STEPS_PER_LATENT} steps and "
-                f"images {size}"
+                f"episode {episode.episode_id}: {len(episode)} steps with images of "
+                f"{episode.image_size_px} px, expected more than {STEPS_PER_LATENT} steps and "
+                f"images of {size_px} px"
             )
+        tracks.append(track)
+    return tracks

@@ -3,8 +3,8 @@
 from collections import Counter
 from collections.abc import Sequence
 
-from dextouch.episodes import split_by_scene
-from dextouch.errors import InvalidInputError
+from dextouch.episodes import data_hash, split_by_scene
+from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.schemas import Domain
 from services.world_model.checkpoints import Checkpoint, TrainingSet
 from services.world_model.settings import TrainSettings
@@ -12,11 +12,9 @@ from services.world_model.tokenizer_files import read_tokenizer
 from services.world_model.training.dataset import (
     EpisodeArrays,
     TrainingEpisode,
-    combined_hash,
 )
 from services.world_model.training.episodes import (
     E,
-    check_rates,
     load_episodes,
     subset_by_hash,
 )
@@ -35,9 +33,15 @@ def load_split(
     trained, heldout = _load_robot(settings)
     trained = subset_by_hash(trained, settings.robot_episodes, what="robot")
     together = [*trained, *_load_human(settings)]
-    if settings.human:
-        rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
-        check_rates(rates_hz, ", ".join([settings.episodes, *settings.human]))
+    rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
+    counts = Counter(episode.episode_id for episode in together)
+    if len(rates_hz) > 1 or len(counts) < len(together):
+        twice = [name for name, count in counts.items() if count > 1]
+        raise ConflictError(
+            f"training: the episodes of {', '.join([settings.episodes, *settings.human])} have "
+            f"model rates of {sorted(rates_hz)} Hz, and {twice[:3]} are in two stores; expected "
+            "one rate, and each episode once"
+        )
     return together, heldout
 
 
@@ -79,7 +83,7 @@ def _load_human(settings: TrainSettings) -> Sequence[TrainingEpisode]:
 def check_not_learned(heldout: Sequence[TrainingEpisode], ancestor: Checkpoint) -> None:
     """Raise if the initial checkpoint was trained on a held-out episode."""
     learned = set(ancestor.metadata.train_fingerprints)
-    both = [episode.episode_id for episode in heldout if episode.content_hash() in learned]
+    both = [episode.episode_id for episode in heldout if episode.fingerprint() in learned]
     if both:
         raise InvalidInputError(
             f"training: the initial checkpoint was trained on {len(both)} of the held-out "
@@ -90,12 +94,12 @@ def check_not_learned(heldout: Sequence[TrainingEpisode], ancestor: Checkpoint) 
 
 def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode]) -> None:
     """Raise if a held-out episode, or its scene, is also trained on."""
-    prints = {episode.content_hash() for episode in trained}
+    prints = {episode.fingerprint() for episode in trained}
     scenes = {episode.scene for episode in trained}
     both = [
         episode.episode_id
         for episode in heldout
-        if episode.content_hash() in prints or episode.scene in scenes
+        if episode.fingerprint() in prints or episode.scene in scenes
     ]
     if both:
         raise InvalidInputError(
@@ -138,7 +142,7 @@ def training_sets(
     trained: Sequence[TrainingEpisode],
     heldout: Sequence[TrainingEpisode],
     *,
-    human_share: float | None,
+    settings: TrainSettings,
     ancestor: Checkpoint | None,
 ) -> tuple[TrainingSet, ...]:
     """The episodes of a run by domain, after those of its ancestors."""
@@ -149,21 +153,23 @@ def training_sets(
             for one in ancestor.metadata.sets
         ]
     domains = sorted({episode.domain for episode in trained})
+    human_share, image_px = settings.share_of_human, settings.network.image_px
     shares: dict[Domain, float] = {}
     if human_share is not None and len(domains) > 1:
         shares = {"human": human_share, "robot": 1 - human_share}
     for domain in domains:
         mine = [episode for episode in trained if episode.domain == domain]
-        found.append(_set_of(mine, domain, window_share=shares.get(domain)))
+        found.append(_set_of(mine, domain, image_px, window_share=shares.get(domain)))
     for domain in sorted({episode.domain for episode in heldout}):
         mine = [episode for episode in heldout if episode.domain == domain]
-        found.append(_set_of(mine, domain, heldout=True))
+        found.append(_set_of(mine, domain, image_px, heldout=True))
     return tuple(found)
 
 
 def _set_of(
     episodes: Sequence[TrainingEpisode],
     domain: Domain,
+    image_px: int,
     *,
     heldout: bool = False,
     window_share: float | None = None,
@@ -172,6 +178,6 @@ def _set_of(
         domain=domain,
         heldout=heldout,
         tasks=dict(sorted(Counter(episode.task for episode in episodes).items())),
-        data_hash=combined_hash([episode.content_hash() for episode in episodes]),
+        data_hash=data_hash((e.content_sha256 for e in episodes), image_px=image_px),
         window_share=window_share,
     )

@@ -12,6 +12,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -19,7 +20,17 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from dextouch.command_line import ProgressLines
-from dextouch.episodes import SPLITS, Split, scene_fraction, split_by_scene
+from dextouch.episodes import (
+    SPLITS,
+    EpisodeGrid,
+    EpisodeStore,
+    Split,
+    data_hash,
+    needs,
+    scene_fraction,
+    select_episodes,
+    split_by_scene,
+)
 from dextouch.errors import InvalidInputError
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.networks.weight_files import read_tensors, write_tensors
@@ -48,10 +59,6 @@ from services.world_model.training.core_training import (
 )
 from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_clips import scene_clips
-from services.world_model.training.scene_episodes import (
-    SceneEpisode,
-    load_scene_episodes,
-)
 from services.world_model.training.scene_table import (
     SceneTable,
     scene_table,
@@ -63,6 +70,8 @@ from services.world_model.training.transfer import Base
 
 # Increment when a change of training gives other weights for the same settings and data.
 READER_VERSION, CORE_VERSION, RENDERER_VERSION = 5, 9, 3
+# What an episode of a state model must have.
+PREDICTED: Final = (needs.WHOLE, needs.OUTCOME, needs.TOUCH, needs.OBJECTS, needs.FIRST_IMAGE)
 # Largest number of episodes the renderer is trained on; it samples few of their images anyway.
 MAX_CLIPS = 1500
 _SEED_STRIDE = 1000
@@ -102,7 +111,10 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         settings = _with_base(base, config, settings)
     parts = settings.output.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
-    data_hash = _data_hash(training)
+    hashed = data_hash(
+        (episode.content_sha256 for episode in training),
+        image_px=None if settings.image_px == USUAL_IMAGE_PX else settings.image_px,
+    )
     # Before training, so that invalid episodes are found at once.
     heldout_table = scene_table(heldout, config)
     table = scene_table(training, config, labelled=_labelled(training, settings))
@@ -113,7 +125,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     table_file = parts / "table.safetensors"
     save_file({**table.tensors(), **_prefixed(codec)}, table_file)
     del table
-    work = _Work(settings, config, parts, data_hash, reads_starts)
+    work = _Work(settings, config, parts, hashed, reads_starts)
     _train_parts(work)
     dynamics, renderer, cpu_s = _assembled(work, codec)
     measured = evaluate_dynamics(dynamics, heldout_table)
@@ -122,7 +134,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         dynamics=config,
         num_members=settings.num_members,
         renderer=settings.renderer,
-        object_names={e.task: e.object_names for e in episodes},
+        object_names={e.task: e.about.object_names for e in episodes},
         object_boxes_m={
             task: tuple(tuple(map(float, row)) for row in boxes_m)
             for task, boxes_m in usual_boxes_m(episodes).items()
@@ -142,7 +154,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         training_seeds=_seed_ranges(training, base),
         training_splits=_splits(settings, base),
         training_scenes=_recorded_scenes(training, base),
-        data_hash=data_hash,
+        data_hash=hashed,
         metrics=measured.figures,
     )
     digest = write_state_checkpoint(settings.output, dynamics, renderer, metadata)
@@ -192,9 +204,8 @@ class _Work:
 
     def _key(self, version: int, *names: str) -> str:
         """Digest of the data and of the settings that affect the weights."""
-        image = () if self.config.image_px == USUAL_IMAGE_PX else ("image_px",)
         chosen = self.settings.model_dump_json(
-            include={"seed", "heldout_share", "labelled_share", *image, *names}
+            include={"seed", "heldout_share", "labelled_share", *names}
         )
         base = "" if self.base is None else self.base.checkpoint.digest
         text = f"{version} {chosen} {self.data_hash} {base}"
@@ -228,38 +239,29 @@ def _with_precision(settings: StateTrainSettings) -> StateTrainSettings:
     return settings.model_copy(update={"reader": settings.reader.model_copy(update=chosen)})
 
 
-def _episodes(settings: StateTrainSettings) -> list[SceneEpisode]:
-    return [
-        episode
-        for url in settings.episodes
-        for episode in load_scene_episodes(
-            url,
-            tasks=settings.tasks or None,
-            splits=settings.splits,
-            image_px=settings.image_px,
-        )
-    ]
+def _episodes(settings: StateTrainSettings) -> list[EpisodeGrid]:
+    readers = select_episodes(
+        [EpisodeStore(url) for url in settings.episodes],
+        tasks=settings.tasks,
+        splits=settings.splits,
+        needs=PREDICTED,
+    )
+    return [EpisodeGrid(reader, settings.image_px) for reader in readers]
 
 
-def _config(episodes: list[SceneEpisode], settings: StateTrainSettings) -> DynamicsConfig:
+def _config(episodes: list[EpisodeGrid], settings: StateTrainSettings) -> DynamicsConfig:
     tasks, num_objects = vocabulary(episodes)
-    sides = {episode.images.shape[1] for episode in episodes}
-    if len(sides) != 1 or 0 in sides:
+    sides = {episode.image_size_px[0] for episode in episodes}
+    if len(sides) != 1:
         raise InvalidInputError(
-            f"state model: got episodes with images of {sorted(sides)} px, expected one size "
-            "(and images in all of them)"
+            f"state model: got episodes with images of {sorted(sides)} px, expected one size"
         )
     return DynamicsConfig(
         tasks=tasks, num_objects=num_objects, image_px=sides.pop(), width=settings.width
     )
 
 
-def _data_hash(episodes: list[SceneEpisode]) -> str:
-    digests = sorted(episode.content_sha256 for episode in episodes)
-    return hashlib.sha256("\n".join(digests).encode()).hexdigest()
-
-
-def _labelled(episodes: list[SceneEpisode], settings: StateTrainSettings) -> list[bool]:
+def _labelled(episodes: list[EpisodeGrid], settings: StateTrainSettings) -> list[bool]:
     """Mask of episodes whose object poses are trained on; equal for all takes of a scene."""
     # Training scenes lie above the held-out share.
     share = settings.heldout_share + (1 - settings.heldout_share) * settings.labelled_share
@@ -274,20 +276,20 @@ def _labelled(episodes: list[SceneEpisode], settings: StateTrainSettings) -> lis
     return labelled
 
 
-def _seed_ranges(episodes: list[SceneEpisode], base: Base | None) -> dict[str, tuple[int, int]]:
+def _seed_ranges(episodes: list[EpisodeGrid], base: Base | None) -> dict[str, tuple[int, int]]:
     """First and last seed of every task, the base's included; recordings have none."""
     known = {} if base is None else base.checkpoint.metadata.training_seeds
     seeds = {task: list(ends) for task, ends in known.items()}
     for episode in episodes:
-        if episode.seed is not None:
-            seeds.setdefault(episode.task, []).append(episode.seed)
+        if episode.about.seed is not None:
+            seeds.setdefault(episode.task, []).append(episode.about.seed)
     return {task: (min(found), max(found)) for task, found in sorted(seeds.items())}
 
 
-def _recorded_scenes(episodes: list[SceneEpisode], base: Base | None) -> tuple[str, ...]:
+def _recorded_scenes(episodes: list[EpisodeGrid], base: Base | None) -> tuple[str, ...]:
     """Digests of the scenes without a seed, the base's included."""
     known = set() if base is None else set(base.checkpoint.metadata.training_scenes)
-    own = {scene_digest(episode.scene) for episode in episodes if episode.seed is None}
+    own = {scene_digest(episode.scene) for episode in episodes if episode.about.seed is None}
     return tuple(sorted(known | own))
 
 

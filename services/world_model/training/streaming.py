@@ -14,27 +14,23 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, Split
+from dextouch.episodes import EpisodeGrid, EpisodeReader, EpisodeStore, Split, select_episodes
 from dextouch.hands.actions import poses_from_actions, reanchor
-from dextouch.images import square_of_at_most
 from dextouch.schemas import ActionKind, Domain
 from services.world_model.network.contact_geometry import SeenObjects
 from services.world_model.network.inputs import PredictionRequest
-from services.world_model.starts import CAMERA
 from services.world_model.training.dataset import (
     EpisodeArrays,
     Place,
     TrainingEpisode,
     Window,
     WindowBatch,
-    fingerprint,
     stack_windows,
 )
 from services.world_model.training.episodes import (
-    check_rates,
+    CUT,
     objects_of,
     read_episode,
-    training_ids,
 )
 
 # Open readers per process; each holds an episode's timestamps and actions.
@@ -58,6 +54,7 @@ class StoredEpisode:
     num_steps: int
     action_kinds: tuple[ActionKind, ...]
     content_sha256: str
+    print_sha256: str
     domain: Domain
     model_rate_hz: float
     image_px: int | None = None
@@ -65,9 +62,9 @@ class StoredEpisode:
     def __len__(self) -> int:
         return self.num_steps
 
-    def content_hash(self) -> str:
-        """`fingerprint` of the content at the time of indexing."""
-        return self.content_sha256
+    def fingerprint(self) -> str:
+        """`fingerprint` of its arrays when it was indexed."""
+        return self.print_sha256
 
     def load(self) -> EpisodeArrays:
         """Load the whole episode."""
@@ -81,16 +78,16 @@ class StoredEpisode:
             UnknownNameError: an action kind that it does not have.
             CorruptDataError: damaged bytes.
         """
-        read = _reader(self.url, self.episode_id).window(
-            place.start, place.num_steps, cameras=(CAMERA,), action_kind=place.action_kind
+        grid = EpisodeGrid(_reader(self.url, self.episode_id), self.image_px)
+        read = grid.reader.window(
+            place.start, place.num_steps, cameras=(), action_kind=place.action_kind
         )
         actions, anchor = read.actions, read.anchor
         if place.from_command and place.action_kind == "commanded":
             anchor = poses_from_actions(actions[:1], anchor).anchor(0)
             actions = reanchor(actions, 0)
-        images, K_head = square_of_at_most(read.images[CAMERA], read.K_head, self.image_px)
-        reader = _reader(self.url, self.episode_id)
-        known = objects_of(reader, read.t_ref_ns[:1])
+        images = grid.images(range(place.start, place.start + place.num_steps))
+        known = objects_of(grid, read.t_ref_ns[:1])
         objects = None if known is None else SeenObjects(known[0][0].astype(np.float64), known[1])
         request = PredictionRequest(
             first_image=images[0],
@@ -99,7 +96,7 @@ class StoredEpisode:
             action_kind=place.action_kind,
             instruction=read.instruction,
             anchor=anchor,
-            K_head=K_head,
+            K_head=grid.K_head,
             objects=objects,
         )
         return Window(request, images, read.tactile_kpa, read.tactile_valid)
@@ -112,37 +109,29 @@ def index_episodes(
     domain: Domain | None = None,
     image_px: int | None = None,
 ) -> list[StoredEpisode]:
-    """Index the episodes of a store, except imagined ones; each is read once to be hashed.
-
-    Only those of the given splits and domain are indexed. The middle square of images that are
-    larger than `image_px` is scaled to it.
-
-    Raises:
-        InvalidInputError: the store is empty, mixes model rates, or lacks the image of a step.
-        UnknownNameError: an episode without the head camera.
-    """
+    """`load_episodes`, for episodes that stay on disk; each is read once to be hashed."""
     # The episode of an id may have changed since it was last read.
     _reader.cache_clear()
-    episodes: list[StoredEpisode] = []
-    for episode_id in training_ids(EpisodeStore(url), splits, domain):
-        # Uses the cached readers, so that processes forked later inherit them open.
-        arrays = read_episode(_reader(url, episode_id), image_px=image_px)
-        episodes.append(
+    store, indexed = EpisodeStore(url), list[StoredEpisode]()
+    for found in select_episodes([store], domain=domain, splits=splits, needs=CUT):
+        # The cached reader, so that processes forked later inherit it open.
+        arrays = read_episode(_reader(url, found.item_id), image_px=image_px)
+        indexed.append(
             StoredEpisode(
                 url=url,
-                episode_id=episode_id,
+                episode_id=arrays.episode_id,
                 task=arrays.task,
                 scene=arrays.scene,
                 num_steps=len(arrays),
                 action_kinds=arrays.action_kinds,
-                content_sha256=fingerprint(arrays),
+                content_sha256=arrays.content_sha256,
+                print_sha256=arrays.fingerprint(),
                 domain=arrays.domain,
                 model_rate_hz=arrays.model_rate_hz,
                 image_px=image_px,
             )
         )
-    check_rates({episode.model_rate_hz for episode in episodes}, url)
-    return episodes
+    return indexed
 
 
 class _Windows(Dataset[Window]):

@@ -1,6 +1,5 @@
 """Touch of single hands from episode stores, to train and evaluate tactile tokenizers."""
 
-import hashlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -8,21 +7,30 @@ from itertools import chain
 import numpy as np
 from jaxtyping import Float32
 
-from dextouch.episodes import EpisodeStore, Split, scene_fraction, scene_of
+from dextouch.episodes import (
+    EpisodeGrid,
+    EpisodeStore,
+    Split,
+    data_hash,
+    scene_fraction,
+    select_episodes,
+)
 from dextouch.errors import InvalidInputError
-from services.world_model.training.episodes import training_ids
+
+# By scene: the touch of each episode, and its content.
+_Side = dict[str, list[tuple[np.ndarray, str]]]
 
 
 @dataclass(frozen=True)
 class TactileHands:
-    """Measured touch of the hands of some scenes, at the model rate."""
+    """Measured touch of the hands of some scenes, at the model rate.
+
+    `data_hash` is that of their episodes.
+    """
 
     tactile_kpa: Float32[np.ndarray, "hands 320"]
     scenes: tuple[str, ...]
-
-    def data_hash(self) -> str:
-        """Hash of all pressures."""
-        return hashlib.sha256(self.tactile_kpa.astype("<f4").tobytes()).hexdigest()
+    data_hash: str
 
 
 def load_hands(
@@ -33,24 +41,24 @@ def load_hands(
     Hands of steps without a measurement and imagined episodes are left out.
 
     Raises:
-        InvalidInputError: either side has no hand.
+        InvalidInputError: either side has no scene.
+        NotFoundError, ConflictError: as `select_episodes`.
     """
-    sides: tuple[dict[str, list[np.ndarray]], dict[str, list[np.ndarray]]] = ({}, {})
-    for url in urls:
-        store = EpisodeStore(url)
-        for episode_id in sorted(training_ids(store, splits)):
-            reader = store.open(episode_id)
-            window = reader.window(0, reader.num_steps, cameras=())
-            scene = scene_of(reader.attributes)
-            side = sides[scene_fraction(scene) < heldout_share]
-            side.setdefault(scene, []).append(window.tactile_kpa[window.tactile_valid])
+    sides: tuple[_Side, _Side] = ({}, {})
+    for reader in select_episodes([EpisodeStore(url) for url in urls], splits=splits):
+        grid = EpisodeGrid(reader)
+        touch_kpa, is_measured = grid.touch()
+        side = sides[scene_fraction(grid.scene) < heldout_share]
+        side.setdefault(grid.scene, []).append((touch_kpa[is_measured], grid.content_sha256))
     if not all(sides):
         raise InvalidInputError(
             f"tokenizer: got {len(sides[0])} scenes to train on and {len(sides[1])} held out, "
             "expected at least one each; add episodes or change --heldout-share"
         )
-    training, heldout = (
-        TactileHands(np.concatenate([*chain(*side.values())]), tuple(sorted(side)))
-        for side in sides
-    )
+    training, heldout = (_hands(side) for side in sides)
     return training, heldout
+
+
+def _hands(side: _Side) -> TactileHands:
+    touch_kpa, contents = zip(*chain(*side.values()), strict=True)
+    return TactileHands(np.concatenate(touch_kpa), tuple(sorted(side)), data_hash(contents))

@@ -94,7 +94,7 @@ def train_tokenizer(
         num_training_hands=len(training.tactile_kpa),
         num_heldout_hands=len(heldout.tactile_kpa),
         train_scenes=training.scenes,
-        data_hash=training.data_hash(),
+        data_hash=training.data_hash,
         curve=(
             Reconstruction(step=0, cpu_s=0, mse_kpa2=0, mae_kpa=0, contact_iou=0, contact_f1=0),
         ),

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from dextouch.episodes import data_hash
 from services.networks.memory import on_device
 from services.world_model.checkpoints import (
     Checkpoint,
@@ -19,7 +20,6 @@ from services.world_model.tokenizer_files import StoredTokenizer
 from services.world_model.training.dataset import (
     EpisodeArrays,
     TrainingEpisode,
-    combined_hash,
 )
 from services.world_model.training.distribution import (
     ALONE,
@@ -89,7 +89,7 @@ def train_on(
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else read_checkpoint(settings.init)
     check_tasks(trained, heldout, settings, ancestor)
-    prints = {episode.content_hash() for episode in trained}
+    prints = {episode.fingerprint() for episode in trained}
     names = {episode.episode_id for episode in trained}
     if ancestor is not None:
         # Episodes that the initial checkpoint was trained on cannot be held out either.
@@ -111,12 +111,10 @@ def train_on(
         training_cpu_s=round(run.budget.cpu_s, 1),
         train_episode_ids=tuple(sorted(names)),
         train_fingerprints=tuple(sorted(prints)),
-        data_hash=combined_hash(sorted(prints)),
+        data_hash=_data_hash(trained, settings, ancestor),
         heldout_episode_ids=tuple(sorted(episode.episode_id for episode in heldout)),
         initialized_from=None if ancestor is None else ancestor.digest,
-        sets=training_sets(
-            trained, heldout, human_share=settings.share_of_human, ancestor=ancestor
-        ),
+        sets=training_sets(trained, heldout, settings=settings, ancestor=ancestor),
         tokenizer_digest=_tokenizer_digest(ancestor, tokenizer),
     )
     write_checkpoint(settings.output, averaged, metadata)
@@ -144,6 +142,17 @@ def train_on(
     )
 
 
+def _data_hash(
+    episodes: Sequence[TrainingEpisode], settings: TrainSettings, ancestor: Checkpoint | None
+) -> str:
+    """Hash of the episodes, and of those that the initial checkpoint was trained on."""
+    return data_hash(
+        (episode.content_sha256 for episode in episodes),
+        image_px=settings.network.image_px,
+        ancestor=None if ancestor is None else ancestor.metadata.data_hash,
+    )
+
+
 def _tokenizer_digest(ancestor: Checkpoint | None, tokenizer: StoredTokenizer | None) -> str | None:
     if tokenizer is not None:
         return tokenizer.digest
@@ -161,7 +170,7 @@ def _run_or_resume(
     files = StateFiles(settings.output, run.processes)
     identity = identity_of(
         settings,
-        data_hash=combined_hash([episode.content_hash() for episode in run.episodes]),
+        data_hash=_data_hash(run.episodes, settings, None),
         init_digest=None if ancestor is None else ancestor.digest,
         tokenizer_digest=None if tokenizer is None else tokenizer.digest,
     )

@@ -6,6 +6,7 @@ from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from dextouch.episodes import care as care
+    from dextouch.episodes import needs as needs
     from dextouch.episodes import spool as spool
     from dextouch.episodes.content import ContentDigest as ContentDigest
     from dextouch.episodes.files import disk_errors as disk_errors
@@ -31,9 +32,9 @@ if TYPE_CHECKING:
     from dextouch.episodes.object_poses import ObjectTrack as ObjectTrack
     from dextouch.episodes.object_poses import has_object_poses as has_object_poses
     from dextouch.episodes.object_poses import object_track as object_track
+    from dextouch.episodes.reader import HEAD_CAMERA as HEAD_CAMERA
     from dextouch.episodes.reader import EpisodeReader as EpisodeReader
     from dextouch.episodes.reader import RecordingReader as RecordingReader
-    from dextouch.episodes.rejection import is_rejected as is_rejected
     from dextouch.episodes.rollout_episode import write_rollout as write_rollout
     from dextouch.episodes.sources import GroupFiles as GroupFiles
     from dextouch.episodes.sources import LocalGroup as LocalGroup
@@ -49,6 +50,11 @@ if TYPE_CHECKING:
     from dextouch.episodes.store import EpisodeStore as EpisodeStore
     from dextouch.episodes.store import local_folder as local_folder
     from dextouch.episodes.stream_writer import WriteOptions as WriteOptions
+    from dextouch.episodes.table import TRUE_ORIGINS as TRUE_ORIGINS
+    from dextouch.episodes.table import EpisodeGrid as EpisodeGrid
+    from dextouch.episodes.table import data_hash as data_hash
+    from dextouch.episodes.table import is_rejected as is_rejected
+    from dextouch.episodes.table import select_episodes as select_episodes
     from dextouch.episodes.trash import TRASH_KINDS as TRASH_KINDS
     from dextouch.episodes.trash import TrashKind as TrashKind
     from dextouch.episodes.window import NativeWindow as NativeWindow

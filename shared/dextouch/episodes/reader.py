@@ -3,10 +3,10 @@
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Literal, TypeVar, overload
+from typing import Final, Literal, TypeVar, overload
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from dextouch.episodes.content import committed_content
 from dextouch.episodes.format import STAMPS
@@ -31,6 +31,7 @@ from dextouch.schemas import (
 from dextouch.streams import SampleBatch
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
+HEAD_CAMERA: Final = "camera_head"
 # Half a step, for a free-running camera at the model rate, plus some jitter.
 OWN_IMAGE_SHARE = 0.6
 # Tolerated share of dropped images; images of every second step miss more.
@@ -142,7 +143,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         start: int,
         num_steps: int = 17,
         *,
-        cameras: tuple[str, ...] = ("camera_head",),
+        cameras: tuple[str, ...] = (HEAD_CAMERA,),
         action_kind: ActionKind = "measured",
         grid: bool = True,
         form: ImageForm = FULL_FORM,
@@ -165,30 +166,59 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         """
         self._check_steps(start, num_steps)
         self._check_cameras(cameras)
-        if action_kind not in ACTION_STREAMS:
-            raise UnknownNameError("action kind", action_kind, list(ACTION_STREAMS))
-        stop = start + num_steps
-        grid_ns = self._column("action_t_ref_ns")
         if not grid:
             return self._native_window(start, num_steps, cameras, form)
-        steps_ns = grid_ns[start:stop]
-        pictures = each_camera(lambda name: self._nearest_pictures(name, steps_ns, form), cameras)
-        left, right = (self._tactile(side, start, stop) for side in SIDES)
+        steps_ns = self.stamps_ns("action")[start : start + num_steps]
+        pictures = each_camera(lambda name: self.nearest_pictures(name, steps_ns, form), cameras)
+        tactile_kpa, tactile_valid = self.touch(start, num_steps)
         return Window(
             images={name: images for name, (_, images) in pictures.items()},
             image_dt_ns={
                 name: self.stamps_ns(name)[nearest] - steps_ns
                 for name, (nearest, _) in pictures.items()
             },
-            tactile_kpa=np.stack([left[0], right[0]], axis=1),
-            tactile_valid=np.stack([left[1], right[1]], axis=1),
-            actions=self._actions(start, stop, action_kind),
+            tactile_kpa=tactile_kpa,
+            tactile_valid=tactile_valid,
+            actions=self.actions(start, num_steps, kind=action_kind),
             action_kind=action_kind,
             instruction=self.attributes.instruction,
             t_ref_ns=steps_ns.copy(),
-            anchor=self._anchor(start),
+            anchor=self.anchor(start),
             K_head=self.attributes.K_head_matrix(),
         )
+
+    def touch(
+        self, start: int, num_steps: int
+    ) -> tuple[Float32[np.ndarray, "n 2 320"], Bool[np.ndarray, "n 2"]]:
+        """Mean pressures (kPa) of steps, and where there was a sample; as in `window`."""
+        self._check_steps(start, num_steps)
+        left, right = (self._tactile(side, start, start + num_steps) for side in SIDES)
+        return np.stack([left[0], right[0]], axis=1), np.stack([left[1], right[1]], axis=1)
+
+    def actions(
+        self, start: int, num_steps: int, *, kind: ActionKind = "measured"
+    ) -> Float64[np.ndarray, "n 67"]:
+        """Actions of steps, relative to the measured poses of the first one; as in `window`.
+
+        Raises:
+            InvalidInputError: steps outside the episode.
+            UnknownNameError: an action kind that the episode does not have.
+        """
+        self._check_steps(start, num_steps)
+        if kind not in ACTION_STREAMS:
+            raise UnknownNameError("action kind", kind, list(ACTION_STREAMS))
+        measured, steps = self._column("action"), slice(start, start + num_steps)
+        if kind == "measured":
+            return reanchor(measured[steps], 0)
+        commanded = self._column(self._stream(ACTION_STREAMS[kind]).name)
+        return reanchor(commanded[steps], 0, anchor_action=measured[start])
+
+    def anchor(self, step: int) -> AnchorPoses:
+        """Measured poses of left wrist, right wrist and head camera at a step, in the world."""
+        measured = self._column("action")[step : step + 1]
+        if measured.shape[1:] != (ACTION_DIM,):
+            raise InvalidInputError(f"{self._what}: 'action' has rows of {measured.shape[1:]}")
+        return poses_from_actions(measured, self.attributes.anchor.to_poses()).anchor(0)
 
     def _native_window(
         self, start: int, num_steps: int, cameras: tuple[str, ...], form: ImageForm
@@ -213,29 +243,43 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             start_ns=first_ns,
             stop_ns=stop_ns,
             instruction=self.attributes.instruction,
-            anchor=self._anchor(start),
+            anchor=self.anchor(start),
             K_head=self.attributes.K_head_matrix(),
         )
 
     def shown_steps(
-        self, camera: str
+        self, camera: str, steps: Int64[np.ndarray, " steps"] | None = None
     ) -> tuple[Int64[np.ndarray, " shown"], Int64[np.ndarray, " shown"]]:
         """Steps that have an image at most 0.6 steps away, and the index of that image.
 
         Images that cannot be decoded do not count: those that are chosen are decoded once.
+
+        Args:
+            camera: of an image stream.
+            steps: increasing steps to look at; None for all.
 
         Raises:
             UnknownNameError: no such camera.
             NotFoundError: none of its images can be decoded.
         """
         self._check_cameras((camera,))
-        stamps, grid_ns = self.stamps_ns(camera), self._column("action_t_ref_ns")
+        stamps, grid_ns = self.stamps_ns(camera), self.stamps_ns("action")
         if not len(stamps):
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-        nearest = self.nearest_images(camera, grid_ns)
+        chosen = np.arange(len(grid_ns)) if steps is None else steps
+        nearest = self.nearest_images(camera, grid_ns[chosen])
         reach_ns = OWN_IMAGE_SHARE * 1e9 / self.attributes.model_rate_hz
-        steps = np.flatnonzero(np.abs(stamps[nearest] - grid_ns) <= reach_ns)
-        return steps.astype(np.int64), nearest[steps]
+        is_near = np.abs(stamps[nearest] - grid_ns[chosen]) <= reach_ns
+        return chosen[is_near], nearest[is_near]
+
+    def has_every_image(self, camera: str) -> bool:
+        """Whether nearly every step has an image of its own; one in twenty may have been dropped.
+
+        Raises:
+            UnknownNameError: no such camera.
+        """
+        num_missing = self.num_steps - len(self.shown_steps(camera)[0])
+        return num_missing <= MAX_UNSHOWN_SHARE * self.num_steps
 
     def require_images(self, camera: str) -> None:
         """Check that nearly every step of the episode has an image of its own.
@@ -247,18 +291,22 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             InvalidInputError: more than a twentieth of the steps have no image of their own.
             UnknownNameError: no such camera.
         """
-        num_missing = self.num_steps - len(self.shown_steps(camera)[0])
-        if num_missing > MAX_UNSHOWN_SHARE * self.num_steps:
+        if not self.has_every_image(camera):
+            num_missing = self.num_steps - len(self.shown_steps(camera)[0])
             raise InvalidInputError(
                 f"{self._what}: {num_missing} of {self.num_steps} steps have no image of "
                 f"{camera!r} within {OWN_IMAGE_SHARE} steps, expected one a step; record it with "
                 "images of every step (`dextouch train data --images 1`)"
             )
 
-    def _nearest_pictures(
-        self, camera: str, t_ns: np.ndarray, form: ImageForm
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The images nearest to some times, and their indices."""
+    def nearest_pictures(
+        self, camera: str, t_ns: np.ndarray, form: ImageForm = FULL_FORM
+    ) -> tuple[Int64[np.ndarray, " n"], UInt8[np.ndarray, "n h w c"]]:
+        """Indices of the images nearest to non-decreasing times, and these images.
+
+        Raises:
+            NotFoundError: no image, or none that can be decoded.
+        """
         if not self.num_samples(camera):
             raise NotFoundError(f"{self._what}: {camera!r} holds no image")
         nearest = nearest_index(self.stamps_ns(camera), t_ns)
@@ -291,16 +339,3 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         ranges = step_ranges(stamps, grid_ns, start, stop)
         low, high = int(ranges[0, 0]), int(max(ranges[0, 0], ranges[-1, 1]))
         return mean_over_ranges(self._values(name, low, high), ranges - low)
-
-    def _actions(self, start: int, stop: int, action_kind: ActionKind) -> np.ndarray:
-        measured = self._column("action")
-        if action_kind == "measured":
-            return reanchor(measured[start:stop], 0)
-        commanded = self._column(self._stream("action_commanded").name)
-        return reanchor(commanded[start:stop], 0, anchor_action=measured[start])
-
-    def _anchor(self, start: int) -> AnchorPoses:
-        measured = self._column("action")[start : start + 1]
-        if measured.shape[1:] != (ACTION_DIM,):
-            raise InvalidInputError(f"{self._what}: 'action' has rows of {measured.shape[1:]}")
-        return poses_from_actions(measured, self.attributes.anchor.to_poses()).anchor(0)

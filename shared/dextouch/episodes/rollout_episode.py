@@ -5,12 +5,12 @@ from typing import Final
 
 import numpy as np
 
+from dextouch.episodes.reader import HEAD_CAMERA
 from dextouch.episodes.store import EpisodeStore
 from dextouch.schemas import EpisodeAttributes, Observation
 from dextouch.streams import StreamDescriptor, StreamKind
 from dextouch.tactile.layout import SIDES
 
-CAMERA: Final = "camera_head"
 NS_PER_S: Final = 1_000_000_000
 
 
@@ -34,13 +34,13 @@ def write_rollout(
     """
     rate_hz = attributes.model_rate_hz
     tactile = np.concatenate([observation.tactile_kpa for observation in observations])
-    shown = [observation for observation in observations if CAMERA in observation.images]
-    images = np.concatenate([observation.images[CAMERA] for observation in shown])
+    shown = [observation for observation in observations if HEAD_CAMERA in observation.images]
+    images = np.concatenate([observation.images[HEAD_CAMERA] for observation in shown])
     shown_steps = np.concatenate([one.first_step + np.arange(len(one)) for one in shown])
     reached = np.concatenate([observation.action_reached for observation in observations])
     t_ref_ns = np.round(np.arange(len(tactile)) * NS_PER_S / rate_hz).astype(np.int64)
     streams: list[tuple[str, StreamKind, str, np.ndarray]] = [
-        (CAMERA, "image", "rgb8", images),
+        (HEAD_CAMERA, "image", "rgb8", images),
         ("action", "robot_state", "action_m_rad", reached),
         ("action_commanded", "robot_state", "action_m_rad", np.asarray(commanded)),
     ]
@@ -65,5 +65,5 @@ def write_rollout(
                     }
                 )
             )
-            stamps_ns = t_ref_ns[shown_steps] if name == CAMERA else t_ref_ns[-len(values) :]
+            stamps_ns = t_ref_ns[shown_steps] if name == HEAD_CAMERA else t_ref_ns[-len(values) :]
             writer.append(name, values=values, t_ref_ns=stamps_ns)

@@ -73,11 +73,12 @@ class EpisodeStore:
         storage_options: of an `s3://…` store; credentials belong here or in the usual AWS_*
             environment, which obstore reads.
 
-    `root` is the local folder of unfinished groups: the store itself if that is a folder, otherwise
-    the work folder.
+    `url` is the address as given; `root` is the local folder of unfinished groups: the store itself
+    if that is a folder, otherwise the work folder.
     """
 
     def __init__(self, url: str | Path, storage_options: Mapping[str, str] | None = None) -> None:
+        self.url = str(url)
         self._storage = _open_storage(url, storage_options or {})
         self.root = self._storage.root
 

@@ -75,4 +75,6 @@ def test_unknown_metrics_name_the_valid_ones(store, capsys):
 
 def test_a_store_without_such_episodes_says_what_it_has(store, capsys):
     assert run(store, "--tasks", "insert_peg") == 3
-    assert "no robot episode of insert_peg" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "no robot episode of insert_peg" in error
+    assert "2 of task 'stand_bottle'" in error

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore, split_of
+from dextouch.errors import NotFoundError
 from services.cli import main
 from services.evaluation.policies.cloning_episodes import read_cloning_episodes
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.world_model.state_checkpoints import write_state_checkpoint
-from services.world_model.training.episodes import training_ids
+from services.world_model.training.episodes import load_episodes
 from tests.contracts.test_world import untrained_state_checkpoint
 
 SEEDS = (4, 5, 8)
@@ -102,7 +103,7 @@ def test_scenes_of_the_world_model_are_refused(generate, truth, capsys):
 def test_failures_are_imagined_on_request_only(generate, capsys):
     status, _ = generate(seeds="9:10")
     assert status == 3
-    assert "no robot episode" in capsys.readouterr().err
+    assert "that failed" in capsys.readouterr().err
     status, made = generate("--with-failures", seeds="9:10")
     assert (status, len(made)) == (0, 1)
 
@@ -110,10 +111,11 @@ def test_failures_are_imagined_on_request_only(generate, capsys):
 def test_imagined_episodes_are_trained_on_only_when_asked(generate, truth, tmp_path):
     generate(seeds="4:5")
     imagined = EpisodeStore(tmp_path / "imagined")
-    assert training_ids(imagined) == []
-    assert len(training_ids(truth)) == 4
+    with pytest.raises(NotFoundError, match="1 of origin 'imagined'"):
+        load_episodes(str(imagined.root))
+    assert len(load_episodes(str(truth.root))) == 4
     scenes = [one.scene for one in read_cloning_episodes(truth)]
     assert sorted(scenes) == [f"stand_bottle/{seed}" for seed in SEEDS]
     assert len(read_cloning_episodes(truth, imagined)) == 3
-    assert len(read_cloning_episodes(truth, imagined, origin="imagined")) == 1
+    assert len(read_cloning_episodes(truth, imagined, imagined=True)) == 1
     assert [one.scene for one in read_cloning_episodes(truth, splits=("B",))] == ["stand_bottle/5"]

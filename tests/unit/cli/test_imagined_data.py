@@ -8,6 +8,7 @@ import pytest
 
 from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
+from dextouch.errors import NotFoundError
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli.imagined_data import (
     WORLD,
@@ -86,11 +87,14 @@ def test_seeds_are_written_as_a_range():
 
 
 def test_episodes_are_chosen_by_task_and_seed(truth):
-    every = truth.list()
-    assert chosen_episodes(truth, None, None) == every
-    assert chosen_episodes(truth, ("stand_bottle",), range(4, 5)) == every
-    assert chosen_episodes(truth, ("stack_bowls",), None) == []
-    assert chosen_episodes(truth, None, range(5, 9)) == []
+    def ids(tasks, seeds):
+        return [about.episode_id for about in chosen_episodes(truth, tasks, seeds)]
+
+    assert ids(None, None) == ids(("stand_bottle",), range(4, 5)) == truth.list()
+    with pytest.raises(NotFoundError, match="1 of task 'stand_bottle'"):
+        ids(("stack_bowls",), None)
+    with pytest.raises(NotFoundError, match="of other seeds"):
+        ids(None, range(5, 9))
 
 
 def test_the_number_of_processes_is_positive():

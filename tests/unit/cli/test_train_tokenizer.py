@@ -20,7 +20,7 @@ def hands(monkeypatch):
     """Two scenes with random contacts instead of a store."""
     rng = np.random.default_rng(0)
     kpa = (rng.random((60, 320)) * 30 * (rng.random((60, 320)) < 0.2)).astype(np.float32)
-    split = (TactileHands(kpa[:40], ("a/1",)), TactileHands(kpa[40:], ("a/2",)))
+    split = (TactileHands(kpa[:40], ("a/1",), "0"), TactileHands(kpa[40:], ("a/2",), "1"))
     module = "services.world_model.training.tokenizer_trainer.load_hands"
     monkeypatch.setattr(module, lambda *_, **__: split)
 

@@ -29,4 +29,5 @@ def ending_episode(item: Demonstration) -> EndingEpisode:
         item.start_digest,
         last,
         {step: final_ending(item, step) for step in sorted(steps)},
+        content_sha256=item.episode_id,
     )

@@ -1,25 +1,21 @@
 """Episodes of a store as arrays and pictures, and what is refused."""
 
 import json
-from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 
 from dextouch.clients.policy import PolicyStart
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, select_episodes
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
-from dextouch.schemas import Review
 from services.cli.main import run_command
 from services.evaluation.endings import read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.cloning_episodes import (
-    cloning_hash,
     read_cloning_episodes,
 )
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import action_picture, episode_picture
-from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import refuse_training_starts, start_digest
 from services.evaluation.success_probe import SuccessProbe
 from tests.unit.evaluation import toy
@@ -36,14 +32,13 @@ def url(tmp_path_factory):
     return str(folder)
 
 
-def ids(*stores, **options):
-    return [reader.attributes.episode_id for reader in robot_episodes(stores, **options)]
+def robot_episodes(*stores):
+    return select_episodes(stores, domain="robot")
 
 
 def test_robot_episodes_are_replayed_as_they_were_commanded(url):
-    found = list(robot_episodes([EpisodeStore(url)]))
+    found = list(robot_episodes(EpisodeStore(url)))
     assert len(found) == 24
-    assert "a-person" not in ids(EpisodeStore(url))
     policy = ReplayPolicy.of(found)
     item = toy.demonstration("reach far", 4, noise_m=0.06)
     policy.reset(PolicyStart(item.task, "", item.seed, toy.ANCHOR, toy.K_HEAD))
@@ -57,40 +52,10 @@ def test_a_start_is_replayed_from_one_episode_of_known_seed(tmp_path):
     for name in ("once", "twice"):
         write(store, toy.demonstration("reach", 4, name=name), shown=[0], success=None)
     with pytest.raises(ConflictError, match="seed 4"):
-        ReplayPolicy.of(robot_episodes([store]))
+        ReplayPolicy.of(robot_episodes(store))
     write(store, toy.demonstration("reach", 5, name="no-seed"), seed=None)
     with pytest.raises(InvalidInputError, match="no-seed"):
         ReplayPolicy.of([store.open("no-seed")])
-
-
-def test_tasks_can_be_chosen(url):
-    chosen = robot_episodes([EpisodeStore(url)], tasks=["reach"])
-    assert {reader.attributes.task for reader in chosen} == {"reach"}
-    with pytest.raises(NotFoundError, match="juggle"):
-        ids(EpisodeStore(url), tasks=["juggle"])
-
-
-def test_rejected_episodes_train_no_policy(tmp_path):
-    store = EpisodeStore(tmp_path)
-    for seed in range(3):
-        write(store, toy.demonstration("reach", seed, name=f"reach-{seed}"))
-    review = Review(verdict="rejected", reviewed_at=datetime(2026, 5, 4, tzinfo=UTC))
-    store.set_review("reach-1", review)
-    assert [one.episode_id for one in read_cloning_episodes(store)] == ["reach-0", "reach-2"]
-    for name in ("reach-0", "reach-2"):
-        store.set_review(name, review)
-    with pytest.raises(NotFoundError, match="3 that were rejected in review"):
-        read_cloning_episodes(store)
-
-
-def test_stores_add_up_but_no_episode_counts_twice(url, tmp_path):
-    more = EpisodeStore(tmp_path)
-    write(more, toy.demonstration("reach", 99))
-    assert len(ids(EpisodeStore(url), more)) == 25
-    with pytest.raises(ConflictError, match="in two stores"):
-        ids(EpisodeStore(url), more, EpisodeStore(url))
-    with pytest.raises(NotFoundError, match="store 2 of 2"):
-        ids(EpisodeStore(url), EpisodeStore(str(tmp_path / "typo")))
 
 
 # What `dextouch train data --images 4` draws.
@@ -181,17 +146,10 @@ def test_policies_learn_from_images_of_every_eighth_step(tmp_path):
         np.testing.assert_allclose(moment.tactile_kpa, item.tactile_kpa[step])
     for name in ("measured", "commanded"):
         np.testing.assert_allclose(getattr(episode, name), getattr(item, name), atol=1e-12)
-    whole = toy.cloning_episode(item)
-    assert cloning_hash([episode]) == cloning_hash([whole])
-    moved = toy.replace(whole, commanded=whole.commanded + 1e-9)
-    assert cloning_hash([moved]) != cloning_hash([whole])
-    with pytest.raises(ConflictError, match="in two stores"):
-        read_cloning_episodes(store, store)
-    with pytest.raises(NotFoundError, match="juggle"):
-        read_cloning_episodes(store, tasks=["juggle"])
-    write(store, toy.demonstration("reach", 3), shown=range(0, 81, 6))
-    with pytest.raises(InvalidInputError, match=r"reach-3-0.*at step 8, .*--images 8"):
-        read_cloning_episodes(store)
+    sparser = EpisodeStore(tmp_path / "sparser")
+    write(sparser, toy.demonstration("reach", 3), shown=range(0, 81, 6))
+    with pytest.raises(NotFoundError, match=r"1 without an image of every 8th step .*--images 8"):
+        read_cloning_episodes(sparser)
 
 
 def test_the_command_line_refuses_clearly():

@@ -91,7 +91,7 @@ def test_takes_are_true_episodes_of_known_outcome(store, items):
         assert take.success == item.success
         np.testing.assert_allclose(take.actions, item.commanded[1:])
     assert len(read_takes([store], most=4)) == 4
-    with pytest.raises(NotFoundError, match="known outcome"):
+    with pytest.raises(NotFoundError, match="no robot episode of stir"):
         read_takes([store], tasks=["stir"])
 
 

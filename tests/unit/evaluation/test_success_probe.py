@@ -9,7 +9,6 @@ from scipy.stats import mannwhitneyu
 
 from dextouch.episodes import split_by_scene
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
-from services.evaluation.endings import endings_hash
 from services.evaluation.judge_network import ProbeShape
 from services.evaluation.success_probe import SuccessProbe
 from services.evaluation.success_probe_data import labelled_endings
@@ -120,16 +119,6 @@ def test_early_endings_do_not_crowd_out_near_misses(demonstrations):
     failed = labelled.outcome[:, 0] < 0.5
     share = labelled.weight[early].sum() / labelled.weight[failed].sum()
     assert float(share) == pytest.approx(0.1, abs=1e-3)
-
-
-def test_data_hash_sees_every_change(demonstrations):
-    few = demonstrations[:3]
-    whole = endings_hash(_episodes(few))
-    assert endings_hash(_episodes(few[::-1])) == whole
-    touched = few[0].tactile_kpa.copy()
-    touched[48, 1, 5] += 0.5
-    changed = [toy.replace(few[0], tactile_kpa=touched), *few[1:]]
-    assert endings_hash(_episodes(changed)) != whole
 
 
 def test_a_probe_with_spoiled_probabilities_is_calibrated_to_what_happened(

@@ -124,7 +124,7 @@ def cloning_episode(item: Demonstration) -> CloningEpisode:
     }
     about = (item.episode_id, item.task, item.instruction, item.scene, item.success)
     actions = (item.measured, item.commanded)
-    return CloningEpisode(*about, ANCHOR, moments, *actions, item.start_digest)
+    return CloningEpisode(*about, ANCHOR, moments, *actions, item.start_digest, item.episode_id)
 
 
 @dataclass(frozen=True)

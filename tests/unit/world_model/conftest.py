@@ -87,6 +87,7 @@ def _drawn_episode(seed, num_steps):
         anchor=anchor,
         K_head=K_HEAD,
         model_rate_hz=15.0,
+        content_sha256=f"{seed:064x}",
         object_poses=np.tile(np.float32([*box_m, 1, 0, 0, 0]), (num_steps, 1, 1)),
         boxes_m=np.array([[0, 0, 0, 0.03, 0.03, 0.02]]),
     )

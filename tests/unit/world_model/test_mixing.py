@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 import torch
 
-from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError
+from dextouch.episodes import EpisodeStore, data_hash
+from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.serving import load_settings
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.command_line import run_adapt
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.recorded_commands import command_line
 from services.world_model.settings import AdaptCommand, TrainCommand, TrainSettings
-from services.world_model.training.dataset import WindowSampler, combined_hash
+from services.world_model.training.dataset import WindowSampler
 from services.world_model.training.episodes import subset_by_hash
 from services.world_model.training.splits import check_tasks, load_split
 from services.world_model.training.trainer import train
-from tests.unit.world_model.conftest import human_episode, make_episode, write_episode
+from tests.unit.world_model.conftest import PX, human_episode, make_episode, write_episode
 
 
 @pytest.fixture
@@ -106,6 +106,18 @@ def test_subsets_of_both_domains_leave_the_held_out_robots_as_they_are(settings,
     assert [e.episode_id for e in load_split(given)[1]] == ["toy-50"]
 
 
+@pytest.mark.parametrize("streaming", [False, True])
+def test_no_episode_counts_twice_and_all_have_one_rate(settings, tmp_path, streaming):
+    settings = settings.model_copy(update={"streaming": streaming, "human_episodes": None})
+    same, other = EpisodeStore(tmp_path / "same"), EpisodeStore(tmp_path / "other")
+    write_episode(same, human_episode(100))
+    write_episode(other, replace(human_episode(110), model_rate_hz=30.0))
+    for store, message in ((same, "human-100"), (other, r"rates of \[15.0, 30.0\]")):
+        human = (*settings.human, str(store.root))
+        with pytest.raises(ConflictError, match=message):
+            load_split(settings.model_copy(update={"human": human}))
+
+
 def test_tasks_that_people_and_robots_share_are_refused_unless_allowed(settings):
     robots, heldout = [make_episode(0)], [make_episode(1)]
     people = [human_episode(100), human_episode(101, task="push_box")]
@@ -131,7 +143,7 @@ def test_a_checkpoint_proves_what_it_was_trained_on(settings):
         one = found.pop((domain, held))
         task = "fold_cloth" if domain == "human" else "push_box"
         assert one.tasks == {task: len(episodes)}
-        assert one.data_hash == combined_hash([e.content_hash() for e in episodes])
+        assert one.data_hash == data_hash((e.content_sha256 for e in episodes), image_px=PX)
         assert one.window_share == (None if held else 0.5)
     assert not found
     assert "--human=human" in metadata.command

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from dextouch.episodes import split_by_scene
+from dextouch.episodes import ObjectTrack, split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
-from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
+from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
+from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
 from dextouch.serving import load_settings
 from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore, SceneStart
@@ -43,10 +44,10 @@ from services.world_model.training.reader_training import (
     reader_errors,
     train_reader,
 )
-from services.world_model.training.scene_episodes import SceneEpisode
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.state_trainer import _command, _labelled
+from tests.unit.world_model.toy_grid import ToyGrid, changed
 
 PX, NUM_STEPS = 32, 17
 K_HEAD = pinhole_matrix(width_px=PX, height_px=PX, fovy_rad=np.deg2rad(60))
@@ -61,25 +62,28 @@ def episode(seed, num_steps=NUM_STEPS):
     hits = seed % 2 == 0
     hand_m = block_m + ([0.0, 0.0, 0.2] if hits else [0.12, 0.12, 0.2])
     left_m = np.array([-0.3, 0.0, 0.2])
-    anchor = np.stack([transform(np.eye(3), left_m), transform(np.eye(3), hand_m), CAMERA])
+    anchor = AnchorPoses(transform(np.eye(3), left_m), transform(np.eye(3), hand_m), CAMERA)
     actions = np.zeros((num_steps, 67))
     for part in POSE_SLICES:
         actions[:, part] = IDENTITY_POSE_9D
     down = np.clip(np.arange(num_steps) / 10, 0, 1)
     actions[:, 11] = -0.2 * down
-    tactile = np.zeros((num_steps, 2, 320), dtype=np.float16)
+    tactile = np.zeros((num_steps, 2, 320), dtype=np.float32)
     tactile[down >= 0.8, 1, 80:] = 20.0 if hits else 0.0
     poses = np.zeros((num_steps, 1, 7), dtype=np.float32)
     poses[:, 0, :3], poses[:, 0, 3] = block_m, 1.0
     steps = np.arange(0, num_steps, 4)
-    return SceneEpisode(
-        episode_id=f"toy-{seed}", task="press", scene=f"press/{seed}", seed=seed, success=hits,
-        object_names=("block",), object_boxes_m=np.array([[0, 0, 0, 0.02, 0.02, 0.03]]),
-        action_kind="commanded", actions=actions, measured_actions=actions, anchor=anchor,
-        K_head=K_HEAD, tactile_kpa=tactile, object_poses=poses,
-        objects_known=np.ones(poses.shape[:2], dtype=bool), objects_measured=False,
-        images=np.repeat(picture(block_m)[None], len(steps), axis=0), image_steps=steps,
-        content_sha256=f"{seed:064x}",
+    about = EpisodeAttributes(
+        episode_id=f"toy-{seed}", task="press", instruction="press it", domain="robot",
+        origin="twin", seed=seed, success=hits, object_names=("block",), K_head=matrix_rows(K_HEAD),
+        anchor=StoredAnchor.from_poses(anchor),
+    )  # fmt: skip
+    known = np.ones(poses.shape[:2], dtype=bool)
+    return ToyGrid(
+        about=about, anchor=anchor, measured=actions, sent=actions, K_head=K_HEAD,
+        tactile_kpa=tactile, objects=ObjectTrack(poses, known, is_measured=False),
+        boxes_m=np.array([[0, 0, 0, 0.02, 0.02, 0.03]]),
+        pictures=np.repeat(picture(block_m)[None], len(steps), axis=0), image_steps=steps,
     )  # fmt: skip
 
 
@@ -150,7 +154,7 @@ def test_a_core_feels_what_it_touches_and_nothing_elsewhere(reader, table, held_
 
 def test_object_poses_without_labels_are_never_looked_at(config):
     episodes = [episode(seed) for seed in range(8)]
-    lies = [dataclasses.replace(e, object_poses=e.object_poses + 0.07) for e in episodes]
+    lies = [changed(e, poses=e.objects.poses + 0.07) for e in episodes]
     known = [seed < 4 for seed in range(8)]
     settings = CoreSettings(num_steps=12, batch=8, held_fraction=0.5)
     trained = []
@@ -169,9 +173,7 @@ def test_object_poses_without_labels_are_never_looked_at(config):
 
 def test_all_takes_of_a_scene_are_labelled_or_none():
     takes = [
-        dataclasses.replace(
-            episode(seed), episode_id=f"{take}-{seed}", scene=f"stand_bottle/{seed}"
-        )
+        changed(episode(seed), episode_id=f"{take}-{seed}", task="stand_bottle")
         for seed in range(100)
         for take in "ab"
     ]
@@ -208,24 +210,20 @@ def test_cores_begin_anywhere_up_to_the_last_latent_step(config):
 
 def test_a_core_knows_the_boxes_of_its_tasks_and_what_moves():
     config = DynamicsConfig(tasks=("lift", "press"), num_objects=(1, 1), image_px=PX, width=32)
-    episodes = [
-        dataclasses.replace(episode(seed), task=("press", "lift")[seed % 2]) for seed in range(8)
-    ]
+    episodes = [changed(episode(seed), task=("press", "lift")[seed % 2]) for seed in range(8)]
     box = np.array([[0, 0, 0.01, 0.04, 0.02, 0.03]])
-    episodes[1] = dataclasses.replace(
-        episodes[1], object_poses=episodes[1].object_poses.copy(), object_boxes_m=box
-    )
-    episodes[1].object_poses[4:, 0, 2] += 0.003
+    episodes[1] = changed(episodes[1], boxes_m=box)
+    episodes[1].objects.poses[4:, 0, 2] += 0.003
     lifts = [one for one in episodes if one.task == "lift"]
     episodes = [one for one in episodes if one.task == "press"] + [
-        dataclasses.replace(one, object_boxes_m=box) for one in lifts
+        changed(one, boxes_m=box) for one in lifts
     ]
     table = scene_table(episodes, config)
     core = RecurrentCore(config)
     describe(core, table)
     assert core.movable.tolist() == [[1, 0, 0], [0, 0, 0]]
     np.testing.assert_allclose(core.boxes_m[0, 0], box[0], rtol=1e-6)
-    np.testing.assert_allclose(core.boxes_m[1, 0], episodes[0].object_boxes_m[0], rtol=1e-6)
+    np.testing.assert_allclose(core.boxes_m[1, 0], episodes[0].boxes_m[0], rtol=1e-6)
     assert core.boxes_m[:, 1:].count_nonzero() == 0
 
 
@@ -286,9 +284,9 @@ def test_a_table_survives_its_tensors(table):
 
 def test_commands_begin_where_hands_are_measured(config):
     one = episode(0)
-    lagging = one.measured_actions.copy()
+    lagging = one.measured.copy()
     lagging[:, 9] += 0.01
-    late = scene_table([dataclasses.replace(one, measured_actions=lagging)], config)
+    late = scene_table([changed(one, measured=lagging)], config)
     rows = torch.tensor([0])
     sent = late.commands(rows, 4, torch.tensor([False]))
     reached = late.commands(rows, 4, torch.tensor([True]))
@@ -301,14 +299,14 @@ def test_commands_begin_where_hands_are_measured(config):
 def shortened(one, num_steps):
     """The first steps of an episode."""
     shown = one.image_steps < num_steps
-    return dataclasses.replace(
+    return changed(
         one,
-        actions=one.actions[:num_steps],
-        measured_actions=one.measured_actions[:num_steps],
+        sent=one.sent[:num_steps],
+        measured=one.measured[:num_steps],
         tactile_kpa=one.tactile_kpa[:num_steps],
-        object_poses=one.object_poses[:num_steps],
-        objects_known=one.objects_known[:num_steps],
-        images=one.images[shown],
+        poses=one.objects.poses[:num_steps],
+        known=one.objects.known[:num_steps],
+        pictures=one.pictures[shown],
         image_steps=one.image_steps[shown],
     )
 
@@ -374,13 +372,13 @@ def _loss_of(data, config, settings):
 
 def test_unknown_poses_train_neither_readers_nor_cores(config):
     one = episode(0)
-    hidden = one.objects_known.copy()
+    hidden = one.objects.known.copy()
     hidden[4:12] = False
-    astray = one.object_poses.copy()
+    astray = one.objects.poses.copy()
     astray[4:12, 0, :3] = [0.3, 0.3, 0.3]
     tables = [
-        scene_table([dataclasses.replace(one, objects_known=hidden, object_poses=poses)], config)
-        for poses in (one.object_poses, astray)
+        scene_table([changed(one, known=hidden, poses=poses)], config)
+        for poses in (one.objects.poses, astray)
     ]
     settings = ReaderSettings(num_steps=4, batch=8, bfloat16=False)
     readers = [train_reader(table, config, settings, seed=0).state_dict() for table in tables]
@@ -397,9 +395,9 @@ def test_unknown_poses_train_neither_readers_nor_cores(config):
 
 def test_a_core_starts_where_objects_are_unknown_from_what_the_reader_sees(reader, config):
     one = episode(0)
-    hidden = one.objects_known.copy()
+    hidden = one.objects.known.copy()
     hidden[8] = False
-    table = scene_table([dataclasses.replace(one, objects_known=hidden)], config)
+    table = scene_table([changed(one, known=hidden)], config)
     dynamics = DynamicsModel(config)
     dynamics.codec.fit(table.tactile_kpa.float().flatten(0, 2))
     readings = {step: read_step(reader, table, step) for step in start_steps(table)}
@@ -414,13 +412,13 @@ def test_a_core_starts_where_objects_are_unknown_from_what_the_reader_sees(reade
 
 def test_measured_objects_move_when_they_move_by_more_than_their_error(config):
     still, noisy = episode(0), episode(1)
-    shaken = noisy.object_poses.copy()
+    shaken = noisy.objects.poses.copy()
     shaken[1::2, 0, 0] += 0.006
-    measured = dataclasses.replace(noisy, object_poses=shaken, objects_measured=True)
+    measured = changed(noisy, poses=shaken, is_measured=True)
     assert scene_table([still, measured], config).movable().tolist() == [[0.0] * MAX_OBJECTS]
-    carried = noisy.object_poses.copy()
+    carried = noisy.objects.poses.copy()
     carried[8:, 0, 0] += 0.05
-    moved = dataclasses.replace(measured, object_poses=carried)
+    moved = changed(measured, poses=carried)
     assert scene_table([still, moved], config).movable()[0, 0] == 1.0
 
 
@@ -428,27 +426,25 @@ def test_measured_objects_move_when_they_move_by_more_than_their_error(config):
 def test_episodes_that_do_not_fit_are_refused(config, fault):
     wrong = episode(1)
     if fault == "size":
-        wrong = dataclasses.replace(wrong, images=wrong.images[:, :16])
+        wrong = changed(wrong, pictures=wrong.pictures[:, :16])
     elif fault == "short":
         wrong = shortened(wrong, 4)
     else:
-        wrong = dataclasses.replace(wrong, task="juggle")
+        wrong = changed(wrong, task="juggle")
     with pytest.raises(InvalidInputError, match="toy-1"):
         scene_table([episode(0), wrong], config)
 
 
 def test_steps_count_with_images_in_half_of_the_episodes(config):
     sparse = episode(1)
-    sparse = dataclasses.replace(
-        sparse, images=sparse.images[::2], image_steps=sparse.image_steps[::2]
-    )
+    sparse = changed(sparse, pictures=sparse.pictures[::2], image_steps=sparse.image_steps[::2])
     table = scene_table([episode(0), episode(2), sparse], config)
     assert list(table.image_steps) == episode(0).image_steps.tolist()
     assert table.shown[2].tolist() == [step in sparse.image_steps for step in table.image_steps]
     assert table.starts_at(4).tolist() == [0, 1]
-    mostly = scene_table([episode(0), *[dataclasses.replace(sparse) for _ in range(2)]], config)
+    mostly = scene_table([episode(0), *[changed(sparse) for _ in range(2)]], config)
     assert list(mostly.image_steps) == sparse.image_steps.tolist()
-    late = dataclasses.replace(sparse, image_steps=sparse.image_steps + 1)
+    late = changed(sparse, image_steps=sparse.image_steps + 1)
     with pytest.raises(InvalidInputError, match=r"toy-1.*expected step 0"):
         scene_table([episode(0), late], config)
 
@@ -464,13 +460,7 @@ def test_starts_that_few_episodes_reach_are_rare(config):
 
 def test_a_task_has_one_number_of_objects():
     one = episode(1)
-    two = dataclasses.replace(
-        one,
-        object_names=("block", "lid"),
-        object_poses=np.repeat(one.object_poses, 2, axis=1),
-        objects_known=np.repeat(one.objects_known, 2, axis=1),
-        object_boxes_m=np.repeat(one.object_boxes_m, 2, axis=0),
-    )
+    two = changed(one, object_names=("block", "lid"))
     with pytest.raises(InvalidInputError, match="press"):
         vocabulary([episode(0), two])
     assert vocabulary([episode(0), episode(2)]) == (("press",), (1,))
@@ -497,10 +487,10 @@ def test_the_command_in_a_checkpoint_can_be_typed_again():
 def test_sizes_are_factors_of_the_usual_boxes():
     config = DynamicsConfig(tasks=("press",), num_objects=(1,), image_px=PX, width=32)
     episodes = [episode(seed) for seed in range(5)]
-    box = episodes[0].object_boxes_m * [[1, 1, 1, 1.25, 1.25, 0.9]]
-    episodes[3] = dataclasses.replace(episodes[3], object_boxes_m=box)
+    box = episodes[0].boxes_m * [[1, 1, 1, 1.25, 1.25, 0.9]]
+    episodes[3] = changed(episodes[3], boxes_m=box)
     table = scene_table(episodes, config)
-    np.testing.assert_allclose(table.boxes_m[0, 0], episodes[0].object_boxes_m[0], rtol=1e-6)
+    np.testing.assert_allclose(table.boxes_m[0, 0], episodes[0].boxes_m[0], rtol=1e-6)
     expected = np.ones((5, 3, 2))
     expected[3, 0] = 1.25, 0.9
     np.testing.assert_allclose(table.size, expected, rtol=1e-5)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.errors import InvalidInputError, NotFoundError
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.command_line import run_train
 from services.world_model.training.dataset import (
@@ -16,7 +16,7 @@ from services.world_model.training.dataset import (
     WindowSampler,
     fingerprint,
 )
-from services.world_model.training.episodes import load_episodes
+from services.world_model.training.episodes import load_episodes, read_episode
 from services.world_model.training.splits import load_split
 from services.world_model.training.streaming import (
     index_episodes,
@@ -88,8 +88,8 @@ def test_an_indexed_episode_says_what_it_is(stored, in_memory):
         )  # fmt: skip
         assert len(ours) == len(theirs)
         assert set(ours.action_kinds) == {"measured", "commanded"}
-        assert ours.content_hash() == fingerprint(theirs)
-        assert fingerprint(ours.load()) == ours.content_hash()
+        assert ours.fingerprint() == fingerprint(theirs)
+        assert fingerprint(ours.load()) == ours.fingerprint()
 
 
 @pytest.mark.parametrize(("num_workers", "start_method"), [(0, None), (2, "fork"), (1, "spawn")])
@@ -123,31 +123,31 @@ def test_reading_ahead_leaves_the_global_random_numbers_alone(stored):
 
 
 def test_only_the_models_camera_is_decoded(stored, monkeypatch):
-    asked = []
-    window = EpisodeStore(stored[0].url).open("toy-0").__class__.window
+    decoded = []
+    images_at = EpisodeReader.images_at
 
-    def noted(self, *arguments, **options):
-        asked.append(options["cameras"])
-        return window(self, *arguments, **options)
+    def noted(self, name, indices, **options):
+        decoded.append((name, indices.tolist()))
+        return images_at(self, name, indices, **options)
 
-    monkeypatch.setattr("dextouch.episodes.EpisodeReader.window", noted)
-    stored[0].cut(PLACES[0])
-    assert asked == [("camera_head",)]
+    monkeypatch.setattr(EpisodeReader, "images_at", noted)
+    stored[0].cut(Place(0, 7, 5))
+    assert decoded == [("camera_head", [7, 8, 9, 10, 11])]
 
 
-def test_what_does_not_exist_is_refused(stored, tmp_path):
+def test_steps_that_do_not_exist_are_refused(stored):
     with pytest.raises(InvalidInputError, match="steps 30"):
         stored[0].cut(Place(0, 30, 17))
-    with pytest.raises(InvalidInputError, match="has none"):
-        index_episodes(str(tmp_path / "empty"))
 
 
 def test_images_of_every_second_step_are_not_taken_for_those_of_all(tmp_path, toy_episode):
     store = EpisodeStore(tmp_path / "sparse")
     write_episode(store, toy_episode(0), image_every=2)
     for read in (index_episodes, load_episodes):
-        with pytest.raises(InvalidInputError, match=r"toy-0.*: 20 of 41 steps .*--images 1"):
+        with pytest.raises(NotFoundError, match=r"1 without an image of nearly .*--images 1"):
             read(str(store.root))
+    with pytest.raises(InvalidInputError, match=r"toy-0.*: 20 of 41 steps .*--images 1"):
+        read_episode(store.open("toy-0"))
 
 
 @pytest.mark.slow
@@ -209,7 +209,7 @@ def test_larger_images_are_scaled_in_memory_and_from_disk_alike(url, in_memory):
     loaded = load_episodes(url, image_px=side)[0]
     stored = index_episodes(url, image_px=side)[0]
     assert loaded.images.shape == (len(large), side, side, 3)
-    assert loaded.content_hash() == stored.content_hash() != large.content_hash()
+    assert loaded.fingerprint() == stored.fingerprint() != large.fingerprint()
     np.testing.assert_allclose(loaded.K_head[:2], large.K_head[:2] / 2)
     place = Place(0, 3, 5)
     from_disk, cut = stored.cut(place), loaded.cut(place)

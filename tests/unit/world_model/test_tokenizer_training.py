@@ -57,7 +57,7 @@ def test_figures_are_those_of_a_plain_count():
     hands = touch[:3, 0].numpy()
     budget = Budget()
     budget.step = 12
-    point = reconstruction(tokenizer, TactileHands(hands, ("a",)), budget)
+    point = reconstruction(tokenizer, TactileHands(hands, ("a",), "0"), budget)
     decoded = tokenizer.decode(tokenizer.encode(touch[:3, 0])).numpy()
     both = either = squared = absolute = 0.0
     for true, predicted in zip(hands.ravel(), decoded.ravel(), strict=True):
@@ -163,14 +163,14 @@ def test_both_sides_need_a_scene(settings):
 
 
 def test_hands_without_a_measurement_are_left_out(toy_store, monkeypatch):
-    whole = EpisodeReader.window
+    whole = EpisodeReader.touch
 
-    def with_gap(reader, *places, **options):
-        window = whole(reader, *places, **options)
-        window.tactile_valid[:5, 0] = False
-        return window
+    def with_gap(reader, *places):
+        tactile_kpa, tactile_valid = whole(reader, *places)
+        tactile_valid[:5, 0] = False
+        return tactile_kpa, tactile_valid
 
-    monkeypatch.setattr(EpisodeReader, "window", with_gap)
+    monkeypatch.setattr(EpisodeReader, "touch", with_gap)
     training, heldout = load_hands([str(toy_store.root)], heldout_share=0.15)
     assert len(training.tactile_kpa) + len(heldout.tactile_kpa) == 6 * (2 * 41 - 5)
     assert not set(training.scenes) & set(heldout.scenes)

@@ -126,7 +126,7 @@ def test_a_run_can_start_from_a_checkpoint(toy_episodes, toy_episode, settings, 
     assert metadata.initialized_from == first.digest
     assert "--init=model.safetensors" in metadata.command
     assert set(metadata.train_episode_ids) == {e.episode_id for e in toy_episodes}
-    assert set(metadata.train_fingerprints) == {e.content_hash() for e in toy_episodes}
+    assert set(metadata.train_fingerprints) == {e.fingerprint() for e in toy_episodes}
     # Codecs are those of the ancestor, not fitted anew.
     learned = {name for name, _ in ancestor.model.named_parameters()}
     for name, tensor in weights(report.checkpoint).items():

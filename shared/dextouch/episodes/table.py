@@ -1,0 +1,327 @@
+"""Episodes as networks learn from them: which are fit, their arrays on the model grid, one hash.
+
+World models, tokenizers, success probes, cloned policies and the figures of predictions all select
+episodes here and read them through `EpisodeGrid`, so that they agree on what an episode is.
+"""
+
+import hashlib
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import structlog
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+
+from dextouch.episodes.format import KINDS
+from dextouch.episodes.needs import ACTIONS, OUTCOME, Need
+from dextouch.episodes.object_poses import ObjectTrack, object_track
+from dextouch.episodes.reader import HEAD_CAMERA, OWN_IMAGE_SHARE, EpisodeReader
+from dextouch.episodes.splits import Split, is_in, recording_of, scene_of, split_of
+from dextouch.episodes.store import EpisodeStore
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.hands.actions import AnchorPoses
+from dextouch.images import scaled_square, square_of_at_most
+from dextouch.schemas import ActionKind, Domain, EpisodeAttributes, Observation, Origin
+
+TRUE_ORIGINS: Final[tuple[Origin, ...]] = ("recorded", "twin")
+
+logger = structlog.get_logger(__name__)
+
+
+def is_rejected(
+    store: EpisodeStore, about: EpisodeAttributes, *, others: Iterable[EpisodeStore] = ()
+) -> bool:
+    """Whether an episode must not be trained on.
+
+    An episode is rejected by its own review; one without a review is rejected with a recording or
+    episode that it was made from, if that is in the same store or in one of `others`.
+    """
+    own = store.review(about.episode_id)
+    if own is not None:
+        return own.verdict == "rejected"
+    places = (store, *others)
+    sources = [(one.id, kind) for one in about.lineage for kind in KINDS if one.kind == kind]
+    reviews = (
+        place.review(name, kind=kind)
+        for name, kind in sources
+        for place in places
+        if place.exists(name, kind=kind)
+    )
+    return any(review is not None and review.verdict == "rejected" for review in reviews)
+
+
+def select_episodes(
+    stores: Sequence[EpisodeStore],
+    *,
+    domain: Domain | None = None,
+    tasks: Collection[str] = (),
+    splits: Collection[Split] = (),
+    origins: Collection[Origin] = TRUE_ORIGINS,
+    needs: Sequence[Need] = (),
+) -> Iterator[EpisodeReader]:
+    """Episodes that are fit for a learner, store by store in the order of their ids.
+
+    Those that were rejected in review and those that lack what is needed are left out, counted and
+    logged by reason.
+
+    Args:
+        stores: stores to read.
+        domain: whose hands act; None for people and robots.
+        tasks: tasks to read; empty for all.
+        splits: splits of their scenes; empty for all.
+        origins: where they come from; empty for all.
+        needs: what an episode must have, beside actions.
+
+    Raises:
+        NotFoundError: an empty store, or no such episode; what those that there are lack is named.
+        ConflictError: an id is in two stores, two episodes are of one recording, or their model
+            rates differ.
+    """
+    passed_over: Counter[str] = Counter()
+    unfit: Counter[str] = Counter()
+    chosen = _Chosen()
+    for place, store in enumerate(stores, 1):
+        if not (names := store.list()):
+            raise NotFoundError(
+                f"episodes: store {place} of {len(stores)}, {store.url}, has none; check its path"
+            )
+        others = [one for one in stores if one is not store]
+        for name in sorted(names):
+            reader = store.open(name)
+            about = reader.attributes
+            if other := _other(about, domain, tasks, splits, origins):
+                passed_over[other] += 1
+            elif is_rejected(store, about, others=others):
+                unfit["rejected in review"] += 1
+            elif lacking := next((n for n in (ACTIONS, *needs) if not n.is_met(reader)), None):
+                counts = passed_over if lacking.is_choice else unfit
+                counts[f"{lacking.lack} ({lacking.remedy})"] += 1
+            else:
+                chosen.add(about)
+                yield reader
+    for reason, count in unfit.items():
+        logger.warning("skipped_episodes", reason=reason, count=count)
+    if not chosen.names:
+        asked = f"{domain or 'human or robot'} episode of {', '.join(tasks) or 'any task'}"
+        asked += f" in splits {', '.join(splits)}" if splits else ""
+        raise NotFoundError(
+            f"no {asked} that can be used in {', '.join(store.url for store in stores)}, only "
+            f"{', '.join(f'{n} {why}' for why, n in (passed_over + unfit).items())}; record some "
+            "at a station, or in the twin by `dextouch train data`"
+        )
+
+
+def _other(
+    about: EpisodeAttributes,
+    domain: Domain | None,
+    tasks: Collection[str],
+    splits: Collection[Split],
+    origins: Collection[Origin],
+) -> str | None:
+    """Why an episode is none of those that were asked for; None if it is one."""
+    if domain not in {None, about.domain}:
+        return f"of {'people' if about.domain == 'human' else 'robots'}"
+    if tasks and about.task not in tasks:
+        return f"of task {about.task!r}"
+    if origins and about.origin not in origins:
+        return f"of origin {about.origin!r}"
+    return None if is_in(about, splits) else f"of split {split_of(about)}"
+
+
+class _Chosen:
+    """Episodes chosen so far; each one added must go together with them."""
+
+    def __init__(self) -> None:
+        self.names: set[str] = set()
+        self._of_recording: dict[str, str] = {}
+        self._first: EpisodeAttributes | None = None
+
+    def add(self, about: EpisodeAttributes) -> None:
+        """Add an episode.
+
+        Raises:
+            ConflictError: it is there already, as another alignment or at another rate.
+        """
+        name, first = about.episode_id, self._first or about
+        recording = recording_of(about) if about.origin == "recorded" else None
+        other = name if recording is None else self._of_recording.setdefault(recording, name)
+        if name in self.names:
+            raise ConflictError(f"episode {name!r}: in two stores; pass only one of them")
+        if other != name:
+            raise ConflictError(
+                f"episodes {other!r} and {name!r}: are of one recording, aligned with different "
+                "options; expected one; delete the other with `dextouch store delete`"
+            )
+        if about.model_rate_hz != first.model_rate_hz:
+            raise ConflictError(
+                f"episodes {first.episode_id!r} and {name!r}: have model rates of "
+                f"{first.model_rate_hz:g} and {about.model_rate_hz:g} Hz, expected one; align them "
+                "with the same `--model-rate`"
+            )
+        self.names.add(name)
+        self._first = first
+
+
+def data_hash(contents: Iterable[str], **options: object) -> str:
+    """SHA-256 of a set of episodes, in any order, as every checkpoint notes what it learned from.
+
+    Outcomes, event times and all else that labels are made of are part of an episode's content.
+
+    Args:
+        contents: `content_sha256` of the episodes.
+        options: what else decides the arrays, such as `image_px`; None is the usual and left out.
+    """
+    lines = [*sorted(contents), *(f"{k}={v}" for k, v in sorted(options.items()) if v is not None)]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+class EpisodeGrid:
+    """One episode on the model grid, read when it is asked for.
+
+    Touch and images, which take the memory, are read anew by each call; only the images that are
+    asked for are decoded.
+
+    Args:
+        reader: the episode.
+        image_px: side that the middle square of larger images is scaled to; None leaves images as
+            they are.
+    """
+
+    def __init__(self, reader: EpisodeReader, image_px: int | None = None) -> None:
+        self.reader = reader
+        self.image_px = image_px
+
+    def __len__(self) -> int:
+        return self.reader.num_steps
+
+    @cached_property
+    def about(self) -> EpisodeAttributes:
+        """Domain, origin, outcome, event times, names of objects and so on."""
+        return self.reader.attributes
+
+    @property
+    def episode_id(self) -> str:
+        """Id in its store."""
+        return self.about.episode_id
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+        return self.about.task
+
+    @property
+    def scene(self) -> str:
+        """Name of the scene, from `scene_of`."""
+        return scene_of(self.about)
+
+    @property
+    def success(self) -> bool:
+        """The outcome.
+
+        Raises:
+            InvalidInputError: it is not known, as the need `OUTCOME` asks for.
+        """
+        if self.about.success is None:
+            raise InvalidInputError(f"episode {self.episode_id!r}: is {OUTCOME.lack}")
+        return self.about.success
+
+    @cached_property
+    def content_sha256(self) -> str:
+        """Digest of all that the store holds of it, for `data_hash`."""
+        return self.reader.content_sha256
+
+    @property
+    def t_ref_ns(self) -> Int64[np.ndarray, " steps"]:
+        """Times of the steps on the episode's clock."""
+        return self.reader.stamps_ns("action")
+
+    @cached_property
+    def anchor(self) -> AnchorPoses:
+        """Measured poses of wrists and head camera at step 0, in the world."""
+        return self.reader.anchor(0)
+
+    @cached_property
+    def measured(self) -> Float64[np.ndarray, "steps 67"]:
+        """Measured actions, relative to `anchor`."""
+        return self.reader.actions(0, len(self))
+
+    @cached_property
+    def action_kind(self) -> ActionKind:
+        """Kind of the actions `sent`."""
+        return "commanded" if "action_commanded" in self.reader.streams else "measured"
+
+    @cached_property
+    def sent(self) -> Float64[np.ndarray, "steps 67"]:
+        """Commanded actions as stored, relative to `anchor`; `measured` where there are none."""
+        if self.action_kind == "measured":
+            return self.measured
+        return self.reader.read("action_commanded").values.astype(np.float64)
+
+    def touch(self) -> tuple[Float32[np.ndarray, "steps 2 320"], Bool[np.ndarray, "steps 2"]]:
+        """Mean pressures (kPa) of each step, and where there was a sample."""
+        return self.reader.touch(0, len(self))
+
+    @cached_property
+    def image_steps(self) -> Int64[np.ndarray, " shown"]:
+        """Steps that have a head camera image of their own."""
+        return self.reader.shown_steps(HEAD_CAMERA)[0]
+
+    @cached_property
+    def K_head(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802 (K is the camera matrix)
+        """Matrix of the head camera (px), for the size of `images`."""
+        K = self.about.K_head_matrix()
+        if self.image_px is None:
+            return K
+        no_images = np.zeros((0, *self._size_px(), 3), dtype=np.uint8)
+        return scaled_square(no_images, K, self.image_size_px[0])[1]
+
+    @cached_property
+    def image_size_px(self) -> tuple[int, int]:
+        """Height and width of `images`."""
+        size_px = self._size_px()
+        side_px = None if self.image_px is None else min(self.image_px, *size_px)
+        return size_px if side_px is None else (side_px, side_px)
+
+    def _size_px(self) -> tuple[int, int]:
+        height_px, width_px, _ = self.reader.streams[HEAD_CAMERA].shape
+        return height_px, width_px
+
+    def images(self, steps: Sequence[int] | np.ndarray) -> UInt8[np.ndarray, "n h w 3"]:
+        """The head camera image nearest to each of some non-decreasing steps, whatever its own."""
+        return self._nearest(steps)[1]
+
+    def own_images(self, steps: Sequence[int] | np.ndarray) -> UInt8[np.ndarray, "n h w 3"] | None:
+        """Head camera images of some non-decreasing steps; None if one has none of its own."""
+        offset_ns, images = self._nearest(steps)
+        reach_ns = OWN_IMAGE_SHARE * 1e9 / self.about.model_rate_hz
+        return images if (np.abs(offset_ns) <= reach_ns).all() else None
+
+    def _nearest(
+        self, steps: Sequence[int] | np.ndarray
+    ) -> tuple[Int64[np.ndarray, " n"], UInt8[np.ndarray, "n h w 3"]]:
+        times_ns = self.t_ref_ns[np.asarray(steps)]
+        indices, images = self.reader.nearest_pictures(HEAD_CAMERA, times_ns)
+        scaled, _ = square_of_at_most(images, self.about.K_head_matrix(), self.image_px)
+        return self.reader.stamps_ns(HEAD_CAMERA)[indices] - times_ns, scaled
+
+    def observation(self, step: int = 0) -> Observation:
+        """What a rollout from a step observes first."""
+        return Observation(
+            first_step=0,
+            images={HEAD_CAMERA: self.images([step])},
+            tactile_kpa=self.reader.touch(step, 1)[0],
+            action_reached=self.reader.actions(step, 1),
+            reached_is_measured=True,
+        )
+
+    @cached_property
+    def objects(self) -> ObjectTrack | None:
+        """Poses of the objects at every step; None if the episode has none."""
+        return object_track(self.reader, self.t_ref_ns)
+
+    @cached_property
+    def boxes_m(self) -> Float64[np.ndarray, "objects 6"]:
+        """Boxes of the objects in their own frames, middle and half sizes; none if unknown."""
+        return np.array(self.about.object_boxes_m, dtype=np.float64).reshape(-1, 6)
