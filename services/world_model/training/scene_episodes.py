@@ -1,12 +1,13 @@
-"""Labelled episodes of a store as arrays on the model grid, with their object poses.
+"""Labelled episodes of stores as arrays on the model grid, with their object poses.
 
-Training data of the state model: whole episodes with the poses of their objects and the outcome,
-from the twin or measured at a station (docs/objects.md). Imagined episodes, truncated ones, those
-with an unknown outcome and those that were rejected in review are skipped and counted.
+Training data of the state model: whole episodes with the outcome and the poses of their objects,
+from the twin, measured at a station or clicked (docs/objects.md); where others of their task have
+poses, those without are taken, too. Imagined episodes, truncated ones, those with an unknown
+outcome and those that were rejected in review are skipped and counted.
 """
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,22 +15,29 @@ import structlog
 from jaxtyping import Bool, Float16, Float32, Float64, Int64, UInt8
 
 from dextouch.episodes import (
+    ClickedPoses,
     EpisodeReader,
     EpisodeStore,
+    ObjectSource,
+    ObjectTrack,
     Split,
+    clicked_poses,
     has_object_poses,
     is_in,
     is_rejected,
+    listed_objects,
     object_track,
     recording_of,
     scene_of,
 )
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.images import square_of_at_most
-from dextouch.schemas import ActionKind, EpisodeAttributes
+from dextouch.schemas import ActionKind, ObjectClicks, SceneObject
 from services.world_model.starts import CAMERA
 
 logger = structlog.get_logger(__name__)
+
+_WITHOUT_POSES = "without poses of the objects"
 
 
 @dataclass(frozen=True)
@@ -39,8 +47,8 @@ class SceneEpisode:
     `actions` are the commanded ones where the episode has them (see `action_kind`), and
     `measured_actions` the measured ones; both are relative to `anchor`, the poses of left wrist,
     right wrist and head camera. `tactile_kpa` is the mean over each step, `object_poses` are
-    x y z (m), qw qx qy qz in the world, `objects_known` the steps at which they are known, and
-    `objects_measured` says that they have the errors of a measurement. `images` are the head camera
+    x y z (m), qw qx qy qz in the world, `objects_known` the steps at which they are known;
+    `object_sources` and `clicked_sd_m` are those of an `ObjectTrack`. `images` are the head camera
     images at the grid steps `image_steps`, and `K_head` (px) is of their size.
     """
 
@@ -59,7 +67,8 @@ class SceneEpisode:
     tactile_kpa: Float16[np.ndarray, "steps 2 320"]
     object_poses: Float32[np.ndarray, "steps objects 7"]
     objects_known: Bool[np.ndarray, "steps objects"]
-    objects_measured: bool
+    object_sources: tuple[ObjectSource, ...]
+    clicked_sd_m: Float32[np.ndarray, " objects"]
     images: UInt8[np.ndarray, "shown h w 3"]
     image_steps: Int64[np.ndarray, " shown"]
     content_sha256: str
@@ -67,64 +76,147 @@ class SceneEpisode:
     def __len__(self) -> int:
         return len(self.actions)
 
+    @property
+    def is_measured(self) -> bool:
+        """Whether poses have the errors of a measurement."""
+        return bool(set(self.object_sources) - {"twin"})
+
+    @property
+    def is_posed(self) -> bool:
+        """Whether the pose of some object is known; true of tasks without objects."""
+        return not self.object_names or bool(self.objects_known.any())
+
 
 def load_scene_episodes(
-    url: str,
-    *,
+    *urls: str,
     tasks: Collection[str] | None = None,
     splits: Collection[Split] = (),
     image_px: int | None = None,
+    clicks: ObjectClicks | None = None,
 ) -> list[SceneEpisode]:
-    """Load the labelled episodes of a store, in the order of their ids.
+    """Load the labelled episodes of stores, in the order of their ids.
 
     The number of skipped episodes is logged by reason.
 
     Args:
-        url: URL of the store.
+        urls: URLs of the stores.
         tasks: tasks to load; None for all.
         splits: splits of the scenes; empty for all.
         image_px: side that the middle square of larger images is scaled to; None leaves images as
             they are.
+        clicks: objects of tasks, and clicks on them; those in the stores are used as well.
 
     Raises:
-        InvalidInputError: no episode remains.
+        NotFoundError: clicks on an episode that no store has.
+        InvalidInputError: no episode remains, or as `clicked_poses`.
     """
-    store = EpisodeStore(url)
-    taken: list[SceneEpisode] = []
+    stores = [EpisodeStore(url) for url in urls]
+    for name in () if clicks is None else clicks.episodes:
+        if not any(store.exists(name) for store in stores):
+            raise NotFoundError(f"clicks: episode {name!r} is in none of {', '.join(urls)}")
     skipped: Counter[str] = Counter()
+    found = [
+        one
+        for store in stores
+        for one in _usable(store, skipped, tasks=tasks, splits=splits, clicks=clicks)
+    ]
+    posed = [one for one in found if one.is_posed]
+    posed_tasks = {one.reader.attributes.task for one in posed}
+    posed_recordings = {one.recording for one in posed} - {None}
     recordings: dict[str, str] = {}
-    for episode_id in sorted(store.list()):
-        reader = store.open(episode_id)
-        about = reader.attributes
-        if (tasks is not None and about.task not in tasks) or not is_in(about, splits):
-            continue
-        reason = "rejected in review" if is_rejected(store, about) else _unfit(reader)
-        if reason is None:
-            _check_aligned_once(about, recordings)
-            taken.append(read_scene_episode(reader, image_px=image_px))
+    taken: list[SceneEpisode] = []
+    for one in found:
+        task = one.reader.attributes.task
+        if one.is_posed or (task in posed_tasks and one.recording not in posed_recordings):
+            _check_aligned_once(one, recordings)
+            taken.append(_read(one, image_px))
         else:
-            skipped[reason] += 1
+            skipped[_WITHOUT_POSES] += 1
     for reason, count in sorted(skipped.items()):
-        logger.warning("skipped_episodes", store=url, reason=reason, count=count)
+        logger.warning("skipped_episodes", stores=urls, reason=reason, count=count)
     if not taken:
         raise InvalidInputError(
-            f"scene episodes: the store {url} has none to train on (skipped: {dict(skipped)}); "
+            f"scene episodes: {', '.join(urls)} have none to train on (skipped: {dict(skipped)}); "
             "episodes need an outcome, touch, actions, images and the poses of their objects "
             "(docs/objects.md)"
         )
     return taken
 
 
-def _check_aligned_once(about: EpisodeAttributes, recordings: dict[str, str]) -> None:
+@dataclass(frozen=True)
+class _Usable:
+    """An episode that can be trained on, its objects as a file lists them, and clicks on them."""
+
+    reader: EpisodeReader
+    listed: tuple[SceneObject, ...]
+    clicked: ClickedPoses | None
+
+    @property
+    def is_posed(self) -> bool:
+        """Whether the pose of an object may be known at some step."""
+        is_clicked = self.clicked is not None and bool(self.clicked.known.any())
+        return is_clicked or has_object_poses(self.reader)
+
+    @property
+    def recording(self) -> str | None:
+        """What it was aligned from, at a station."""
+        about = self.reader.attributes
+        return recording_of(about) if about.origin == "recorded" else None
+
+
+def _usable(
+    store: EpisodeStore,
+    skipped: Counter[str],
+    *,
+    tasks: Collection[str] | None,
+    splits: Collection[Split],
+    clicks: ObjectClicks | None,
+) -> Iterator[_Usable]:
+    """Episodes of a store whose objects have names; others are counted in `skipped`."""
+    for episode_id in sorted(store.list()):
+        reader = store.open(episode_id)
+        about = reader.attributes
+        if (tasks is not None and about.task not in tasks) or not is_in(about, splits):
+            continue
+        reason = "rejected in review" if is_rejected(store, about) else _unfit(reader)
+        if reason is not None:
+            skipped[reason] += 1
+        elif clicks is not None and about.task in clicks.tasks:
+            yield _with_clicks(store, reader, clicks)
+        elif has_object_poses(reader) or about.object_names:
+            yield _Usable(reader, (), None)
+        else:
+            skipped[_WITHOUT_POSES] += 1
+
+
+def _with_clicks(store: EpisodeStore, reader: EpisodeReader, clicks: ObjectClicks) -> _Usable:
+    """An episode whose objects a file lists; unfinished clicks of the store are left out."""
+    listed = listed_objects(reader.attributes, clicks)
+    given = clicks.episodes.get(reader.item_id)
+    stored = store.clicks(reader.item_id) if given is None else None
+    clicked = None
+    if (one := given or stored) is not None:
+        clicked = clicked_poses(reader, clicks, one, may_lack_headings=given is None)
+        unfinished = [
+            name
+            for name, known in zip((o.name for o in listed), clicked.known.tolist(), strict=True)
+            if not known and name in one.objects and one.objects[name].state == "seen"
+        ]
+        if unfinished:
+            logger.warning("clicks_without_heading", episode=reader.item_id, objects=unfinished)
+    return _Usable(reader, listed, clicked)
+
+
+def _check_aligned_once(one: _Usable, recordings: dict[str, str]) -> None:
     """Refuse a second episode of one recording, as another file of objects gives."""
-    recording = recording_of(about) if about.origin == "recorded" else None
-    if recording is None:
+    if one.recording is None:
         return
-    other = recordings.setdefault(recording, about.episode_id)
-    if other != about.episode_id:
+    own = one.reader.item_id
+    other = recordings.setdefault(one.recording, own)
+    if other != own:
         raise InvalidInputError(
-            f"episodes {other!r} and {about.episode_id!r}: are of one recording, aligned with "
-            "different options; expected one; delete the other with `dextouch store delete`"
+            f"episodes {other!r} and {own!r}: are of one recording, aligned with different "
+            "options; expected one; delete the other with `dextouch store delete`"
         )
 
 
@@ -138,31 +230,14 @@ def _unfit(reader: EpisodeReader) -> str | None:
     if attributes.success is None:
         return "success unknown"
     missing = {"action", "tactile_left", "tactile_right"} - set(reader.streams)
-    if not has_object_poses(reader):
-        missing.add("poses of the objects")
     if not missing and CAMERA in reader.streams and 0 not in reader.shown_steps(CAMERA)[0]:
         missing.add("an image of its first step")
     return f"without {', '.join(sorted(missing))}" if missing else None
 
 
-def read_scene_episode(reader: EpisodeReader, *, image_px: int | None = None) -> SceneEpisode:
-    """Read one episode of known success.
-
-    Args:
-        reader: the episode.
-        image_px: side that the middle square of larger images is scaled to.
-
-    Raises:
-        InvalidInputError: success is unknown, or there are no poses of the objects.
-        UnknownNameError: a stream is missing.
-        CorruptDataError: damaged bytes.
-    """
+def _read(one: _Usable, image_px: int | None) -> SceneEpisode:
+    reader = one.reader
     attributes = reader.attributes
-    if attributes.success is None:
-        raise InvalidInputError(
-            f"episode {attributes.episode_id!r}: its outcome is unknown, expected success or "
-            "failure, as operators enter it after a take"
-        )
     window = reader.window(0, reader.num_steps, cameras=())
     actions = window.actions
     kind: ActionKind = "commanded" if "action_commanded" in reader.streams else "measured"
@@ -170,21 +245,19 @@ def read_scene_episode(reader: EpisodeReader, *, image_px: int | None = None) ->
         actions = reader.read("action_commanded").values.astype(np.float64)
     images, image_steps = _images(reader)
     images, K_head = square_of_at_most(images, window.K_head, image_px)
+    names = attributes.object_names or tuple(each.name for each in one.listed)
     track = object_track(reader, window.t_ref_ns)
-    if track is None:
-        raise InvalidInputError(
-            f"episode {attributes.episode_id!r}: has no poses of its objects; docs/objects.md says "
-            "how they are measured"
-        )
-    boxes = np.array(attributes.object_boxes_m, dtype=np.float64).reshape(-1, 6)
+    track = ObjectTrack.unknown(reader.num_steps, len(names)) if track is None else track
+    track = track if one.clicked is None else one.clicked.fill(track)
+    boxes = attributes.object_boxes_m or tuple(each.box_m for each in one.listed)
     return SceneEpisode(
         episode_id=attributes.episode_id,
         task=attributes.task,
         scene=scene_of(attributes),
         seed=attributes.seed,
-        success=attributes.success,
-        object_names=attributes.object_names,
-        object_boxes_m=boxes,
+        success=bool(attributes.success),
+        object_names=names,
+        object_boxes_m=np.array(boxes, dtype=np.float64).reshape(-1, 6),
         action_kind=kind,
         actions=actions,
         measured_actions=window.actions,
@@ -193,7 +266,8 @@ def read_scene_episode(reader: EpisodeReader, *, image_px: int | None = None) ->
         tactile_kpa=window.tactile_kpa.astype(np.float16),
         object_poses=track.poses,
         objects_known=track.known,
-        objects_measured=bool(set(track.sources) - {"twin"}),
+        object_sources=track.sources,
+        clicked_sd_m=track.clicked_sd_m,
         images=images,
         image_steps=image_steps,
         content_sha256=reader.content_sha256,

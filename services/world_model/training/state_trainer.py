@@ -7,6 +7,7 @@ run resumes with the missing ones.
 import hashlib
 import multiprocessing
 import time
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from torch import Tensor, nn
 from dextouch.command_line import ProgressLines
 from dextouch.episodes import SPLITS, Split, scene_fraction, split_by_scene
 from dextouch.errors import InvalidInputError
+from dextouch.schemas import load_object_clicks
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.configuration import DynamicsConfig
@@ -62,7 +64,7 @@ from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.transfer import Base
 
 # Increment when a change of training gives other weights for the same settings and data.
-READER_VERSION, CORE_VERSION, RENDERER_VERSION = 5, 9, 3
+READER_VERSION, CORE_VERSION, RENDERER_VERSION = 6, 9, 3
 # Largest number of episodes the renderer is trained on; it samples few of their images anyway.
 MAX_CLIPS = 1500
 _SEED_STRIDE = 1000
@@ -106,6 +108,8 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     # Before training, so that invalid episodes are found at once.
     heldout_table = scene_table(heldout, config)
     table = scene_table(training, config, labelled=_labelled(training, settings))
+    if base is None:
+        _check_drawable(training)
     codec = _codec(table, config, base)
     reads_starts = settings.labelled_share < 1 or not all(
         bool(table.knows_all(step).all()) for step in start_steps(table)
@@ -143,6 +147,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         training_splits=_splits(settings, base),
         training_scenes=_recorded_scenes(training, base),
         data_hash=data_hash,
+        object_sources=_sources(training),
         metrics=measured.figures,
     )
     digest = write_state_checkpoint(settings.output, dynamics, renderer, metadata)
@@ -229,16 +234,13 @@ def _with_precision(settings: StateTrainSettings) -> StateTrainSettings:
 
 
 def _episodes(settings: StateTrainSettings) -> list[SceneEpisode]:
-    return [
-        episode
-        for url in settings.episodes
-        for episode in load_scene_episodes(
-            url,
-            tasks=settings.tasks or None,
-            splits=settings.splits,
-            image_px=settings.image_px,
-        )
-    ]
+    return load_scene_episodes(
+        *settings.episodes,
+        tasks=settings.tasks or None,
+        splits=settings.splits,
+        image_px=settings.image_px,
+        clicks=None if settings.clicks is None else load_object_clicks(settings.clicks),
+    )
 
 
 def _config(episodes: list[SceneEpisode], settings: StateTrainSettings) -> DynamicsConfig:
@@ -254,24 +256,52 @@ def _config(episodes: list[SceneEpisode], settings: StateTrainSettings) -> Dynam
     )
 
 
+def _check_drawable(episodes: list[SceneEpisode]) -> None:
+    """Refuse what no renderer can be trained on, before hours of training other parts."""
+    if not any(e.objects_known[e.image_steps].all(axis=1).sum() > 1 for e in episodes):
+        raise InvalidInputError(
+            "state model: no episode shows all of its objects at known poses twice, which cores "
+            "and the renderer learn from (clicks are poses of the first step alone); add --base "
+            "PATH, a trained state model whose cores and renderer are kept"
+        )
+
+
 def _data_hash(episodes: list[SceneEpisode]) -> str:
-    digests = sorted(episode.content_sha256 for episode in episodes)
+    digests = sorted(episode.content_sha256 + _of_clicks(episode) for episode in episodes)
     return hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
 
+def _of_clicks(episode: SceneEpisode) -> str:
+    """Digest of what is no part of an episode's content: clicked poses, and boxes of a file."""
+    if not set(episode.object_sources) & {"clicks", "none"}:
+        return ""
+    arrays = (episode.object_poses, episode.objects_known, episode.object_boxes_m)
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
+
+
 def _labelled(episodes: list[SceneEpisode], settings: StateTrainSettings) -> list[bool]:
-    """Mask of episodes whose object poses are trained on; equal for all takes of a scene."""
+    """Mask of episodes whose object poses are trained on.
+
+    Of a scene, these are all takes that have poses, or none.
+    """
     # Training scenes lie above the held-out share.
     share = settings.heldout_share + (1 - settings.heldout_share) * settings.labelled_share
-    labelled = [scene_fraction(episode.scene) <= share for episode in episodes]
+    labelled = [e.is_posed and scene_fraction(e.scene) <= share for e in episodes]
     known = {episode.task for episode, yes in zip(episodes, labelled, strict=True) if yes}
     without = {episode.task for episode in episodes} - known
     if without:
         raise InvalidInputError(
-            f"--labelled-share {settings.labelled_share:g}: leaves no labelled scene of "
-            f"{', '.join(sorted(without))}; choose a larger share"
+            f"--labelled-share {settings.labelled_share:g}: leaves no scene with known objects of "
+            f"{', '.join(sorted(without))} to train on; choose a larger share, a smaller "
+            "--heldout-share, or click the objects of more episodes"
         )
     return labelled
+
+
+def _sources(episodes: list[SceneEpisode]) -> dict[str, int]:
+    """Number of episodes with poses of objects from each source, and without any ("none")."""
+    each = [{*e.object_sources} - {"none"} or {"none"} for e in episodes if e.object_names]
+    return dict(sorted(Counter(source for sources in each for source in sources).items()))
 
 
 def _seed_ranges(episodes: list[SceneEpisode], base: Base | None) -> dict[str, tuple[int, int]]:
@@ -461,8 +491,9 @@ def _together(cores: Sequence[RecurrentCore]) -> dict[str, Tensor]:
 
 def _command(settings: StateTrainSettings) -> str:
     """Command that repeats a run; stores and the base are given by their last path component."""
-    left_out = {"output", "episodes", "base", "jobs", "json_path"}
+    left_out = {"output", "episodes", "base", "clicks", "jobs", "json_path"}
     given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
     flags = [f"--episodes={last_name(url)}" for url in settings.episodes]
-    flags += [] if settings.base is None else [f"--base={settings.base.name}"]
+    files = {"base": settings.base, "clicks": settings.clicks}
+    flags += [f"--{name}={path.name}" for name, path in files.items() if path is not None]
     return " ".join(["dextouch train state", *flags, *flags_of(given)])

@@ -21,10 +21,9 @@ Pixel = tuple[float, float]
 CLICK_SD_PX: Final = 3.0
 # Second clicks that are nearer to the first say nothing of a heading.
 LEAST_HEADING_M: Final = 0.01
-# Rays that meet the table farther away are almost level: a pixel would be decimetres.
-_FARTHEST_M: Final = 3.0
-# Positions farther than a metre from the world's origin count as absent (`ObjectPoses`).
-_ABSENT_POSE: Final = np.array([0.0, 0.0, -2.0, 1.0, 0.0, 0.0, 0.0])
+# Objects farther than this from the world's origin count as absent in world models.
+_REACH_M: Final = 1.0
+_ABSENT_POSE: Final = np.array([0.0, 0.0, -2.0 * _REACH_M, 1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -198,10 +197,10 @@ def _on_level(pixel: Pixel, z_m: float, view: _View, what: str) -> Float64[np.nd
     (point_m,), (is_hit,) = points_on_level(
         np.array([pixel]), view.camera, view.T_world_camera, z_m
     )
-    if not is_hit or np.linalg.norm(point_m - view.T_world_camera[:3, 3]) > _FARTHEST_M:
+    if not is_hit or np.linalg.norm(point_m) > _REACH_M:
         raise InvalidInputError(
             f"{view.where}: the ray of {what} {list(pixel)} does not meet the height {z_m:.3f} m "
-            f"within {_FARTHEST_M:g} m in front of the camera; click on the object, or correct "
-            "table_z_m, box_m and click in the file of objects"
+            f"in front of the camera and within {_REACH_M:g} m of the world's origin; click on the "
+            "object, or correct table_z_m, box_m and click in the file of objects"
         )
     return point_m

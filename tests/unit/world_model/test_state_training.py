@@ -77,7 +77,8 @@ def episode(seed, num_steps=NUM_STEPS):
         object_names=("block",), object_boxes_m=np.array([[0, 0, 0, 0.02, 0.02, 0.03]]),
         action_kind="commanded", actions=actions, measured_actions=actions, anchor=anchor,
         K_head=K_HEAD, tactile_kpa=tactile, object_poses=poses,
-        objects_known=np.ones(poses.shape[:2], dtype=bool), objects_measured=False,
+        objects_known=np.ones(poses.shape[:2], dtype=bool), object_sources=("twin",),
+        clicked_sd_m=np.zeros(1, dtype=np.float32),
         images=np.repeat(picture(block_m)[None], len(steps), axis=0), image_steps=steps,
         content_sha256=f"{seed:064x}",
     )  # fmt: skip
@@ -416,7 +417,7 @@ def test_measured_objects_move_when_they_move_by_more_than_their_error(config):
     still, noisy = episode(0), episode(1)
     shaken = noisy.object_poses.copy()
     shaken[1::2, 0, 0] += 0.006
-    measured = dataclasses.replace(noisy, object_poses=shaken, objects_measured=True)
+    measured = dataclasses.replace(noisy, object_poses=shaken, object_sources=("markers",))
     assert scene_table([still, measured], config).movable().tolist() == [[0.0] * MAX_OBJECTS]
     carried = noisy.object_poses.copy()
     carried[8:, 0, 0] += 0.05
@@ -470,6 +471,7 @@ def test_a_task_has_one_number_of_objects():
         object_poses=np.repeat(one.object_poses, 2, axis=1),
         objects_known=np.repeat(one.objects_known, 2, axis=1),
         object_boxes_m=np.repeat(one.object_boxes_m, 2, axis=0),
+        clicked_sd_m=np.repeat(one.clicked_sd_m, 2),
     )
     with pytest.raises(InvalidInputError, match="press"):
         vocabulary([episode(0), two])
