@@ -20,8 +20,8 @@ def clicks(context: Context) -> Outcome:
     rows: list[tuple[str, ...]] = [("episode", "object", "x mm", "y mm", "heading", "± mm")]
     for name, one in episodes.items():
         is_lenient = name not in given.episodes
-        reader = context.store.open(name)
-        rows += _rows(name, one, clicked_poses(reader, given, one, may_lack_headings=is_lenient))
+        about = context.store.open(name).attributes
+        rows += _rows(name, one, clicked_poses(about, given, one, may_lack_headings=is_lenient))
     for line in table(rows):
         context.say(line)
     return json_ready(given.model_copy(update={"episodes": episodes})), 0

@@ -196,7 +196,7 @@ def _with_clicks(store: EpisodeStore, reader: EpisodeReader, clicks: ObjectClick
     stored = store.clicks(reader.item_id) if given is None else None
     clicked = None
     if (one := given or stored) is not None:
-        clicked = clicked_poses(reader, clicks, one, may_lack_headings=given is None)
+        clicked = clicked_poses(reader.attributes, clicks, one, may_lack_headings=given is None)
         unfinished = [
             name
             for name, known in zip((o.name for o in listed), clicked.known.tolist(), strict=True)

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from dextouch.episodes.object_poses import CAMERA, ObjectTrack
-from dextouch.episodes.reader import EpisodeReader
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.geometry import points_on_level, pose_from_transform, transform
 from dextouch.schemas import EpisodeAttributes, EpisodeClicks, SceneObject, SceneObjects
@@ -59,7 +58,7 @@ class ClickedPoses:
 class _View:
     """The image of the first step: size (px), camera, height of the table, and what to call it."""
 
-    size_px: tuple[int, int]
+    size_px: tuple[int, ...]
     camera: tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "5"]]
     T_world_camera: Float64[np.ndarray, "4 4"]
     table_z_m: float
@@ -95,7 +94,7 @@ def listed_objects(about: EpisodeAttributes, objects: SceneObjects) -> tuple[Sce
 
 
 def clicked_poses(
-    reader: EpisodeReader,
+    about: EpisodeAttributes,
     objects: SceneObjects,
     clicks: EpisodeClicks,
     *,
@@ -106,7 +105,7 @@ def clicked_poses(
     Objects that were not clicked, or are hidden, are unknown; absent ones are known to be away.
 
     Args:
-        reader: the episode.
+        about: the episode.
         objects: of the tasks, with the height of the table.
         clicks: on objects of this episode.
         may_lack_headings: whether an object whose second click is missing counts as unknown,
@@ -117,15 +116,14 @@ def clicked_poses(
         InvalidInputError: a click outside the image or beside the table, or a missing or too near
             second click.
     """
-    about = reader.attributes
     listed = listed_objects(about, objects)
     names = [one.name for one in listed]
     for name in clicks.objects:
         if name not in names:
             raise UnknownNameError(f"object of episode {about.episode_id!r}", name, names)
-    if CAMERA not in reader.streams:
+    sizes_px = [stream.shape[1::-1] for stream in about.streams if stream.name == CAMERA]
+    if not sizes_px:
         raise InvalidInputError(f"episode {about.episode_id!r}: has no {CAMERA} to click in")
-    height_px, width_px, *_ = reader.streams[CAMERA].shape
     camera, T_world_camera = first_camera(about)
     poses = np.tile(_ABSENT_POSE, (len(listed), 1))
     known, sd_m = np.zeros(len(listed), dtype=np.bool_), np.zeros(len(listed))
@@ -141,7 +139,7 @@ def clicked_poses(
                     f"{where}: has no heading_px, which an object needs that is not symmetric; "
                     f"click a second point along its axis {one.click.heading}"
                 )
-            view = _View((width_px, height_px), camera, T_world_camera, objects.table_z_m, where)
+            view = _View(sizes_px[0], camera, T_world_camera, objects.table_z_m, where)
             poses[index], sd_m[index] = _pose(one, (click.point_px, click.heading_px), view)
         known[index] = click.state == "absent" or not lacks
     return ClickedPoses(listed, poses, known, sd_m)

@@ -63,8 +63,8 @@ class ClickedAt(FrozenModel):
     Attributes:
         up: axis that points up.
         heading: level axis, along which the second click lies.
-        symmetric: whether the object looks the same from all sides around `up`; it needs no second
-            click, and `heading` is taken to point along the world's x axis.
+        symmetric: whether the object looks the same from all sides around `up`, through the origin
+            of its frame; it needs no second click, and `heading` counts as the world's x axis.
         point_m: the point that is clicked, in the object's frame; by default the middle of the top
             of the box.
         base_m: height of the lowest side of the box above the table.
@@ -113,6 +113,13 @@ class SceneObject(FrozenModel):
         if min(self.box_m[3:]) <= 0:
             raise ValueError(
                 f"{self.name}: got box_m with half sizes {self.box_m[3:]}, expected positive ones"
+            )
+        clicked = self.click.point_m or self.box_m[:3]
+        off_m = max(abs(clicked["xyz".index(axis)]) for axis in {*"xyz"} - {self.click.up[-1]})
+        if self.click.symmetric and off_m > _UNIT:
+            raise ValueError(
+                f"{self.name}: got a symmetric object whose clicked point {clicked} is {off_m:.3g} "
+                "m from its axis of symmetry, expected it there; shift its frame"
             )
         return self
 

@@ -25,7 +25,7 @@ BOTTLE = {
 }
 CUP = {
     "name": "cup",
-    "box_m": [0.01, 0.0, 0.05, 0.04, 0.04, 0.05],
+    "box_m": [0.0, 0.0, 0.05, 0.04, 0.04, 0.05],
     "click": {"symmetric": True, "base_m": 0.01},
 }
 MAT = {"name": "mat", "box_m": [0, 0, 0, 0.05, 0.03, 0.001], "fixed": True}
@@ -42,7 +42,7 @@ def written(store, name="take", **changes):
     anchor = dict.fromkeys(POSES, IDENTITY_ROWS) | {"T_world_camera_head": CAMERA.tolist()}
     about = {"K_head": K.tolist(), "calibration": {"distortion_head": [DISTORTION.tolist()]}}
     about |= {"origin": "recorded", "anchor": anchor}
-    return write_episode(store, name, **about | changes)
+    return write_episode(store, name, **about | changes).attributes
 
 
 def seen(points_world, distortion=DISTORTION):
@@ -71,10 +71,6 @@ def objects(**changes):
     return ObjectClicks.model_validate(FILE | changes)
 
 
-def with_bottle(**click):
-    return objects(tasks={"stand_bottle": [BOTTLE | {"click": BOTTLE["click"] | click}, CUP, MAT]})
-
-
 def test_two_clicks_give_the_pose_of_a_lying_object(store):
     found = clicked_poses(written(store), objects(), clicks())
     np.testing.assert_allclose(transform_from_pose(found.poses[0]), bottle(), atol=1e-7)
@@ -82,33 +78,33 @@ def test_two_clicks_give_the_pose_of_a_lying_object(store):
 
 
 def test_one_click_gives_the_place_of_a_symmetric_object(store):
-    # Its top is 10 cm over the base; the box's middle is 1 cm along x from the frame's origin.
+    # Its top is 10 cm over the base.
     place_m = [0.07, -0.1, TABLE_Z_M + 0.01]
-    (pixel,) = seen([[place_m[0] + 0.01, place_m[1], place_m[2] + 0.1]])
+    (pixel,) = seen([[*place_m[:2], place_m[2] + 0.1]])
     found = clicked_poses(written(store), objects(), clicks(cup={"point_px": pixel}))
     np.testing.assert_allclose(found.poses[1], [*place_m, 1, 0, 0, 0], atol=1e-7)
     assert found.known.tolist() == [True, True, False]
 
 
 def test_without_a_distortion_the_lens_is_straight(store):
-    reader = written(store, calibration={})
+    about = written(store, calibration={})
     (pixel,) = seen([[0.0, -0.1, TABLE_Z_M + 0.002]], np.zeros(5))
     ahead = seen([[0.1, -0.1, TABLE_Z_M + 0.002]], np.zeros(5))[0]
     found = clicked_poses(
-        reader, objects(), clicks(bottle=None, mat={"point_px": pixel, "heading_px": ahead})
+        about, objects(), clicks(bottle=None, mat={"point_px": pixel, "heading_px": ahead})
     )
     np.testing.assert_allclose(found.poses[2], [0, -0.1, TABLE_Z_M + 0.001, 1, 0, 0, 0], atol=1e-7)
 
 
 def test_the_error_is_that_of_three_pixels(store):
-    found = clicked_poses(written(store), objects(), clicks())
+    about = written(store)
+    found = clicked_poses(about, objects(), clicks())
     usual = clicks().objects["bottle"]
     places = []
     for shift_px in np.random.default_rng(0).normal(scale=0.1, size=(400, 2)):
-        moved = usual.model_copy(update={"point_px": tuple(usual.point_px + shift_px)})
-        one = EpisodeClicks(objects={"bottle": moved})
-        reader = store.open("take")
-        places.append(clicked_poses(reader, with_bottle(symmetric=True), one).poses[0, :2])
+        both = {"point_px": usual.point_px, "heading_px": usual.heading_px}
+        moved = {name: (np.array(pixel) + shift_px).tolist() for name, pixel in both.items()}
+        places.append(clicked_poses(about, objects(), clicks(bottle=moved)).poses[0, :2])
     sd_m = np.sqrt(np.var(places, axis=0).mean())
     assert found.sd_m[0] == pytest.approx(30 * sd_m, rel=0.1)
 
@@ -140,15 +136,15 @@ def test_a_ray_over_the_table_is_refused(store):
     up[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=float)
     up[2, 3] = 0.5
     anchor = dict.fromkeys(POSES, IDENTITY_ROWS) | {"T_world_camera_head": up.tolist()}
-    reader = written(store, anchor=anchor)
+    about = written(store, anchor=anchor)
     # The camera looks along y, level: the upper half of the image is over the horizon.
     for row, is_refused in ((4.0, True), (16.1, True), (28.0, False)):
         click = clicks(bottle={"point_px": [16.0, row], "heading_px": [20.0, row]})
         if is_refused:
             with pytest.raises(InvalidInputError, match=r"does not meet the height 0\.080 m"):
-                clicked_poses(reader, objects(), click)
+                clicked_poses(about, objects(), click)
         else:
-            assert clicked_poses(reader, objects(), click).known[0]
+            assert clicked_poses(about, objects(), click).known[0]
 
 
 def test_an_unfinished_click_may_count_as_unknown(store):
@@ -158,11 +154,11 @@ def test_an_unfinished_click_may_count_as_unknown(store):
 
 
 def test_unknown_names_are_refused(store):
-    reader = written(store)
+    about = written(store)
     with pytest.raises(UnknownNameError, match="lid"):
-        clicked_poses(reader, objects(), clicks(lid={"state": "hidden"}))
+        clicked_poses(about, objects(), clicks(lid={"state": "hidden"}))
     with pytest.raises(UnknownNameError, match="stand_bottle"):
-        clicked_poses(reader, objects(tasks={"pour": [CUP]}), clicks())
+        clicked_poses(about, objects(tasks={"pour": [CUP]}), clicks())
     other = written(store, "other", object_names=("cup", "bottle"))
     with pytest.raises(InvalidInputError, match=r"\['cup', 'bottle'\]"):
         clicked_poses(other, objects(), clicks())
@@ -222,6 +218,7 @@ def test_clicks_are_kept_beside_the_content(store):
         ({"episodes": {"take": {"objects": {"cup": {"point_px": [1, 2, 3]}}}}}, "point_px"),
         ({"episodes": {"a": {"objects": {"cup": {"state": "absent", "point_px": [1, 2]}}}}}, "cup"),
         ({"tasks": {"pour": [CUP | {"click": {"up": "x", "heading": "-x"}}]}}, "different axes"),
+        ({"tasks": {"pour": [CUP | {"box_m": [0.01, 0, 0.05, 0.04, 0.04, 0.05]}]}}, "symmetry"),
     ],
 )  # fmt: skip
 def test_a_wrong_file_is_refused_with_the_place(tmp_path, content, says):
