@@ -25,7 +25,14 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
-from dextouch.episodes import EpisodeGrid, EpisodeStore, data_hash, select_episodes, split_by_scene
+from dextouch.episodes import (
+    EpisodeGrid,
+    EpisodeStore,
+    data_hash,
+    needs,
+    select_episodes,
+    split_by_scene,
+)
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import RolloutStart
 from services.evaluation.calibration import (
@@ -59,11 +66,11 @@ from services.world_model.settings import ReaderSettings
 from services.world_model.starts import CAMERA, observed_start
 from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
-from services.world_model.training.state_trainer import PREDICTED
 
 KIND: Final = "direct-judge-2"
 # Stores of `make reproduce-checkpoints`, from which the committed state model was trained.
 _EPISODES: Final = ("runs/reproduce/train", "runs/reproduce/judge")
+_NEEDED: Final = (needs.WHOLE, needs.OUTCOME, needs.TOUCH, needs.OBJECTS, needs.FIRST_IMAGE)
 _HIDDEN: Final = 128
 _CHECK_EVERY: Final = 100
 _BATCH_OF_JUDGING: Final = 128
@@ -226,7 +233,7 @@ def read_takes(
     """
     episodes, starts = [], set()
     stores = [EpisodeStore(url) for url in urls]
-    for reader in select_episodes(stores, domain="robot", tasks=tasks, needs=PREDICTED):
+    for reader in select_episodes(stores, domain="robot", tasks=tasks, needs=_NEEDED):
         first = EpisodeGrid(reader).observation()
         starts.add(start_digest(first.images[CAMERA][0], first.tactile_kpa[0]))
         episodes.append(EpisodeGrid(reader, USUAL_IMAGE_PX))

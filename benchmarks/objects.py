@@ -1,4 +1,4 @@
-"""The benchmark stage `objects`: poses of objects from the markers on them, against the twin's."""
+"""The benchmark stage `objects`: poses of objects from markers and clicks, against the twin's."""
 
 import argparse
 import time
@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from benchmarks.figures import Requirement
 from benchmarks.machine import describe_machine
+from benchmarks.object_clicks import ClickErrors, click_errors
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
@@ -101,12 +102,13 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                             key = side_px, look, design
                             found.setdefault(key, []).append(_errors(take, images, track))
                     step(f"{task} {seed}")
-    best = found[sides_px[-1], LOOKS[0], OURS]
+    clicked = click_errors(tasks, range(FIRST_SEED, FIRST_SEED + count))
+    best, exact, usual = found[sides_px[-1], LOOKS[0], OURS], clicked[480, 0], clicked[480, 3]
     return StageReport(
         stage="objects",
         machine=describe_machine(PACKAGES),
         options={"takes": count, "tasks": ", ".join(tasks)},
-        tables=[_table(found)],
+        tables=[_table(found), _click_table(clicked)],
         panels=[],
         requirements=[
             Requirement("median error, sharp (mm)", _of(best, "off_mm", 0.5), "at most", 1.0),
@@ -117,8 +119,19 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                 "at most",
                 0.5,
             ),
+            Requirement("95 % error of exact clicks (mm)", exact.off(0.95), "at most", 1.0),
+            Requirement("median error of clicks, 3 px of 480 (mm)", usual.off(0.5), "at most", 8.0),
         ],
         data={
+            f"clicks, {noise_px} px of {side_px}": {
+                "off_mm": one.off(0.5),
+                "off_mm_95": one.off(0.95),
+                "turned_deg": one.turned(0.5),
+                "turned_deg_95": one.turned(0.95),
+            }
+            for (side_px, noise_px), one in clicked.items()
+        }
+        | {
             f"{side_px} px, {look}, {design}": {
                 name: _of(each, name, 0.5) for name in ("off_mm", "depth_mm", "turned_deg")
             }
@@ -250,3 +263,26 @@ def _table(found: Mapping[tuple[int, str, str], list[_Found]]) -> ResultTable:
     columns = ("images", "design", "seen", "error (mm)", "along the view (mm)", "turn (deg)",
                "ms an image")  # fmt: skip
     return ResultTable("Poses of objects from markers; errors: median / 95 %", columns, rows)
+
+
+def _click_table(clicked: Mapping[tuple[int, int], ClickErrors]) -> ResultTable:
+    rows = [
+        (
+            f"{side_px} px",
+            f"{noise_px} px",
+            f"{one.off(0.5):.1f} / {one.off(0.95):.1f}",
+            f"{one.turned(0.5):.1f} / {one.turned(0.95):.1f}",
+            f"{one.told(0.5):.1f}",
+            f"{one.refused:.1%}",
+        )
+        for (side_px, noise_px), one in clicked.items()
+    ]
+    columns = (
+        "images",
+        "noise of a click (sd)",
+        "error (mm)",
+        "heading (deg)",
+        "as stated (mm)",
+        "refused",
+    )
+    return ResultTable("Poses of objects from clicks; errors: median / 95 %", columns, rows)

@@ -2,12 +2,13 @@
 
 import argparse
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import TRASH_KINDS, EpisodeStore
 from dextouch.free_text import printable
 from dextouch.serving import configure_logging, load_settings
-from services.episode_store.commands import delete, inspect, repair
+from services.episode_store.commands import clicks, delete, inspect, repair
 from services.episode_store.commands.context import Context, Outcome, seconds_of
 from services.episode_store.settings import EpisodeStoreSettings
 
@@ -35,6 +36,7 @@ _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
     "list": inspect.list_items,
     "show": inspect.show,
     "verify": inspect.verify,
+    "clicks": clicks.clicks,
     "delete": delete.delete,
     "deletions": delete.deletions,
     "restore": delete.restore,
@@ -68,6 +70,15 @@ def _parser() -> argparse.ArgumentParser:
     show = _command(commands, kind, "show", "show attributes and streams of an item", "take-7")
     show.add_argument("id", metavar="ID", help="of an episode or recording")
     _add_ids(_command(commands, kind, "verify", "verify all checksums and list damage"))
+    does = "check clicks on objects and list the places that they give"
+    clicked = _command(commands, shared, "clicks", does, "--clicks objects.json --json clicks.json")
+    clicked.add_argument(
+        "--clicks",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="objects of the tasks, with or without clicks on them; those in the store are added",
+    )
     repairing = _command(
         commands,
         kind,

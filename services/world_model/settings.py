@@ -262,6 +262,11 @@ class StateTrainSettings(FrozenModel):
     episodes: Stores
     tasks: Tasks = ()
     splits: Splits = ()
+    clicks: Path | None = Field(
+        default=None,
+        description="JSON file of the tasks' objects, with clicks on them or without: clicks that "
+        "the dashboard stored are used, too (docs/objects.md)",
+    )
     output: Path = Field(
         default=Path("runs/world_model/state.safetensors"), description="checkpoint to write"
     )

@@ -56,7 +56,8 @@ class StateMetadata(FrozenModel):
 
     `training_seeds` are the first and last seed of every task, of the scenes in `training_splits`
     (all splits if empty); `training_scenes` are `scene_digest` of those without a seed, which a
-    station recorded.
+    station recorded. `object_sources` are the numbers of training episodes whose object poses are
+    from the twin, markers, trackers or clicks, and of those without any ("none").
     """
 
     format_version: int = FORMAT_VERSION
@@ -76,6 +77,7 @@ class StateMetadata(FrozenModel):
     training_splits: tuple[Split, ...] = ()
     training_scenes: tuple[str, ...] = Field(default=(), exclude_if=not_)
     data_hash: str
+    object_sources: dict[str, int] = Field(default={}, exclude_if=not_)
     metrics: dict[str, float] = Field(default={})
 
     def may_have_seen_episode(self, about: EpisodeAttributes) -> bool:

@@ -186,7 +186,8 @@ def _read_start(
 ) -> Reading:
     """True objects with noise, or a reader's where they are unknown or it shall be so.
 
-    The noise of each object has its own standard deviation, of up to `pose_noise_m`.
+    The noise of each object has its own standard deviation, of up to `pose_noise_m`; that of clicks
+    is in the poses already.
     """
     true = data.table.objects_at(rows, start_step)
     sd_m = settings.pose_noise_m * torch.rand(true.present.shape, generator=generator).square()
@@ -195,7 +196,7 @@ def _read_start(
     turn = torch.randn(true.axes.shape, generator=generator) * sd_m[..., None, None] * 5.0
     noisy = Reading(
         ObjectPoses(true.position_m + shift, true.axes + turn, true.present),
-        sd_m,
+        torch.hypot(sd_m, data.table.clicked_sd_m[rows]),
         _read_size(data.table.size[rows], generator),
     )
     known = data.table.labelled[rows] & data.table.knows_all(start_step)[rows]

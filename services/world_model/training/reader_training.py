@@ -64,8 +64,11 @@ def train_reader(
     _fit_heights(reader, table, config)
     later = [step for step in table.image_steps if step % 4 == 0 and step > 0]
     known = torch.nonzero(table.labelled)[:, 0]
-    # Later steps of each episode, in their order; further ones have no image or lie behind its end.
+    is_told = _knows_some(table, config)
+    # Later steps of each episode, in their order; of further ones nothing is known, they have no
+    # image or lie behind its end.
     reached = (torch.tensor(later) < table.length[:, None]) & table.shown[:, _places(table, later)]
+    reached &= is_told[:, later]
     counts = reached.sum(1)
     order = torch.argsort(~reached, dim=1, stable=True)
 
@@ -74,6 +77,7 @@ def train_reader(
         drawn = torch.randint(len(later), rows.shape, generator=generator)
         amid = torch.tensor(later)[order[rows, drawn % counts[rows].clamp_min(1)]]
         is_first = torch.rand(rows.shape, generator=generator) < settings.first_fraction
+        is_first &= is_told[rows, 0]
         steps = torch.where(is_first | (counts[rows] == 0), 0, amid)
         return _loss(
             reader,
@@ -83,6 +87,13 @@ def train_reader(
         )
 
     return train_averaged(reader, loss, settings, weight_decay=_WEIGHT_DECAY, on_step=on_step)
+
+
+def _knows_some(table: SceneTable, config: DynamicsConfig) -> Bool[Tensor, "episodes steps"]:
+    """Steps at which the pose of an object is known; all of tasks without objects."""
+    count = torch.tensor(config.num_objects)[table.task]
+    is_slot = torch.arange(MAX_OBJECTS) < count[:, None]
+    return (table.objects_known & is_slot[:, None]).any(-1) | (count == 0)[:, None]
 
 
 def _places(table: SceneTable, steps: list[int]) -> list[int]:

@@ -54,8 +54,9 @@ class SceneTable:
     """Episodes on the model grid; shorter ones are filled up by their last step.
 
     `length` is the number of an episode's own steps; `objects_known` are the steps at which the
-    pose of an object is known, and `measured_objects` marks episodes whose poses have the errors of
-    a measurement. `images` are those of the steps `image_steps`, where `shown`; `in_contact` marks
+    pose of an object is known, `measured_objects` marks episodes whose poses have the errors of a
+    measurement, and `clicked_sd_m` is the standard deviation of clicked positions, 0 of others.
+    `images` are those of the steps `image_steps`, where `shown`; `in_contact` marks
     pads in contact; `sent` are commanded hands where available and measured ones elsewhere, as
     given by `commanded`. `labelled` marks episodes whose object poses are trained on; `boxes_m` are
     the usual boxes of each task's objects in their frames (middle, half sizes), and `size` factors
@@ -80,6 +81,7 @@ class SceneTable:
     length: Int64[Tensor, " episodes"]
     objects_known: Bool[Tensor, "episodes steps objects"]
     measured_objects: Bool[Tensor, " episodes"]
+    clicked_sd_m: Float32[Tensor, "episodes objects"]
     size: Float32[Tensor, "episodes objects 2"]
     boxes_m: Float32[Tensor, "tasks objects 6"]
 
@@ -92,7 +94,10 @@ class SceneTable:
         return self.tactile_kpa.shape[1]
 
     def movable(self) -> Float32[Tensor, "tasks objects"]:
-        """1 for objects that move in some labelled episode of their task, 0 for fixed ones."""
+        """1 for objects that move in some labelled episode of their task, 0 for fixed ones.
+
+        One that is known at single steps alone, as by clicks, counts as moving.
+        """
         known = self.objects_known
         position_m, far = self.objects.position_m, torch.tensor(torch.inf)
         highest = torch.where(known[..., None], position_m, -far).amax(1)
@@ -101,9 +106,11 @@ class SceneTable:
         least_m = torch.where(self.measured_objects, _MEASURED_MOVED_M, _MOVED_M)[:, None]
         is_there = (self.objects.present > 0) | ~known
         moves = known.any(1) & (way_m > least_m) & is_there.all(1) & self.labelled[:, None]
+        is_watched = (known.sum(1) > 1) & self.labelled[:, None]
         found = torch.zeros(self.boxes_m.shape[:2])
         for task in range(len(found)):
-            found[task] = moves[self.task == task].any(0).float()
+            rows = self.task == task
+            found[task] = (moves[rows].any(0) | ~is_watched[rows].any(0)).float()
         return found
 
     def first_steps(
@@ -224,7 +231,7 @@ def vocabulary(episodes: Sequence[EpisodeGrid]) -> tuple[tuple[str, ...], tuple[
     """
     names: dict[str, set[tuple[str, ...]]] = {}
     for episode in episodes:
-        names.setdefault(episode.task, set()).add(episode.about.object_names)
+        names.setdefault(episode.task, set()).add(episode.object_names)
     uneven = {task: sorted(found) for task, found in names.items() if len(found) > 1}
     many = [name for name, (objects, *_) in names.items() if len(objects) > MAX_OBJECTS]
     if many:
@@ -290,6 +297,7 @@ def scene_table(
         length=torch.tensor(lengths),
         objects_known=torch.from_numpy(known),
         measured_objects=torch.tensor([track.is_measured for track in tracks]),
+        clicked_sd_m=torch.from_numpy(np.stack([_clicked_sd_m(track) for track in tracks])),
         size=torch.from_numpy(np.stack([_size(e, boxes_m[e.task]) for e in episodes])),
         boxes_m=_padded(boxes_m, config),
     )
@@ -316,6 +324,12 @@ def _known(
     known[:, :count] = _filled(track.known, episode, num_steps)
     known[_whole(episode) :, :count] = False
     return known
+
+
+def _clicked_sd_m(track: ObjectTrack) -> Float32[np.ndarray, " slots"]:
+    sd_m = np.zeros(MAX_OBJECTS, dtype=np.float32)
+    sd_m[: len(track.clicked_sd_m)] = track.clicked_sd_m
+    return sd_m
 
 
 def _image_steps(episodes: Sequence[EpisodeGrid], lengths: Sequence[int]) -> list[int]:

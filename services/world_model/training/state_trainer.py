@@ -7,12 +7,12 @@ run resumes with the missing ones.
 import hashlib
 import multiprocessing
 import time
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import torch
@@ -23,15 +23,13 @@ from dextouch.command_line import ProgressLines
 from dextouch.episodes import (
     SPLITS,
     EpisodeGrid,
-    EpisodeStore,
     Split,
     data_hash,
-    needs,
     scene_fraction,
-    select_episodes,
     split_by_scene,
 )
 from dextouch.errors import InvalidInputError
+from dextouch.schemas import load_object_clicks
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.configuration import DynamicsConfig
@@ -59,6 +57,7 @@ from services.world_model.training.core_training import (
 )
 from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_clips import scene_clips
+from services.world_model.training.scene_episodes import SceneGrid, load_scene_episodes
 from services.world_model.training.scene_table import (
     SceneTable,
     scene_table,
@@ -69,9 +68,7 @@ from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.transfer import Base
 
 # Increment when a change of training gives other weights for the same settings and data.
-READER_VERSION, CORE_VERSION, RENDERER_VERSION = 5, 9, 3
-# What an episode of a state model must have.
-PREDICTED: Final = (needs.WHOLE, needs.OUTCOME, needs.TOUCH, needs.OBJECTS, needs.FIRST_IMAGE)
+READER_VERSION, CORE_VERSION, RENDERER_VERSION = 6, 9, 3
 # Largest number of episodes the renderer is trained on; it samples few of their images anyway.
 MAX_CLIPS = 1500
 _SEED_STRIDE = 1000
@@ -118,6 +115,8 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     # Before training, so that invalid episodes are found at once.
     heldout_table = scene_table(heldout, config)
     table = scene_table(training, config, labelled=_labelled(training, settings))
+    if base is None:
+        _check_drawable(training)
     codec = _codec(table, config, base)
     reads_starts = settings.labelled_share < 1 or not all(
         bool(table.knows_all(step).all()) for step in start_steps(table)
@@ -134,7 +133,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         dynamics=config,
         num_members=settings.num_members,
         renderer=settings.renderer,
-        object_names={e.task: e.about.object_names for e in episodes},
+        object_names={e.task: e.object_names for e in episodes},
         object_boxes_m={
             task: tuple(tuple(map(float, row)) for row in boxes_m)
             for task, boxes_m in usual_boxes_m(episodes).items()
@@ -155,6 +154,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         training_splits=_splits(settings, base),
         training_scenes=_recorded_scenes(training, base),
         data_hash=hashed,
+        object_sources=_sources(training),
         metrics=measured.figures,
     )
     digest = write_state_checkpoint(settings.output, dynamics, renderer, metadata)
@@ -239,17 +239,17 @@ def _with_precision(settings: StateTrainSettings) -> StateTrainSettings:
     return settings.model_copy(update={"reader": settings.reader.model_copy(update=chosen)})
 
 
-def _episodes(settings: StateTrainSettings) -> list[EpisodeGrid]:
-    readers = select_episodes(
-        [EpisodeStore(url) for url in settings.episodes],
+def _episodes(settings: StateTrainSettings) -> list[SceneGrid]:
+    return load_scene_episodes(
+        *settings.episodes,
         tasks=settings.tasks,
         splits=settings.splits,
-        needs=PREDICTED,
+        image_px=settings.image_px,
+        clicks=None if settings.clicks is None else load_object_clicks(settings.clicks),
     )
-    return [EpisodeGrid(reader, settings.image_px) for reader in readers]
 
 
-def _config(episodes: list[EpisodeGrid], settings: StateTrainSettings) -> DynamicsConfig:
+def _config(episodes: Sequence[EpisodeGrid], settings: StateTrainSettings) -> DynamicsConfig:
     tasks, num_objects = vocabulary(episodes)
     sides = {episode.image_size_px[0] for episode in episodes}
     if len(sides) != 1:
@@ -261,22 +261,51 @@ def _config(episodes: list[EpisodeGrid], settings: StateTrainSettings) -> Dynami
     )
 
 
-def _labelled(episodes: list[EpisodeGrid], settings: StateTrainSettings) -> list[bool]:
-    """Mask of episodes whose object poses are trained on; equal for all takes of a scene."""
+def _check_drawable(episodes: Sequence[EpisodeGrid]) -> None:
+    """Refuse what no renderer can be trained on, before hours of training other parts."""
+    for one in episodes:
+        if one.objects is not None and one.objects.known[one.image_steps].all(axis=1).sum() > 1:
+            return
+    raise InvalidInputError(
+        "state model: no episode shows all of its objects at known poses twice, which cores and "
+        "the renderer learn from (clicks are poses of the first step alone); add --base PATH, a "
+        "trained state model whose cores and renderer are kept"
+    )
+
+
+def _has_poses(episode: EpisodeGrid) -> bool:
+    """Whether the pose of some object is known; true of tasks without objects."""
+    track = episode.objects
+    return not episode.object_names or (track is not None and bool(track.known.any()))
+
+
+def _labelled(episodes: Sequence[EpisodeGrid], settings: StateTrainSettings) -> list[bool]:
+    """Mask of episodes whose object poses are trained on.
+
+    Of a scene, these are all takes that have poses, or none.
+    """
     # Training scenes lie above the held-out share.
     share = settings.heldout_share + (1 - settings.heldout_share) * settings.labelled_share
-    labelled = [scene_fraction(episode.scene) <= share for episode in episodes]
+    labelled = [_has_poses(e) and scene_fraction(e.scene) <= share for e in episodes]
     known = {episode.task for episode, yes in zip(episodes, labelled, strict=True) if yes}
     without = {episode.task for episode in episodes} - known
     if without:
         raise InvalidInputError(
-            f"--labelled-share {settings.labelled_share:g}: leaves no labelled scene of "
-            f"{', '.join(sorted(without))}; choose a larger share"
+            f"--labelled-share {settings.labelled_share:g}: leaves no scene with known objects of "
+            f"{', '.join(sorted(without))} to train on; choose a larger share, a smaller "
+            "--heldout-share, or click the objects of more episodes"
         )
     return labelled
 
 
-def _seed_ranges(episodes: list[EpisodeGrid], base: Base | None) -> dict[str, tuple[int, int]]:
+def _sources(episodes: Sequence[EpisodeGrid]) -> dict[str, int]:
+    """Number of episodes with poses of objects from each source, and without any ("none")."""
+    tracks = [one.objects for one in episodes if one.object_names and one.objects is not None]
+    each = [{*track.sources} - {"none"} or {"none"} for track in tracks]
+    return dict(sorted(Counter(source for sources in each for source in sources).items()))
+
+
+def _seed_ranges(episodes: Sequence[EpisodeGrid], base: Base | None) -> dict[str, tuple[int, int]]:
     """First and last seed of every task, the base's included; recordings have none."""
     known = {} if base is None else base.checkpoint.metadata.training_seeds
     seeds = {task: list(ends) for task, ends in known.items()}
@@ -286,7 +315,7 @@ def _seed_ranges(episodes: list[EpisodeGrid], base: Base | None) -> dict[str, tu
     return {task: (min(found), max(found)) for task, found in sorted(seeds.items())}
 
 
-def _recorded_scenes(episodes: list[EpisodeGrid], base: Base | None) -> tuple[str, ...]:
+def _recorded_scenes(episodes: Sequence[EpisodeGrid], base: Base | None) -> tuple[str, ...]:
     """Digests of the scenes without a seed, the base's included."""
     known = set() if base is None else set(base.checkpoint.metadata.training_scenes)
     own = {scene_digest(episode.scene) for episode in episodes if episode.about.seed is None}
@@ -463,8 +492,9 @@ def _together(cores: Sequence[RecurrentCore]) -> dict[str, Tensor]:
 
 def _command(settings: StateTrainSettings) -> str:
     """Command that repeats a run; stores and the base are given by their last path component."""
-    left_out = {"output", "episodes", "base", "jobs", "json_path"}
+    left_out = {"output", "episodes", "base", "clicks", "jobs", "json_path"}
     given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
     flags = [f"--episodes={last_name(url)}" for url in settings.episodes]
-    flags += [] if settings.base is None else [f"--base={settings.base.name}"]
+    files = {"base": settings.base, "clicks": settings.clicks}
+    flags += [f"--{name}={path.name}" for name, path in files.items() if path is not None]
     return " ".join(["dextouch train state", *flags, *flags_of(given)])

@@ -29,6 +29,11 @@ if TYPE_CHECKING:
     from dextouch.episodes.image_codecs import decoder_of_this_thread as decoder_of_this_thread
     from dextouch.episodes.image_codecs import is_keyframe as is_keyframe
     from dextouch.episodes.image_codecs import parameter_sets as parameter_sets
+    from dextouch.episodes.object_clicks import ClickedPoses as ClickedPoses
+    from dextouch.episodes.object_clicks import clicked_poses as clicked_poses
+    from dextouch.episodes.object_clicks import first_camera as first_camera
+    from dextouch.episodes.object_clicks import listed_objects as listed_objects
+    from dextouch.episodes.object_poses import ObjectSource as ObjectSource
     from dextouch.episodes.object_poses import ObjectTrack as ObjectTrack
     from dextouch.episodes.object_poses import has_object_poses as has_object_poses
     from dextouch.episodes.object_poses import object_track as object_track

@@ -50,7 +50,7 @@ TOUCH: Final = Need(
 )
 OBJECTS: Final = Need(
     "without poses of their objects",
-    "measure them by markers or trackers, docs/objects.md",
+    "measure them by markers or trackers, or click on them, docs/objects.md",
     has_object_poses,
 )
 IMAGES: Final = Need(

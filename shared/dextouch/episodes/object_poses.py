@@ -1,7 +1,7 @@
 """Poses of an episode's objects at given times, from whichever streams the episode has of them."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -18,6 +18,10 @@ from dextouch.schemas import object_stream
 
 # Ground truth, and what imagined worlds say: all objects in one stream, without gaps.
 OBJECT_POSES: Final = "object_poses"
+# Which camera sees markers, and is clicked in.
+CAMERA: Final = "camera_head"
+# Where the pose of an object is from; "none" of one that is known nowhere.
+ObjectSource = Literal["twin", "markers", "tracker", "clicks", "none"]
 # Between two sightings that are at most so far apart, an object is taken to have moved evenly ...
 _MAX_GAP_NS: Final = 250_000_000
 # ... and to have stood still between two that are this close to one another, however far apart.
@@ -30,13 +34,37 @@ _EDGE_PERIODS: Final = 1.5
 class ObjectTrack:
     """Poses T_world_object (x y z m, qw qx qy qz) of objects, and at which steps they are known.
 
-    Where a pose is not known it is the last one before, or the first one after. `is_measured` says
-    that poses have the errors of a measurement, a few millimetres.
+    Where a pose is not known it is the last one before, or the first one after. `sources` say where
+    each object's poses are from: those that are not from the twin have the errors of a measurement,
+    a few millimetres. `clicked_sd_m` is the standard deviation of a clicked position on each axis
+    of the table, 0 of other sources.
     """
 
     poses: Float32[np.ndarray, "steps objects 7"]
     known: Bool[np.ndarray, "steps objects"]
-    is_measured: bool
+    sources: tuple[ObjectSource, ...]
+    clicked_sd_m: Float32[np.ndarray, " objects"]
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether poses have the errors of a measurement."""
+        return bool(set(self.sources) - {"twin"})
+
+    @classmethod
+    def unknown(cls, num_steps: int, num_objects: int) -> "ObjectTrack":
+        """Objects of which nothing is known."""
+        poses = np.zeros((num_steps, num_objects, 7), dtype=np.float32)
+        poses[..., 3] = 1.0
+        known = np.zeros((num_steps, num_objects), dtype=np.bool_)
+        return cls.of_one_source("none", poses, known)
+
+    @classmethod
+    def of_one_source(
+        cls, source: ObjectSource, poses: np.ndarray, known: np.ndarray
+    ) -> "ObjectTrack":
+        """Objects whose poses are all from one source, which is not clicks."""
+        count = poses.shape[1]
+        return cls(poses, known, (source,) * count, np.zeros(count, dtype=np.float32))
 
 
 def object_track(
@@ -54,13 +82,22 @@ def object_track(
         CorruptDataError: damaged bytes.
     """
     if OBJECT_POSES in reader.streams:
-        return ObjectTrack(*_all_at_once(reader, t_ref_ns), is_measured=False)
+        return ObjectTrack.of_one_source("twin", *_all_at_once(reader, t_ref_ns))
     names = reader.attributes.object_names
     if not any(object_stream(name) in reader.streams for name in names):
         return None
     each = [_one(reader, object_stream(name), t_ref_ns) for name in names]
     poses = np.stack([one[0] for one in each], axis=1).astype(np.float32)
-    return ObjectTrack(poses, np.stack([one[1] for one in each], axis=1), is_measured=True)
+    known = np.stack([one[1] for one in each], axis=1)
+    sources = tuple(
+        _measured_by(reader, name) if known[:, index].any() else "none"
+        for index, name in enumerate(names)
+    )
+    return ObjectTrack(poses, known, sources, np.zeros(len(names), dtype=np.float32))
+
+
+def _measured_by(reader: EpisodeReader, name: str) -> ObjectSource:
+    return "markers" if reader.streams[object_stream(name)].device == CAMERA else "tracker"
 
 
 def has_object_poses(reader: EpisodeReader) -> bool:

@@ -23,7 +23,6 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.migration import is_current
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
-from dextouch.episodes.reviews import REVIEW_FILE
 from dextouch.episodes.staged_group import (
     STAGING,
     new_stage,
@@ -268,9 +267,9 @@ class ObjectStorage:
         """Delete a group: its commit record first, then its other objects."""
         delete_group(self._bucket, kind, item_id)
 
-    def set_review(self, kind: Kind, item_id: str, content: bytes | None) -> None:
-        """Put the review of a group in place of an earlier one; None removes it."""
-        key = f"{group_key(kind, item_id)}/{REVIEW_FILE}"
+    def set_remark(self, kind: Kind, item_id: str, name: str, content: bytes | None) -> None:
+        """Put a file beside the content in place of an earlier one; None removes it."""
+        key = f"{group_key(kind, item_id)}/{name}"
         if content is None:
             self._bucket.remove([key])
         else:

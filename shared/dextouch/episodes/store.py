@@ -23,7 +23,7 @@ from dextouch.episodes.format import (
 from dextouch.episodes.group_contents import read_group, read_live
 from dextouch.episodes.migration import OldGroup, is_current
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
-from dextouch.episodes.reviews import REVIEW_FILE, read_review
+from dextouch.episodes.reviews import CLICKS_FILE, REMARK_FILES, REVIEW_FILE, read_remark
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.staged_group import STAGING, new_stage, stages_of, unheld_folders
 from dextouch.episodes.staging_recovery import (
@@ -53,7 +53,13 @@ from dextouch.errors import (
     UnavailableError,
     UnknownNameError,
 )
-from dextouch.schemas import ID_PATTERN, EpisodeAttributes, RecordingAttributes, Review
+from dextouch.schemas import (
+    ID_PATTERN,
+    EpisodeAttributes,
+    EpisodeClicks,
+    RecordingAttributes,
+    Review,
+)
 
 if TYPE_CHECKING:
     from dextouch.episodes.object_storage import ObjectStorage
@@ -176,7 +182,7 @@ class EpisodeStore:
             CorruptDataError: its review cannot be read.
         """
         group = self._storage.group(*_check(kind, item_id))
-        return read_review(group, what=f"{kind} {item_id!r}")
+        return read_remark(group, REVIEW_FILE, Review, what=f"{kind} {item_id!r}")
 
     def set_review(self, item_id: str, review: Review | None, *, kind: Kind = "episode") -> None:
         """Keep the review of an item in place of an earlier one; None removes it.
@@ -184,9 +190,23 @@ class EpisodeStore:
         Raises:
             NotFoundError: no such id.
         """
+        self._set_remark(kind, item_id, REVIEW_FILE, review)
+
+    def clicks(self, episode_id: str) -> EpisodeClicks | None:
+        """Clicks on the objects of an episode; None if there are none. Raises as `review`."""
+        group = self._storage.group(*_check("episode", episode_id))
+        return read_remark(group, CLICKS_FILE, EpisodeClicks, what=f"episode {episode_id!r}")
+
+    def set_clicks(self, episode_id: str, clicks: EpisodeClicks | None) -> None:
+        """Keep clicks in place of earlier ones; None removes them. Raises as `set_review`."""
+        self._set_remark("episode", episode_id, CLICKS_FILE, clicks)
+
+    def _set_remark(
+        self, kind: Kind, item_id: str, name: str, remark: Review | EpisodeClicks | None
+    ) -> None:
         self._storage.group(*_check(kind, item_id))
-        content = None if review is None else review.model_dump_json().encode()
-        self._storage.set_review(kind, item_id, content)
+        content = None if remark is None else remark.model_dump_json().encode()
+        self._storage.set_remark(kind, item_id, name, content)
 
     def delete(self, item_id: str, *, kind: Kind = "episode", for_good: bool = False) -> None:
         """Move an episode or recording to the trash, or delete it `for_good`.
@@ -365,9 +385,9 @@ class _LocalStorage:
         """Delete a group permanently; it disappears atomically and is then removed from disk."""
         remove_for_good(put_into_trash(self.root, kind, item_id))
 
-    def set_review(self, kind: Kind, item_id: str, content: bytes | None) -> None:
-        path = self._folder(kind, item_id) / REVIEW_FILE
-        with disk_errors(f"review {kind} {item_id}"):
+    def set_remark(self, kind: Kind, item_id: str, name: str, content: bytes | None) -> None:
+        path = self._folder(kind, item_id) / name
+        with disk_errors(f"write {name} of {kind} {item_id}"):
             try:
                 if content is not None:
                     replace_file(path, content)
@@ -375,7 +395,7 @@ class _LocalStorage:
                     path.unlink()
                     sync_folder(path.parent)
             except FileNotFoundError as error:
-                # Deleted meanwhile: an item without a review has no file to remove either.
+                # Deleted meanwhile: an item without the file has none to remove either.
                 raise self._missing(kind, item_id) from error
 
     def migrate(self, kind: Kind, item_id: str) -> bool:
@@ -393,10 +413,11 @@ class _LocalStorage:
         )
         streams = ((stream.name, old.blocks(stream)) for stream in old.attributes.streams)
         write_blocks(new_stage(self.root, kind, item_id), whole, old.attributes, streams)
-        review = files.get(REVIEW_FILE)
+        remarks = {name: files.get(name) for name in REMARK_FILES}
         with disk_errors(f"migrate {item_id}"):
-            if review is not None:
-                replace_file(whole / REVIEW_FILE, review)
+            for name, content in remarks.items():
+                if content is not None:
+                    replace_file(whole / name, content)
             files.folder.rename(before)
             whole.rename(files.folder)
             sync_folder(files.folder.parent)

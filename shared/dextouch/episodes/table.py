@@ -217,6 +217,11 @@ class EpisodeGrid:
         return scene_of(self.about)
 
     @property
+    def object_names(self) -> tuple[str, ...]:
+        """Names of the objects."""
+        return self.about.object_names
+
+    @property
     def success(self) -> bool:
         """The outcome.
 

@@ -10,6 +10,9 @@ if TYPE_CHECKING:
     from dextouch.geometry.interpolation import interpolate_linear as interpolate_linear
     from dextouch.geometry.interpolation import interpolate_poses as interpolate_poses
     from dextouch.geometry.interpolation import nearest_index as nearest_index
+    from dextouch.geometry.lens import box_pixels as box_pixels
+    from dextouch.geometry.lens import lens_pixels as lens_pixels
+    from dextouch.geometry.lens import points_on_level as points_on_level
     from dextouch.geometry.transforms import apply as apply
     from dextouch.geometry.transforms import invert as invert
     from dextouch.geometry.transforms import pinhole_matrix as pinhole_matrix

@@ -121,10 +121,15 @@ if TYPE_CHECKING:
     from dextouch.schemas.rollouts import WorldDescription as WorldDescription
     from dextouch.schemas.rollouts import WorldKind as WorldKind
     from dextouch.schemas.rollouts import WorldList as WorldList
+    from dextouch.schemas.scene_objects import ClickedAt as ClickedAt
+    from dextouch.schemas.scene_objects import EpisodeClicks as EpisodeClicks
     from dextouch.schemas.scene_objects import MarkerDictionary as MarkerDictionary
+    from dextouch.schemas.scene_objects import ObjectClick as ObjectClick
+    from dextouch.schemas.scene_objects import ObjectClicks as ObjectClicks
     from dextouch.schemas.scene_objects import ObjectMarker as ObjectMarker
     from dextouch.schemas.scene_objects import SceneObject as SceneObject
     from dextouch.schemas.scene_objects import SceneObjects as SceneObjects
+    from dextouch.schemas.scene_objects import load_object_clicks as load_object_clicks
     from dextouch.schemas.scene_objects import load_scene_objects as load_scene_objects
     from dextouch.schemas.scene_objects import object_stream as object_stream
     from dextouch.schemas.station import CameraList as CameraList

@@ -1,13 +1,13 @@
-"""Schema of the file that describes the objects of tasks, and what their poses are measured by."""
+"""Schemas of the files that describe the objects of tasks, and say where they were clicked."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, FiniteFloat, ValidationError, field_validator, model_validator
 
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas.episodes import Box
+from dextouch.schemas.episodes import Box, StoreId
 
 # Position x y z (m), then the quaternion w x y z.
 Pose = tuple[
@@ -16,7 +16,14 @@ Pose = tuple[
 MarkerDictionary = Literal[
     "DICT_4X4_50", "DICT_5X5_250", "DICT_6X6_250", "DICT_APRILTAG_16h5", "DICT_APRILTAG_36h11"
 ]
-MAX_FILE_BYTES = 1 << 20
+# An axis of an object's frame, or the direction against it.
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+ObjectName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,47}$")]
+# Column and row in an image; the first pixel spans 0 … 1.
+Pixel = tuple[FiniteFloat, FiniteFloat]
+# Room for thousands of clicked episodes.
+MAX_FILE_BYTES = 4 << 20
+MAX_CLICKED = 10_000
 # Objects of a task: slots of the state model and of the judge, where unused ones are masked.
 MAX_OBJECTS = 3
 DICTIONARY_SIZES: dict[MarkerDictionary, int] = {
@@ -50,20 +57,50 @@ class ObjectMarker(FrozenModel):
     _pose_is_turned = field_validator("pose")(_is_turned)
 
 
+class ClickedAt(FrozenModel):
+    """How an object stands at the first step, so that clicks in its image give a pose.
+
+    Attributes:
+        up: axis that points up.
+        heading: level axis, along which the second click lies.
+        symmetric: whether the object looks the same from all sides around `up`, through the origin
+            of its frame; it needs no second click, and `heading` counts as the world's x axis.
+        point_m: the point that is clicked, in the object's frame; by default the middle of the top
+            of the box.
+        base_m: height of the lowest side of the box above the table.
+    """
+
+    up: Axis = "z"
+    heading: Axis = "x"
+    symmetric: bool = False
+    point_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat] | None = None
+    base_m: FiniteFloat = 0.0
+
+    @model_validator(mode="after")
+    def _are_two_axes(self) -> "ClickedAt":
+        if self.up[-1] == self.heading[-1]:
+            raise ValueError(
+                f"got up {self.up!r} and heading {self.heading!r}, expected different axes"
+            )
+        return self
+
+
 class SceneObject(FrozenModel):
     """One object of a task: its name, bounding box, and what measures its pose.
 
     `box_m` are centre and half sizes in the object's own frame. The pose comes from the `markers`
     as the head camera sees them or, if there are none, from the recorded stream `object_NAME` of a
     tracker, which sits on the object at `tracker_pose`, T_tracker_object. An object that is `fixed`
-    stands still during a take: all sightings of its markers give one pose.
+    stands still during a take: all sightings of its markers give one pose. `click` says how clicks
+    in an episode's first image give a pose, where neither measured it.
     """
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,47}$")
+    name: ObjectName
     box_m: Box
     markers: tuple[ObjectMarker, ...] = Field(default=(), max_length=32)
     tracker_pose: Pose | None = None
     fixed: bool = False
+    click: ClickedAt = Field(default=ClickedAt(), exclude_if=lambda click: click == ClickedAt())
 
     _tracker_is_turned = field_validator("tracker_pose")(
         lambda pose: None if pose is None else _is_turned(pose)
@@ -76,6 +113,13 @@ class SceneObject(FrozenModel):
         if min(self.box_m[3:]) <= 0:
             raise ValueError(
                 f"{self.name}: got box_m with half sizes {self.box_m[3:]}, expected positive ones"
+            )
+        clicked = self.click.point_m or self.box_m[:3]
+        off_m = max(abs(clicked["xyz".index(axis)]) for axis in {*"xyz"} - {self.click.up[-1]})
+        if self.click.symmetric and off_m > _UNIT:
+            raise ValueError(
+                f"{self.name}: got a symmetric object whose clicked point {clicked} is {off_m:.3g} "
+                "m from its axis of symmetry, expected it there; shift its frame"
             )
         return self
 
@@ -93,7 +137,10 @@ class SceneObject(FrozenModel):
 
 
 class SceneObjects(FrozenModel):
-    """Objects of every task, in the order of the world model's slots."""
+    """Objects of every task, in the order of the world model's slots.
+
+    `table_z_m` is the height of the table in the world, which clicks need.
+    """
 
     dictionary: MarkerDictionary = Field(
         default="DICT_4X4_50", description="OpenCV's dictionary of the markers"
@@ -102,6 +149,11 @@ class SceneObjects(FrozenModel):
         Annotated[str, Field(min_length=1, max_length=128)],
         Annotated[tuple[SceneObject, ...], Field(min_length=1, max_length=MAX_OBJECTS)],
     ] = Field(description="objects of each task, as JSON")
+    table_z_m: FiniteFloat = Field(
+        default=0.0,
+        exclude_if=lambda z_m: z_m == 0.0,
+        description="height of the table in the world (m), which clicks on objects need",
+    )
 
     @model_validator(mode="after")
     def _has_unique_names(self) -> "SceneObjects":
@@ -120,10 +172,55 @@ class SceneObjects(FrozenModel):
         return self
 
     def of_task(self, task: str) -> "SceneObjects | None":
-        """The objects of one task alone; None if the file does not have it."""
+        """The objects of one task as streams measure them; None if the file does not have it.
+
+        Without what only clicks need: that does not change an episode.
+        """
         if task not in self.tasks:
             return None
-        return self.model_copy(update={"tasks": {task: self.tasks[task]}})
+        listed = tuple(one.model_copy(update={"click": ClickedAt()}) for one in self.tasks[task])
+        return self.model_copy(update={"tasks": {task: listed}, "table_z_m": 0.0})
+
+
+class ObjectClick(FrozenModel):
+    """Where an object is in the image of an episode's first step.
+
+    `point_px` is the image of its clicked point, `heading_px` a place farther along its heading at
+    the same height. An object without them is `absent` from the scene, or `hidden` from the camera.
+    """
+
+    state: Literal["seen", "absent", "hidden"] = "seen"
+    point_px: Pixel | None = None
+    heading_px: Pixel | None = None
+
+    @model_validator(mode="after")
+    def _fits_the_state(self) -> "ObjectClick":
+        is_seen = self.state == "seen"
+        if (self.point_px is None) is is_seen or (self.heading_px is not None and not is_seen):
+            raise ValueError(
+                f"got state {self.state!r} with point_px {self.point_px} and heading_px "
+                f"{self.heading_px}, expected a point_px if it is seen, and none otherwise"
+            )
+        return self
+
+
+class EpisodeClicks(FrozenModel):
+    """Clicks on the objects of one episode, by their names."""
+
+    objects: dict[ObjectName, ObjectClick] = Field(min_length=1, max_length=MAX_OBJECTS)
+
+
+class ObjectClicks(SceneObjects):
+    """Objects of the tasks, and clicks on them by episode.
+
+    A file of objects alone is one without clicks.
+    """
+
+    version: Literal[1] = 1
+    episodes: dict[StoreId, EpisodeClicks] = Field(default={}, max_length=MAX_CLICKED)
+
+
+Objects = TypeVar("Objects", bound=SceneObjects)
 
 
 def object_stream(name: str) -> str:
@@ -132,12 +229,21 @@ def object_stream(name: str) -> str:
 
 
 def load_scene_objects(path: Path) -> SceneObjects:
-    """Read the objects of a JSON file.
+    """Read the objects of a JSON file; raises as `load_object_clicks`."""
+    return _loaded(path, SceneObjects)
+
+
+def load_object_clicks(path: Path) -> ObjectClicks:
+    """Read objects, and clicks on them, of a JSON file.
 
     Raises:
         NotFoundError: there is no such file.
         InvalidInputError: not JSON, too large, or other fields than expected.
     """
+    return _loaded(path, ObjectClicks)
+
+
+def _loaded(path: Path, form: type[Objects]) -> Objects:
     if not path.is_file():
         raise NotFoundError(f"objects: there is no file {path}; docs/objects.md shows one")
     if path.stat().st_size > MAX_FILE_BYTES:
@@ -145,7 +251,7 @@ def load_scene_objects(path: Path) -> SceneObjects:
             f"objects {path}: got {path.stat().st_size} bytes, expected at most {MAX_FILE_BYTES}"
         )
     try:
-        return SceneObjects.model_validate_json(path.read_bytes())
+        return form.model_validate_json(path.read_bytes())
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"]) or "the file"

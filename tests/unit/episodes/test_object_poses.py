@@ -48,7 +48,7 @@ def test_truth_is_read_as_it_was_written(store):
     track = track_of(reader)
     np.testing.assert_array_equal(track.poses, truth.astype(np.float32))
     assert track.known.all()
-    assert not track.is_measured
+    assert track.sources == ("twin", "twin")
 
 
 def test_steps_lie_between_the_sightings_around_them(store):
@@ -59,7 +59,7 @@ def test_steps_lie_between_the_sightings_around_them(store):
     np.testing.assert_allclose(track.poses[:, 0, 0], expected, atol=1e-6)
     # The first step is 10 ms before the first sighting: within a period and a half.
     assert track.known.all()
-    assert track.is_measured
+    assert track.sources == ("tracker",)
 
 
 def test_a_moved_object_is_unknown_while_nobody_saw_it(store):

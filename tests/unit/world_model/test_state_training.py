@@ -81,7 +81,7 @@ def episode(seed, num_steps=NUM_STEPS):
     known = np.ones(poses.shape[:2], dtype=bool)
     return ToyGrid(
         about=about, anchor=anchor, measured=actions, sent=actions, K_head=K_HEAD,
-        tactile_kpa=tactile, objects=ObjectTrack(poses, known, is_measured=False),
+        tactile_kpa=tactile, objects=ObjectTrack.of_one_source("twin", poses, known),
         boxes_m=np.array([[0, 0, 0, 0.02, 0.02, 0.03]]),
         pictures=np.repeat(picture(block_m)[None], len(steps), axis=0), image_steps=steps,
     )  # fmt: skip
@@ -414,7 +414,7 @@ def test_measured_objects_move_when_they_move_by_more_than_their_error(config):
     still, noisy = episode(0), episode(1)
     shaken = noisy.objects.poses.copy()
     shaken[1::2, 0, 0] += 0.006
-    measured = changed(noisy, poses=shaken, is_measured=True)
+    measured = changed(noisy, poses=shaken, sources=("markers",))
     assert scene_table([still, measured], config).movable().tolist() == [[0.0] * MAX_OBJECTS]
     carried = noisy.objects.poses.copy()
     carried[8:, 0, 0] += 0.05

@@ -24,7 +24,7 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.group_contents import GroupContents, read_group
 from dextouch.episodes.journal import damaged_payload, log_paths, part_path, read_rows, scan_rows
-from dextouch.episodes.reviews import REVIEW_FILE
+from dextouch.episodes.reviews import REMARK_FILES
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.spool import SpoolReader, read_attributes
 from dextouch.episodes.spool_log import body_at, find_records, open_log
@@ -128,7 +128,7 @@ def _stamp_findings(contents: Group) -> list[Finding]:
 
 def _foreign_paths(folder: Path, entries: dict[str, ArrayEntry]) -> list[str]:
     """Files, folders and links in a group's folder that belong to no array."""
-    wanted = {COMMIT_FILE, METADATA_FILE, REVIEW_FILE}
+    wanted = {COMMIT_FILE, METADATA_FILE, *REMARK_FILES}
     for name, entry in entries.items():
         wanted |= {f"{name}/{METADATA_FILE}", f"{name}/{shard_path(len(entry.shape))}"}
     folders = {str(parent) for path in wanted for parent in Path(path).parents}

@@ -1,0 +1,197 @@
+"""Errors of places that are clicked in first images of the twin's takes, by noise of the click."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.episodes import clicked_poses
+from dextouch.errors import InvalidInputError
+from dextouch.geometry import apply, invert, pinhole_matrix, project, transform_from_pose
+from dextouch.schemas import (
+    ClickedAt,
+    EpisodeAttributes,
+    EpisodeClicks,
+    ObjectClick,
+    SceneObject,
+    SceneObjects,
+    StoredAnchor,
+    matrix_rows,
+)
+from dextouch.streams import StreamDescriptor
+from services.twin.bounding_boxes import object_boxes_m
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+
+SIDES_PX: Final = (64, 320, 480)
+NOISE_PX: Final = (0, 1, 2, 3)
+CAMERA: Final = "camera_head"
+# Of every object of a take.
+NUM_DRAWS: Final = 25
+# Sides of a box that differ by less look alike: such an object gets one click.
+_ALIKE: Final = 0.2
+_CENTRED_M: Final = 1e-3
+# Second clicks lie this far out on the way to the end of the box.
+_SHARE_OUT: Final = 0.8
+
+
+@dataclass(frozen=True)
+class ClickErrors:
+    """Errors of positions and headings, and the standard deviation that was stated for them.
+
+    `refused` is the share of second clicks that were too near the first.
+    """
+
+    off_mm: Float64[np.ndarray, " n"]
+    turned_deg: Float64[np.ndarray, " m"]
+    told_mm: Float64[np.ndarray, " n"]
+    refused: float
+
+    def off(self, share: float) -> float:
+        """Quantile of the position error in mm."""
+        return float(np.quantile(self.off_mm, share))
+
+    def turned(self, share: float) -> float:
+        """Quantile of the heading error in degrees."""
+        return float(np.quantile(self.turned_deg, share))
+
+    def told(self, share: float) -> float:
+        """Quantile of the stated standard deviation in mm, on each axis of the table."""
+        return float(np.quantile(self.told_mm, share))
+
+
+@dataclass(frozen=True)
+class _Start:
+    """The first step of a take: its objects with their true poses, and the head camera."""
+
+    task: str
+    objects: tuple[SceneObject, ...]
+    Ts_world_object: Float64[np.ndarray, "objects 4 4"]
+    T_world_camera: Float64[np.ndarray, "4 4"]
+    focal_of_side: float
+
+    def about(self, side_px: int) -> EpisodeAttributes:
+        """An episode with square images of a size."""
+        camera = StreamDescriptor(
+            name=CAMERA, kind="image", shape=(side_px, side_px, 3), dtype="uint8", unit="rgb8",
+            nominal_rate_hz=15,
+        )  # fmt: skip
+        still = matrix_rows(np.eye(4))
+        return EpisodeAttributes(
+            episode_id="clicked",
+            task=self.task,
+            instruction="",
+            domain="robot",
+            origin="twin",
+            anchor=StoredAnchor(
+                T_world_wrist_left=still,
+                T_world_wrist_right=still,
+                T_world_camera_head=matrix_rows(self.T_world_camera),
+            ),
+            K_head=matrix_rows(self.camera(side_px)),
+            streams=(camera,),
+        )
+
+    def camera(self, side_px: int) -> Float64[np.ndarray, "3 3"]:
+        """The camera matrix of images of a size."""
+        fovy_rad = 2 * np.arctan(0.5 / self.focal_of_side)
+        return pinhole_matrix(width_px=side_px, height_px=side_px, fovy_rad=fovy_rad)
+
+
+def click_errors(tasks: Sequence[str], seeds: Iterable[int]) -> dict[tuple[int, int], ClickErrors]:
+    """Errors by side of the image and standard deviation of clicks on each of its axes (px).
+
+    The middle of the top of every object's box is clicked, and a place farther along its longer
+    side, with normal noise. Without noise, what is left is the error of the stated heights.
+    """
+    starts = [start for task in tasks for start in _starts(task, seeds)]
+    return {
+        (side_px, noise_px): _errors(starts, side_px, noise_px)
+        for side_px in SIDES_PX
+        for noise_px in NOISE_PX
+    }
+
+
+def _starts(task: str, seeds: Iterable[int]) -> list[_Start]:
+    stage = Stage(task, "robot", TwinSettings())
+    simulation = stage.simulation
+    boxes_m = object_boxes_m(simulation.scene)
+    starts = []
+    for seed in seeds:
+        stage.start(stage.plan(seed))
+        Ts = transform_from_pose(simulation.object_poses())
+        listed = zip(simulation.scene.object_names, boxes_m, Ts, strict=True)
+        objects = tuple(_described(name, box_m, T) for name, box_m, T in listed)
+        K = stage.rig.K[CAMERA]
+        T_camera = stage.rig.pose(simulation, CAMERA)
+        starts.append(_Start(task, objects, Ts, T_camera, K[1, 1] / (2 * K[1, 2])))
+    return starts
+
+
+def _described(
+    name: str, box_m: Float64[np.ndarray, "6"], T: Float64[np.ndarray, "4 4"]
+) -> SceneObject:
+    """An object as a person would describe it who sees how it stands."""
+    up = int(np.argmax(np.abs(T[2, :3])))
+    sign = 1.0 if T[2, up] > 0 else -1.0
+    others = [axis for axis in range(3) if axis != up]
+    ahead = max(others, key=lambda axis: box_m[3 + axis])
+    short, long = sorted(box_m[3 + axis] for axis in others)
+    is_centred = max(abs(box_m[axis]) for axis in others) < _CENTRED_M
+    base_m = T[2, 3] + sign * box_m[up] - box_m[3 + up]
+    click = ClickedAt.model_validate(
+        {
+            "up": ("" if sign > 0 else "-") + "xyz"[up],
+            "heading": "xyz"[ahead],
+            "symmetric": is_centred and short > (1 - _ALIKE) * long,
+            "base_m": round(float(base_m), 3),
+        }
+    )
+    x, y, z, half_x, half_y, half_z = box_m.tolist()
+    return SceneObject(name=name, box_m=(x, y, z, half_x, half_y, half_z), click=click)
+
+
+def _errors(starts: Sequence[_Start], side_px: int, noise_px: int) -> ClickErrors:
+    draw = np.random.default_rng([side_px, noise_px])
+    off, turned, told, num_refused = [], [], [], 0
+    for start in starts:
+        about, K = start.about(side_px), start.camera(side_px)
+        objects = SceneObjects(tasks={start.task: start.objects})
+        for index, (one, true) in enumerate(zip(start.objects, start.Ts_world_object, strict=True)):
+            exact_px = _places_px(one, start, K, true)
+            for _ in range(NUM_DRAWS):
+                noisy = (exact_px + noise_px * draw.normal(size=(2, 2))).clip(0, side_px)
+                point_px, heading_px = ((u, v) for u, v in noisy.tolist())
+                click = ObjectClick(
+                    point_px=point_px, heading_px=None if one.click.symmetric else heading_px
+                )
+                try:
+                    found = clicked_poses(about, objects, EpisodeClicks(objects={one.name: click}))
+                except InvalidInputError:
+                    num_refused += 1
+                    continue
+                T = transform_from_pose(found.poses[index])
+                off.append(1e3 * float(np.linalg.norm(T[:3, 3] - true[:3, 3])))
+                told.append(1e3 * float(found.sd_m[index]))
+                if not one.click.symmetric:
+                    axis = "xyz".index(one.click.heading)
+                    cosine = float(T[:3, axis] @ true[:3, axis])
+                    turned.append(float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))))
+    share = num_refused / (num_refused + len(off))
+    return ClickErrors(np.array(off), np.array(turned), np.array(told), share)
+
+
+def _places_px(
+    one: SceneObject, start: _Start, K: Float64[np.ndarray, "3 3"], T: Float64[np.ndarray, "4 4"]
+) -> Float64[np.ndarray, "2 2"]:
+    """Where the middle of the top of a box is seen, and a place farther along its longer side."""
+    box_m = np.array(one.box_m)
+    up, ahead = ("xyz".index(name[-1]) for name in (one.click.up, one.click.heading))
+    top_m = box_m[:3].copy()
+    top_m[up] += box_m[3 + up] * (-1 if one.click.up[0] == "-" else 1)
+    farther_m = top_m.copy()
+    farther_m[ahead] += _SHARE_OUT * box_m[3 + ahead]
+    points_m = apply(invert(start.T_world_camera) @ T, np.stack([top_m, farther_m]))
+    return project(K, points_m)[0]

@@ -1,0 +1,125 @@
+"""Cameras with lens distortion: pixels of points, and the points of a level plane at pixels.
+
+`K` and `distortion` (k1 k2 p1 p2 k3) are those of OpenCV's model, which calibration estimates; the
+first pixel spans 0 … 1. Images are stored as the camera took them, never undistorted.
+"""
+
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from dextouch.geometry.transforms import apply, invert
+
+# Newton's method doubles the digits each time; far from the middle of a strong lens it needs more.
+_MAX_ITERATIONS: Final = 50
+_TOLERANCE: Final = 1e-11
+# What is farther off after all of them is an image of no point; far below a hundredth of a pixel.
+_WRONG: Final = 1e-6
+# Points nearer to the camera are not in front of it.
+_LEAST_DEPTH_M: Final = 0.01
+
+
+def lens_pixels(
+    K: np.ndarray, distortion: np.ndarray, points_camera: np.ndarray
+) -> tuple[Float64[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+    """Pixels [n, 2] of points [n, 3] in metres, and whether each lies in front of the camera.
+
+    Points nearer than 1 cm are projected as if at that depth and marked False.
+    """
+    points = np.asarray(points_camera, dtype=np.float64)
+    depth = np.maximum(points[..., 2:], _LEAST_DEPTH_M)
+    seen, _ = _distorted(points[..., :2] / depth, distortion)
+    return seen * K[[0, 1], [0, 1]] + K[:2, 2], points[..., 2] >= _LEAST_DEPTH_M
+
+
+def points_on_level(
+    pixels: np.ndarray,
+    camera: tuple[np.ndarray, np.ndarray],
+    T_world_camera: np.ndarray,
+    z_m: float,
+) -> tuple[Float64[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Points [n, 3] of the plane of a height that a camera shows at pixels [n, 2].
+
+    Args:
+        pixels: where to look.
+        camera: K [3, 3] in pixels, and the distortion [5].
+        T_world_camera: pose of the camera (optical frame: x right, y down, z forward).
+        z_m: height of the plane in the world.
+
+    Returns:
+        The points, and whether the ray of each pixel meets the plane in front of the camera; rays
+        that do not, or that the lens maps nowhere, have NaN.
+    """
+    K, distortion = camera
+    seen = (np.asarray(pixels, dtype=np.float64) - K[:2, 2]) / K[[0, 1], [0, 1]]
+    flat, is_mapped = _undistorted(seen, distortion)
+    rays = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1) @ T_world_camera[:3, :3].T
+    centre = T_world_camera[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth_m = (z_m - centre[2]) / rays[..., 2]
+        points = centre + depth_m[..., None] * rays
+    hits = is_mapped & (depth_m >= _LEAST_DEPTH_M) & np.isfinite(depth_m)
+    return np.where(hits[..., None], points, np.nan), hits
+
+
+def box_pixels(
+    box_m: np.ndarray,
+    T_world_object: np.ndarray,
+    camera: tuple[np.ndarray, np.ndarray],
+    T_world_camera: np.ndarray,
+) -> Float64[np.ndarray, "8 2"]:
+    """Pixels of the corners of a box (centre, half sizes in the object's frame).
+
+    Corner number i has the upper x, y, z where bit 0, 1, 2 of i is set. Corners behind the camera
+    have NaN.
+    """
+    box = np.asarray(box_m, dtype=np.float64)
+    signs = np.array([[1 if index >> axis & 1 else -1 for axis in range(3)] for index in range(8)])
+    corners_m = apply(invert(T_world_camera) @ T_world_object, box[:3] + signs * box[3:])
+    pixels, in_front = lens_pixels(*camera, corners_m)
+    return np.where(in_front[:, None], pixels, np.nan)
+
+
+def _distorted(
+    flat: Float64[np.ndarray, "n 2"], distortion: np.ndarray
+) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2 2"]]:
+    """Where a lens shows points at depth 1, and the derivatives of that."""
+    k1, k2, p1, p2, k3 = np.asarray(distortion, dtype=np.float64).ravel()
+    x, y = flat[..., 0], flat[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+    seen = np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+        ],
+        axis=-1,
+    )
+    mixed = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    rows = [
+        np.stack([radial + x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed], axis=-1),
+        np.stack([mixed, radial + y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1),
+    ]
+    return seen, np.stack(rows, axis=-2)
+
+
+def _undistorted(
+    seen: Float64[np.ndarray, "n 2"], distortion: np.ndarray
+) -> tuple[Float64[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+    """Inverse of `_distorted` by Newton's method, and where there is one."""
+    flat = seen
+    with np.errstate(all="ignore"):
+        for _ in range(_MAX_ITERATIONS):
+            shown, slopes = _distorted(flat, distortion)
+            off = shown - seen
+            if np.abs(off).max(initial=0.0) < _TOLERANCE:
+                break
+            (a, b), (_, d) = np.moveaxis(slopes, (-2, -1), (0, 1))
+            step = np.stack([d * off[..., 0] - b * off[..., 1], a * off[..., 1] - b * off[..., 0]])
+            flat = flat - np.moveaxis(step / (a * d - b * b), 0, -1)
+        shown, slopes = _distorted(flat, distortion)
+        # Beyond the angle at which the lens turns back, other points have the same image.
+        is_first = (slopes[..., 0, 0] > 0) & (np.linalg.det(slopes) > 0)
+        return flat, is_first & (np.abs(shown - seen).max(axis=-1) < _WRONG)
