@@ -70,6 +70,7 @@ SCREENS: Final = (
         within="Episodes",
         help="playing-an-episode",
     ),
+    Screen("/objects", "objects.html", "Mark objects", within="Episodes", help="mark-objects"),
     Screen("/review", "review.html", "Review", help="review"),
     Screen("/hours", "hours.html", "Hours", help="hours"),
     Screen("/calibration", "calibration.html", "Calibration", help="calibration"),

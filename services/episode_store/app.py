@@ -10,8 +10,10 @@ from fastapi import FastAPI
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.care import DeletionRecords
 from dextouch.errors import StorageError
+from dextouch.schemas import load_object_clicks
 from dextouch.serving import ServedFolder, create_service_app, serve
 from services.episode_store.catalog import Catalog
+from services.episode_store.clicking import clicks_router
 from services.episode_store.deletions import DeletionWatch, deletions_router
 from services.episode_store.enrolment import Enrolments
 from services.episode_store.enrolment_routes import enrolment_router
@@ -37,6 +39,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     """Create the application of one store; recovers data of crashed writers at startup."""
     store = EpisodeStore(settings.store_url)
     catalog = Catalog(store)
+    objects = None if settings.objects is None else load_object_clicks(settings.objects)
     ingest = Ingest(store, settings)
     limits = StorageLimits(ingest.folder, settings, recordings=catalog.bytes_by_station)
     admission = Admission(
@@ -67,6 +70,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
             idle_uploads_router(ingest, limits),
             catalog_router(catalog, max_page=settings.max_page),
             reviews_router(catalog),
+            clicks_router(store, catalog, objects),
             content_router(store, settings),
             playback_router(store, settings),
             trash_router(store, max_page=settings.max_page),

@@ -7,6 +7,7 @@ import time
 from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from typing import Any, Generic
@@ -20,6 +21,7 @@ from dextouch.episodes import (
     Kind,
     RecordingReader,
     disk_errors,
+    has_object_poses,
 )
 from dextouch.errors import NotFoundError, StorageError
 from dextouch.schemas import (
@@ -29,6 +31,7 @@ from dextouch.schemas import (
     CatalogValues,
     ComparedGroups,
     EpisodeAttributes,
+    EpisodeClicks,
     EpisodeList,
     EpisodeSummary,
     HoursByField,
@@ -255,6 +258,22 @@ class Catalog:
         self._store.set_review(item.id, review, kind=item.kind)
         (self._episodes if item.kind == "episode" else self._recordings).forget(item.id)
 
+    def clickable(self) -> dict[str, Entry[Any]]:
+        """Episodes by id that training would take if their objects were clicked."""
+        entries = self._items.entries(
+            "episode", self._recordings.entries(), self._episodes.entries()
+        )
+        return {
+            one.item.id: one
+            for one in entries.values()
+            if one.is_clickable and not (one.item.review and one.item.review.verdict == "rejected")
+        }
+
+    def set_clicks(self, episode_id: str, clicks: EpisodeClicks | None) -> None:
+        """Keep the clicks on the objects of an episode; raises as `review`."""
+        self._store.set_clicks(episode_id, clicks)
+        self._episodes.forget(episode_id)
+
     def hours(self, wanted: EpisodeFilter) -> CatalogHours:
         """Total duration of matching episodes by task, domain and origin."""
         return hours_of(_matching(self._episodes.entries(), wanted).values())
@@ -287,7 +306,12 @@ class Catalog:
             created_at=attributes.created_at,
             **_shared_fields(reader),
         )
-        return self._entry(reader, summary, attributes.created_at)
+        entry = self._entry(reader, summary, attributes.created_at)
+        is_judged = attributes.success is not None and not attributes.recovered
+        if attributes.origin != "recorded" or not is_judged or has_object_poses(reader):
+            return entry
+        is_clickable = num_steps > 0 and "camera_head" in reader.streams
+        return replace(entry, is_clickable=is_clickable, clicks=self._store.clicks(episode_id))
 
     def _recording(self, recording_id: str) -> Entry[RecordingSummary]:
         reader = self._store.recording(recording_id)

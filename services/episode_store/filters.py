@@ -14,6 +14,7 @@ from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
     CatalogItem,
     Domain,
+    EpisodeClicks,
     EpisodeSummary,
     LineageEntry,
     Origin,
@@ -43,7 +44,8 @@ _SUCCESS: dict[Outcome, bool | None] = {"success": True, "failure": False, "not_
 class Entry(Generic[S]):
     """A row of the catalog in both forms, with further properties to filter by.
 
-    `text` is in lower case.
+    `text` is in lower case. `is_clickable` marks episodes whose objects no stream knows, and
+    `clicks` are those on them.
     """
 
     summary: S
@@ -52,6 +54,8 @@ class Entry(Generic[S]):
     created_at: datetime | None
     lineage: tuple[LineageEntry, ...] = ()
     text: str = ""
+    is_clickable: bool = False
+    clicks: EpisodeClicks | None = None
 
 
 def quality_bound(text: str) -> tuple[str, float]:

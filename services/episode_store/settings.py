@@ -23,6 +23,11 @@ class EpisodeStoreSettings(ServiceSettings):
     store_url: str = Field(
         default_factory=default_store, min_length=1, description="folder, file:///… or s3://…"
     )
+    objects: Path | None = Field(
+        default=None,
+        description="JSON file of the tasks' objects, which are clicked in first images "
+        "(docs/objects.md)",
+    )
     enrolments: Path | None = Field(
         default=None,
         description="file of the enrolled stations, with hashes of their keys (default: "

@@ -1,5 +1,6 @@
 """A whole platform with content, for tests and pictures of all screens of the dashboard."""
 
+import json
 import time
 from datetime import UTC, datetime, timedelta
 
@@ -36,6 +37,15 @@ INSTRUCTIONS = {
     "stand_bottle": "Stand the bottle up.",
     "fold_towel": "Fold the towel twice, with its edges on each other.",
     "plug_charger": "Plug the charger into the left socket of the power strip, without looking.",
+}
+BOX_M = [0, 0, 0, 0.03, 0.03, 0.1]
+OBJECTS = {
+    "tasks": {
+        "stand_bottle": [
+            {"name": "bottle", "box_m": BOX_M, "click": {"up": "x", "heading": "z"}},
+            {"name": "mat", "box_m": BOX_M, "click": {"symmetric": True}},
+        ]
+    }
 }
 STREAMS = {
     "desk_1": ("tactile_left", "tactile_right", "keypoints_left", "wrist_left", "camera_head"),
@@ -91,10 +101,12 @@ def serve_stations(station_process):
 
 def serve_store(serve, folder):
     write_store(folder / "store")
+    (folder / "objects.json").write_text(json.dumps(OBJECTS))
+    settings = EpisodeStoreSettings(
+        store_url=str(folder / "store"), objects=folder / "objects.json"
+    )
     return {
-        "episode_store_url": serve(
-            create_store(EpisodeStoreSettings(store_url=str(folder / "store")))
-        ),
+        "episode_store_url": serve(create_store(settings)),
         "goal_hours": {"stand_bottle": 0.02, "fold_towel": 0.01},
     }
 

@@ -207,7 +207,7 @@ class ObjectClick(FrozenModel):
 class EpisodeClicks(FrozenModel):
     """Clicks on the objects of one episode, by their names."""
 
-    objects: dict[ObjectName, ObjectClick] = Field(min_length=1, max_length=MAX_OBJECTS)
+    objects: dict[ObjectName, ObjectClick] = Field(max_length=MAX_OBJECTS)
 
 
 class ObjectClicks(SceneObjects):

@@ -57,6 +57,16 @@ async def test_reviews_are_forwarded(client, services):
     assert answer.status_code == 413
 
 
+async def test_clicks_are_forwarded(client, services):
+    body = {"objects": {"cup": {"state": "hidden"}}}
+    await client.post("/v1/episode_store/episodes/take-1/clicks", json=body)
+    assert services.asked == ["/v1/episodes/take-1/clicks"]
+    answer = await client.post(
+        "/v1/episode_store/episodes/take-1/clicks", json={"objects": {"cup": "x" * 20_000}}
+    )
+    assert answer.status_code == 413
+
+
 async def test_names_in_paths_stay_one_part(client, services):
     await client.get("/v1/episode_store/episodes/a%3Fb%23c")
     assert services.asked[-1] == "/v1/episodes/a%3Fb%23c"

@@ -21,6 +21,7 @@ KEY = "a-key-of-some-length"
     [
         ("/", "/static/main.js"),
         ("/episodes", "/static/catalog/episodes.js"),
+        ("/objects", "/static/marking/objects.js"),
         ("/review", "/static/catalog/review.js"),
         ("/hours", "/static/catalog/hours.js"),
     ],

@@ -213,7 +213,6 @@ def test_clicks_are_kept_beside_the_content(store):
     [
         ({"version": 2}, "version"),
         ({"episodes": {"../take": {"objects": {"cup": {"state": "hidden"}}}}}, "episodes"),
-        ({"episodes": {"take": {"objects": {}}}}, "objects"),
         ({"episodes": {"take": {"objects": {"cup": {}}}}}, "point_px"),
         ({"episodes": {"take": {"objects": {"cup": {"point_px": [1, 2, 3]}}}}}, "point_px"),
         ({"episodes": {"a": {"objects": {"cup": {"state": "absent", "point_px": [1, 2]}}}}}, "cup"),

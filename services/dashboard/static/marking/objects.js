@@ -1,0 +1,203 @@
+// Mark objects: the first images of a task's episodes one after the other, each click saved at once.
+
+import { get, post } from "../catalog/api.js";
+import { element, setText } from "../dom.js";
+import { unpack } from "../packed.js";
+import { ask, pagePath } from "../session.js";
+import { startTheme } from "../theme.js";
+import { counts, isDone, nextEpisode, nextOpen, stateOf, withClick, withState } from "./clicks.js";
+import { Stage } from "./stage.js";
+
+const STORE = "/v1/episode_store";
+const ACTIVE = "#ffd24a";
+const OTHER = "#7ddba6";
+const find = (id) => document.getElementById(id);
+const task = find("task");
+const state = { objects: [], episodes: [], current: 0, active: 0, history: [] };
+let saving = Promise.resolve();
+let pending = 0;
+let asked = 0;
+
+const stage = new Stage(find("image"), (pixel) => change((object, clicks) => withClick(object, clicks, pixel)));
+const episode = () => state.episodes[state.current];
+const clicksOf = (one) => one?.clicks?.objects ?? {};
+
+function say(text, level = "") {
+  setText(find("message"), text);
+  find("message").dataset.level = level;
+}
+
+// What is shown
+
+const WORDS = {
+  open: (object) => `click ${object.click?.point_m ? "its point" : "the middle of its top"}`,
+  heading: (object) => `click farther along its ${object.click?.heading ?? "x"} axis`,
+  done: (_, click) => ({ seen: "clicked", absent: "not there", hidden: "cannot be seen" })[click.state],
+};
+
+function objectRow(object, index) {
+  const click = clicksOf(episode())[object.name];
+  const now = stateOf(object, click);
+  const button = element("button", { type: "button", "data-key": object.name, "data-state": now, "aria-pressed": index === state.active },
+    element("span", { class: "digit" }, index + 1), element("span", { class: "name" }, object.name), element("span", { class: "quiet" }, WORDS[now](object, click)));
+  button.addEventListener("click", () => choose(index));
+  return button;
+}
+
+function show() {
+  const one = episode();
+  const { done, all } = counts(state.objects, state.episodes);
+  setText(find("progress"), all ? `${done} of ${all} marked` : "");
+  find("bar").max = Math.max(all, 1);
+  find("bar").value = done;
+  setText(find("episode"), one ? `${state.current + 1}: ${one.episode_id}` : "");
+  find("player").href = one ? pagePath(`/episodes/episode/${encodeURIComponent(one.episode_id)}`) : "";
+  for (const id of ["player", "tools", "objects"]) find(id).hidden = !one;
+  find("undo").disabled = !state.history.length;
+  find("objects").replaceChildren(...(one ? state.objects.map(objectRow) : []));
+  stage.mark(state.objects.map((object, index) => ({
+    ...clicksOf(one)[object.name], label: String(index + 1), box_px: one?.boxes?.[object.name], colour: index === state.active ? ACTIVE : OTHER,
+  })));
+}
+
+function choose(index) {
+  if (!state.objects[index]) return;
+  state.active = index;
+  show();
+}
+
+// Changes are shown at once and saved one after the other; what the store refuses is taken back.
+
+function change(changed) {
+  const object = state.objects[state.active];
+  if (!object || !stage.image) return;
+  const before = clicksOf(episode());
+  const after = changed(object, before);
+  state.history.push(before);
+  if (stateOf(object, after[object.name]) === "done") state.active = nextOpen(state.objects, after, state.active);
+  save(after);
+}
+
+function undo() {
+  const before = stage.image ? state.history.pop() : null;
+  if (!before) return;
+  const now = clicksOf(episode());
+  state.active = Math.max(state.objects.findIndex(({ name }) => before[name] !== now[name]), 0);
+  save(before);
+}
+
+function save(objects) {
+  const one = episode();
+  one.clicks = { objects };
+  pending += 1;
+  say("Saving …");
+  show();
+  saving = saving.then(async () => {
+    try {
+      const kept = await post(`${STORE}/episodes/${encodeURIComponent(one.episode_id)}/clicks`, { objects });
+      Object.assign(one, { kept: objects, boxes: kept.boxes_px });
+      if (pending === 1) say(isDone(state.objects, objects) ? "Saved. Enter goes on." : "Saved.", "OK");
+    } catch (error) {
+      one.clicks = { objects: one.kept };
+      if (one === episode()) Object.assign(state, { history: [], active: nextOpen(state.objects, one.kept, 0) });
+      say(error.message, "ERROR");
+    }
+    pending -= 1;
+    show();
+  });
+}
+
+async function go(index) {
+  const number = ++asked;
+  Object.assign(state, { current: index, history: [] });
+  const one = episode();
+  stage.show(null);
+  say("");
+  state.active = one ? nextOpen(state.objects, clicksOf(one), 0) : 0;
+  show();
+  if (!one) return;
+  try {
+    await saving;
+    const id = encodeURIComponent(one.episode_id);
+    const about = await get(`${STORE}/episodes/${id}/clicks`);
+    const span = `start_ns=${about.image_t_ns}&stop_ns=${about.image_t_ns + 1}`;
+    const answer = await ask(`${STORE}/playback/episode/${id}/images/camera_head?${span}`);
+    if (!answer.ok) throw new Error(`The image of ${one.episode_id} cannot be read.`);
+    const { arrays } = unpack(await answer.arrayBuffer());
+    const image = await createImageBitmap(new Blob([arrays.data.values], { type: "image/jpeg" }), { imageOrientation: "none" });
+    if (number !== asked) return image.close();
+    Object.assign(one, { clicks: about.clicks, kept: about.clicks.objects, boxes: about.boxes_px });
+    state.active = nextOpen(state.objects, clicksOf(one), 0);
+    stage.show(image);
+    if (about.problem) say(about.problem, "ERROR");
+    show();
+  } catch (error) {
+    if (number === asked) say(error.message, "ERROR");
+  }
+}
+
+async function open(name) {
+  const query = new URLSearchParams({ limit: find("limit").value, ...(name && { task: name }) });
+  try {
+    const queue = await get(`${STORE}/catalog/clicks?${query}`);
+    task.replaceChildren(...queue.tasks.map((value) => element("option", { value }, value)));
+    task.value = queue.task;
+    Object.assign(state, { objects: queue.objects, episodes: queue.episodes });
+    const more = queue.num_matching - queue.episodes.length;
+    setText(find("more"), more > 0 ? `${more} more could be marked; 10 to 30 are enough to begin with.` : "");
+    find("empty").hidden = queue.episodes.length > 0;
+    find("list_error").hidden = true;
+  } catch (error) {
+    find("list_error").hidden = false;
+    setText(find("list_error"), error.message);
+    Object.assign(state, { objects: [], episodes: [] });
+  }
+  const first = state.episodes.findIndex((one) => !isDone(state.objects, clicksOf(one)));
+  await go(Math.max(first, 0));
+}
+
+function reopen() {
+  history.replaceState(null, "", pagePath(`${location.pathname}?${new URLSearchParams({ task: task.value, limit: find("limit").value })}`));
+  open(task.value);
+}
+
+// Keys and buttons
+
+const ACTIONS = {
+  next: () => go(nextEpisode(state.objects, state.episodes, state.current)),
+  previous: () => state.episodes.length && go((state.current + state.episodes.length - 1) % state.episodes.length),
+  undo,
+  absent: () => change((object, clicks) => withState(object, clicks, "absent")),
+  hidden: () => change((object, clicks) => withState(object, clicks, "hidden")),
+  zoom_in: () => stage.zoomBy(1.5),
+  zoom_out: () => stage.zoomBy(1 / 1.5),
+  whole: () => stage.zoomBy(0),
+};
+const KEYS = { Enter: "next", Backspace: "undo", a: "absent", h: "hidden", "+": "zoom_in", "-": "zoom_out", 0: "whole" };
+
+for (const [name, act] of Object.entries(ACTIONS)) {
+  find(name).addEventListener("click", ({ detail, currentTarget }) => {
+    // After a click of the mouse, Enter goes on; after a key it presses the button again.
+    if (detail) currentTarget.blur();
+    act();
+  });
+}
+document.addEventListener("keydown", (event) => {
+  const isOfButton = event.target.matches("button") && ["Enter", " "].includes(event.key);
+  if (isOfButton || event.target.matches("input, select, a") || event.ctrlKey || event.metaKey || event.altKey) return;
+  const name = event.key === "Enter" && event.shiftKey ? "previous" : KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+  const digit = Number(event.key);
+  if (!name && !(digit >= 1)) return;
+  event.preventDefault();
+  if (name) ACTIONS[name]();
+  else choose(digit - 1);
+});
+task.addEventListener("change", reopen);
+find("limit").addEventListener("change", reopen);
+// A click that is still on its way is not lost.
+window.addEventListener("beforeunload", (event) => { if (pending) event.preventDefault(); });
+
+startTheme(find("theme"), () => {});
+const given = new URLSearchParams(location.search);
+if (given.get("limit")) find("limit").value = given.get("limit");
+await open(given.get("task") ?? "");
