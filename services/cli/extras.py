@@ -4,9 +4,9 @@ from dextouch.errors import DexTouchError, UnavailableError
 
 # Import names; if several extras provide a package, the most relevant one has it.
 _PACKAGES = {
-    "store": "zarr zstandard google_crc32c av",
+    "store": "zarr zstandard google_crc32c av structlog",
     "station": "serial fastcrc hid usb cv2",
-    "serve": "fastapi uvicorn httptools rich redis httpx pydantic_settings structlog "
+    "serve": "fastapi uvicorn httptools rich redis httpx pydantic_settings "
     "prometheus_client jinja2 websockets shtab",
     "align": "scipy numba",
     "model": "torch safetensors PIL",

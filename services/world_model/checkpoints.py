@@ -35,10 +35,10 @@ _TEXT: Final = "text_features."
 class TrainingSet(FrozenModel):
     """Episodes of one domain that a model was trained on, or that it was evaluated on (held out).
 
-    `tasks` has the number of episodes of each task, `data_hash` is `combined_hash` of their
-    content. `window_share` is the share of windows from the set, None where it follows from the
-    number of episodes. `checkpoint` is the digest of the ancestor that was trained on the set, None
-    for the checkpoint's own training.
+    `tasks` has the number of episodes of each task, `data_hash` is that of the episodes
+    (`dextouch.episodes`). `window_share` is the share of windows from the set, None where it
+    follows from the number of episodes. `checkpoint` is the digest of the ancestor that was trained
+    on the set, None for the checkpoint's own training.
     """
 
     domain: Domain

@@ -39,7 +39,7 @@ def test_malformed_words_are_refused(wrong, capsys):
 
 def test_a_store_without_takes_is_refused(tmp_path, capsys):
     EpisodeStore(tmp_path)
-    with pytest.raises(NotFoundError, match="has no episode"):
+    with pytest.raises(NotFoundError, match=r"store 1 of 1, .* has none"):
         evaluate_recorded.main(["--episodes", str(tmp_path)])
     assert main.main(["evaluate", "recorded", "--episodes", str(tmp_path)]) == 3
-    assert "has no episode" in capsys.readouterr().err
+    assert "has none; check its path" in capsys.readouterr().err
