@@ -5,7 +5,7 @@ from collections.abc import Collection, Sequence
 from typing import Final, TypeVar
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float64
 
 from dextouch.episodes import (
     HEAD_CAMERA,
@@ -14,7 +14,6 @@ from dextouch.episodes import (
     EpisodeStore,
     Split,
     needs,
-    object_track,
     select_episodes,
 )
 from dextouch.errors import InvalidInputError
@@ -59,7 +58,7 @@ def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> Episo
     if grid.action_kind == "commanded":
         actions["commanded"] = reader.actions(0, len(grid), kind="commanded")
     tactile_kpa, tactile_valid = grid.touch()
-    poses, boxes_m = objects_of(grid, grid.t_ref_ns) or (None, None)
+    poses, boxes_m = grid.boxed_objects(grid.t_ref_ns) or (None, None)
     return EpisodeArrays(
         episode_id=about.episode_id,
         task=about.task,
@@ -77,17 +76,6 @@ def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> Episo
         object_poses=poses,
         boxes_m=boxes_m,
     )
-
-
-def objects_of(
-    grid: EpisodeGrid, t_ref_ns: Int64[np.ndarray, " steps"]
-) -> tuple[Float32[np.ndarray, "steps objects 7"], Float64[np.ndarray, "objects 6"]] | None:
-    """Poses of an episode's objects at given times and their boxes; None where unknown."""
-    track = object_track(grid.reader, t_ref_ns)
-    # What is not known is not stated: a window's first step needs all of its objects.
-    if track is None or not len(grid.boxes_m) or not track.known.all():
-        return None
-    return track.poses, grid.boxes_m
 
 
 def subset_by_hash(episodes: Sequence[E], count: int | None, *, what: str) -> list[E]:

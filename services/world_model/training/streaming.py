@@ -29,7 +29,6 @@ from services.world_model.training.dataset import (
 )
 from services.world_model.training.episodes import (
     CUT,
-    objects_of,
     read_episode,
 )
 
@@ -87,7 +86,7 @@ class StoredEpisode:
             anchor = poses_from_actions(actions[:1], anchor).anchor(0)
             actions = reanchor(actions, 0)
         images = grid.images(range(place.start, place.start + place.num_steps))
-        known = objects_of(grid, read.t_ref_ns[:1])
+        known = grid.boxed_objects(read.t_ref_ns[:1])
         objects = None if known is None else SeenObjects(known[0][0].astype(np.float64), known[1])
         request = PredictionRequest(
             first_image=images[0],

@@ -330,3 +330,12 @@ class EpisodeGrid:
     def boxes_m(self) -> Float64[np.ndarray, "objects 6"]:
         """Boxes of the objects in their own frames, middle and half sizes; none if unknown."""
         return np.array(self.about.object_boxes_m, dtype=np.float64).reshape(-1, 6)
+
+    def boxed_objects(
+        self, t_ref_ns: Int64[np.ndarray, " n"]
+    ) -> tuple[Float32[np.ndarray, "n objects 7"], Float64[np.ndarray, "objects 6"]] | None:
+        """Poses of the objects at given times, and their boxes; None unless all are known."""
+        track = object_track(self.reader, t_ref_ns)
+        if track is None or not len(self.boxes_m) or not track.known.all():
+            return None
+        return track.poses, self.boxes_m
