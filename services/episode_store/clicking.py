@@ -55,7 +55,7 @@ class ClickedEpisode(FrozenModel):
 
 def clicks_router(store: EpisodeStore, catalog: Catalog, objects: ObjectClicks | None) -> APIRouter:
     """Create the routes of clicks; without a description of the objects they are refused."""
-    router = APIRouter(prefix="/v1", tags=["clicks"])
+    router = APIRouter(prefix="/v1", tags=["clicks"], responses={404: {}})
 
     def described() -> ObjectClicks:
         if objects is None:
