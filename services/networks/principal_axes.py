@@ -1,5 +1,6 @@
 """Principal axes from second moments: an orthonormal basis with fixed signs, and its scales."""
 
+import numpy as np
 import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
@@ -14,9 +15,9 @@ def principal_axes(
     """Strongest eigenvectors, strongest first, and the root mean square along each.
 
     Each vector's largest entry is made positive, so that equal data give an equal basis.
-
     """
-    values, vectors = torch.linalg.eigh(second_moment)
+    # Of data that touch few taxels, whose other rows are zero, torch's solver (MKL) can fail.
+    values, vectors = map(torch.from_numpy, np.linalg.eigh(second_moment.numpy()))
     basis = vectors[:, -num_channels:].flip(1)
     largest = basis.abs().argmax(dim=0)
     signs = torch.sign(basis[largest, torch.arange(num_channels)])
