@@ -93,8 +93,8 @@ reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's st
 	$(BIN)/dextouch train data --store $(MADE)/judge --first 1000 --count 250 --images 4 --varied 0.7 --resized 0.4
 	$(BIN)/dextouch train data --store $(MADE)/kinds --mix development --first 21000 --count 180 --images 4 --resized 0.4
 	$(BIN)/dextouch train data --store $(MADE)/development --mix ladder --first 20000 --count 144 --images 4
-	$(BIN)/dextouch train state --episodes $(MADE)/train --output $(MADE)/cores.safetensors --jobs 3
-	$(BIN)/dextouch train state --base $(MADE)/cores.safetensors --keep-readers --episodes $(MADE)/judge \
+	$(BIN)/dextouch train world-model --episodes $(MADE)/train --output $(MADE)/cores.safetensors --jobs 3
+	$(BIN)/dextouch train world-model --init $(MADE)/cores.safetensors --learn success --episodes $(MADE)/judge \
 		--core.num-steps 1200 --output $(MADE)/state.safetensors
 	$(BIN)/dextouch train imagined --episodes $(MADE)/judge --store $(MADE)/imagined \
 		--checkpoint $(MADE)/state.safetensors
@@ -104,7 +104,7 @@ reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's st
 		--checkpoint $(MADE)/state.safetensors
 	$(BIN)/dextouch train imagined --episodes $(MADE)/kinds --store $(MADE)/imagined_development \
 		--checkpoint $(MADE)/state.safetensors
-	$(BIN)/dextouch train probe --episodes $(MADE)/train --episodes $(MADE)/judge --episodes $(MADE)/imagined \
+	$(BIN)/dextouch train judge --episodes $(MADE)/train --episodes $(MADE)/judge --episodes $(MADE)/imagined \
 		--development $(MADE)/development --development $(MADE)/kinds --development $(MADE)/imagined_development \
 		--output $(MADE)/success_probe.safetensors --training.num-training-steps 1500 --training.held-out-share 0.1
 	$(BIN)/dextouch train data --store $(MADE)/exact --mix exact --first 700 --count 50 --images 8

@@ -47,12 +47,13 @@ GENERATED: Final = ("Real", "Half", *(f"+{world}" for world in ADAPTED))
 BASES: Final[dict[Table, str]] = {
     "options": "default",
     "design": "Robot-only",
+    "scaling": "0",
     "evaluator": "WM-Robot",
 }
 # Predictions that hardly depend on the model, measured beside the first seed of these columns.
 REFERENCES: Final = ("copy", "warp", "zero", "codec", "true_images")
 OTHER_ACTIONS: Final = "other_take"
-# Half of the windows of a model with human data are the robot's: without human data, it has seen
+# Half of the examples of a model with human data are the robot's: without human data, it has seen
 # as many of them after half the training.
 HALF_TRAINING: Final = "0, half as long"
 # Windows of held-out episodes for the short measurement at the end of a training: every n-th.
@@ -60,9 +61,22 @@ _SHORT_EVALUATION: Final = "--evaluation-stride 40"
 _CANS: Final = "lift_full_can,lift_empty_can,move_can_left,move_can_right"
 _FIRST_HELDOUT_SEED: Final = 60_000
 _FIRST_STUDY_SEED: Final = 70_000
-# Stands in for one of the paper's three policies, beside a cloned one and the same early in
-# training.
-_SCRIPT_POLICY: Final = "script 15 mm"
+# Policies beside a cloned one and the same early in training: demonstrators with an error of
+# position, and with mistakes of kinds that no data of these experiments have.
+SCRIPTS: Final = (
+    "script 0 mm",
+    "script 10 mm",
+    "script 20 mm",
+    "script 40 mm",
+    "gain 0.5",
+    "short 0.5",
+    "roll 0.5",
+    "shake 0.5",
+    "side_approach 0.4",
+)
+# Whole rollouts from their first step, whose images are those at the ends of chunks.
+_STATE_METRICS: Final = "psnr,tactile_mse,contact_iou,contact_f1,pad_contact_f1,object_error"
+STATE_REFERENCES: Final = ("copy", OTHER_ACTIONS)
 _MODEL: Final = "model.safetensors"
 _POLICY: Final = "policy.safetensors"
 _EARLY_POLICY: Final = "policy_early.safetensors"
@@ -85,7 +99,11 @@ class Sizes(FrozenModel):
     tokenizer_cpu_s: int = Field(default=60, ge=1)
     train_cpu_s: int = Field(default=300, ge=1)
     option_cpu_s: int = Field(default=120, ge=1)
-    adapt_cpu_s: int = Field(default=150, ge=1)
+    reader_steps: int = Field(default=1000, ge=2)
+    core_steps: int = Field(default=1000, ge=2)
+    adapt_reader_steps: int = Field(default=1000, ge=1)
+    adapt_core_steps: int = Field(default=1000, ge=1)
+    drawing_cpu_s: int = Field(default=30, ge=1)
     policy_steps: int = Field(default=3000, ge=1)
     num_starts: int = Field(default=10, ge=1)
     num_generated: int = Field(default=100, ge=1)
@@ -101,7 +119,11 @@ QUICK: Final = Sizes(
     tokenizer_cpu_s=3,
     train_cpu_s=6,
     option_cpu_s=4,
-    adapt_cpu_s=4,
+    reader_steps=4,
+    core_steps=4,
+    adapt_reader_steps=2,
+    adapt_core_steps=2,
+    drawing_cpu_s=1,
     policy_steps=20,
     num_starts=1,
     num_generated=4,
@@ -195,18 +217,44 @@ class Experiments:
                 yield self._predicted(model, self._references("design", design, seed))
 
     def _scaling(self) -> Iterator[Step]:
-        """Models with more and more human data, beside those of the table `design` without any."""
+        """State models with more and more human data."""
         for seed in self.seeds:
-            plain = self._world_model("design/Robot-only", seed)
-            yield self._predicted(plain, self._references("design", "Robot-only", seed))
-            yield self._predicted(self._world_model(f"scaling/{folder_of(HALF_TRAINING)}", seed))
+            for column in ("0", HALF_TRAINING):
+                yield self._rolled_out(self._state_model(column, seed))
             for multiple in self.sizes.multiples:
-                yield self._predicted(self._with_human(multiple, seed))
+                yield self._rolled_out(self._with_human(multiple, seed))
 
     def _with_human(self, multiple: int, seed: int) -> Step:
         count = multiple * self.sizes.robot_per_task * len(ROBOT_PRETRAINING)
         flags = f"--human data/human/store --human-episodes {count}"
-        return self._world_model(f"scaling/{multiple}x", seed, flags, needs=(self._data["human"],))
+        return self._state_model(f"{multiple}x", seed, flags, needs=(self._data["human"],))
+
+    def _state_model(
+        self, column: str, seed: int, flags: str = "", *, needs: tuple[Step, ...] = ()
+    ) -> Step:
+        """One member of a state model, trained for as many steps in every column but one."""
+        sizes, name = self.sizes, f"scaling/{folder_of(column)}/seed-{seed}/model"
+        share = 2 if column == HALF_TRAINING else 1
+        return _step(
+            name,
+            f"train world-model --episodes data/robot/store --heldout data/robot-heldout/store "
+            f"{flags} --seed {seed} --num-members 1 --jobs 1 "
+            f"--reader.num-steps {sizes.reader_steps // share} "
+            f"--core.num-steps {sizes.core_steps // share} "
+            f"--drawing.cpu-budget-s {sizes.drawing_cpu_s} --output {name}/{_MODEL}",
+            _MODEL,
+            needs=(self._data["robot"], self._data["robot-heldout"], *needs),
+        )
+
+    def _rolled_out(self, model: Step, *, data: str = "robot") -> Step:
+        """Errors of a state model over whole rollouts of held-out episodes."""
+        return _step(
+            f"{model.name.removesuffix('model')}prediction",
+            f"evaluate prediction --checkpoint {model.name}/{_MODEL} --horizon rollouts "
+            f"--episodes data/{data}-heldout/store --metrics {_STATE_METRICS} "
+            f"--baselines {','.join(STATE_REFERENCES)}",
+            needs=(self._data[f"{data}-heldout"], model),
+        )
 
     def _world_model(
         self,
@@ -215,21 +263,18 @@ class Experiments:
         flags: str = "",
         *,
         data: str = "robot",
-        needs: tuple[Step, ...] = (),
     ) -> Step:
         """A world model of the paper's form; `column` is the folder of a table's column."""
         name = f"{column}/seed-{seed}/model"
         is_option = column.startswith("options/")
         cpu_s = self.sizes.option_cpu_s if is_option else self.sizes.train_cpu_s
-        if column.endswith(folder_of(HALF_TRAINING)):
-            cpu_s //= 2
         return _step(
             name,
-            f"train world-model {flags} --episodes data/{data}/store "
+            f"train world-model --preset tiny {flags} --episodes data/{data}/store "
             f"--heldout data/{data}-heldout/store --seed {seed} --cpu-budget-s {cpu_s} --resume "
             f"{_SHORT_EVALUATION} --output {name}/{_MODEL}",
             _MODEL,
-            needs=(self._data[data], self._data[f"{data}-heldout"], *needs),
+            needs=(self._data[data], self._data[f"{data}-heldout"]),
         )
 
     def _references(self, table: Table, column: str, seed: int) -> Sequence[str]:
@@ -272,7 +317,9 @@ class Experiments:
             name,
             f"train adapt --init {ancestor.name}/{_MODEL} --episodes data/downstream/store "
             f"--splits B,C {flags[world]} --heldout data/downstream-heldout/store --seed {seed} "
-            f"--cpu-budget-s {sizes.adapt_cpu_s} {_SHORT_EVALUATION} --output {name}/{_MODEL}",
+            f"--jobs 1 --reader.num-steps {sizes.adapt_reader_steps} "
+            f"--core.num-steps {sizes.adapt_core_steps} "
+            f"--drawing.cpu-budget-s {sizes.drawing_cpu_s} --output {name}/{_MODEL}",
             _MODEL,
             needs=(*(s for n, s in self._data.items() if n.startswith("downstream")), ancestor),
         )
@@ -294,15 +341,13 @@ class Experiments:
             for world in ADAPTED
             for seed in self.seeds
         }
-        for name, model in worlds.items():
-            world, _, seed = name.partition(" ")
-            references = self._references("evaluator", world, int(seed))
-            yield self._predicted(model, references, data="downstream")
+        for model in worlds.values():
+            yield self._rolled_out(model, data="downstream")
         cloned = self._policy("evaluator/policy", "--splits A,B --early-at 0.15", early=True)
         policies = {"cloned": _POLICY, "cloned early": _EARLY_POLICY}
         files = {name: f"{cloned.name}/{made}" for name, made in policies.items()}
-        script = f'[policies."{_SCRIPT_POLICY}"]\nscript = "{_SCRIPT_POLICY}"\n'
-        yield self._study("evaluator", worlds, files, (cloned, *worlds.values()), script)
+        scripts = "".join(f'[policies."{name}"]\nscript = "{name}"\n' for name in SCRIPTS)
+        yield self._study("evaluator", worlds, files, (cloned, *worlds.values()), scripts)
 
     def _generation(self) -> Iterator[Step]:
         """Policies from real and from generated demonstrations, and their study in the twin."""

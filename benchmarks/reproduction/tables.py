@@ -59,9 +59,16 @@ METRICS: Final = (
     ("Contact-MAE", "contact_mae", False),
     ("Contact-IoU", "contact_iou", True),
     ("Contact-F1", "contact_f1", True),
+    ("Contact-F1 of pads", "pad_contact_f1", True),
+    ("Object error", "object_error", False),
 )
 # Figures of the models with the actions of another take: what the actions matter.
-_OTHER_ACTIONS_ROWS: Final = (("PSNR", "psnr", True), ("Contact-F1", "contact_f1", True))
+_OTHER_ACTIONS_ROWS: Final = (
+    ("PSNR", "psnr", True),
+    ("Contact-F1", "contact_f1", True),
+    ("Contact-F1 of pads", "pad_contact_f1", True),
+    ("Object error", "object_error", False),
+)
 _TOKENIZER_METRICS: Final = (
     ("MSE (kPa²)", "mse_kpa2", False),
     ("MAE (kPa)", "mae_kpa", False),
@@ -240,9 +247,16 @@ def _predictions(folder: Path, experiments: Experiments, column: str) -> list[An
 
 
 def _figures(results: Iterable[Any], key: str, source: str = MODEL) -> Measured:
-    """A metric of the windows of all tasks; NaN where it is not available."""
-    found = [one["windows"]["all"].get(source, {}).get(key) for one in results]
+    """A metric of all tasks; NaN where it is not available."""
+    found = [_of_all_tasks(one).get(source, {}).get(key) for one in results]
     return Measured(tuple(math.nan if one is None else float(one) for one in found))
+
+
+def _of_all_tasks(result: Mapping[str, Any]) -> Mapping[str, Mapping[str, float | None]]:
+    """Figures of a prediction by source, of whole rollouts or of windows of one chunk."""
+    horizon = "rollouts" if "rollouts" in result else "windows"
+    found: Mapping[str, Mapping[str, float | None]] = result[horizon]["all"]
+    return found
 
 
 def _tokenizer_pages(folder: Path, experiments: Experiments) -> list[Page]:
@@ -311,13 +325,13 @@ def _instruction_pages(folder: Path, experiments: Experiments) -> list[Page]:
 def _scaling_pages(folder: Path, experiments: Experiments) -> list[Page]:
     paper = ("+10h Human", "+50h Human", "+100h Human")
     multiples = experiments.sizes.multiples
-    columns = {"0": ("design/Robot-only", "Robot-only")}
+    columns = {"0": ("scaling/0", "Robot-only")}
     columns[HALF_TRAINING] = (f"scaling/{folder_of(HALF_TRAINING)}", "")
     for index, multiple in enumerate(multiples):
         name = paper[index] if len(multiples) == len(paper) else ""
         columns[f"{multiple}x"] = (f"scaling/{multiple}x", name)
     rows = _prediction_rows(folder, experiments, columns)
-    return [Page("Human data at a fixed amount of robot data", rows, "0")]
+    return [Page("Human data at a fixed amount of robot data", rows, BASES["scaling"])]
 
 
 def _prediction_rows(
@@ -330,10 +344,11 @@ def _prediction_rows(
         return {column: _figures(results, key, source) for column, results in found.items()}
 
     first = [results[0] for results in found.values()]
-    measured = [one for one in first if REFERENCES[0] in one["windows"]["all"]][:1]
+    measured = [one for one in first if REFERENCES[0] in _of_all_tasks(one)][:1]
     rows = []
     for name, key, higher in METRICS:
-        paper = {column: PAPER["prediction"][name].get(c) for column, (_, c) in columns.items()}
+        of_paper = PAPER["prediction"].get(name, {})
+        paper = {column: of_paper.get(c) for column, (_, c) in columns.items()}
         beside = {one: _figures(measured, key, one).mean for one in REFERENCES if measured}
         rows.append(Row(name, cells(key), paper, higher, beside))
     for name, key, higher in _OTHER_ACTIONS_ROWS:
@@ -347,9 +362,11 @@ def _evaluator_pages(folder: Path, experiments: Experiments) -> list[Page]:
     adapted = {world: (f"evaluator/{world}", "") for world in ADAPTED}
     prediction = _prediction_rows(folder, experiments, adapted)
     title = "Policy evaluation"
+    success = tuple(_success_rows(report, experiments))
     return [
         Page("Adapted world models on held-out robot episodes", prediction, BASES["evaluator"]),
-        Page(f"{title}: success rates", tuple(_success_rows(report, experiments))),
+        Page(f"{title}: success rates", success),
+        Page(f"{title}: agreement of the two worlds", (_pooled_row(success),)),
         Page(
             f"{title}: agreement with the twin",
             tuple(_agreement_rows(report, experiments)),
@@ -357,6 +374,13 @@ def _evaluator_pages(folder: Path, experiments: Experiments) -> list[Page]:
         ),
         _paper_page(title, PAPER["policies"]),
     ]
+
+
+def _pooled_row(success: Sequence[Row]) -> Row:
+    """Correlation of the two worlds' success rates over all tasks and policies, by seed."""
+    rates = [np.array([row.cells[world].values for row in success]).T for world in ADAPTED]
+    pooled = tuple(float(np.corrcoef(*pair)[0, 1]) for pair in zip(*rates, strict=True))
+    return Row("Pearson over all tasks and policies", {" and ".join(ADAPTED): Measured(pooled)})
 
 
 def _success_rows(report: Mapping[str, Any], experiments: Experiments) -> Iterator[Row]:

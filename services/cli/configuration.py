@@ -48,6 +48,7 @@ SECTIONS: Final = {
     "world_model_train_tokenizer": "world_model.tokenizer_settings:TrainTokenizerCommand",
     "world_model_distill": "world_model.distillation_settings:DistillCommand",
     "world_model_adapt": "world_model.settings:AdaptCommand",
+    "world_model_adapt_state": "world_model.settings:AdaptStateCommand",
 }
 # Those of `config example` unless others are named.
 SERVICES: Final = tuple(SECTIONS)[:9]

@@ -145,7 +145,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--count", type=positive, metavar="N", help="takes a task (default: all)")
     model = "world model (default: the package's)"
     add("--checkpoint", type=Path, default=default_checkpoint(), metavar="PATH", help=model)
-    judge = "checkpoint of `dextouch train probe` (default: the package's)"
+    judge = "checkpoint of `dextouch train judge` (default: the package's)"
     add("--probe", type=Path, default=DEFAULT_PROBE, metavar="PATH", help=judge)
     own = "a policy of yours, [NAME=]MODULE:FACTORY; repeat for more"
     add("--policy", action="append", default=[], metavar="ADDRESS", help=own)

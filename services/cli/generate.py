@@ -25,7 +25,7 @@ from services.world_model.training.episodes import read_episode
 _NUM_MOMENTS = 8
 _EPILOG = """\
 example:
-  dextouch train state --episodes runs/episodes --splits B,C --output runs/robot.safetensors
+  dextouch train world-model --episodes runs/episodes --splits B,C --output runs/robot.safetensors
   dextouch generate --episodes runs/episodes --split A --checkpoint runs/robot.safetensors \\
     --store runs/generated --strips runs/generated.html
 """

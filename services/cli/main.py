@@ -57,14 +57,14 @@ COMMANDS = {
     "import": Command("read LeRobot, MCAP or UMI files into a store", "cli.exports:import_main"),
     "align": Command("convert recordings to synchronized episodes", "alignment.command_line:main"),
     "align serve": Command("serve alignment over HTTP", "alignment.app:main"),
-    "train": Command("train the world model, a policy or the success probe"),
+    "train": Command("train the world model, its judge of success, or a policy"),
     "train data": Command("record training episodes in the twin", "cli.training_data:main"),
     "train tokenizer": Command(
         "train a tactile tokenizer for the paper's form of the world model",
         "cli.train_tokenizer:main",
     ),
     "train world-model": Command(
-        "train the flow-matching world model, in the paper's form",
+        "train a world model on episodes of robots and people, of either form",
         "world_model.command_line:run_train",
     ),
     "train distill": Command(
@@ -72,12 +72,8 @@ COMMANDS = {
         "world_model.command_line:run_distill",
     ),
     "train adapt": Command(
-        "adapt a world model in the paper's form to new tasks",
+        "adapt a world model of either form to new tasks",
         "world_model.command_line:run_adapt",
-    ),
-    "train state": Command(
-        "train a state model, the default form of the world model",
-        "world_model.command_line:run_train_state",
     ),
     "train imagined": Command(
         "predict the episodes of a store with the world model", "cli.imagined_data:main"
@@ -86,8 +82,8 @@ COMMANDS = {
         "train a closed-loop policy on demonstrations",
         "evaluation.command_line:run_train_policy",
     ),
-    "train probe": Command(
-        "train the success probe on true and imagined episodes",
+    "train judge": Command(
+        "train the judge of success on true and imagined episodes",
         "evaluation.command_line:run_train_probe",
     ),
     "generate": Command(

@@ -75,7 +75,7 @@ def clicks_router(store: EpisodeStore, catalog: Catalog, objects: ObjectClicks |
 
     @router.get("/catalog/clicks/file", dependencies=[MAY_READ])
     def file() -> ObjectClicks:
-        """The described objects and all clicks in the store, for `train state --clicks`."""
+        """The described objects and all clicks in the store, for `train world-model --clicks`."""
         known = described()
         stored = {name: one.clicks for name, one in catalog.clickable().items() if one.clicks}
         return known.model_copy(update={"episodes": known.episodes | stored})

@@ -81,7 +81,7 @@ def run_train_probe(arguments: list[str]) -> int:
     if settings.base is not None:
         if settings.held_out:
             raise InvalidInputError(
-                f"train probe --base: got --held-out {','.join(settings.held_out)}, expected none: "
+                f"train judge --base: got --held-out {','.join(settings.held_out)}, expected none: "
                 "the figures of the base's weights are kept"
             )
         calibrated = calibrate_success_probe(

@@ -68,7 +68,7 @@ class Metric:
     unit: str
     better: Literal["higher", "lower"]
     about: str
-    of: Literal["images", "touch", "geometry"]
+    of: Literal["images", "touch", "geometry", "objects"]
     measure: Callable[[Pairs], float] | None
     missing: str = ""
 
@@ -107,6 +107,24 @@ def _of_geometry(function: Callable[..., float]) -> Callable[[Pairs], float]:
         )
 
     return measure
+
+
+# Objects that stay where they are say nothing of a prediction.
+_MOVED_M: Final = 0.01
+
+
+def _object_error(pairs: Pairs) -> float:
+    """Median error in mm of objects that moved; NaN if there are none, or no prediction of them."""
+    errors_m = [np.zeros(0)]
+    for scene, future in pairs:
+        first_m, last_m, said_m = scene.first_objects_m, scene.truth.objects_m, future.objects_m
+        if first_m is None or last_m is None or said_m is None:
+            continue
+        # False where a position is not known.
+        moved = np.linalg.norm(last_m - first_m, axis=1) >= _MOVED_M
+        errors_m.append(np.linalg.norm(said_m - last_m, axis=1)[moved])
+    found_m = np.concatenate(errors_m)
+    return 1e3 * float(np.median(found_m)) if len(found_m) else float("nan")
 
 
 _PEAK = f"{tactile_metrics.PEAK_KPA:g} kPa"
@@ -213,6 +231,25 @@ METRICS: Final = {
             "F1 of taxels in contact; 1 if neither side has any",
             "touch",
             _of_touch(tactile_metrics.contact_f1),
+        ),
+        Metric(
+            "pad_contact_f1",
+            "Contact-F1 of pads",
+            "",
+            "higher",
+            "F1 of fingertips and palms in contact; 1 if neither side has any",
+            "touch",
+            _of_touch(tactile_metrics.pad_contact_f1),
+        ),
+        Metric(
+            "object_error",
+            "Object error",
+            "mm",
+            "lower",
+            "median error at the last step of objects that moved by 1 cm or more, whose true poses "
+            "are known",
+            "objects",
+            _object_error,
         ),
     )
 }
@@ -366,6 +403,8 @@ def _figures(
         if metric.of == "touch" and source not in ("copy", "zero"):
             absent = absent or not world.description.predicts_touch
         absent = absent or (source == "true_images" and metric.of != "geometry")
+        # These are the truth with other images or touch.
+        absent = absent or (metric.of == "objects" and source in ("warp", "zero", "codec"))
         value = float("nan")
         if metric.measure is not None and mine and not absent:
             value = metric.measure(mine)

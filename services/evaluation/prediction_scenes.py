@@ -26,19 +26,22 @@ class Future:
     """Touch of every step after the first, and the images of some of them.
 
     Steps are counted from 1, the one after the first observation; `image_steps` are those of the
-    images.
+    images. `objects_m` are the positions of the task's objects at the last step in the world, NaN
+    where they are not known, and None of what says nothing of objects.
     """
 
     images: UInt8[np.ndarray, "shown h w 3"]
     tactile_kpa: Float32[np.ndarray, "steps 2 320"]
     image_steps: tuple[int, ...]
+    objects_m: Float64[np.ndarray, "objects 3"] | None = None
 
 
 @dataclass(frozen=True)
 class Scene:
     """Start at a step of an episode, its actions from there, and the true future.
 
-    `geometry` is that of the true images, if it is known.
+    `geometry` is that of the true images, if it is known, and `first_objects_m` are the positions
+    of the objects at the start, as in `Future`.
     """
 
     episode_id: str
@@ -48,6 +51,7 @@ class Scene:
     model_rate_hz: float
     first_step: int = 0
     geometry: SceneGeometry | None = None
+    first_objects_m: Float64[np.ndarray, "objects 3"] | None = None
 
     @property
     def first(self) -> Observation:
@@ -105,15 +109,37 @@ def _read(grid: EpisodeGrid, first_step: int, num_steps: int, *, image_every: in
         K_head=grid.K_head,
     )
     touch_kpa, _ = reader.touch(first_step + 1, num_steps)
-    truth = Future(grid.images([first_step + step for step in shown]), touch_kpa, shown)
+    truth = Future(
+        grid.images([first_step + step for step in shown]),
+        touch_kpa,
+        shown,
+        _objects_m(grid, first_step + num_steps),
+    )
     actions = reader.actions(first_step, num_steps + 1, kind=kind)[1:]
-    return Scene(about.episode_id, start, actions, truth, about.model_rate_hz, first_step)
+    return Scene(
+        about.episode_id,
+        start,
+        actions,
+        truth,
+        about.model_rate_hz,
+        first_step,
+        first_objects_m=_objects_m(grid, first_step),
+    )
+
+
+def _objects_m(grid: EpisodeGrid, step: int) -> Float64[np.ndarray, "objects 3"] | None:
+    """Positions of an episode's objects at a step, NaN where unknown; None without any."""
+    track = grid.objects
+    if track is None:
+        return None
+    positions_m = track.poses[step, :, :3].astype(np.float64)
+    return np.where(track.known[step, :, None], positions_m, np.nan)
 
 
 def imagine(world: World[Any], scene: Scene, actions: Float64[np.ndarray, "steps 67"]) -> Future:
     """Prediction of a scene's future for given actions, with images of the steps of its truth."""
     state = world.reset(scene.start).state
-    images, touch = [], []
+    images, touch, objects_m = [], [], None
     for first in range(0, len(actions), CHUNK_STEPS):
         chunk, seed = actions[first : first + CHUNK_STEPS], scene.start.seed + first
         shown = [s - first - 1 for s in scene.truth.image_steps if first < s <= first + len(chunk)]
@@ -128,8 +154,11 @@ def imagine(world: World[Any], scene: Scene, actions: Float64[np.ndarray, "steps
             last = world.step(state, chunk, seed=seed, selector=_LAST_STEP)
             images.append(last.observation.images[CAMERA])
         touch.append(felt.observation.tactile_kpa)
+        poses = felt.observation.object_poses
+        objects_m = None if poses is None else poses[-1, :, :3].astype(np.float64)
         state = felt.state
-    return Future(np.concatenate(images), np.concatenate(touch), scene.truth.image_steps)
+    shown_steps = scene.truth.image_steps
+    return Future(np.concatenate(images), np.concatenate(touch), shown_steps, objects_m)
 
 
 def other_take(scene: Scene, scenes: Sequence[Scene]) -> Scene | None:
@@ -178,6 +207,7 @@ def copied(scene: Scene) -> Future:
         np.repeat(first.images[CAMERA], len(truth.images), axis=0),
         np.repeat(first.tactile_kpa, len(truth.tactile_kpa), axis=0),
         truth.image_steps,
+        scene.first_objects_m,
     )
 
 

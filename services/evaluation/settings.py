@@ -59,14 +59,14 @@ class TrainProbeSettings(CommandSettings):
     r"""Train the success probe on true and imagined robot episodes of some stores.
 
     Example:
-      dextouch train probe --episodes runs/true,runs/imagined --output runs/probe.safetensors
+      dextouch train judge --episodes runs/true,runs/imagined --output runs/probe.safetensors
 
     To calibrate a trained probe to another world model, on what that imagined:
-      dextouch train probe --base runs/probe.safetensors --episodes runs/true,runs/imagined_anew \
+      dextouch train judge --base runs/probe.safetensors --episodes runs/true,runs/imagined_anew \
         --output runs/calibrated.safetensors
     """
 
-    model_config = service_config("evaluation_train_probe", "dextouch train probe")
+    model_config = service_config("evaluation_train_probe", "dextouch train judge")
 
     episodes: Stores
     base: Path | None = Field(
@@ -137,7 +137,7 @@ class RunSettings(CommandSettings):
     cloned_policy: Path = Field(
         default=DEFAULT_POLICY, description="checkpoint of `dextouch train policy`"
     )
-    probe: Path = Field(default=DEFAULT_PROBE, description="checkpoint of `dextouch train probe`")
+    probe: Path = Field(default=DEFAULT_PROBE, description="checkpoint of `dextouch train judge`")
     num_steps: int = Field(default=80, ge=4, description="steps of a rollout, at 15 per second")
     results: Path | None = Field(
         default=None,

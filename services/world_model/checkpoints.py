@@ -9,7 +9,6 @@ from typing import Final
 from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import Domain
 from services.networks.memory import available_memory
 from services.networks.weight_files import (
     MAX_FILE_BYTES,
@@ -24,29 +23,13 @@ from services.networks.weight_files import (
 )
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel
+from services.world_model.training_set import TrainingSet
 
 FORMAT_VERSION = 1
 METADATA_KEY = "dextouch_world_model"
 # Statistics missing from files of older releases; the network's defaults are used instead.
 LATER_STATISTICS = ("tokenizer.peak_kpa",)
 _TEXT: Final = "text_features."
-
-
-class TrainingSet(FrozenModel):
-    """Episodes of one domain that a model was trained on, or that it was evaluated on (held out).
-
-    `tasks` has the number of episodes of each task, `data_hash` is that of the episodes
-    (`dextouch.episodes`). `window_share` is the share of windows from the set, None where it
-    follows from the number of episodes. `checkpoint` is the digest of the ancestor that was trained
-    on the set, None for the checkpoint's own training.
-    """
-
-    domain: Domain
-    heldout: bool = False
-    tasks: dict[str, int]
-    data_hash: str
-    window_share: float | None = None
-    checkpoint: str | None = None
 
 
 class CheckpointMetadata(FrozenModel):

@@ -1,15 +1,21 @@
 """Commands of the world model: train both kinds of models, serve one, show its provenance."""
 
 import json
+import os
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dextouch.command_line import ProgressLines, write_result
+from dextouch.command_line import CommandParser, ProgressLines, write_result
 from dextouch.serving import load_settings
+from dextouch.serving.configuration_file import (
+    configuration_path,
+    read_configuration,
+    section_of,
+)
 from dextouch.worlds import World, serve_worlds
 from services.networks.weight_files import digest_of
 from services.world_model.checkpoints import list_checkpoints, read_checkpoint, read_metadata
@@ -17,6 +23,7 @@ from services.world_model.distillation_settings import DistillCommand
 from services.world_model.plan import plan_table
 from services.world_model.settings import (
     AdaptCommand,
+    AdaptStateCommand,
     ShowCommand,
     TrainCommand,
     TrainSettings,
@@ -30,9 +37,14 @@ from services.world_model.training.trainer import TrainingReport, train
 from services.world_model.training.training_run import TrainingProgress
 from services.world_model.world import open_world
 
+STATE: Final = "state"
+
 
 def run_train(arguments: list[str]) -> int:
-    """Train with a progress bar; print the report and optionally write it to a file."""
+    """Train the form that --preset names; print the report and optionally write it to a file."""
+    preset = _flag(arguments, "--preset") or _configured_preset()
+    if preset == STATE:
+        return _train_state(load_settings(TrainStateCommand, arguments))
     settings = load_settings(TrainCommand, arguments)
     if settings.plan:
         print(plan_table(settings.network))
@@ -40,8 +52,27 @@ def run_train(arguments: list[str]) -> int:
     return _train(settings, settings.json_path)
 
 
+def _configured_preset() -> str:
+    """The preset that the environment or the configuration file names."""
+    path, section = configuration_path(), section_of(TrainCommand)
+    kept = {} if path is None else read_configuration(path).get(section, {})
+    named: str = os.environ.get(f"DEXTOUCH_{section.upper()}_PRESET") or kept.get("preset", STATE)
+    return named
+
+
+def _flag(arguments: list[str], name: str) -> str | None:
+    """Value of one flag, before it is known which command the others are of."""
+    parser = CommandParser(add_help=False, allow_abbrev=False)
+    parser.add_argument(name, dest="value")
+    value: str | None = parser.parse_known_args(arguments)[0].value
+    return value
+
+
 def run_adapt(arguments: list[str]) -> int:
     """Adapt a checkpoint to new tasks; print the report and optionally write it to a file."""
+    init = _flag(arguments, "--init")
+    if init is None or is_state_checkpoint(Path(init)):
+        return _train_state(load_settings(AdaptStateCommand, arguments))
     settings = load_settings(AdaptCommand, arguments)
     network = read_checkpoint(settings.init).metadata.network
     return _train(settings.training(network), settings.json_path)
@@ -91,11 +122,10 @@ def _train_together(settings: TrainSettings, processes: Processes) -> TrainingRe
         return train(settings, on_progress, processes)
 
 
-def run_train_state(arguments: list[str]) -> int:
+def _train_state(settings: TrainStateCommand | AdaptStateCommand) -> int:
     """Train a state model; print its evaluation and optionally write it to a file."""
     from services.world_model.training.state_trainer import train_state
 
-    settings = load_settings(TrainStateCommand, arguments)
     report = train_state(settings)
     print(
         f"{report.checkpoint}: {report.num_parameters:,} parameters, {report.cpu_s:.0f} CPU s, "

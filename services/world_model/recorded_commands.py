@@ -26,6 +26,7 @@ def command_line(settings: TrainSettings) -> str:
             "device",
             "wan",
             "plan",
+            "preset",
         },
     )
     flags = [f"--episodes={last_name(settings.episodes)}"]
@@ -36,7 +37,8 @@ def command_line(settings: TrainSettings) -> str:
         flags.append(f"--init={settings.init.name}")
     if settings.tokenizer is not None:
         flags.append(f"--tokenizer={settings.tokenizer.name}")
-    return " ".join(["dextouch train world-model", *flags, *flags_of(given)])
+    form = f"--preset={settings.preset}"
+    return " ".join(["dextouch train world-model", form, *flags, *flags_of(given)])
 
 
 def flags_of(given: Mapping[str, object], prefix: str = "") -> list[str]:

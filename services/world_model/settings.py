@@ -82,19 +82,18 @@ class WindowSettings(FrozenModel):
     fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
 
 
-class RunSettings(FrozenModel):
-    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first.
+class DataSettings(FrozenModel):
+    """Which episodes of people and robots a world model of either form is trained on.
 
     With `human` stores, only robot episodes are taken from `episodes` and `heldout`, and only human
     ones from `human`.
     """
 
-    episodes: str = Field(description="URL or folder of the episode store to train on")
     human: tuple[str, ...] = Field(
         default=(), description="stores (folder or file:// URL) with human episodes to mix in"
     )
     human_share: float = Field(
-        default=0.5, ge=0, le=1, description="share of training windows from human episodes"
+        default=0.5, ge=0, le=1, description="share of training examples from human episodes"
     )
     robot_episodes: int | None = Field(
         default=None,
@@ -112,14 +111,25 @@ class RunSettings(FrozenModel):
     )
     splits: Splits = ()
     heldout: str | None = Field(
-        default=None, description="store to evaluate on; default: a tenth of `episodes`, by hash"
+        default=None, description="store to evaluate on; default: a share of `episodes`, by hash"
     )
+
+    @property
+    def share_of_human(self) -> float | None:
+        """Share of examples from human episodes; None where domains are not told apart."""
+        return self.human_share if self.human else None
+
+
+class RunSettings(DataSettings):
+    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
+
+    episodes: str = Field(description="URL or folder of the episode store to train on")
     output: Path = Field(
         default=Path("runs/world_model/tiny.safetensors"), description="checkpoint to write"
     )
     name: str = Field(default="tiny", description="model name in the checkpoint")
-    preset: str | None = Field(
-        default=None,
+    preset: str = Field(
+        default="tiny",
         description=f"named settings that other flags override: {', '.join(PRESETS)}",
     )
     seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
@@ -156,11 +166,6 @@ class RunSettings(FrozenModel):
     windows: WindowSettings = Field(
         default=WindowSettings(), description="sampling of training windows"
     )
-
-    @property
-    def share_of_human(self) -> float | None:
-        """Share of windows from human episodes; None where domains are not told apart."""
-        return self.human_share if self.human else None
 
 
 class TrainSettings(RunSettings):
@@ -256,12 +261,15 @@ class CoreSettings(FrozenModel):
     )
 
 
-class StateTrainSettings(FrozenModel):
+# What is trained of a state model that a training starts from.
+Learned = Literal["all", "readers", "success"]
+
+
+class StateTrainSettings(DataSettings):
     """Training of a state model: an ensemble of start readers and recurrent cores."""
 
     episodes: Stores
     tasks: Tasks = ()
-    splits: Splits = ()
     clicks: Path | None = Field(
         default=None,
         description="JSON file of the tasks' objects, with clicks on them or without: clicks that "
@@ -271,19 +279,19 @@ class StateTrainSettings(FrozenModel):
         default=Path("runs/world_model/state.safetensors"), description="checkpoint to write"
     )
     name: str = Field(default="state", description="model name in the checkpoint")
-    base: Path | None = Field(
-        default=None,
-        description="state model to start from, for new tasks: its cores, touch codec and renderer "
-        "are kept, start readers and the estimate of success are trained",
+    init: Path | None = Field(
+        default=None, description="state model to start from; --learn says what is trained of it"
     )
-    keep_readers: CliImplicitFlag[bool] = Field(
-        default=False,
-        description="with --base and the same tasks: keep its start readers, too, and train the "
-        "estimate of success alone",
+    learn: Learned = Field(
+        default="all",
+        description="of --init: all but its touch codec; readers, that is start readers and the "
+        "estimate of success, for new tasks from few takes; or the estimate of success alone",
     )
     seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
     num_members: int = Field(default=3, ge=1, le=16, description="members of the ensemble")
-    heldout_share: float = Field(default=0.08, gt=0, lt=1, description="share of held-out scenes")
+    heldout_share: float = Field(
+        default=0.08, gt=0, lt=1, description="share of held-out scenes, if no --heldout is given"
+    )
     jobs: int = Field(default=2, ge=1, le=64, description="members trained in parallel")
     image_px: ImagePx = USUAL_IMAGE_PX
     labelled_share: float = Field(
@@ -303,23 +311,86 @@ class StateTrainSettings(FrozenModel):
     )
 
 
-class TrainStateCommand(CommandSettings, StateTrainSettings):
-    """Train a state model, start readers and recurrent cores, on whole episodes.
+class AdaptReaderSettings(ReaderSettings):
+    """Training of start readers from those of another model."""
 
-    Example:
-      dextouch train state --episodes runs/episodes --output runs/state.safetensors
+    num_steps: NumSteps = 2000
+
+
+class AdaptCoreSettings(CoreSettings):
+    """Training of recurrent cores from those of another model."""
+
+    num_steps: NumSteps = 1500
+    learning_rate: LearningRate = 1e-3
+
+
+class StateAdaptSettings(StateTrainSettings):
+    """Adaptation of a state model to new tasks, from robot and human episodes.
+
+    Its touch codec is kept, all else is trained on; human and robot episodes may be of the same
+    tasks, but not of those that the model was trained on.
     """
 
-    model_config = service_config("world_model_train_state", "dextouch train state")
+    init: Path = Field(description="checkpoint to adapt")
+    output: Path = Field(
+        default=Path("runs/world_model/adapted.safetensors"), description="checkpoint to write"
+    )
+    name: str = Field(default="adapted", description="model name in the checkpoint")
+    disjoint_tasks: CliImplicitFlag[bool] = Field(
+        default=False, description="refuse human episodes of tasks that robots have, too"
+    )
+    new_tasks: CliImplicitFlag[bool] = Field(
+        default=True, description="refuse tasks that the initial checkpoint was trained on"
+    )
+    reader: AdaptReaderSettings = Field(
+        default=AdaptReaderSettings(), description="training of start readers"
+    )
+    core: AdaptCoreSettings = Field(
+        default=AdaptCoreSettings(), description="training of recurrent cores"
+    )
+
+
+class TrainStateCommand(CommandSettings, StateTrainSettings):
+    """Train a world model on whole episodes of robots and people: the state model, by default.
+
+    Example:
+      dextouch train world-model --episodes runs/episodes --output runs/state.safetensors
+
+    With people of other tasks, half of what is drawn:
+      dextouch train world-model --episodes runs/robot --human runs/human
+
+    The paper's form has presets, and settings of its own:
+      dextouch train world-model --preset tiny --help
+    """
+
+    model_config = service_config("world_model_train_state", "dextouch train world-model")
+
+    preset: Literal["state"] = Field(
+        default="state",
+        description=f"form of the model: state, or of the paper's form {', '.join(PRESETS)}",
+    )
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
+
+
+class AdaptStateCommand(CommandSettings, StateAdaptSettings):
+    """Adapt a world model of either form to new tasks, from robot and human episodes.
+
+    A checkpoint of the paper's form has other settings: --init PATH --help shows them.
+
+    Example:
+      dextouch train adapt --init runs/mixed.safetensors --episodes runs/new --robot-episodes 200
+    """
+
+    model_config = service_config("world_model_adapt_state", "dextouch train adapt")
 
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
 class TrainCommand(CommandSettings, TrainSettings):
-    r"""Train the joint visuo-tactile flow-matching model on windows of episodes.
+    r"""Train the paper's form: a joint visuo-tactile flow-matching model of windows of episodes.
 
     Example:
-      dextouch train world-model --episodes runs/episodes --output runs/tiny.safetensors
+      dextouch train world-model --preset tiny --episodes runs/data --output runs/tiny.safetensors
 
     In the paper's design, whose tokenizer is trained first:
       dextouch train tokenizer --episodes runs/episodes --output runs/tokenizer.safetensors
@@ -353,10 +424,10 @@ class TrainCommand(CommandSettings, TrainSettings):
 
 
 class AdaptCommand(CommandSettings, AdaptSettings):
-    """Adapt a world model in the paper's form to new tasks, from robot and human episodes.
+    """Adapt a world model of the paper's form to new tasks, from robot and human episodes.
 
     Example:
-      dextouch train adapt --init runs/mixed.safetensors --episodes runs/new --robot-episodes 200
+      dextouch train adapt --init runs/paper.safetensors --episodes runs/new --robot-episodes 200
     """
 
     model_config = service_config("world_model_adapt", "dextouch train adapt")

@@ -21,6 +21,7 @@ from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.network import RendererNetwork
+from services.world_model.training_set import TrainingSet
 
 FORMAT_VERSION = 5
 METADATA_KEY = "dextouch_state_model"
@@ -57,7 +58,9 @@ class StateMetadata(FrozenModel):
     `training_seeds` are the first and last seed of every task, of the scenes in `training_splits`
     (all splits if empty); `training_scenes` are `scene_digest` of those without a seed, which a
     station recorded. `object_sources` are the numbers of training episodes whose object poses are
-    from the twin, markers, trackers or clicks, and of those without any ("none").
+    from the twin, markers, trackers or clicks, and of those without any ("none"). `sets` are the
+    episodes by domain, those of the models that it started from included; files of older releases
+    have none.
     """
 
     format_version: int = FORMAT_VERSION
@@ -78,6 +81,7 @@ class StateMetadata(FrozenModel):
     training_scenes: tuple[str, ...] = Field(default=(), exclude_if=not_)
     data_hash: str
     object_sources: dict[str, int] = Field(default={}, exclude_if=not_)
+    sets: tuple[TrainingSet, ...] = Field(default=(), exclude_if=not_)
     metrics: dict[str, float] = Field(default={})
 
     def may_have_seen_episode(self, about: EpisodeAttributes) -> bool:

@@ -180,6 +180,7 @@ def test_every_step_is_a_command_of_ours_with_flags_that_it_has(capsys):
         words = step.command.split()
         find_command(words)
         name = re.match(r"[a-z]+( [a-z][a-z-]+)*(?= -| [^ ]*/)", step.command)[0]
+        name += " --preset tiny" if "--preset" in words else ""
         flags.setdefault(name, set()).update(word for word in words if word.startswith("--"))
     for name, given in flags.items():
         with pytest.raises(SystemExit):
@@ -206,12 +207,15 @@ def test_studies_are_read_by_the_command_that_runs_them(tmp_path):
     assert len(read_definition(path).policies) == 8
 
 
-def test_the_table_of_scaling_takes_the_models_without_human_data():
+def test_models_of_scaling_differ_in_human_data_and_one_in_its_length():
     steps = {step.name: step for step in Experiments(QUICK, (0, 1)).steps(["scaling"])}
-    assert "design/Robot-only/seed-1/prediction" in steps
-    assert "design/V-only/seed-0/model" not in steps
-    assert "--cpu-budget-s 3 " in steps["scaling/0-half-as-long/seed-0/model"].command
-    assert "--cpu-budget-s 6 " in steps["scaling/1x/seed-0/model"].command
+    assert "scaling/0/seed-1/prediction" in steps
+    assert not any(name.startswith("design") for name in steps)
+    for column, count in (("0", 4), ("0-half-as-long", 2), ("1x", 4)):
+        command = steps[f"scaling/{column}/seed-0/model"].command
+        assert f"--core.num-steps {count} " in command
+        assert f"--reader.num-steps {count} " in command
+        assert ("--human data/human/store" in command) is (column == "1x")
 
 
 def test_predictions_without_a_model_are_measured_once():

@@ -18,14 +18,14 @@ from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
 from services.world_model.settings import TrainStateCommand
 from services.world_model.training.episodes import load_episodes
-from services.world_model.training.state_trainer import _episodes
+from services.world_model.training.state_data import load_state_data
 from services.world_model.training.streaming import index_episodes
 from services.world_model.training.tactile_hands import load_hands
 
 LEARNERS = {
     "joint world model": load_episodes,
     "joint world model, streaming": index_episodes,
-    "state world model": lambda url: _episodes(TrainStateCommand(episodes=(url,))),
+    "state world model": lambda url: load_state_data(TrainStateCommand(episodes=(url,))).episodes,
     "success probe": lambda url: read_ending_episodes(EpisodeStore(url)),
     "cloned policy": lambda url: read_cloning_episodes(EpisodeStore(url)),
     "recorded takes": lambda url: read_takes([EpisodeStore(url)]),

@@ -75,10 +75,10 @@ def train_models(folder: Path) -> Models:
         ("data", "--store", exact, *EXACT_DATA),
         ("data", "--store", endings, *ENDINGS),
         ("data", "--store", unseen, *UNSEEN_ENDINGS),
-        ("state", *_stores(episodes, endings, to=world_model), scenes, *SMALL_STATE_MODEL),
+        ("world-model", *_stores(episodes, endings, to=world_model), scenes, *SMALL_STATE_MODEL),
         ("policy", *_stores(exact, episodes, to=policy)),
         ("imagined", *_stores(endings), "--store", imagined, "--checkpoint", str(world_model)),
-        ("probe", "--held-out", unseen, *_stores(endings, imagined, to=probe)),
+        ("judge", "--held-out", unseen, *_stores(endings, imagined, to=probe)),
     ):
         run_command(["train", *words])
     return _load(world_model, policy, probe)

@@ -148,11 +148,13 @@ class RecurrentCore(nn.Module):
             linear(128, _SLOT_WIDTH), nn.GELU(),
         )  # fmt: skip
         self.hand = nn.Sequential(linear(_SLOT_WIDTH + OWN_SIZE, _HAND_WIDTH), nn.GELU())
+        # Whether actions are commanded, and whether a person acts.
+        flags = 2 if config.has_humans else 1
         self.mix = nn.Sequential(
-            linear(_SIDES * _HAND_WIDTH + 1, width), MemberNorm(members, width), nn.GELU()
+            linear(_SIDES * _HAND_WIDTH + flags, width), MemberNorm(members, width), nn.GELU()
         )
         self.begin = nn.Sequential(
-            linear(NUM_PADS + _SIDES * channels + 1, width), nn.GELU(),
+            linear(NUM_PADS + _SIDES * channels + flags, width), nn.GELU(),
             linear(width, width), nn.Tanh(),
         )  # fmt: skip
         self.memory = MemberGRU(members, width, width)
@@ -167,6 +169,17 @@ class RecurrentCore(nn.Module):
         self.contact = linear(160, STEPS_PER_LATENT * (NUM_PADS // _SIDES))
         self.pattern = linear(160, STEPS_PER_LATENT * NUM_PATTERNS)
         self.taxels = linear(NUM_PATTERNS, NUM_TAXELS)
+        # A person's skin and a robot's differ; where a pad meets an object does not.
+        self.human = (
+            nn.ModuleDict(
+                {
+                    "touch": linear(160, STEPS_PER_LATENT * channels),
+                    "pattern": linear(160, STEPS_PER_LATENT * NUM_PATTERNS),
+                }
+            )
+            if config.has_humans
+            else None
+        )
         self.success = nn.Sequential(
             linear(width + MAX_OBJECTS * _END_SIZE + len(_PAIRS) * _PAIR_SIZE, 128), nn.GELU(),
             nn.Dropout(0.2), linear(128, 1),
@@ -195,12 +208,29 @@ class RecurrentCore(nn.Module):
         """Largest number of objects of the entries of a batch."""
         return max(self.config.num_objects[index] for index in task.tolist())
 
-    def first_state(self, start: SceneStart, standing: Commands) -> CoreState:
-        """The state before the first step, with the measured hands as one latent step."""
+    def _flags(self, start: SceneStart, human: Tensor | None) -> Float32[Tensor, "batch flags"]:
+        flags = [start.commanded]
+        if self.config.has_humans:
+            flags.append(torch.zeros_like(start.commanded) if human is None else human)
+        return torch.stack(flags, dim=1)
+
+    def first_state(
+        self,
+        start: SceneStart,
+        standing: Commands,
+        human: Float32[Tensor, " batch"] | None = None,
+    ) -> CoreState:
+        """The state before the first step, with the measured hands as one latent step.
+
+        Args:
+            start: start of the rollout.
+            standing: the measured hands.
+            human: 1 where a person acts, 0 for robots; None for robots alone, as in rollouts.
+        """
         known = [
             compressed(start.pads_kpa * 1e-2),
             start.touch.flatten(1),
-            start.commanded[:, None],
+            self._flags(start, human),
         ]
         return CoreState(
             self.begin(torch.cat(known, dim=1)),
@@ -211,7 +241,11 @@ class RecurrentCore(nn.Module):
         )
 
     def forward(
-        self, commands: Commands, start: SceneStart, state: CoreState
+        self,
+        commands: Commands,
+        start: SceneStart,
+        state: CoreState,
+        human: Float32[Tensor, " batch"] | None = None,
     ) -> tuple[SceneFuture, CoreState]:
         """Predictions for every latent, and the state after the last one.
 
@@ -219,7 +253,9 @@ class RecurrentCore(nn.Module):
             commands: of the next latents.
             start: start of the rollout, the same for all its chunks.
             state: from `first_state` or from the previous chunk.
+            human: as for `first_state`.
         """
+        flags = self._flags(start, human)
         # Slots that no entry of the batch uses need no computation.
         counts = torch.tensor(self.config.num_objects)[start.task]
         used = self.used_slots(start.task)
@@ -244,7 +280,7 @@ class RecurrentCore(nn.Module):
             each = about[:, None].expand(-1, _SIDES, -1, -1)
             slots = self.slot(torch.cat([seen, each], dim=-1)) * present[:, None, :, None]
             hands = self.hand(torch.cat([slots.sum(2), own[:, latent]], dim=-1))
-            mixed = self.mix(torch.cat([hands.flatten(1), start.commanded[:, None]], dim=1))
+            mixed = self.mix(torch.cat([hands.flatten(1), flags], dim=1))
             hidden = self.memory(self.dropout(mixed), hidden)
             near = torch.cat(
                 [
@@ -264,7 +300,7 @@ class RecurrentCore(nn.Module):
             )
             steps.append((hidden, hands, position, R_object, about))
         stacked = [torch.stack(parts, dim=1) for parts in zip(*steps, strict=True)]
-        future = self._decoded(stacked, there, start.objects.position_m)
+        future = self._decoded(stacked, there, start.objects.position_m, human)
         objects = future.objects
         last = CoreState(
             hidden,
@@ -280,6 +316,7 @@ class RecurrentCore(nn.Module):
         steps: list[Tensor],
         there: Float32[Tensor, "batch objects"],
         first_m: Float32[Tensor, "batch objects 3"],
+        human: Float32[Tensor, " batch"] | None,
     ) -> SceneFuture:
         hidden, hands, position, R_object, about = steps
         axes = torch.stack([R_object[..., 2], R_object[..., 0]], dim=-2)
@@ -291,8 +328,13 @@ class RecurrentCore(nn.Module):
         each = hidden[:, :, None].expand(-1, -1, _SIDES, -1)
         felt = self.feel(torch.cat([each, hands, side], dim=-1))
         pads = self.contact(felt).unflatten(-1, (STEPS_PER_LATENT, NUM_PADS // _SIDES))
-        touch = self.touch(felt).unflatten(-1, (STEPS_PER_LATENT, self.config.touch_channels))
-        pattern = self.pattern(felt).unflatten(-1, (STEPS_PER_LATENT, NUM_PATTERNS))
+        touch, pattern = self.touch(felt), self.pattern(felt)
+        if self.human is not None and human is not None:
+            by_person = human.view(-1, 1, 1, 1) > 0
+            touch = torch.where(by_person, self.human["touch"](felt), touch)
+            pattern = torch.where(by_person, self.human["pattern"](felt), pattern)
+        touch = touch.unflatten(-1, (STEPS_PER_LATENT, self.config.touch_channels))
+        pattern = pattern.unflatten(-1, (STEPS_PER_LATENT, NUM_PATTERNS))
         present = there[:, None].expand(-1, hidden.shape[1], -1)
         ends = _ending_features(position, axes, about, present, position - first_m[:, None])
         return SceneFuture(

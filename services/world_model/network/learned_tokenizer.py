@@ -1,6 +1,7 @@
 """Learned tactile tokenizers: what Split-Hands and Grid share.
 
-`dextouch train tokenizer` trains one, and `dextouch train world-model --tokenizer` uses it.
+`dextouch train tokenizer` trains one, and the paper's form of the world model uses it
+(`dextouch train world-model --preset paper --tokenizer PATH`).
 """
 
 from abc import abstractmethod

@@ -1,4 +1,4 @@
-"""Presets of `dextouch train world-model`: named settings, one TOML file each."""
+"""Presets of the paper's form of the world model: named settings, one TOML file each."""
 
 import tomllib
 from pathlib import Path

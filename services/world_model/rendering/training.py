@@ -59,6 +59,7 @@ def train_renderer(
     *,
     rng: np.random.Generator,
     on_progress: Callable[[RendererProgress], None] | None = None,
+    initial: RendererNetwork | None = None,
 ) -> TrainedRenderer:
     """Train on pairs of images of one clip: a start image and a target image.
 
@@ -68,11 +69,14 @@ def train_renderer(
         settings: how to train.
         rng: source of initial weights, pairs and pose noise.
         on_progress: called every few steps.
+        initial: network to start from, of the same shape; default: random weights.
 
     Raises:
         InvalidInputError: no clips, or image sides that the network does not support.
     """
     run = RendererRun(clips, config, settings, rng=rng)
+    if initial is not None:
+        run.network.load_state_dict(initial.state_dict())
     log: list[RendererProgress] = []
     budget = Budget(settings.cpu_budget_s, settings.max_steps)
     options = OptimizerOptions(

@@ -139,7 +139,7 @@ def _draw(
     later = [step for step in start_steps(table) if step > 0 and len(table.starts_at(step))]
     start_step = 0 if is_first or not later else _later_start(later, table, rng)
     able = table.starts_at(start_step)
-    rows = able[torch.randint(len(able), (settings.batch,), generator=generator)]
+    rows = table.drawn(able, settings.batch, generator)
 
     def chance(fraction: float) -> Bool[Tensor, " batch"]:
         return torch.rand(len(rows), generator=generator) < fraction
@@ -234,8 +234,9 @@ def core_loss(
     Where hands are held still without contact, the targets are no motion and no change of touch.
     """
     commands, start = batch.commands, batch.start
-    future, _ = core(commands, start, core.first_state(start, commands[:1]))
     table, rows = data.table, batch.rows
+    human = table.human[rows].float()
+    future, _ = core(commands, start, core.first_state(start, commands[:1], human), human)
     within = table.within(rows, batch.start_step)
     weights = settings.weights
     success = weights.success * _success_error(

@@ -8,7 +8,7 @@ episodes that stay on disk.
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -86,6 +86,9 @@ class TrainingEpisode(Protocol):
     def cut(self, place: Place) -> "Window":
         """Cut the window at a place in this episode."""
         ...
+
+
+E = TypeVar("E", bound=TrainingEpisode)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
 """Episodes of a store in memory, and subsets of them by their content."""
 
-import hashlib
-from collections.abc import Collection, Sequence
-from typing import Final, TypeVar
+from collections.abc import Collection
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -16,11 +15,9 @@ from dextouch.episodes import (
     needs,
     select_episodes,
 )
-from dextouch.errors import InvalidInputError
 from dextouch.schemas import ActionKind, Domain
-from services.world_model.training.dataset import EpisodeArrays, TrainingEpisode
+from services.world_model.training.dataset import EpisodeArrays
 
-E = TypeVar("E", bound=TrainingEpisode)
 # What an episode must have for windows to be cut from it.
 CUT: Final = (needs.EVERY_IMAGE,)
 
@@ -76,27 +73,3 @@ def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> Episo
         object_poses=poses,
         boxes_m=boxes_m,
     )
-
-
-def subset_by_hash(episodes: Sequence[E], count: int | None, *, what: str) -> list[E]:
-    """A number of episodes chosen by their content, in their order; None for all.
-
-    A larger subset of the same episodes contains every smaller one.
-
-    Raises:
-        InvalidInputError: there are fewer; `what` names them.
-    """
-    if count is None:
-        return list(episodes)
-    if count > len(episodes):
-        raise InvalidInputError(
-            f"training: got {count} as the number of {what} episodes, expected at most the "
-            f"{len(episodes)} there are; record more, or ask for fewer"
-        )
-
-    def place(index: int) -> str:
-        content = episodes[index].fingerprint()
-        return hashlib.sha256(f"subset/{content}".encode()).hexdigest()
-
-    chosen = sorted(range(len(episodes)), key=place)[:count]
-    return [episodes[index] for index in sorted(chosen)]

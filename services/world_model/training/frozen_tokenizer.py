@@ -7,8 +7,7 @@ from dextouch.episodes import scene_fraction
 from dextouch.errors import InvalidInputError
 from services.world_model.settings import TrainSettings
 from services.world_model.tokenizer_files import StoredTokenizer, read_tokenizer
-from services.world_model.training.dataset import TrainingEpisode
-from services.world_model.training.episodes import E
+from services.world_model.training.dataset import E, TrainingEpisode
 
 
 def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokenizer | None]:

@@ -73,7 +73,7 @@ def train_reader(
     order = torch.argsort(~reached, dim=1, stable=True)
 
     def loss() -> Tensor:
-        rows = known[torch.randint(len(known), (settings.batch,), generator=generator)]
+        rows = table.drawn(known, settings.batch, generator)
         drawn = torch.randint(len(later), rows.shape, generator=generator)
         amid = torch.tensor(later)[order[rows, drawn % counts[rows].clamp_min(1)]]
         is_first = torch.rand(rows.shape, generator=generator) < settings.first_fraction

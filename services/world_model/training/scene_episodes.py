@@ -29,8 +29,7 @@ from dextouch.episodes import (
     recording_of,
     select_episodes,
 )
-from dextouch.errors import NotFoundError
-from dextouch.schemas import ObjectClicks, SceneObject
+from dextouch.schemas import Domain, ObjectClicks, SceneObject
 
 logger = structlog.get_logger(__name__)
 
@@ -101,6 +100,7 @@ def load_scene_episodes(
     splits: Collection[Split] = (),
     image_px: int | None = None,
     clicks: ObjectClicks | None = None,
+    domain: Domain | None = None,
 ) -> list[SceneGrid]:
     """Episodes of stores that a state model can learn from, store by store.
 
@@ -111,16 +111,14 @@ def load_scene_episodes(
         image_px: side that the middle square of larger images is scaled to; None leaves images as
             they are.
         clicks: objects of tasks, and clicks on them; those in the stores are used as well.
+        domain: whose hands act; None for people and robots.
 
     Raises:
-        NotFoundError: clicks on an episode that no store has, or as `select_episodes`.
+        NotFoundError: as `select_episodes`.
         ConflictError: as `select_episodes`.
         InvalidInputError: as `clicked_poses`.
     """
     stores = [EpisodeStore(url) for url in urls]
-    for name in () if clicks is None else clicks.episodes:
-        if not any(store.exists(name) for store in stores):
-            raise NotFoundError(f"clicks: episode {name!r} is in none of {', '.join(urls)}")
     grids: dict[str, SceneGrid] = {}
 
     def has_poses(reader: EpisodeReader) -> bool:
@@ -129,7 +127,9 @@ def load_scene_episodes(
         return grid.may_have_poses
 
     posed = needs.Need(needs.OBJECTS.lack, needs.OBJECTS.remedy, has_poses, is_choice=True)
-    selected = select_episodes(stores, tasks=tasks, splits=splits, needs=(*_NEEDED, posed))
+    selected = select_episodes(
+        stores, domain=domain, tasks=tasks, splits=splits, needs=(*_NEEDED, posed)
+    )
     with_poses = {reader.item_id for reader in selected}
     without = grids.keys() - with_poses
     tasks_posed = {grids[name].task for name in with_poses}
@@ -147,7 +147,7 @@ def load_scene_episodes(
     if not used:
         return [grids[name] for name in grids if name in with_poses]
     both = replace(posed, is_met=lambda reader: reader.item_id in used | with_poses)
-    again = select_episodes(stores, tasks=tasks, splits=splits, needs=(both,))
+    again = select_episodes(stores, domain=domain, tasks=tasks, splits=splits, needs=(both,))
     return [grids[reader.item_id] for reader in again]
 
 

@@ -58,9 +58,10 @@ class SceneTable:
     measurement, and `clicked_sd_m` is the standard deviation of clicked positions, 0 of others.
     `images` are those of the steps `image_steps`, where `shown`; `in_contact` marks
     pads in contact; `sent` are commanded hands where available and measured ones elsewhere, as
-    given by `commanded`. `labelled` marks episodes whose object poses are trained on; `boxes_m` are
-    the usual boxes of each task's objects in their frames (middle, half sizes), and `size` factors
-    of their width and height.
+    given by `commanded`. `human` marks episodes in which a person acts, and `chance` is how
+    likely an episode is drawn, relative to others. `labelled` marks episodes whose object poses are
+    trained on; `boxes_m` are the usual boxes of each task's objects in their
+    frames (middle, half sizes), and `size` factors of their width and height.
     """
 
     sent: HandTable
@@ -77,6 +78,8 @@ class SceneTable:
     K_head: Float32[Tensor, "episodes 3 3"]
     success: Float32[Tensor, " episodes"]
     task: Int64[Tensor, " episodes"]
+    human: Bool[Tensor, " episodes"]
+    chance: Float32[Tensor, " episodes"]
     labelled: Bool[Tensor, " episodes"]
     length: Int64[Tensor, " episodes"]
     objects_known: Bool[Tensor, "episodes steps objects"]
@@ -133,6 +136,15 @@ class SceneTable:
         return ObjectPoses(
             objects.position_m[rows, steps], objects.axes[rows, steps], objects.present[rows, steps]
         )
+
+    def drawn(
+        self, able: Int64[Tensor, " rows"], count: int, generator: torch.Generator
+    ) -> Int64[Tensor, " count"]:
+        """Random episodes of some, each as often as its chance says."""
+        chance = self.chance[able]
+        if bool((chance == chance[0]).all()):
+            return able[torch.randint(len(able), (count,), generator=generator)]
+        return able[torch.multinomial(chance, count, replacement=True, generator=generator)]
 
     def knows_all(self, step: int) -> Bool[Tensor, " episodes"]:
         """Episodes in which the poses of all objects are known at a step."""
@@ -249,7 +261,11 @@ def vocabulary(episodes: Sequence[EpisodeGrid]) -> tuple[tuple[str, ...], tuple[
 
 
 def scene_table(
-    episodes: Sequence[EpisodeGrid], config: DynamicsConfig, *, labelled: Sequence[bool] = ()
+    episodes: Sequence[EpisodeGrid],
+    config: DynamicsConfig,
+    *,
+    labelled: Sequence[bool] = (),
+    human_share: float | None = None,
 ) -> SceneTable:
     """Build the tensors of episodes; what is left over of a latent step at an end is cut off.
 
@@ -257,6 +273,7 @@ def scene_table(
         episodes: at least one.
         config: of the dynamics model.
         labelled: for each episode, whether its object poses are trained on; default: all.
+        human_share: share of human episodes in what is drawn; None if it follows from their number.
 
     Raises:
         InvalidInputError: no image of the first step, none later that all episodes have, too short
@@ -293,6 +310,8 @@ def scene_table(
         K_head=torch.from_numpy(np.stack([e.K_head for e in episodes]).astype(np.float32)),
         success=torch.tensor([float(episode.success) for episode in episodes]),
         task=torch.tensor([config.tasks.index(episode.task) for episode in episodes]),
+        human=torch.tensor([episode.domain == "human" for episode in episodes]),
+        chance=_chances([episode.domain == "human" for episode in episodes], human_share),
         labelled=torch.tensor(list(labelled) or [True] * len(episodes)),
         length=torch.tensor(lengths),
         objects_known=torch.from_numpy(known),
@@ -301,6 +320,15 @@ def scene_table(
         size=torch.from_numpy(np.stack([_size(e, boxes_m[e.task]) for e in episodes])),
         boxes_m=_padded(boxes_m, config),
     )
+
+
+def _chances(human: Sequence[bool], human_share: float | None) -> Float32[Tensor, " episodes"]:
+    """Chance of every episode to be drawn; equal ones without a share or a second domain."""
+    is_human = torch.tensor(human)
+    if human_share is None or bool(is_human.all()) or not bool(is_human.any()):
+        return torch.ones(len(human))
+    share = (human_share / is_human.sum(), (1 - human_share) / (~is_human).sum())
+    return torch.where(is_human, *share) * len(human)
 
 
 def _whole(episode: EpisodeGrid) -> int:

@@ -3,21 +3,15 @@
 from collections import Counter
 from collections.abc import Sequence
 
-from dextouch.episodes import data_hash, split_by_scene
+from dextouch.episodes import split_by_scene
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.schemas import Domain
-from services.world_model.checkpoints import Checkpoint, TrainingSet
+from services.world_model.checkpoints import Checkpoint
 from services.world_model.settings import TrainSettings
 from services.world_model.tokenizer_files import read_tokenizer
-from services.world_model.training.dataset import (
-    EpisodeArrays,
-    TrainingEpisode,
-)
-from services.world_model.training.episodes import (
-    E,
-    load_episodes,
-    subset_by_hash,
-)
+from services.world_model.training.dataset import E, EpisodeArrays, TrainingEpisode
+from services.world_model.training.domains import subset_by_hash
+from services.world_model.training.episodes import load_episodes
 from services.world_model.training.frozen_tokenizer import split_unseen
 from services.world_model.training.streaming import index_episodes
 
@@ -107,77 +101,3 @@ def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[Trainin
             "or same scene); expected disjoint sets",
             episodes=both,
         )
-
-
-def check_tasks(
-    trained: Sequence[TrainingEpisode],
-    heldout: Sequence[TrainingEpisode],
-    settings: TrainSettings,
-    ancestor: Checkpoint | None = None,
-) -> None:
-    """Raise if a task is both human and robot (`disjoint_tasks`), or not new (`new_tasks`)."""
-    tasks: dict[Domain, set[str]] = {"human": set(), "robot": set()}
-    for episode in (*trained, *heldout):
-        tasks[episode.domain].add(episode.task)
-    if settings.new_tasks and ancestor is not None:
-        learned = set(ancestor.metadata.tasks)
-        learned |= {task for one in ancestor.metadata.sets if not one.heldout for task in one.tasks}
-        known = sorted(learned & (tasks["human"] | tasks["robot"]))
-        if known:
-            raise InvalidInputError(
-                f"training: the initial checkpoint {ancestor.metadata.name!r} was trained on tasks "
-                f"{known}, expected new ones; use other stores, or allow it with --no-new-tasks",
-                tasks=known,
-            )
-    both = sorted(tasks["human"] & tasks["robot"])
-    if settings.human and settings.disjoint_tasks and both:
-        raise InvalidInputError(
-            f"training: tasks {both} are in the human and in the robot episodes, expected disjoint "
-            "sets; use other stores, or allow it with --no-disjoint-tasks",
-            tasks=both,
-        )
-
-
-def training_sets(
-    trained: Sequence[TrainingEpisode],
-    heldout: Sequence[TrainingEpisode],
-    *,
-    settings: TrainSettings,
-    ancestor: Checkpoint | None,
-) -> tuple[TrainingSet, ...]:
-    """The episodes of a run by domain, after those of its ancestors."""
-    found: list[TrainingSet] = []
-    if ancestor is not None:
-        found += [
-            one if one.checkpoint else one.model_copy(update={"checkpoint": ancestor.digest})
-            for one in ancestor.metadata.sets
-        ]
-    domains = sorted({episode.domain for episode in trained})
-    human_share, image_px = settings.share_of_human, settings.network.image_px
-    shares: dict[Domain, float] = {}
-    if human_share is not None and len(domains) > 1:
-        shares = {"human": human_share, "robot": 1 - human_share}
-    for domain in domains:
-        mine = [episode for episode in trained if episode.domain == domain]
-        found.append(_set_of(mine, domain, image_px, window_share=shares.get(domain)))
-    for domain in sorted({episode.domain for episode in heldout}):
-        mine = [episode for episode in heldout if episode.domain == domain]
-        found.append(_set_of(mine, domain, image_px, heldout=True))
-    return tuple(found)
-
-
-def _set_of(
-    episodes: Sequence[TrainingEpisode],
-    domain: Domain,
-    image_px: int,
-    *,
-    heldout: bool = False,
-    window_share: float | None = None,
-) -> TrainingSet:
-    return TrainingSet(
-        domain=domain,
-        heldout=heldout,
-        tasks=dict(sorted(Counter(episode.task for episode in episodes).items())),
-        data_hash=data_hash((e.content_sha256 for e in episodes), image_px=image_px),
-        window_share=window_share,
-    )

@@ -25,14 +25,13 @@ from services.world_model.training.distribution import (
     ALONE,
     Processes,
 )
+from services.world_model.training.domains import check_tasks, training_sets
 from services.world_model.training.evaluation import evaluate_prediction
 from services.world_model.training.frozen_tokenizer import check_unseen, with_tokenizer
 from services.world_model.training.splits import (
     check_disjoint,
     check_not_learned,
-    check_tasks,
     load_split,
-    training_sets,
 )
 from services.world_model.training.state_files import StateFiles
 from services.world_model.training.training_run import OnProgress, TrainingProgress, TrainingRun
@@ -41,6 +40,7 @@ from services.world_model.training.training_state import (
     TrainingState,
     identity_of,
 )
+from services.world_model.training_set import learned_tasks
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,12 @@ def train_on(
         check_unseen(heldout, tokenizer)
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else read_checkpoint(settings.init)
-    check_tasks(trained, heldout, settings, ancestor)
+    known = (
+        set()
+        if ancestor is None
+        else {*ancestor.metadata.tasks, *learned_tasks(ancestor.metadata.sets)}
+    )
+    check_tasks((*trained, *heldout), settings, known)
     prints = {episode.fingerprint() for episode in trained}
     names = {episode.episode_id for episode in trained}
     if ancestor is not None:
@@ -114,7 +119,14 @@ def train_on(
         data_hash=_data_hash(trained, settings, ancestor),
         heldout_episode_ids=tuple(sorted(episode.episode_id for episode in heldout)),
         initialized_from=None if ancestor is None else ancestor.digest,
-        sets=training_sets(trained, heldout, settings=settings, ancestor=ancestor),
+        sets=training_sets(
+            trained,
+            heldout,
+            human_share=settings.share_of_human,
+            image_px=settings.network.image_px,
+            inherited=() if ancestor is None else ancestor.metadata.sets,
+            ancestor=None if ancestor is None else ancestor.digest,
+        ),
         tokenizer_digest=_tokenizer_digest(ancestor, tokenizer),
     )
     write_checkpoint(settings.output, averaged, metadata)

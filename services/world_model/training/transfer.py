@@ -1,9 +1,11 @@
-"""A state model for new tasks that keeps what another one learned of hands and objects."""
+"""A state model that a training starts from: what it keeps, and what is trained of it."""
 
 from functools import cached_property
 from pathlib import Path
 
 import torch
+from torch import Tensor
+from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
 from services.world_model.dynamics.configuration import DynamicsConfig
@@ -18,7 +20,7 @@ _SUCCESS = "success."
 
 
 class Base:
-    """A trained state model whose cores, touch codec and renderer are kept.
+    """A trained state model that another one starts from.
 
     Args:
         path: its checkpoint.
@@ -45,10 +47,12 @@ class Base:
         own = self.checkpoint.metadata.dynamics
         if own.image_px != config.image_px:
             raise InvalidInputError(
-                f"--base {self._path.name}: reads images of {own.image_px} px, the episodes have "
+                f"--init {self._path.name}: reads images of {own.image_px} px, the episodes have "
                 f"{config.image_px} px; record them with its size"
             )
-        return own.model_copy(update={"tasks": config.tasks, "num_objects": config.num_objects})
+        domains = own.domains if own.has_humans else config.domains
+        of_data = {"tasks": config.tasks, "num_objects": config.num_objects, "domains": domains}
+        return own.model_copy(update=of_data)
 
     def has_tasks_of(self, config: DynamicsConfig) -> bool:
         """Whether the base has the same tasks and objects."""
@@ -56,7 +60,7 @@ class Base:
         return (own.tasks, own.num_objects) == (config.tasks, config.num_objects)
 
     def reader(self, config: DynamicsConfig, member: int, *, seed: int) -> StartReader:
-        """A member's reader with fresh weights for the tasks."""
+        """A member's reader; weights of tasks that the base does not know are fresh."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             reader = StartReader(config)
@@ -65,8 +69,10 @@ class Base:
         reader.load_state_dict(kept, strict=False)
         return reader
 
-    def core(self, config: DynamicsConfig, member: int, *, seed: int) -> RecurrentCore:
-        """A member's core, in which only fresh weights that predict success can be trained.
+    def core(
+        self, config: DynamicsConfig, member: int, *, seed: int, learns_all: bool
+    ) -> RecurrentCore:
+        """A member's core, in which only fresh weights that predict success can be trained, or all.
 
         Of new tasks, they see distances, heights and angles of predicted poses alone: a few takes
         do not suffice to find which directions, or which units of the hidden state, do not matter.
@@ -78,11 +84,13 @@ class Base:
         kept = {
             name: value[member : member + 1]
             for name, value in known.named_parameters()
-            if not name.startswith(_SUCCESS)
+            if learns_all or not name.startswith(_SUCCESS)
         }
-        core.load_state_dict(kept, strict=False)
+        core.load_state_dict(_with_humans(kept, core), strict=False)
         core.lowest.copy_(known.lowest)
         core.highest.copy_(known.highest)
+        if learns_all:
+            return core
         core.requires_grad_(requires_grad=False)
         core.success.requires_grad_(requires_grad=True)
         if self.has_tasks_of(config):
@@ -94,3 +102,21 @@ class Base:
             first.mul_(used)
         first.register_hook(lambda gradient: gradient * used)  # type: ignore[no-untyped-call]
         return core
+
+
+def _with_humans(kept: dict[str, Tensor], core: RecurrentCore) -> dict[str, Tensor]:
+    """Weights of a core that knows robots alone, for one that tells people from robots.
+
+    Its new input, the last one, has no effect at first, and people feel as robots do.
+    """
+    shapes = {name: value.shape for name, value in core.named_parameters()}
+    known = dict(kept)
+    for name, value in kept.items():
+        missing = shapes[name][1] - value.shape[1] if value.ndim == 3 else 0
+        if missing:
+            known[name] = functional.pad(value, (0, 0, 0, missing))
+    for name in shapes:
+        robots = name.removeprefix("human.")
+        if name not in kept and robots in kept:
+            known[name] = kept[robots]
+    return known

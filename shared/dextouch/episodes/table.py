@@ -212,6 +212,11 @@ class EpisodeGrid:
         return self.about.task
 
     @property
+    def domain(self) -> Domain:
+        """Whose hands act."""
+        return self.about.domain
+
+    @property
     def scene(self) -> str:
         """Name of the scene, from `scene_of`."""
         return scene_of(self.about)

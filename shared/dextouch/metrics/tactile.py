@@ -90,10 +90,32 @@ def contact_iou(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
 
 def contact_f1(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
     """2 TP / (2 TP + FP + FN) of contact taxels; 1 when neither side has contact."""
-    both, either = _overlap(predicted_kpa, true_kpa, "contact F1")
+    return _f1(*_overlap(predicted_kpa, true_kpa, "contact F1"))
+
+
+def pad_contact_f1(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
+    """F1 of pads in contact, six of each hand; 1 when neither side has contact.
+
+    A fingertip or palm is in contact if one of its taxels is. Where exactly skin is pressed does
+    not matter, which differs between people and robots.
+    """
+    a, b = _pair(predicted_kpa, true_kpa, "contact F1 of pads")
+    return _f1(*_counted(_pads_in_contact(a), _pads_in_contact(b)))
+
+
+def _pads_in_contact(kpa: np.ndarray) -> np.ndarray:
+    tips, palm = split_pads(np.asarray(in_contact(kpa)))
+    return np.concatenate([tips.any((-1, -2)), palm.any((-1, -2))[..., None]], axis=-1)
+
+
+def _f1(both: int, either: int) -> float:
     return 2 * both / (both + either) if either else 1.0
 
 
 def _overlap(predicted: np.ndarray, true: np.ndarray, what: str) -> tuple[int, int]:
     a, b = (in_contact(kpa) for kpa in _pair(predicted, true, what))
+    return _counted(a, b)
+
+
+def _counted(a: np.ndarray, b: np.ndarray) -> tuple[int, int]:
     return int(np.count_nonzero(a & b)), int(np.count_nonzero(a | b))

@@ -23,8 +23,8 @@ station calibrate show, station calibrate wrist, station enrol, station serve,
 store clicks, store delete, store deletions, store enrol, store list, store migrate, store purge,
 store repair, store restore, store revoke, store serve, store show, store stations, store verify,
 study report, study run, study serve,
-train adapt, train data, train distill, train imagined, train policy,
-train probe, train state, train tokenizer, train world-model,
+train adapt, train data, train distill, train imagined, train judge, train policy,
+train tokenizer, train world-model,
 twin record, twin serve, up
 """
 NAMES = [" ".join(name.split()) for name in COMMANDS.split(",")]

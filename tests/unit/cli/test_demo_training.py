@@ -23,13 +23,13 @@ def test_a_small_state_model_is_trained_before_its_endings_are_judged(tmp_path, 
         scoring.train_models(tmp_path)
     world_model, _, probe = caught.value.args
     words = [word for word, *_ in called]
-    assert words == ["data"] * 4 + ["state", "policy", "imagined", "probe"]
-    settings = load_settings(TrainStateCommand, called[words.index("state")][1:])
+    assert words == ["data"] * 4 + ["world-model", "policy", "imagined", "judge"]
+    settings = load_settings(TrainStateCommand, called[words.index("world-model")][1:])
     assert settings.output == world_model
     assert settings.tasks == ("stand_bottle", "stack_bowls")
     assert settings.episodes == (str(tmp_path / "episodes"), str(tmp_path / "endings"))
     assert (settings.num_members, settings.core.num_steps) == (1, 1500)
-    imagined, judged = called[words.index("imagined")], called[words.index("probe")]
+    imagined, judged = called[words.index("imagined")], called[words.index("judge")]
     assert imagined[imagined.index("--checkpoint") + 1] == str(world_model)
     assert imagined[imagined.index("--store") + 1] in judged
     assert judged[-1] == str(probe)

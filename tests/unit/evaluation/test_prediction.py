@@ -169,6 +169,41 @@ def test_every_metric_stands_beside_every_baseline_that_has_it():
     assert figures["zero"]["tactile_mae"] == pytest.approx(truth, rel=1e-5)
 
 
+class PushWorld(PressWorld):
+    """Says that its one object has gone as far in x as the right hand went down."""
+
+    def step(self, state, actions, *, seed, selector=EVERYTHING):
+        stepped = super().step(state, actions, seed=seed)
+        poses = np.zeros((len(actions), 2, 7), dtype=np.float32)
+        poses[:, 0, 0] = -actions[:, 11]
+        seen = replace(stepped.observation, object_poses=poses)
+        return SteppedRollout(stepped.state, seen.selected(selector))
+
+
+def with_objects(one, moved_m):
+    """A scene whose first object moves in x; where the second one is, is not known at the end."""
+    last_m = np.array([[moved_m, 0.0, 0.0], [np.nan] * 3])
+    truth = replace(one.truth, objects_m=last_m)
+    return replace(one, truth=truth, first_objects_m=np.zeros((2, 3)))
+
+
+def test_errors_of_objects_are_those_of_the_ones_that_moved():
+    world = PushWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
+    said_m = 0.2 * (NUM_STEPS - 1) / NUM_STEPS
+    scenes = [with_objects(scene(1, 0.2), said_m + 0.03), with_objects(scene(2, 0.0), 0.009)]
+    metrics = (METRICS["object_error"],)
+    figures = measure_prediction(world, scenes, metrics=metrics).flat()
+    assert figures["object_error"] == pytest.approx(30.0, abs=1e-3)
+    assert figures["object_error_copy"] == pytest.approx(1e3 * (said_m + 0.03))
+    # Given the actions of the other take, in which nothing moves.
+    assert figures["object_error_other_take"] == pytest.approx(1e3 * (said_m + 0.03))
+    assert not {"object_error_warp", "object_error_zero", "object_error_codec"} & set(figures)
+    blind = PressWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
+    unseen = measure_prediction(blind, scenes, metrics=metrics).by_task[ALL_TASKS]
+    assert unseen[MODEL]["object_error"] is None
+    assert unseen["copy"]["object_error"] == pytest.approx(1e3 * (said_m + 0.03))
+
+
 class CodingWorld(PressWorld):
     """Codecs that lose three grey levels and half of the touch."""
 

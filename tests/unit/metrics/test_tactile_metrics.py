@@ -14,6 +14,7 @@ MEASURES = [
     tactile.contact_mae,
     tactile.contact_iou,
     tactile.contact_f1,
+    tactile.pad_contact_f1,
 ]
 
 
@@ -49,10 +50,21 @@ def test_the_empty_union_is_agreement_and_no_contact_error():
     assert np.isnan(tactile.contact_mae(**light))
 
 
+def test_pads_are_in_contact_wherever_they_are_touched():
+    # Fingertips have 16 taxels each, thumb first; the palm has the 240 after them.
+    predicted = hands(t0=5.0, t20=5.0, t300=5.0)
+    true = hands(t15=5.0, t40=5.0, t90=5.0)
+    pair = {"predicted_kpa": predicted, "true_kpa": true}
+    # Thumb and palm are right, the index finger is wrong and the middle finger is missed.
+    assert tactile.pad_contact_f1(**pair) == pytest.approx(4 / 6)
+    assert tactile.contact_f1(**pair) == 0.0
+
+
 def test_one_sided_contact_scores_zero():
     for pair in ((hands(), hands(t3=5.0)), (hands(t3=5.0), hands())):
         assert tactile.contact_iou(predicted_kpa=pair[0], true_kpa=pair[1]) == 0.0
         assert tactile.contact_f1(predicted_kpa=pair[0], true_kpa=pair[1]) == 0.0
+        assert tactile.pad_contact_f1(predicted_kpa=pair[0], true_kpa=pair[1]) == 0.0
 
 
 def test_everything_pools_over_samples():

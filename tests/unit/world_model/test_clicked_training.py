@@ -23,12 +23,13 @@ from services.world_model.training.core_training import CoreData, _read_start, s
 from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_episodes import load_scene_episodes
 from services.world_model.training.scene_table import SceneTable, scene_table
-from services.world_model.training.state_trainer import (
-    _check_drawable,
-    _has_poses,
-    _labelled,
-    train_state,
+from services.world_model.training.state_data import (
+    check_drawable,
+    has_poses,
+    labelled_episodes,
+    load_state_data,
 )
+from services.world_model.training.state_trainer import train_state
 from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.world_model.test_state_training import (  # noqa: F401 (fixture)
     PX,
@@ -147,11 +148,13 @@ def test_takes_without_poses_need_others_with_poses(store, truths):
     assert len(loaded) == 7
 
 
-def test_clicks_on_unknown_takes_are_refused(store, truths):
+def test_clicks_on_unknown_takes_are_refused(store, truths, tmp_path):
     given = clicks_file(truths, [0])
     given = given.model_copy(update={"episodes": {"gone": clicks_on(truths[0])}})
+    path = tmp_path / "clicks.json"
+    path.write_text(given.model_dump_json())
     with pytest.raises(NotFoundError, match="'gone'"):
-        load_scene_episodes(str(store.root), clicks=given)
+        load_state_data(StateTrainSettings(episodes=(str(store.root),), clicks=path, image_px=PX))
 
 
 def test_unfinished_clicks_of_a_file_are_refused_and_those_of_the_page_wait(store, truths):
@@ -159,7 +162,7 @@ def test_unfinished_clicks_of_a_file_are_refused_and_those_of_the_page_wait(stor
     half = EpisodeClicks(objects={"bottle": whole.model_copy(update={"heading_px": None})})
     store.set_clicks(name_of(1), half)
     loaded = load_scene_episodes(str(store.root), clicks=clicks_file(truths, [0]))
-    assert [_has_poses(one) for one in loaded] == [True] + [False] * 5
+    assert [has_poses(one) for one in loaded] == [True] + [False] * 5
     given = clicks_file(truths, [0])
     given = given.model_copy(update={"episodes": {name_of(1): half}})
     with pytest.raises(InvalidInputError, match="has no heading_px"):
@@ -199,7 +202,7 @@ def test_readers_are_trained_on_what_is_known(config, monkeypatch):  # noqa: F81
     known[:5] = False
     late = changed(late, known=known)
     takes = [clicked(0), *(unposed(seed) for seed in range(1, 9)), episode(9), late]
-    table = scene_table(takes, config, labelled=[_has_poses(one) for one in takes])
+    table = scene_table(takes, config, labelled=[has_poses(one) for one in takes])
     seen = []
     first_steps = SceneTable.first_steps
 
@@ -241,17 +244,17 @@ def test_what_is_known_at_single_steps_counts_as_moving(config):  # noqa: F811
     assert scene_table([fixed, clicked(1)], config).movable().tolist() == [[0.0, 0.0, 0.0]]
 
 
-def test_takes_without_poses_are_not_labelled():
+def test_takes_without_poses_are_notlabelled_episodes():
     settings = StateTrainSettings(episodes=("takes",))
-    assert _labelled([clicked(0), unposed(1)], settings) == [True, False]
+    assert labelled_episodes([clicked(0), unposed(1)], settings) == [True, False]
     with pytest.raises(InvalidInputError, match="no scene with known objects of press"):
-        _labelled([unposed(1)], settings)
+        labelled_episodes([unposed(1)], settings)
 
 
 def test_clicks_alone_need_a_base():
-    _check_drawable([clicked(0), episode(1)])
-    with pytest.raises(InvalidInputError, match="add --base"):
-        _check_drawable([clicked(0), unposed(1)])
+    check_drawable([clicked(0), episode(1)])
+    with pytest.raises(InvalidInputError, match="add --init"):
+        check_drawable([clicked(0), unposed(1)])
 
 
 def test_other_clicks_are_other_data(store, truths):
@@ -287,7 +290,8 @@ def test_a_lab_trains_with_a_base_and_clicks(store, truths, tmp_path):
     settings = StateTrainSettings(
         episodes=(str(store.root),),
         clicks=path,
-        base=place,
+        init=place,
+        learn="readers",
         output=tmp_path / "lab.safetensors",
         image_px=PX,
         heldout_share=0.3,

@@ -20,7 +20,7 @@ def test_train_then_show(toy_store, tmp_path, capsys):
         "network.codec_channels": 8, "windows.fit_windows": 8, "optimizer.batch": 2,
     }  # fmt: skip
     arguments = [f"--{name.replace('_', '-')}={value}" for name, value in flags.items()]
-    assert run_train([*arguments]) == 0
+    assert run_train(["--preset=tiny", *arguments]) == 0
     written = json.loads(report.read_text())
     assert written["steps"] == 3
     assert "psnr_copy" in written["metrics"]

@@ -45,8 +45,9 @@ from services.world_model.training.reader_training import (
     train_reader,
 )
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
+from services.world_model.training.state_data import labelled_episodes
 from services.world_model.training.state_evaluation import evaluate_dynamics
-from services.world_model.training.state_trainer import _command, _labelled
+from services.world_model.training.state_trainer import _command
 from tests.unit.world_model.toy_grid import ToyGrid, changed
 
 PX, NUM_STEPS = 32, 17
@@ -179,12 +180,12 @@ def test_all_takes_of_a_scene_are_labelled_or_none():
     ]
     settings = TrainStateCommand(episodes=("takes",), labelled_share=0.3)
     training, _ = split_by_scene(takes, held_out_share=settings.heldout_share)
-    known = _labelled(training, settings)
+    known = labelled_episodes(training, settings)
     chosen = {e.scene for e, one in zip(training, known, strict=True) if one}
     assert sum(known) == 2 * len(chosen)
     assert 0.15 < len(chosen) / len({e.scene for e in training}) < 0.45
     with pytest.raises(InvalidInputError, match="--labelled-share"):
-        _labelled(training, settings.model_copy(update={"labelled_share": 1e-6}))
+        labelled_episodes(training, settings.model_copy(update={"labelled_share": 1e-6}))
 
 
 @pytest.mark.slow
@@ -470,16 +471,16 @@ def test_the_command_in_a_checkpoint_can_be_typed_again():
     settings = TrainStateCommand(
         episodes=("file:///data/takes", "more"),
         tasks=("press",),
-        base=Path("/models/cores.safetensors"),
+        init=Path("/models/cores.safetensors"),
         core=CoreSettings(num_steps=7, weights=CoreLossWeights(touch=0.0)),
         json=Path("/somewhere/figures.json"),
     )
     command = _command(settings)
-    assert command.startswith("dextouch train state --episodes=takes --episodes=more ")
+    assert command.startswith("dextouch train world-model --episodes=takes --episodes=more ")
     assert "/" not in command
     again = load_settings(TrainStateCommand, command.split()[3:])
     assert again.core.num_steps == 7
-    assert again.base == Path("cores.safetensors")
+    assert again.init == Path("cores.safetensors")
     assert again.core.weights.touch == 0.0
     assert again.tasks == ("press",)
 

@@ -193,7 +193,7 @@ def test_the_command_line_streams(toy_store, tmp_path, capsys):
         "loader_workers": 0,
     }  # fmt: skip
     arguments = [f"--{name.replace('_', '-')}={value}" for name, value in flags.items()]
-    assert run_train(["--streaming", *arguments]) == 0
+    assert run_train(["--preset=tiny", "--streaming", *arguments]) == 0
     assert json.loads(report.read_text())["steps"] == 2
     command = read_checkpoint(output).metadata.command
     assert command.startswith("dextouch train world-model --")

@@ -19,11 +19,10 @@ from services.world_model.training.core_training import (
 )
 from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_table import scene_table
+from services.world_model.training.state_data import seed_ranges, trained_splits
 from services.world_model.training.state_trainer import (
     _assembled,
     _keep,
-    _seed_ranges,
-    _splits,
     _with_base,
     _Work,
     train_state,
@@ -62,7 +61,7 @@ def test_shapes_are_the_bases_and_tasks_the_new_ones(base, config):
 
 def test_only_the_estimate_of_success_of_a_core_changes(base, config, table):
     data = CoreData(table, touch_latents(TouchCodec(config.touch_channels), table), {})
-    core = base.core(config, 1, seed=0)
+    core = base.core(config, 1, seed=0, learns_all=False)
     trained = train_core(
         data, config, CoreSettings(num_steps=5, batch=4), seed=0, initial=core
     ).state_dict()
@@ -88,7 +87,8 @@ def test_a_reader_starts_from_the_member_it_replaces(base, config, table):
 
 
 def test_new_weights_of_tasks_are_drawn_from_the_seed(base, config):
-    success = [base.core(config, 0, seed=seed).success[-1].weight for seed in (1, 1, 2)]
+    cores = [base.core(config, 0, seed=seed, learns_all=False) for seed in (1, 1, 2)]
+    success = [core.success[-1].weight for core in cores]
     assert torch.equal(success[0], success[1])
     assert not torch.equal(success[0], success[2])
     one, same, other = (base.reader(config, 0, seed=seed).task.weight for seed in (1, 1, 2))
@@ -99,7 +99,7 @@ def test_new_weights_of_tasks_are_drawn_from_the_seed(base, config):
 def test_of_the_same_tasks_the_estimate_sees_the_hidden_state_too(base):
     own = base.checkpoint.metadata.dynamics
     assert base.has_tasks_of(own)
-    core = base.core(own, 0, seed=0)
+    core = base.core(own, 0, seed=0, learns_all=False)
     assert core.success[0].weight[:, : own.width].any()
     assert [name for name, one in core.named_parameters() if one.requires_grad] == [
         name for name, _ in core.named_parameters() if name.startswith("success.")
@@ -107,8 +107,8 @@ def test_of_the_same_tasks_the_estimate_sees_the_hidden_state_too(base):
 
 
 def test_readers_of_the_base_can_be_kept(base, config, tmp_path):
-    given = StateTrainSettings(episodes=("takes",), base=base._path, keep_readers=True)
-    with pytest.raises(InvalidInputError, match=r"have tasks press, expected the base's, stand_b"):
+    given = StateTrainSettings(episodes=("takes",), init=base._path, learn="success")
+    with pytest.raises(InvalidInputError, match="have tasks press, expected those of --init, s"):
         _with_base(base, config, given)
     own = base.checkpoint.metadata.dynamics
     settings = _with_base(base, own, given)
@@ -117,7 +117,7 @@ def test_readers_of_the_base_can_be_kept(base, config, tmp_path):
     assert (weights.success, settings.num_members) == (1, 2)
     work = _Work(settings, own, tmp_path, "hash", reads_starts=False)
     for member in range(2):
-        _keep(base.core(own, member, seed=7), work.core_file(member), 1.5)
+        _keep(base.core(own, member, seed=7, learns_all=False), work.core_file(member), 1.5)
     dynamics, _, cpu_s = _assembled(work, TouchCodec(own.touch_channels))
     assert cpu_s == 3.0
     for old, new in zip(base.checkpoint.dynamics.readers(), dynamics.readers(), strict=True):
@@ -126,8 +126,8 @@ def test_readers_of_the_base_can_be_kept(base, config, tmp_path):
 
 
 def test_without_a_base_no_readers_can_be_kept(tmp_path):
-    settings = StateTrainSettings(episodes=(str(tmp_path),), keep_readers=True)
-    with pytest.raises(InvalidInputError, match="add --base PATH"):
+    settings = StateTrainSettings(episodes=(str(tmp_path),), learn="success")
+    with pytest.raises(InvalidInputError, match="add --init PATH"):
         train_state(settings)
 
 
@@ -135,14 +135,14 @@ def test_seeds_of_the_base_remain_known(base):
     known = base.checkpoint.metadata.model_copy(update={"training_seeds": {"press": (3, 9)}})
     other = Base(base._path)
     other.checkpoint = dataclasses.replace(base.checkpoint, metadata=known)
-    assert _seed_ranges([episode(20), episode(21)], other) == {"press": (3, 21)}
-    assert _seed_ranges([episode(20), episode(21)], None) == {"press": (20, 21)}
+    assert seed_ranges([episode(20), episode(21)], other) == {"press": (3, 21)}
+    assert seed_ranges([episode(20), episode(21)], None) == {"press": (20, 21)}
     settings = StateTrainSettings(episodes=("takes",), splits=("C",))
     # The base was trained on all splits.
-    assert (_splits(settings, other), _splits(settings, None)) == ((), ("C",))
+    assert (trained_splits(settings, other), trained_splits(settings, None)) == ((), ("C",))
     known = known.model_copy(update={"training_splits": ("A",)})
     other.checkpoint = dataclasses.replace(base.checkpoint, metadata=known)
-    assert _splits(settings, other) == ("A", "C")
+    assert trained_splits(settings, other) == ("A", "C")
 
 
 def test_the_estimate_alone_is_trained_from_what_a_reader_reads(base, table):

@@ -151,7 +151,7 @@ def test_plans_are_printed_instead_of_training_and_provenance(checkpoint, tmp_pa
     assert checkpoint.digest
     assert run_show(["--checkpoint", str(tmp_path / "untrained.safetensors"), "--plan"]) == 0
     assert "one action chunk of 16 steps, 20 video and 34" in capsys.readouterr().out
-    assert run_train(["--episodes", "unused", "--plan"]) == 0
+    assert run_train(["--preset", "tiny", "--episodes", "unused", "--plan"]) == 0
     assert "one action chunk of 16 steps, 80 video and 34" in capsys.readouterr().out
 
 

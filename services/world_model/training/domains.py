@@ -1,0 +1,153 @@
+"""Episodes of people and of robots in one training: subsets of them, checks, and their provenance.
+
+Both forms of the world model are trained on them, so that only what is common to their episodes is
+used here.
+"""
+
+import hashlib
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
+from typing import Protocol, TypeVar, runtime_checkable
+
+from dextouch.episodes import data_hash
+from dextouch.errors import InvalidInputError
+from dextouch.schemas import Domain
+from services.world_model.settings import DataSettings
+from services.world_model.training_set import TrainingSet
+
+
+@runtime_checkable
+class DomainEpisode(Protocol):
+    """An episode of either form of the world model."""
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+        ...
+
+    @property
+    def domain(self) -> Domain:
+        """Whose hands act."""
+        ...
+
+    @property
+    def content_sha256(self) -> str:
+        """Digest of all that its store holds of it."""
+        ...
+
+
+E = TypeVar("E", bound=DomainEpisode)
+
+
+def subset_by_hash(episodes: Sequence[E], count: int | None, *, what: str) -> list[E]:
+    """A number of episodes chosen by their content, in their order; None for all.
+
+    A larger subset of the same episodes contains every smaller one.
+
+    Args:
+        episodes: to choose from.
+        count: how many.
+        what: what they are, for the message.
+
+    Raises:
+        InvalidInputError: there are fewer; `what` names them.
+    """
+    if count is None:
+        return list(episodes)
+    if count > len(episodes):
+        raise InvalidInputError(
+            f"training: got {count} as the number of {what} episodes, expected at most the "
+            f"{len(episodes)} there are; record more, or ask for fewer"
+        )
+
+    def place(index: int) -> str:
+        text = f"subset/{episodes[index].content_sha256}"
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    chosen = sorted(range(len(episodes)), key=place)[:count]
+    return [episodes[index] for index in sorted(chosen)]
+
+
+def check_tasks(
+    episodes: Iterable[DomainEpisode], settings: DataSettings, known: Collection[str] = ()
+) -> None:
+    """Check that tasks are of one domain (`disjoint_tasks`) and new (`new_tasks`).
+
+    Args:
+        episodes: trained on and held out.
+        settings: of the run.
+        known: tasks that the initial checkpoint was trained on.
+
+    Raises:
+        InvalidInputError: a task is both human and robot, or is known already.
+    """
+    tasks: dict[Domain, set[str]] = {"human": set(), "robot": set()}
+    for episode in episodes:
+        tasks[episode.domain].add(episode.task)
+    again = sorted(set(known) & (tasks["human"] | tasks["robot"]))
+    if settings.new_tasks and again:
+        raise InvalidInputError(
+            f"training: the initial checkpoint was trained on tasks {again}, expected new ones; "
+            "use other stores, or allow it with --no-new-tasks",
+            tasks=again,
+        )
+    both = sorted(tasks["human"] & tasks["robot"])
+    if settings.human and settings.disjoint_tasks and both:
+        raise InvalidInputError(
+            f"training: tasks {both} are in the human and in the robot episodes, expected disjoint "
+            "sets; use other stores, or allow it with --no-disjoint-tasks",
+            tasks=both,
+        )
+
+
+def training_sets(
+    trained: Sequence[DomainEpisode],
+    heldout: Sequence[DomainEpisode],
+    *,
+    human_share: float | None,
+    image_px: int | None,
+    inherited: Sequence[TrainingSet] = (),
+    ancestor: str | None = None,
+) -> tuple[TrainingSet, ...]:
+    """The episodes of a run by domain, after those of its ancestors.
+
+    Args:
+        trained: episodes of training.
+        heldout: episodes of evaluation.
+        human_share: share of human episodes in what is drawn; None if it follows from their number.
+        image_px: side that images are scaled to, as `data_hash` wants it.
+        inherited: sets of the initial checkpoint.
+        ancestor: its digest.
+    """
+    found = [
+        one if one.checkpoint else one.model_copy(update={"checkpoint": ancestor})
+        for one in inherited
+    ]
+    domains = sorted({episode.domain for episode in trained})
+    shares: dict[Domain, float] = {}
+    if human_share is not None and len(domains) > 1:
+        shares = {"human": human_share, "robot": 1 - human_share}
+    for domain in domains:
+        mine = [episode for episode in trained if episode.domain == domain]
+        found.append(_set_of(mine, domain, image_px, window_share=shares.get(domain)))
+    for domain in sorted({episode.domain for episode in heldout}):
+        mine = [episode for episode in heldout if episode.domain == domain]
+        found.append(_set_of(mine, domain, image_px, heldout=True))
+    return tuple(found)
+
+
+def _set_of(
+    episodes: Sequence[DomainEpisode],
+    domain: Domain,
+    image_px: int | None,
+    *,
+    heldout: bool = False,
+    window_share: float | None = None,
+) -> TrainingSet:
+    return TrainingSet(
+        domain=domain,
+        heldout=heldout,
+        tasks=dict(sorted(Counter(episode.task for episode in episodes).items())),
+        data_hash=data_hash((e.content_sha256 for e in episodes), image_px=image_px),
+        window_share=window_share,
+    )

@@ -1,0 +1,210 @@
+"""Episodes that a state model is trained and evaluated on, and their provenance."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from dextouch.episodes import (
+    SPLITS,
+    EpisodeGrid,
+    EpisodeStore,
+    Split,
+    scene_fraction,
+    split_by_scene,
+)
+from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.schemas import Domain, ObjectClicks, load_object_clicks
+from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.settings import StateTrainSettings
+from services.world_model.state_checkpoints import scene_digest
+from services.world_model.training.domains import check_tasks, subset_by_hash
+from services.world_model.training.scene_episodes import load_scene_episodes
+from services.world_model.training.scene_table import vocabulary
+from services.world_model.training.transfer import Base
+
+
+@dataclass(frozen=True)
+class StateData:
+    """Episodes of training, of robots and people, and held-out ones.
+
+    Of data of both domains, those of robots alone are held out: rollouts are of robots.
+    """
+
+    training: Sequence[EpisodeGrid]
+    heldout: Sequence[EpisodeGrid]
+
+    @property
+    def episodes(self) -> list[EpisodeGrid]:
+        """All of them."""
+        return [*self.training, *self.heldout]
+
+    @property
+    def has_both_domains(self) -> bool:
+        """Whether people and robots act in the episodes of training."""
+        return len({episode.domain for episode in self.training}) > 1
+
+
+def load_state_data(settings: StateTrainSettings) -> StateData:
+    """Read the episodes of a run.
+
+    Robot episodes are split before a subset of them is taken, so that every subset has the same
+    held-out episodes.
+
+    Raises:
+        NotFoundError: an empty store, none that can be used, or clicks on an unknown episode.
+        ConflictError: an id is in two stores, or two episodes are of one recording.
+        InvalidInputError: held-out scenes that are trained on, or too few episodes.
+    """
+    clicks = None if settings.clicks is None else load_object_clicks(settings.clicks)
+    heldout_urls = () if settings.heldout is None else (settings.heldout,)
+    _check_clicked(clicks, (*settings.episodes, *settings.human, *heldout_urls))
+    load = partial(
+        load_scene_episodes, tasks=settings.tasks, image_px=settings.image_px, clicks=clicks
+    )
+    domain: Domain | None = "robot" if settings.human else None
+    training = load(*settings.episodes, splits=settings.splits, domain=domain)
+    if settings.heldout is None:
+        training, heldout = split_by_scene(training, held_out_share=settings.heldout_share)
+    else:
+        heldout = load(settings.heldout, domain=domain)
+    training = subset_by_hash(training, settings.robot_episodes, what="robot")
+    if settings.human and settings.human_episodes != 0:
+        people = load(*settings.human, splits=settings.splits, domain="human")
+        training += subset_by_hash(people, settings.human_episodes, what="human")
+    robots = [episode for episode in heldout if episode.domain == "robot"]
+    data = StateData(training, robots or heldout)
+    both = {one.scene for one in training} & {one.scene for one in data.heldout}
+    if both:
+        raise InvalidInputError(
+            f"training: scenes {sorted(both)[:3]} are trained on and held out, expected disjoint "
+            "ones; use another --heldout store"
+        )
+    return data
+
+
+def check_new(data: StateData, settings: StateTrainSettings, base: Base | None) -> None:
+    """Check tasks by domain, and that the initial checkpoint has not seen what is held out.
+
+    Raises:
+        InvalidInputError: it has, or as `check_tasks`.
+    """
+    known = () if base is None else base.checkpoint.metadata.dynamics.tasks
+    check_tasks(data.episodes, settings, known)
+    if base is None or settings.heldout is None:
+        return
+    about = base.checkpoint.metadata
+    seen = [one.episode_id for one in data.heldout if about.may_have_seen_episode(one.about)]
+    if seen:
+        raise InvalidInputError(
+            f"training: the initial checkpoint may have been trained on {len(seen)} of the "
+            f"held-out episodes {seen[:3]}; use a held-out store that it has not seen"
+        )
+
+
+def _check_clicked(clicks: ObjectClicks | None, urls: Sequence[str]) -> None:
+    stores = [EpisodeStore(url) for url in urls]
+    for name in () if clicks is None else clicks.episodes:
+        if not any(store.exists(name) for store in stores):
+            raise NotFoundError(f"clicks: episode {name!r} is in none of {', '.join(urls)}")
+
+
+def configured(data: StateData, settings: StateTrainSettings) -> DynamicsConfig:
+    """The configuration of a model of some episodes.
+
+    Raises:
+        InvalidInputError: images of several sizes, or tasks whose episodes differ in their objects.
+    """
+    episodes = data.episodes
+    tasks, num_objects = vocabulary(episodes)
+    sides = {episode.image_size_px[0] for episode in episodes}
+    if len(sides) != 1:
+        raise InvalidInputError(
+            f"state model: got episodes with images of {sorted(sides)} px, expected one size"
+        )
+    return DynamicsConfig(
+        tasks=tasks,
+        num_objects=num_objects,
+        image_px=sides.pop(),
+        width=settings.width,
+        domains=("robot", "human") if data.has_both_domains else ("robot",),
+    )
+
+
+def check_drawable(episodes: Sequence[EpisodeGrid]) -> None:
+    """Refuse what no renderer can be trained on, before hours of training other parts.
+
+    Raises:
+        InvalidInputError: no episode shows its objects at two known poses.
+    """
+    for one in episodes:
+        if one.objects is not None and one.objects.known[one.image_steps].all(axis=1).sum() > 1:
+            return
+    raise InvalidInputError(
+        "state model: no episode shows all of its objects at known poses twice, which cores and "
+        "the renderer learn from (clicks are poses of the first step alone); add --init PATH "
+        "--learn readers, a trained state model whose cores and renderer are kept"
+    )
+
+
+def has_poses(episode: EpisodeGrid) -> bool:
+    """Whether the pose of some object is known; true of tasks without objects."""
+    track = episode.objects
+    return not episode.object_names or (track is not None and bool(track.known.any()))
+
+
+def labelled_episodes(episodes: Sequence[EpisodeGrid], settings: StateTrainSettings) -> list[bool]:
+    """Mask of episodes whose object poses are trained on.
+
+    Of a scene, these are all takes that have poses, or none.
+
+    Raises:
+        InvalidInputError: a task has none.
+    """
+    # Training scenes lie above the held-out share, if some of them are held out.
+    least = 0.0 if settings.heldout else settings.heldout_share
+    share = least + (1 - least) * settings.labelled_share
+    labelled = [has_poses(e) and scene_fraction(e.scene) <= share for e in episodes]
+    known = {episode.task for episode, yes in zip(episodes, labelled, strict=True) if yes}
+    without = {episode.task for episode in episodes} - known
+    if without:
+        raise InvalidInputError(
+            f"--labelled-share {settings.labelled_share:g}: leaves no scene with known objects of "
+            f"{', '.join(sorted(without))} to train on; choose a larger share, a smaller "
+            "--heldout-share, or click the objects of more episodes"
+        )
+    return labelled
+
+
+def object_sources(episodes: Sequence[EpisodeGrid]) -> dict[str, int]:
+    """Number of episodes with poses of objects from each source, and without any ("none")."""
+    tracks = [one.objects for one in episodes if one.object_names and one.objects is not None]
+    each = [{*track.sources} - {"none"} or {"none"} for track in tracks]
+    return dict(sorted(Counter(source for sources in each for source in sources).items()))
+
+
+def seed_ranges(episodes: Sequence[EpisodeGrid], base: Base | None) -> dict[str, tuple[int, int]]:
+    """First and last seed of every task, the base's included; recordings have none."""
+    known = {} if base is None else base.checkpoint.metadata.training_seeds
+    seeds = {task: list(ends) for task, ends in known.items()}
+    for episode in episodes:
+        if episode.about.seed is not None:
+            seeds.setdefault(episode.task, []).append(episode.about.seed)
+    return {task: (min(found), max(found)) for task, found in sorted(seeds.items())}
+
+
+def recorded_scenes(episodes: Sequence[EpisodeGrid], base: Base | None) -> tuple[str, ...]:
+    """Digests of the scenes without a seed, the base's included."""
+    known = set() if base is None else set(base.checkpoint.metadata.training_scenes)
+    own = {scene_digest(episode.scene) for episode in episodes if episode.about.seed is None}
+    return tuple(sorted(known | own))
+
+
+def trained_splits(settings: StateTrainSettings, base: Base | None) -> tuple[Split, ...]:
+    """Splits that the run and its base were trained on; none means all."""
+    if base is None:
+        return settings.splits
+    known = base.checkpoint.metadata.training_splits
+    if not (settings.splits and known):
+        return ()
+    return tuple(split for split in SPLITS if split in {*settings.splits, *known})
