@@ -105,7 +105,7 @@ def pad_contact_f1(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
 
 def _pads_in_contact(kpa: np.ndarray) -> np.ndarray:
     tips, palm = split_pads(np.asarray(in_contact(kpa)))
-    return np.concatenate([tips.any((-1, -2)), palm.any((-1, -2))[..., None]], axis=-1)
+    return np.concatenate([tips.any((-1, -2)), np.expand_dims(palm.any((-1, -2)), -1)], axis=-1)
 
 
 def _f1(both: int, either: int) -> float:
