@@ -88,7 +88,7 @@ reproduce: $(VENV)/.runtime   ## the paper's tables in miniature, in runs/reprod
 	$(BIN)/python -m benchmarks reproduction $(ARGS)
 
 # Run again to resume after an interruption. The last step reports which bounds are met and which figures match docs/evaluator.json.
-reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's state model, success probe and cloned policies, and measure them, in runs/reproduce
+reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's state model and cloned policies, calibrate its judge, and measure them, in runs/reproduce
 	$(BIN)/dextouch train data --store $(MADE)/train --count 800 --images 4 --varied 0.7 --resized 0.2
 	$(BIN)/dextouch train data --store $(MADE)/judge --first 1000 --count 250 --images 4 --varied 0.7 --resized 0.4
 	$(BIN)/dextouch train data --store $(MADE)/kinds --mix development --first 21000 --count 180 --images 4 --resized 0.4
@@ -96,17 +96,13 @@ reproduce-checkpoints: $(VENV)/.runtime   ## record data, train the package's st
 	$(BIN)/dextouch train world-model --episodes $(MADE)/train --output $(MADE)/cores.safetensors --jobs 3
 	$(BIN)/dextouch train world-model --init $(MADE)/cores.safetensors --learn success --episodes $(MADE)/judge \
 		--core.num-steps 1200 --output $(MADE)/state.safetensors
-	$(BIN)/dextouch train imagined --episodes $(MADE)/judge --store $(MADE)/imagined \
-		--checkpoint $(MADE)/state.safetensors
-	$(BIN)/dextouch train imagined --episodes $(MADE)/train --seeds 0:100 --store $(MADE)/imagined \
-		--checkpoint $(MADE)/state.safetensors
 	$(BIN)/dextouch train imagined --episodes $(MADE)/development --store $(MADE)/imagined_development \
 		--checkpoint $(MADE)/state.safetensors
 	$(BIN)/dextouch train imagined --episodes $(MADE)/kinds --store $(MADE)/imagined_development \
 		--checkpoint $(MADE)/state.safetensors
-	$(BIN)/dextouch train judge --episodes $(MADE)/train --episodes $(MADE)/judge --episodes $(MADE)/imagined \
-		--development $(MADE)/development --development $(MADE)/kinds --development $(MADE)/imagined_development \
-		--output $(MADE)/success_probe.safetensors --training.num-training-steps 1500 --training.held-out-share 0.1
+	$(BIN)/dextouch train judge --base services/evaluation/pretrained/success_probe.safetensors \
+		--episodes $(MADE)/kinds,$(MADE)/development,$(MADE)/imagined_development \
+		--output $(MADE)/success_probe.safetensors
 	$(BIN)/dextouch train data --store $(MADE)/exact --mix exact --first 700 --count 50 --images 8
 	$(BIN)/dextouch train policy --episodes $(MADE)/train --episodes $(MADE)/exact --early-at 0.1 \
 		--training.num-training-steps 3600 --training.max-cpu-s 150 --output $(MADE)/cloned.safetensors

@@ -1,6 +1,11 @@
-"""Whether a run of the evaluator repeats an earlier one: each figure within a stated tolerance."""
+"""Whether a run of the evaluator repeats an earlier one: each figure within a stated tolerance.
+
+Figures of few starts scatter, those of policies most. The tolerance of a difference is therefore at
+least its own 95 % half width, the root of the sum of squares of those of both figures.
+"""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -11,7 +16,7 @@ from benchmarks.evaluator.drawn import Line
 from benchmarks.figures import Requirement
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 
-# Tolerances by unit: of areas under the curve, correlations, rates and the like, and of decibels.
+# Smallest tolerances by unit: of areas under the curve, correlations, rates and the like, and of decibels.
 # Figures in other units scatter too much to be compared.
 TOLERANCES: Final = {"": 0.08, "dB": 1.0}
 
@@ -22,6 +27,7 @@ class _EarlierLine(BaseModel):
     task: str
     what: str
     value: float | None
+    interval: tuple[float, float] | None = None
     unit: str = ""
 
 
@@ -74,5 +80,11 @@ def repetition(lines: Sequence[Line], earlier: Earlier) -> list[Requirement]:
             continue
         apart = None if line.value is None else abs(line.value - other.value)
         what = f"{line.task}: {line.what}, apart from {other.value:.3f} before"
-        found.append(Requirement(what, apart, "at most", TOLERANCES[other.unit], line.unit))
+        sampling = math.hypot(_half_width(line.interval), _half_width(other.interval))
+        bound = max(TOLERANCES[other.unit], sampling)
+        found.append(Requirement(what, apart, "at most", bound, line.unit))
     return found
+
+
+def _half_width(interval: tuple[float, float] | None) -> float:
+    return 0.0 if interval is None else (interval[1] - interval[0]) / 2

@@ -1,6 +1,7 @@
 """Whether a run of the evaluator repeats an earlier one."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -40,6 +41,22 @@ def test_figures_are_compared_with_their_own_and_within_their_tolerance(path):
     assert image.figure == pytest.approx(1.5)
     assert (area.is_met, image.is_met) == (True, False)
     assert "0.950" in area.what
+
+
+def test_figures_of_few_starts_may_differ_by_what_their_intervals_say(path):
+    lines = [
+        {"task": "stack_bowls", "what": name, "value": 0.9, "interval": [0.7, 1.0]}
+        for name in ("Pearson", "MMRV")
+    ]
+    path.write_text(json.dumps({"lines": lines}))
+    # Half widths of 0.15 and 0.2 give 0.25.
+    now = [
+        replace(_line("Pearson", 0.66), interval=(0.5, 0.9)),
+        replace(_line("MMRV", 0.64), interval=(0.5, 0.9)),
+    ]
+    near, far = repetition(now, read_lines(path))
+    assert near.bound == pytest.approx(0.25)
+    assert (near.is_met, far.is_met) == (True, False)
 
 
 def test_a_figure_that_is_gone_does_not_count_as_repeated(path):
