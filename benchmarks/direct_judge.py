@@ -34,7 +34,8 @@ from dextouch.episodes import (
     split_by_scene,
 )
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import RolloutStart
+from dextouch.schemas import MAX_OBJECTS, RolloutStart
+from dextouch.streams import HEAD_CAMERA
 from services.evaluation.calibration import (
     Calibration,
     expected_calibration_error,
@@ -54,7 +55,7 @@ from services.evaluation.statistics import area_under_roc
 from services.evaluation.success_probe_figures import MIN_OUTCOMES
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.world_model.dynamics.commands import Commands
-from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
+from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import NUM_PADS, OWN_SIZE, own_features
 from services.world_model.dynamics.features import SLOT_SIZE, compressed, slot_features
 from services.world_model.dynamics.hand_motion import hand_motion
@@ -63,7 +64,7 @@ from services.world_model.dynamics.nested import combined, mapped
 from services.world_model.dynamics.objects import BOX_AXES, rotations
 from services.world_model.dynamics.start_reader import TASK_WIDTH, FirstStep, Reading, StartReader
 from services.world_model.settings import ReaderSettings
-from services.world_model.starts import CAMERA, observed_start
+from services.world_model.starts import observed_start
 from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 
@@ -235,7 +236,7 @@ def read_takes(
     stores = [EpisodeStore(url) for url in urls]
     for reader in select_episodes(stores, domain="robot", tasks=tasks, needs=_NEEDED):
         first = EpisodeGrid(reader).observation()
-        starts.add(start_digest(first.images[CAMERA][0], first.tactile_kpa[0]))
+        starts.add(start_digest(first.images[HEAD_CAMERA][0], first.tactile_kpa[0]))
         episodes.append(EpisodeGrid(reader, USUAL_IMAGE_PX))
     return episodes, starts
 

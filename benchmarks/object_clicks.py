@@ -20,14 +20,13 @@ from dextouch.schemas import (
     StoredAnchor,
     matrix_rows,
 )
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import HEAD_CAMERA, StreamDescriptor
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 
 SIDES_PX: Final = (64, 320, 480)
 NOISE_PX: Final = (0, 1, 2, 3)
-CAMERA: Final = "camera_head"
 # Of every object of a take.
 NUM_DRAWS: Final = 25
 # Sides of a box that differ by less look alike: such an object gets one click.
@@ -75,7 +74,7 @@ class _Start:
     def about(self, side_px: int) -> EpisodeAttributes:
         """An episode with square images of a size."""
         camera = StreamDescriptor(
-            name=CAMERA, kind="image", shape=(side_px, side_px, 3), dtype="uint8", unit="rgb8",
+            name=HEAD_CAMERA, kind="image", shape=(side_px, side_px, 3), dtype="uint8", unit="rgb8",
             nominal_rate_hz=15,
         )  # fmt: skip
         still = matrix_rows(np.eye(4))
@@ -124,8 +123,8 @@ def _starts(task: str, seeds: Iterable[int]) -> list[_Start]:
         Ts = transform_from_pose(simulation.object_poses())
         listed = zip(simulation.scene.object_names, boxes_m, Ts, strict=True)
         objects = tuple(_described(name, box_m, T) for name, box_m, T in listed)
-        K = stage.rig.K[CAMERA]
-        T_camera = stage.rig.pose(simulation, CAMERA)
+        K = stage.rig.K[HEAD_CAMERA]
+        T_camera = stage.rig.pose(simulation, HEAD_CAMERA)
         starts.append(_Start(task, objects, Ts, T_camera, K[1, 1] / (2 * K[1, 2])))
     return starts
 

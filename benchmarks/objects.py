@@ -21,6 +21,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from dextouch.schemas import SceneObjects
+from dextouch.streams import HEAD_CAMERA
 from services.alignment.marker_poses import CameraLens, MarkerTracker
 from services.alignment.marker_sheet import cells_of_markers
 from services.twin.bounding_boxes import object_boxes_m
@@ -33,7 +34,6 @@ from services.twin.tasks import EVALUATED, named_tasks
 PACKAGES: Final = ("numpy", "opencv-contrib-python-headless", "mujoco")
 FIRST_SEED, NUM_TAKES = 46_000, 4
 SIDES_PX: Final = (320, 480)
-CAMERA: Final = "camera_head"
 NUM_STEPS: Final = 81
 # Every so many steps of a take an image is taken.
 STRIDE: Final = 2
@@ -158,10 +158,10 @@ def _take(on: tuple[Stage, SceneObjects], seed: int) -> _Take:
         for _ in simulation.advance(command_row(plan.commands, row)):
             pass
         if row % STRIDE == 0:
-            images.append(stage.rig.image(simulation, CAMERA))
-            cameras.append(stage.rig.pose(simulation, CAMERA))
+            images.append(stage.rig.image(simulation, HEAD_CAMERA))
+            cameras.append(stage.rig.pose(simulation, HEAD_CAMERA))
             poses.append(transform_from_pose(simulation.object_poses()))
-    return _Take(objects, stage.rig.K[CAMERA], images, np.stack(cameras), np.stack(poses))
+    return _Take(objects, stage.rig.K[HEAD_CAMERA], images, np.stack(cameras), np.stack(poses))
 
 
 def _seen(images: Images, look: str, seed: int) -> Images:

@@ -21,6 +21,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.images import decode_jpeg, encode_jpeg
 from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.streams import HEAD_CAMERA
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
 from services.twin.scripted_actions import Actions, script_name, scripted_actions
@@ -32,7 +33,6 @@ from services.world_model.state_checkpoints import read_state_checkpoint
 from services.world_model.state_world import StateWorld
 
 PACKAGES: Final = ("numpy", "mujoco", "torch")
-CAMERA: Final = "camera_head"
 FIRST_SEED, NUM_STARTS = 45_000, 20
 STEPS: Final = (32, 64)
 WIDTHS: Final = (0.8, 1.2)
@@ -121,7 +121,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     found: dict[str, dict[str, list[_Read]]] = {}
     with bar("starting", len(tasks) * count) as step:
         for width in (1.0, *WIDTHS):
-            settings = TwinSettings(cameras=(CAMERA,), object_width=width)
+            settings = TwinSettings(cameras=(HEAD_CAMERA,), object_width=width)
             twin = TwinWorld(settings)
             for task in tasks:
                 by_kind = found.setdefault(task, {})
@@ -207,11 +207,11 @@ def _true_m(twin: TwinWorld, state: TwinState) -> Float64[np.ndarray, "objects 3
 def _seen_by(first: RolloutStart, camera: Camera, draw: np.random.Generator) -> RolloutStart:
     if first.observation is None or first.K_head is None:
         raise ValueError("the twin gives an observation with every start")
-    image = first.observation.images[CAMERA][0] / 255.0
+    image = first.observation.images[HEAD_CAMERA][0] / 255.0
     changed = shifted(_pixels(camera.change(image, draw)), camera.shift_px)
     K = first.K_head.copy()
     K[:2, 2] += camera.shift_px
-    seen = replace(first.observation, images={CAMERA: changed[None]})
+    seen = replace(first.observation, images={HEAD_CAMERA: changed[None]})
     return replace(first, observation=seen, K_head=K)
 
 
@@ -230,7 +230,7 @@ def _amid(first: RolloutStart, seen: Observation) -> RolloutStart:
     reached = seen.action_reached[-1:]
     here = Observation(
         first_step=0,
-        images={CAMERA: seen.images[CAMERA][-1:]},
+        images={HEAD_CAMERA: seen.images[HEAD_CAMERA][-1:]},
         tactile_kpa=seen.tactile_kpa[-1:],
         action_reached=reanchor(reached, 0),
         reached_is_measured=True,

@@ -5,12 +5,12 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from benchmarks.evaluator.plan import CHUNK_STEPS
 from benchmarks.evaluator.playing import ImaginedRollout, TrueRollout
 from dextouch.geometry import apply, invert, transform_from_pose
 from dextouch.hands.actions import AnchorPoses, poses_from_actions
 from dextouch.metrics.image import PEAK, decibels
 from dextouch.metrics.tactile import mse
+from dextouch.schemas import CHUNK_STEPS
 from dextouch.tactile import in_contact
 from services.evaluation.camera_warp import warp_over_table
 

@@ -12,10 +12,8 @@ from dextouch.errors import InvalidInputError
 from services.evaluation.policies.outside import PolicySource
 from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name
 
-CAMERA: Final = "camera_head"
 # 5 1/3 s at 15 steps a second, in chunks as policies send them.
 NUM_STEPS: Final = 80
-CHUNK_STEPS: Final = 16
 # Still hands are rolled out for 63 chunks, 1008 steps, with images after every 9th.
 STILL_CHUNKS: Final = 63
 STILL_SHOWN_EVERY: Final = 9

@@ -6,15 +6,17 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from benchmarks.evaluator.plan import CAMERA, CHUNK_STEPS, NUM_STEPS
+from benchmarks.evaluator.plan import NUM_STEPS
 from dextouch.clients import Policy, PolicyStart
 from dextouch.schemas import (
+    CHUNK_STEPS,
     Observation,
     ReturnSelector,
     RolloutDoubt,
     RolloutStart,
     rollout_doubt,
 )
+from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import StartedRollout, State, World
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.policies.asking import action_chunk, ask
@@ -98,7 +100,7 @@ def play_in_twin(
         touch.extend(part.observation.tactile_kpa for part in parts)
         state, seen = parts[-1].state, parts[-1].observation
         if shows_chunks:
-            images.append(stage.rig.image(stage.simulation, CAMERA))
+            images.append(stage.rig.image(stage.simulation, HEAD_CAMERA))
         poses.append(stage.simulation.object_poses())
         sent.append(chunk)
     return TrueRollout(
@@ -106,7 +108,7 @@ def play_in_twin(
         np.concatenate(sent),
         np.concatenate(touch),
         _stacked(images, seen),
-        seen.images[CAMERA][-NUM_SEEN_STEPS:],
+        seen.images[HEAD_CAMERA][-NUM_SEEN_STEPS:],
         np.stack(poses),
     )
 
@@ -150,7 +152,7 @@ def play_in_imagination(
             if shows_chunks or looks == "last":
                 last = world.step(state, chunk, seed=start.seed + at, selector=_LAST_IMAGE)
         if shows_chunks:
-            images.append(last.observation.images[CAMERA][-1])
+            images.append(last.observation.images[HEAD_CAMERA][-1])
         state, seen = step.state, last.observation
         touch.append(step.observation.tactile_kpa)
         shown.append(seen)
@@ -158,14 +160,14 @@ def play_in_imagination(
     return ImaginedRollout(
         np.concatenate(touch),
         _stacked(images, seen),
-        seen.images[CAMERA][-NUM_SEEN_STEPS:],
+        seen.images[HEAD_CAMERA][-NUM_SEEN_STEPS:],
         None if poses is None else poses[-NUM_SEEN_STEPS:],
         rollout_doubt(shown),
     )
 
 
 def _stacked(images: list[np.ndarray], seen: Observation) -> UInt8[np.ndarray, "chunks h w 3"]:
-    return np.stack(images) if images else seen.images[CAMERA][:0]
+    return np.stack(images) if images else seen.images[HEAD_CAMERA][:0]
 
 
 def _begin(policy: Policy | Actions, start: PolicyStart) -> Literal["no", "last", "all"]:

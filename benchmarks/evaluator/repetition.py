@@ -16,8 +16,8 @@ from benchmarks.evaluator.drawn import Line
 from benchmarks.figures import Requirement
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 
-# Smallest tolerances by unit: of areas under the curve, correlations, rates and the like, and of decibels.
-# Figures in other units scatter too much to be compared.
+# Smallest tolerances by unit: of areas under the curve, correlations, rates and the like, and of
+# decibels. Figures in other units scatter too much to be compared.
 TOLERANCES: Final = {"": 0.08, "dB": 1.0}
 
 

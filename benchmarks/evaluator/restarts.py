@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from benchmarks.evaluator.measuring import contact_counts
-from benchmarks.evaluator.plan import CAMERA, CHUNK_STEPS
 from benchmarks.evaluator.playing import TrueRollout
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.hands.actions import (
@@ -14,7 +13,8 @@ from dextouch.hands.actions import (
     poses_from_actions,
     reanchor,
 )
-from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutStart
+from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import StartedRollout, State, World
 from services.twin.world import TwinState, TwinWorld
 
@@ -70,7 +70,7 @@ def _restart(
         raise ValueError("the twin gives an anchor with every start")
     observation = Observation(
         first_step=0,
-        images={CAMERA: real.images_of_chunks[index - 1][None]},
+        images={HEAD_CAMERA: real.images_of_chunks[index - 1][None]},
         tactile_kpa=real.tactile_kpa[index * CHUNK_STEPS][None],
         action_reached=reanchor(reached[None], 0),
         reached_is_measured=True,

@@ -15,7 +15,6 @@ from benchmarks.evaluator.measuring import (
     wrong_action_figures,
 )
 from benchmarks.evaluator.members import Member
-from benchmarks.evaluator.plan import CAMERA
 from benchmarks.evaluator.playing import (
     ImaginedRollout,
     TrueRollout,
@@ -29,6 +28,7 @@ from dextouch.clients import Policy
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions
 from dextouch.schemas import RolloutDoubt, RolloutStart
+from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.success_probe import DECISION_THRESHOLD
@@ -141,7 +141,7 @@ class PolicyRollout:
 
     @property
     def _first_image(self) -> np.ndarray:
-        return self._started.observation.images[CAMERA][0]
+        return self._started.observation.images[HEAD_CAMERA][0]
 
     def _imagined_row(self, member: Member) -> Row:
         imagined = self.imagined(member)

@@ -7,16 +7,15 @@ from jaxtyping import Float64, UInt8
 
 from benchmarks.evaluator.measuring import psnr_within
 from benchmarks.evaluator.plan import (
-    CAMERA,
-    CHUNK_STEPS,
     STILL_CHUNKS,
     STILL_SHOWN_EVERY,
 )
-from dextouch.schemas import ReturnSelector, RolloutStart
+from dextouch.schemas import CHUNK_STEPS, ReturnSelector, RolloutStart
+from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import State, World
 
 _NO_IMAGES = ReturnSelector(cameras=())
-_LAST_IMAGE = ReturnSelector(cameras=(CAMERA,), steps="last")
+_LAST_IMAGE = ReturnSelector(cameras=(HEAD_CAMERA,), steps="last")
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ def hold_still(
     for index in range(1, STILL_CHUNKS + 1):
         if index % STILL_SHOWN_EVERY == 0:
             shown = world.step(state, chunk, seed=index, selector=_LAST_IMAGE)
-            images.append(shown.observation.images[CAMERA][-1])
+            images.append(shown.observation.images[HEAD_CAMERA][-1])
         step = world.step(state, chunk, seed=index, selector=_NO_IMAGES)
         greatest = max(greatest, float(step.observation.tactile_kpa.max()))
         state = step.state

@@ -10,11 +10,12 @@ from benchmarks.evaluator.keeping import KeptRows, Row, row_key
 from benchmarks.evaluator.kind_lines import VERDICTS
 from benchmarks.evaluator.kinds import mistakes_digest
 from benchmarks.evaluator.members import Member, open_members, refuse_unequal_rivals
-from benchmarks.evaluator.plan import CAMERA, StudyPlan
+from benchmarks.evaluator.plan import StudyPlan
 from benchmarks.evaluator.playing import start_in_twin
 from benchmarks.evaluator.rollouts import DEPENDS_ON, PolicyRollout
 from dextouch.clients import Policy
 from dextouch.errors import DexTouchError
+from dextouch.streams import HEAD_CAMERA
 from services.evaluation.matched_starts import first_digest
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.starts import refuse_training_starts
@@ -44,7 +45,7 @@ class Study:
     def __init__(self, plan: StudyPlan) -> None:
         torch.set_num_threads(1)
         self.plan = plan
-        self.twin = TwinWorld(TwinSettings(cameras=(CAMERA,)))
+        self.twin = TwinWorld(TwinSettings(cameras=(HEAD_CAMERA,)))
         self.members = open_members(plan.trained)
         refuse_unequal_rivals(self.members)
         self.cloned = {one.key: BehaviourCloningPolicy.load(one.path) for one in plan.cloned}

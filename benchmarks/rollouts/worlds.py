@@ -14,11 +14,11 @@ from dextouch.schemas import (
     RolloutStart,
     WorldDescription,
 )
+from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import StartedRollout, SteppedRollout
 
 SIZE_PX = 64
 MAX_STEPS = 16
-CAMERA = "camera_head"
 # A batch of n takes 5 ms · (0.8 + 0.2 n).
 DEVICE_S = 5e-3
 FIXED_SHARE = 0.8
@@ -46,7 +46,7 @@ class StillWorld:
             kind="model",
             digest="still",
             tasks=("rest",),
-            cameras=(CAMERA,),
+            cameras=(HEAD_CAMERA,),
             image_height_px=SIZE_PX,
             image_width_px=SIZE_PX,
             model_rate_hz=15.0,
@@ -93,7 +93,7 @@ class StillWorld:
         n = len(actions)
         return Observation(
             first_step=first_step,
-            images={CAMERA: self._images[:n]},
+            images={HEAD_CAMERA: self._images[:n]},
             tactile_kpa=self._touch[:n],
             action_reached=actions,
             reached_is_measured=True,

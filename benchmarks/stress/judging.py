@@ -8,11 +8,12 @@ import numpy as np
 
 import services.evaluation
 from benchmarks.stress.cells import Check, StageCells
-from benchmarks.stress.worlds import CAMERA, CHUNK_STEPS, NUM_CHUNKS, twin_start
+from benchmarks.stress.worlds import NUM_CHUNKS, twin_start
 from dextouch.clients import PolicyStart
 from dextouch.errors import DexTouchError, InvalidInputError, NonFiniteError
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
-from dextouch.schemas import Observation
+from dextouch.schemas import CHUNK_STEPS, Observation
+from dextouch.streams import HEAD_CAMERA
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.object_features import known_objects, object_features
@@ -192,7 +193,7 @@ def _seen(num_steps: int = 1) -> Observation:
         raise InvalidInputError("stress: the twin's start has no observation")
     return replace(
         observation,
-        images={CAMERA: np.repeat(observation.images[CAMERA], num_steps, axis=0)},
+        images={HEAD_CAMERA: np.repeat(observation.images[HEAD_CAMERA], num_steps, axis=0)},
         tactile_kpa=np.repeat(observation.tactile_kpa, num_steps, axis=0),
         action_reached=np.repeat(observation.action_reached, num_steps, axis=0),
     )

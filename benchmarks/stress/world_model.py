@@ -7,8 +7,9 @@ import torch
 
 from benchmarks.stress import worlds
 from benchmarks.stress.cells import Check, StageCells
-from benchmarks.stress.worlds import CAMERA, Subject
+from benchmarks.stress.worlds import Subject
 from dextouch.errors import InvalidInputError
+from dextouch.streams import HEAD_CAMERA
 from services.world_model.checkpoints import Checkpoint, read_checkpoint
 from services.world_model.network.flow_matching import add_noise, sample, shift_time
 from services.world_model.network.inputs import PredictionRequest, build_inputs
@@ -73,7 +74,7 @@ def _precision(check: Check) -> None:
         worlds.check_answer(check, coarse)
         off_kpa = np.abs(coarse.tactile_kpa - exact.tactile_kpa).max()
         check.at_most(f"{name}: touch off", off_kpa, _BFLOAT16_KPA, "kPa")
-        off = np.abs(coarse.images[CAMERA].astype(int) - exact.images[CAMERA]).max()
+        off = np.abs(coarse.images[HEAD_CAMERA].astype(int) - exact.images[HEAD_CAMERA]).max()
         check.at_most(f"{name}: images off", off, _BFLOAT16_LEVELS, "levels")
 
 
@@ -89,7 +90,7 @@ def _device(check: Check) -> None:
     if start.observation is None or start.anchor is None or start.K_head is None:
         raise InvalidInputError("stress: a world model starts from an observation")
     request = PredictionRequest(
-        first_image=start.observation.images[CAMERA][0],
+        first_image=start.observation.images[HEAD_CAMERA][0],
         first_tactile_kpa=start.observation.tactile_kpa[0],
         actions=np.concatenate([subject.still(1), subject.actions[:16]]),
         action_kind="commanded",

@@ -10,14 +10,14 @@ import numpy as np
 from benchmarks.stress.cells import Check
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
 from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT, actions_from_poses
-from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutStart
+from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.world import TwinWorld
 
-CAMERA = "camera_head"
-CHUNK_STEPS, NUM_CHUNKS = 16, 63
+NUM_CHUNKS = 63
 # Seed of the twin; not used in training.
 SEED = 30_001
 TASK = "stand_bottle"
@@ -56,7 +56,9 @@ class Subject:
 @cache
 def twin_start(image_px: int) -> tuple[RolloutStart, np.ndarray]:
     """First observation of a twin demonstration, and its commanded actions."""
-    settings = TwinSettings(cameras=(CAMERA,), image_height_px=image_px, image_width_px=image_px)
+    settings = TwinSettings(
+        cameras=(HEAD_CAMERA,), image_height_px=image_px, image_width_px=image_px
+    )
     world, stage = TwinWorld(settings), Stage(TASK, "robot", settings)
     begun = world.reset(RolloutStart(TASK, SEED, stage.task.instruction))
     start = RolloutStart(
@@ -143,7 +145,7 @@ def check_batch(check: Check, subject: Subject, *, max_kpa: float) -> None:
         alone = subject.world.step(states[index], chunks[index], seed=1).observation
         touch = np.abs(stepped.observation.tactile_kpa - alone.tactile_kpa).max()
         check.at_most("touch differs", touch, max_kpa, "kPa")
-        images = stepped.observation.images[CAMERA].astype(int) - alone.images[CAMERA]
+        images = stepped.observation.images[HEAD_CAMERA].astype(int) - alone.images[HEAD_CAMERA]
         check.at_most("images differ", np.abs(images).max(), 1, "levels")
     check.refused("no rollout", lambda: subject.world.step_batch([], chunks[:0], seeds=[]))
 
@@ -171,7 +173,7 @@ def check_answer(check: Check, observation: Observation) -> None:
     """Check that an observation is finite, with pressures of 0 or more."""
     check.finite("touch", observation.tactile_kpa)
     check.at_most("pressure below zero", -float(observation.tactile_kpa.min()), 0.0, "kPa")
-    check.true("images are whole", observation.images[CAMERA].dtype == np.uint8)
+    check.true("images are whole", observation.images[HEAD_CAMERA].dtype == np.uint8)
     if observation.object_poses is not None:
         check.finite("object poses", observation.object_poses)
         length = np.linalg.norm(observation.object_poses[..., 3:], axis=-1)

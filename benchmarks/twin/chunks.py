@@ -6,12 +6,11 @@ from functools import partial
 from typing import Final
 
 from dextouch.hands.actions import actions_from_poses
-from dextouch.schemas import EVERYTHING, ReturnSelector, RolloutStart
+from dextouch.schemas import CHUNK_STEPS, EVERYTHING, ReturnSelector, RolloutStart
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.world import TwinState, TwinWorld
 
-CHUNK_STEPS: Final = 16
 # Both scripts have contact in their second chunk.
 CHUNK: Final = 1
 EVERY_CAMERA: Final = "three cameras, 16 steps"

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float64
 
-from benchmarks.twin.chunks import CHUNK_STEPS
+from dextouch.schemas import CHUNK_STEPS
 from services.twin.settings import TwinSettings
 from services.twin.simulation import STEPS_PER_GRID, STEPS_PER_TACTILE, Simulation
 from services.twin.stage import Plan, Stage, command_row

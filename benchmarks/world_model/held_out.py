@@ -2,19 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.hands.actions import actions_from_poses
-from dextouch.schemas import ReturnSelector, RolloutStart
+from dextouch.schemas import CHUNK_STEPS, ReturnSelector, RolloutStart
+from dextouch.streams import HEAD_CAMERA
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.world import TwinWorld
-
-CAMERA: Final = "camera_head"
-CHUNK_STEPS: Final = 16
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,9 @@ def held_out(tasks: Sequence[str], seeds: Sequence[int], image_px: int) -> list[
         seeds: held-out seeds.
         image_px: width and height of the images.
     """
-    settings = TwinSettings(cameras=(CAMERA,), image_height_px=image_px, image_width_px=image_px)
+    settings = TwinSettings(
+        cameras=(HEAD_CAMERA,), image_height_px=image_px, image_width_px=image_px
+    )
     world = TwinWorld(settings)
     return [
         _played(world, Stage(task, "robot", settings), seed) for task in tasks for seed in seeds
@@ -61,7 +60,7 @@ def _played(world: TwinWorld, stage: Stage, seed: int) -> HeldOut:
             state,
             actions[first : first + CHUNK_STEPS],
             seed=0,
-            selector=ReturnSelector(cameras=(CAMERA,)),
+            selector=ReturnSelector(cameras=(HEAD_CAMERA,)),
         )
         state = stepped.state
         seen.append(stepped.observation)
@@ -75,6 +74,6 @@ def _played(world: TwinWorld, stage: Stage, seed: int) -> HeldOut:
             K_head=begun.K_head,
         ),
         actions=actions,
-        images=np.concatenate([one.images[CAMERA] for one in seen]),
+        images=np.concatenate([one.images[HEAD_CAMERA] for one in seen]),
         tactile_kpa=np.concatenate([one.tactile_kpa for one in seen]),
     )

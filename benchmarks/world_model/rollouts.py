@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.world_model.held_out import CAMERA, CHUNK_STEPS, HeldOut
+from benchmarks.world_model.held_out import HeldOut
 from dextouch.metrics.tactile import contact_f1
-from dextouch.schemas import EVERYTHING, Observation, ReturnSelector
+from dextouch.schemas import CHUNK_STEPS, EVERYTHING, Observation, ReturnSelector
+from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld, World
 
 
@@ -74,7 +75,7 @@ def rollout_error(imagined: Imagined, episodes: Sequence[HeldOut]) -> RolloutErr
     pairs = list(zip(imagined.seen, episodes, strict=True))
     true_images = [episode.images[: CHUNK_STEPS * len(seen)] for seen, episode in pairs]
     true_touches = [episode.tactile_kpa[: CHUNK_STEPS * len(seen)] for seen, episode in pairs]
-    images = np.concatenate([one.images[CAMERA] for one in all_seen])
+    images = np.concatenate([one.images[HEAD_CAMERA] for one in all_seen])
     off_levels = images.astype(np.float64) - np.concatenate(true_images)
     touch = np.concatenate([one.tactile_kpa for one in all_seen])
     true_touch = np.concatenate(true_touches)

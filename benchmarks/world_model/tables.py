@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 from benchmarks.chart import Panel, Point
 from benchmarks.figures import Figure, Requirement
 from benchmarks.report import ResultTable
-from benchmarks.world_model.held_out import CHUNK_STEPS
 from benchmarks.world_model.rollouts import RolloutError
+from dextouch.schemas import CHUNK_STEPS
 
 if TYPE_CHECKING:
     from services.world_model.network.configuration import Precision, Sampler

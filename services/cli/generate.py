@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from dextouch.command_line import write_result
-from dextouch.episodes import HEAD_CAMERA, SPLITS, EpisodeReader, EpisodeStore, needs
+from dextouch.episodes import SPLITS, EpisodeReader, EpisodeStore, needs
 from dextouch.errors import ConflictError
+from dextouch.streams import HEAD_CAMERA
 from services.cli.imagined_data import chosen_episodes, imagination_parser, imagine, positive
 from services.evaluation.reporting import PredictionPicture, ReportPictures, write_report
 from services.world_model.checkpoints import read_checkpoint

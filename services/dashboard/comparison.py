@@ -16,6 +16,7 @@ from dextouch.errors import DexTouchError, EndedError, InvalidInputError, NotFou
 from dextouch.frozen_model import FrozenModel
 from dextouch.metrics import tactile
 from dextouch.schemas import (
+    CHUNK_STEPS,
     ID_PATTERN,
     Doubt,
     EpisodeDetail,
@@ -29,15 +30,13 @@ from dextouch.schemas import (
     start_from,
 )
 from dextouch.serving import MSGPACK, OCTETS
-from dextouch.streams import unpack
+from dextouch.streams import HEAD_CAMERA, unpack
 from dextouch.tactile import in_contact
 from services.dashboard.feeds import Feeds, Topic
 from services.dashboard.rollout_feeds import MAX_RESPONSE_BYTES, packed_message
 
 logger = structlog.get_logger(__name__)
 
-CAMERA: Final = "camera_head"
-CHUNK_STEPS: Final = 16
 MAX_STEPS: Final = 640
 # Of the images of both worlds that are kept for the page.
 MAX_KEPT_BYTES: Final = 64 * 2**20
@@ -265,7 +264,7 @@ class Comparisons:
 
     async def _post(self, side: _Side, path: str, kind: str, body: bytes) -> RolloutAnswer:
         headers = {"content-type": kind, "accept": MSGPACK, "dextouch-client": "replay"}
-        path = f"{path}?{urlencode({'cameras': CAMERA})}"
+        path = f"{path}?{urlencode({'cameras': HEAD_CAMERA})}"
         upstream = self._feeds.upstream(side.service)
         answer = await upstream.forward("POST", path, headers, body, timeout_s=WORLD_TIMEOUT_S)
         return decode_answer(answer.content, max_bytes=MAX_RESPONSE_BYTES)
@@ -298,7 +297,7 @@ def compared(real: Observation, imagined: Observation) -> tuple[dict[str, tuple[
     The message is laid out as that of `steps_message`, with the real world first in every array:
     touch [2, steps, 2, 320] and images [2, steps, height, width, 3].
     """
-    images = [seen.images[CAMERA] for seen in (real, imagined)]
+    images = [seen.images[HEAD_CAMERA] for seen in (real, imagined)]
     touch = [seen.tactile_kpa for seen in (real, imagined)]
     apart = np.abs(images[0].astype(np.int16) - images[1])
     pairs = list(zip(*touch, strict=True))

@@ -12,9 +12,9 @@ from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import box_pixels, transform_from_pose
 from dextouch.schemas import EpisodeClicks, ObjectClicks, SceneObject
 from dextouch.serving import JSON, KIB, JsonBody, RequireScope, takes
+from dextouch.streams import HEAD_CAMERA
 from services.episode_store.catalog import Catalog
 
-CAMERA = "camera_head"
 MAY_READ = Depends(RequireScope("store_read"))
 MAY_DELETE = Depends(RequireScope("store_delete"))
 
@@ -140,10 +140,10 @@ def _clicked(
             corners_px = box_pixels(np.array(one.box_m), T, camera, T_world_camera)
             if np.isfinite(corners_px).all():
                 boxes_px[one.name] = tuple((u, v) for u, v in corners_px.tolist())
-    nearest = reader.nearest_images(CAMERA, reader.stamps_ns("action")[:1])
+    nearest = reader.nearest_images(HEAD_CAMERA, reader.stamps_ns("action")[:1])
     return ClickedEpisode(
         episode_id=episode_id,
-        image_t_ns=int(reader.stamps_ns(CAMERA)[nearest[0]]),
+        image_t_ns=int(reader.stamps_ns(HEAD_CAMERA)[nearest[0]]),
         clicks=clicks,
         boxes_px=boxes_px,
     )

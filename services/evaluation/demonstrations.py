@@ -3,8 +3,6 @@
 from collections.abc import Iterable
 from typing import Protocol, runtime_checkable
 
-CAMERA = "camera_head"
-
 
 @runtime_checkable
 class Instructed(Protocol):

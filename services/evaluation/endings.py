@@ -19,7 +19,7 @@ from dextouch.episodes import (
 )
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Observation, RolloutDoubt, is_rollout, rollout_doubt
-from services.evaluation.demonstrations import CAMERA
+from dextouch.streams import HEAD_CAMERA
 from services.evaluation.starts import start_digest
 from services.networks.training_settings import USUAL_IMAGE_PX
 
@@ -102,7 +102,7 @@ class Ending:
                 f"ending: got {len(observation)} steps, expected at least {NUM_SEEN_STEPS}; send "
                 "longer chunks and request all steps of the last one"
             )
-        images = observation.images.get(CAMERA)
+        images = observation.images.get(HEAD_CAMERA)
         poses = observation.object_poses
         ending = cls(
             None if images is None else images[-NUM_SEEN_STEPS:],

@@ -9,7 +9,7 @@ from dextouch.clients import PolicyStart
 from dextouch.errors import DexTouchError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import ActionKind, Observation
-from services.evaluation.demonstrations import CAMERA
+from dextouch.streams import HEAD_CAMERA
 from services.evaluation.scores import RolloutFailure
 from services.evaluation.starts import start_digest
 from services.evaluation.study_worlds import WorldAddress
@@ -51,7 +51,7 @@ class FailedStart:
 
 def first_digest(observation: Observation) -> str:
     """Digest of the head camera's image and the touch of a first observation."""
-    return start_digest(observation.images[CAMERA][0], observation.tactile_kpa[0])
+    return start_digest(observation.images[HEAD_CAMERA][0], observation.tactile_kpa[0])
 
 
 def matched_start(real: WorldAddress, task: str, seed: int, instruction: str) -> MatchedStart:

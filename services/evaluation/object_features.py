@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float32, Float64
 from dextouch.errors import ShapeError
 from dextouch.geometry import invert, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
+from dextouch.schemas import MAX_OBJECTS
 
-MAX_OBJECTS: Final = 3
 _PAIRS: Final = tuple(combinations(range(MAX_OBJECTS), 2))
 _WIDE_M, _NEAR_M, _STILL_M, _STILL_RAD = 0.1, 0.01, 0.002, 0.05
 _OF_OBJECT, _OF_PAIR = 17, 18

@@ -16,10 +16,10 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError
 from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
+from dextouch.schemas import CHUNK_STEPS
 from dextouch.worlds import World
 from services.evaluation import scene_geometry
 from services.evaluation.prediction_scenes import (
-    CHUNK_STEPS,
     Future,
     Scene,
     copied,

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -10,15 +10,14 @@ from jaxtyping import Float32, Float64, UInt8
 from dextouch.episodes import EpisodeGrid, EpisodeReader
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import CAMERA_HEAD, AnchorPoses, poses_from_actions
-from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutStart
+from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import ReconstructingWorld, World
 from services.evaluation.camera_warp import warp_over_table
-from services.evaluation.demonstrations import CAMERA
 from services.evaluation.scene_geometry import SceneGeometry
 
-CHUNK_STEPS: Final = 16
 _NO_IMAGE = ReturnSelector(cameras=())
-_LAST_STEP = ReturnSelector(cameras=(CAMERA,), steps="last")
+_LAST_STEP = ReturnSelector(cameras=(HEAD_CAMERA,), steps="last")
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class Scene:
     @property
     def first_image(self) -> UInt8[np.ndarray, "1 h w 3"]:
         """The observed first image of the head camera."""
-        return self.first.images[CAMERA]
+        return self.first.images[HEAD_CAMERA]
 
 
 def read_rollout(reader: EpisodeReader, *, image_every: int = CHUNK_STEPS) -> Scene:
@@ -145,14 +144,14 @@ def imagine(world: World[Any], scene: Scene, actions: Float64[np.ndarray, "steps
         shown = [s - first - 1 for s in scene.truth.image_steps if first < s <= first + len(chunk)]
         # Only what is compared is rendered; a world is functional, so one state serves two calls.
         selector = (
-            _NO_IMAGE if shown in ([], [len(chunk) - 1]) else ReturnSelector(cameras=(CAMERA,))
+            _NO_IMAGE if shown in ([], [len(chunk) - 1]) else ReturnSelector(cameras=(HEAD_CAMERA,))
         )
         felt = world.step(state, chunk, seed=seed, selector=selector)
         if selector is not _NO_IMAGE:
-            images.append(felt.observation.images[CAMERA][shown])
+            images.append(felt.observation.images[HEAD_CAMERA][shown])
         elif shown:
             last = world.step(state, chunk, seed=seed, selector=_LAST_STEP)
-            images.append(last.observation.images[CAMERA])
+            images.append(last.observation.images[HEAD_CAMERA])
         touch.append(felt.observation.tactile_kpa)
         poses = felt.observation.object_poses
         objects_m = None if poses is None else poses[-1, :, :3].astype(np.float64)
@@ -204,7 +203,7 @@ def copied(scene: Scene) -> Future:
     """The first step, repeated."""
     first, truth = scene.first, scene.truth
     return Future(
-        np.repeat(first.images[CAMERA], len(truth.images), axis=0),
+        np.repeat(first.images[HEAD_CAMERA], len(truth.images), axis=0),
         np.repeat(first.tactile_kpa, len(truth.tactile_kpa), axis=0),
         truth.image_steps,
         scene.first_objects_m,
@@ -219,7 +218,7 @@ def warped(scene: Scene) -> UInt8[np.ndarray, "shown h w 3"]:
     cameras = poses_from_actions(scene.actions, anchor).Ts_world_camera_head
     return np.stack(
         [
-            _warp(scene.first.images[CAMERA][0], K_head, anchor, cameras[step - 1])
+            _warp(scene.first.images[HEAD_CAMERA][0], K_head, anchor, cameras[step - 1])
             for step in scene.truth.image_steps
         ]
     )
@@ -241,7 +240,7 @@ def reconstructed(world: World[Any], scene: Scene) -> Future | str:
         return "the world has no codecs"
     if truth.image_steps != tuple(range(1, len(truth.tactile_kpa) + 1)):
         return "it needs images of all steps"
-    images = np.concatenate([scene.first.images[CAMERA], truth.images])
+    images = np.concatenate([scene.first.images[HEAD_CAMERA], truth.images])
     touch = np.concatenate([scene.first.tactile_kpa, truth.tactile_kpa])
     seen, felt = world.reconstruct(images, touch)
     return Future(seen, felt, truth.image_steps)

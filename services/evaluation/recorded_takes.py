@@ -24,7 +24,7 @@ from dextouch.episodes import (
 from dextouch.errors import InvalidInputError
 from dextouch.images import square_of_at_most
 from dextouch.schemas import WorldDescription
-from services.evaluation.demonstrations import CAMERA
+from dextouch.streams import HEAD_CAMERA
 from services.evaluation.matched_starts import MatchedStart
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.progress import Progress
@@ -244,7 +244,7 @@ def _digests(start: MatchedStart) -> tuple[str, ...]:
     Such worlds scale the image and take no negative pressure.
     """
     touch = start.observation.tactile_kpa[0]
-    images = start.observation.images[CAMERA]
+    images = start.observation.images[HEAD_CAMERA]
     small = square_of_at_most(images, start.K_head, USUAL_IMAGE_PX)[0][0]
     return start.digest, start_digest(small, np.maximum(touch, 0.0))
 

@@ -15,8 +15,8 @@ from dextouch.schemas import (
     RolloutDoubt,
     rollout_doubt,
 )
+from dextouch.streams import HEAD_CAMERA
 from dextouch.tracing import current_trace_id, in_trace
-from services.evaluation.demonstrations import CAMERA
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.matched_starts import (
     FailedStart,
@@ -192,7 +192,7 @@ class RolloutRunner:
         """
         cameras, is_last = self.worlds.cameras, len(chunk) == left
         if self.shows_all or looks is True or (looks and is_last):
-            shown = ReturnSelector(cameras=cameras if looks else (CAMERA,))
+            shown = ReturnSelector(cameras=cameras if looks else (HEAD_CAMERA,))
             return [rollout.step(chunk, selector=shown, validated=True)]
         if looks:
             newest = ReturnSelector(cameras=cameras, steps="last")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from dextouch.clients import RolloutClient
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.schemas import WorldDescription
-from services.evaluation.demonstrations import CAMERA
+from dextouch.streams import HEAD_CAMERA
 from services.evaluation.scores import REAL
 
 
@@ -71,8 +71,8 @@ class StudyWorlds:
                 f"real world {real.name!r}: does not report success or does not start from a "
                 "task and seed; expected a world that does both, such as the twin"
             )
-        if CAMERA not in real.cameras:
-            raise UnknownNameError("camera of the real world", CAMERA, list(real.cameras))
+        if HEAD_CAMERA not in real.cameras:
+            raise UnknownNameError("camera of the real world", HEAD_CAMERA, list(real.cameras))
         for name, world in self.descriptions.items():
             for task in tasks:
                 if task not in world.tasks:
@@ -99,10 +99,10 @@ def _check_imagined(name: str, world: WorldDescription, real: WorldDescription) 
             "that starts from an observation of the real world"
         )
     missing = [camera for camera in world.cameras if camera not in real.cameras]
-    if missing or CAMERA not in world.cameras:
+    if missing or HEAD_CAMERA not in world.cameras:
         raise InvalidInputError(
             f"imagined world {name!r}: got cameras {', '.join(world.cameras)}, expected "
-            f"{CAMERA} and only cameras of the real world ({', '.join(real.cameras)}), which "
+            f"{HEAD_CAMERA} and only cameras of the real world ({', '.join(real.cameras)}), which "
             "provides its first images"
         )
     if world.model_rate_hz != real.model_rate_hz:

@@ -11,6 +11,7 @@ from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeGrid, EpisodeReader, EpisodeStore, write_rollout
 from dextouch.errors import UnknownNameError
 from dextouch.schemas import (
+    CHUNK_STEPS,
     LineageEntry,
     Observation,
     ReturnSelector,
@@ -19,7 +20,6 @@ from dextouch.schemas import (
     rollout_doubt,
 )
 
-CHUNK_STEPS: Final = 16
 SHORT_CHUNK_STEPS: Final = 4
 
 

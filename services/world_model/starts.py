@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -11,8 +10,8 @@ from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, Unkno
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.images import scaled_square
 from dextouch.schemas import Observation, RolloutStart
+from dextouch.streams import HEAD_CAMERA
 
-CAMERA: Final = "camera_head"
 # Larger values are mistakes of units or frames.
 MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
 
@@ -37,7 +36,7 @@ class ObservedStart:
         """Observation of step 0, as returned to clients."""
         return Observation(
             first_step=0,
-            images={CAMERA: self.image[None].copy()},
+            images={HEAD_CAMERA: self.image[None].copy()},
             tactile_kpa=self.tactile_kpa[None].copy(),
             action_reached=self.reached[None].copy(),
             reached_is_measured=True,
@@ -69,8 +68,8 @@ def observed_start(
             "start: this world begins from an observation; send one step of images, touch and "
             "reached action together with the anchor poses and K_head"
         )
-    if CAMERA not in observation.images:
-        raise UnknownNameError("camera of the start", "none of them", [CAMERA])
+    if HEAD_CAMERA not in observation.images:
+        raise UnknownNameError("camera of the start", "none of them", [HEAD_CAMERA])
     if len(observation) != 1:
         raise ShapeError(f"start: got {len(observation)} observed steps, expected one")
     if not np.isfinite(observation.tactile_kpa).all():
@@ -78,7 +77,7 @@ def observed_start(
     reached = observation.action_reached[-1].copy()
     for part in POSE_SLICES:
         reached[part] = IDENTITY_POSE_9D
-    image, K_head = observation.images[CAMERA][-1:], np.array(start.K_head)
+    image, K_head = observation.images[HEAD_CAMERA][-1:], np.array(start.K_head)
     if image_px is not None:
         image, K_head = scaled_square(image, K_head, image_px)
     return ObservedStart(

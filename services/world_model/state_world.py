@@ -28,6 +28,7 @@ from dextouch.schemas import (
     RolloutStart,
     WorldDescription,
 )
+from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import StartedRollout, SteppedRollout
 from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT
@@ -53,7 +54,7 @@ from services.world_model.network.inputs import (
 )
 from services.world_model.rendering.renderer import Drawing, Renderer
 from services.world_model.rendering.scene_states import SceneState
-from services.world_model.starts import CAMERA, ObservedStart, check_geometry, observed_start
+from services.world_model.starts import ObservedStart, check_geometry, observed_start
 from services.world_model.state_checkpoints import StateCheckpoint
 from services.world_model.state_rollout import StateRollout, rollout_bytes, rollout_from_bytes
 
@@ -94,7 +95,7 @@ class StateWorld:
             kind="model",
             digest=checkpoint.digest,
             tasks=config.tasks,
-            cameras=(CAMERA,),
+            cameras=(HEAD_CAMERA,),
             image_height_px=config.image_px,
             image_width_px=config.image_px,
             model_rate_hz=self._metadata.model_rate_hz,
@@ -268,7 +269,7 @@ class StateWorld:
             doubt=self._doubt(state, steps, index),
         ).selected(selector)
         drawing = None
-        if selector.wants(CAMERA):
+        if selector.wants(HEAD_CAMERA):
             shown = slice(len(chunk) - len(observation), None)
             drawing = self._drawing(state, chunk[shown], poses[shown])
         return SteppedRollout(state, observation), drawing
@@ -299,7 +300,8 @@ class StateWorld:
             stepped
             if drawing is None
             else replace(
-                stepped, observation=replace(stepped.observation, images={CAMERA: next(images)})
+                stepped,
+                observation=replace(stepped.observation, images={HEAD_CAMERA: next(images)}),
             )
             for stepped, drawing in answers
         ]

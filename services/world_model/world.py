@@ -27,7 +27,7 @@ from dextouch.schemas import (
     RolloutStart,
     WorldDescription,
 )
-from dextouch.streams import pack, unpack
+from dextouch.streams import HEAD_CAMERA, pack, unpack
 from dextouch.worlds import StartedRollout, SteppedRollout
 from services.networks.memory import on_device
 from services.world_model.checkpoints import Checkpoint, read_checkpoint
@@ -38,7 +38,7 @@ from services.world_model.network.visual_codec import to_uint8, to_unit
 from services.world_model.placement import Placement
 from services.world_model.scene_reader import SceneReader
 from services.world_model.shipped_checkpoints import default_checkpoint
-from services.world_model.starts import CAMERA, observed_start
+from services.world_model.starts import observed_start
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.state_world import StateWorld
 
@@ -101,7 +101,7 @@ class ModelWorld:
             kind="model",
             digest=checkpoint.digest,
             tasks=metadata.tasks,
-            cameras=(CAMERA,),
+            cameras=(HEAD_CAMERA,),
             image_height_px=config.image_px,
             image_width_px=config.image_px,
             model_rate_hz=config.model_rate_hz,
@@ -187,7 +187,7 @@ class ModelWorld:
         noise = stack_noise(
             [self._model.noise(inputs.num_steps, _generator(seed)) for seed in seeds]
         )
-        wanted = any(one.steps == "all" and one.wants(CAMERA) for one in requested)
+        wanted = any(one.steps == "all" and one.wants(HEAD_CAMERA) for one in requested)
         future = self._model.predict(
             inputs,
             noise,
@@ -383,7 +383,7 @@ def _advance(
     first = 0 if selector.steps == "all" else len(chunk) - 1
     observation = Observation(
         first_step=state.step + 1 + first,
-        images={CAMERA: images[first - len(chunk) :]} if selector.wants(CAMERA) else {},
+        images={HEAD_CAMERA: images[first - len(chunk) :]} if selector.wants(HEAD_CAMERA) else {},
         tactile_kpa=tactile_kpa[first:],
         action_reached=chunk[first:],
         reached_is_measured=False,

@@ -14,7 +14,7 @@ import pytest
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
 from benchmarks.world_model import benchmark, tables
-from benchmarks.world_model.held_out import CAMERA, held_out
+from benchmarks.world_model.held_out import held_out
 from benchmarks.world_model.rollouts import (
     Imagined,
     RolloutError,
@@ -24,6 +24,7 @@ from benchmarks.world_model.rollouts import (
 )
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ReturnSelector
+from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import CopyFirstWorld
 
 
@@ -91,7 +92,7 @@ def test_errors_by_hand(episode):
     assert len(imagined.seen[0]) == len(episode.chunks) == 5
     error = rollout_error(imagined, [episode])
     first = episode.start.observation
-    off = episode.images[:80].astype(float) - first.images[CAMERA].astype(float)
+    off = episode.images[:80].astype(float) - first.images[HEAD_CAMERA].astype(float)
     assert error.image_levels == pytest.approx(np.sqrt((off**2).mean()))
     off_kpa = episode.tactile_kpa[:80].astype(float) - first.tactile_kpa
     assert error.touch_kpa == pytest.approx(np.sqrt((off_kpa**2).mean()), rel=1e-6)
@@ -104,7 +105,7 @@ def test_the_truth_itself_has_no_error(episode):
     true = [
         type(one)(
             first_step=one.first_step,
-            images={CAMERA: episode.images[16 * k : 16 * k + 16]},
+            images={HEAD_CAMERA: episode.images[16 * k : 16 * k + 16]},
             tactile_kpa=episode.tactile_kpa[16 * k : 16 * k + 16],
             action_reached=one.action_reached,
             reached_is_measured=False,

@@ -16,7 +16,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.geometry import pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import SceneObject, SceneObjects
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import HEAD_CAMERA, StreamDescriptor
 from services.alignment.synchronization.progress import OnProgress, progress_within
 from services.alignment.synchronization.recorded_streams import (
     Block,
@@ -34,7 +34,6 @@ from services.alignment.synchronization.resampling import (
 if TYPE_CHECKING:
     from services.alignment.marker_poses import TrackedObject
 
-CAMERA: Final = "camera_head"
 # Images that are decoded at once.
 _IMAGES_AT_ONCE: Final = 32
 _MOST_COMPARED: Final = 64
@@ -52,7 +51,7 @@ def with_tracked_objects(
     for one in _listed(objects):
         stream = streams.get(one.stream)
         if one.markers:
-            missing = [name for name in (CAMERA, "head") if name not in streams]
+            missing = [name for name in (HEAD_CAMERA, "head") if name not in streams]
             if missing or stream is not None:
                 raise InvalidInputError(
                     f"object {one.name!r}: has markers, and the recording "
@@ -101,7 +100,7 @@ def marker_streams(
         return []
     from services.alignment.marker_poses import CameraLens, MarkerTracker
 
-    camera = streams[CAMERA]
+    camera = streams[HEAD_CAMERA]
     period_ns = camera.descriptor.period_ns()
     tracker = MarkerTracker(listed, objects.dictionary, CameraLens(*_lens(recording)))
     wanted = np.flatnonzero(
@@ -111,13 +110,13 @@ def marker_streams(
     for low in range(0, len(places), _IMAGES_AT_ONCE):
         part = places[low : low + _IMAGES_AT_ONCE]
         kept = camera.timing.kept[part]
-        damaged = recording.damaged_images(CAMERA, kept)
+        damaged = recording.damaged_images(HEAD_CAMERA, kept)
         whole = np.isin(kept, damaged, invert=True)
-        images = recording.images_at(CAMERA, kept[whole])
+        images = recording.images_at(HEAD_CAMERA, kept[whole])
         here = Ts[low : low + _IMAGES_AT_ONCE][whole]
         for t_ns, image, T in zip(camera.t_ns[part[whole]].tolist(), images, here, strict=True):
             tracker.add(t_ns - inside_ns[0], image, T)
-        on_progress(progress_within("objects", low / len(places), CAMERA))
+        on_progress(progress_within("objects", low / len(places), HEAD_CAMERA))
     tracked = tracker.tracked()
     rate_hz = camera.descriptor.nominal_rate_hz
     return [
@@ -171,7 +170,7 @@ def _stream(
         unit="pose_m_wxyz",
         nominal_rate_hz=rate_hz,
         frame="world",
-        device=CAMERA,
+        device=HEAD_CAMERA,
     )
     quality = {
         f"{one.stream}_share_seen": len(tracked.t_ns) / max(len(image_ns), 1),

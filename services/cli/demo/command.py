@@ -19,6 +19,7 @@ from dextouch.command_line import write_result
 from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.serving import configure_logging
+from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, create_world_app
 from services.alignment.app import create_app as create_alignment
 from services.alignment.settings import AlignmentSettings
@@ -52,7 +53,6 @@ from services.twin.world import TwinWorld
 COMMON_ERRORS = ("taxel_mae_kpa", "fingertip_error_mm", "wrist_error_mm", "wrist_error_deg")
 ERRORS_BY_STREAM = ("clock_rms_ms", "latency_ms", "latency_error_ms", "num_dropped")
 NUM_MOMENTS = 7
-CAMERA = "camera_head"
 
 
 class Stages:
@@ -177,7 +177,7 @@ def _apps(jobs_folder: Path, world_model: World[Any]) -> dict[str, FastAPI]:
     alignment = AlignmentSettings(
         store_url=store, jobs_folder=jobs_folder, align_new=False, log_level="warning"
     )
-    twin = TwinWorld(TwinSettings(cameras=(CAMERA,)))
+    twin = TwinWorld(TwinSettings(cameras=(HEAD_CAMERA,)))
     imagined = {
         scoring.MODEL: world_model,
         scoring.BASELINE: CopyFirstWorld.beside(world_model.description),
@@ -245,11 +245,11 @@ def _pictures(
 def _strip(episode: EpisodeReader, name: str) -> EpisodePicture:
     """Images and touch of a take at a few moments."""
     steps = np.linspace(0, episode.num_steps - 1, NUM_MOMENTS).astype(int)
-    window = episode.window(0, episode.num_steps, cameras=(CAMERA,))
+    window = episode.window(0, episode.num_steps, cameras=(HEAD_CAMERA,))
     return EpisodePicture(
         title=f"{name} take, as recorded and aligned: {episode.attributes.instruction}",
         times_s=(window.t_ref_ns[steps] - window.t_ref_ns[0]) * 1e-9,
-        images=window.images[CAMERA][steps],
+        images=window.images[HEAD_CAMERA][steps],
         tactile_kpa=window.tactile_kpa[steps],
     )
 

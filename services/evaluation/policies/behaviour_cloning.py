@@ -18,8 +18,8 @@ from dextouch.hands.actions import (
     poses_from_actions,
 )
 from dextouch.schemas import Observation
+from dextouch.streams import HEAD_CAMERA
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_network
-from services.evaluation.demonstrations import CAMERA
 from services.evaluation.features import pad_features
 from services.evaluation.policies.cloning_network import (
     SLOT_STEPS,
@@ -194,11 +194,11 @@ class BehaviourCloningPolicy:
         """
         if self._start is None:
             raise InvalidInputError("cloned policy: act before reset; call reset with the start")
-        if CAMERA not in observation.images:
-            raise UnknownNameError("camera", CAMERA, list(observation.images))
-        image = observation.images[CAMERA][-1]
+        if HEAD_CAMERA not in observation.images:
+            raise UnknownNameError("camera", HEAD_CAMERA, list(observation.images))
+        image = observation.images[HEAD_CAMERA][-1]
         if self._first_image is None:
-            self._first_image = observation.images[CAMERA][0]
+            self._first_image = observation.images[HEAD_CAMERA][0]
         moment = CloningInput(
             self._first_image,
             image,

@@ -8,9 +8,9 @@ import torch
 from torch import nn
 
 from dextouch.hands.actions import ACTION_DIM, CAMERA_HEAD, POSE_DIM, POSE_SLICES
+from dextouch.schemas import CHUNK_STEPS
 from services.evaluation.features import NUM_PAD_FEATURES
 
-CHUNK_STEPS = 16
 CHUNK_SIZE = CHUNK_STEPS * ACTION_DIM
 NUM_PHASE_FEATURES = 8
 SLOT_STEPS = 8

@@ -9,6 +9,7 @@ import torch
 from dextouch.episodes import data_hash, split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT
+from dextouch.schemas import CHUNK_STEPS
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
 from services.evaluation.demonstrations import instructions_of
 from services.evaluation.optimization import optimized
@@ -26,7 +27,6 @@ from services.evaluation.policies.cloning_episodes import (
     CloningEpisode,
 )
 from services.evaluation.policies.cloning_network import (
-    CHUNK_STEPS,
     NUM_POSE_FEATURES,
     CloningBatch,
     CloningNetwork,

@@ -21,10 +21,9 @@ from dextouch.hands.actions import (
     actions_from_poses,
     poses_from_actions,
 )
-from dextouch.schemas import Observation
+from dextouch.schemas import CHUNK_STEPS, Observation
+from dextouch.streams import HEAD_CAMERA
 
-CAMERA: Final = "camera_head"
-CHUNK_STEPS: Final = 16
 # Pixels of the object are brighter than this, and their hue (share of each colour in their sum)
 # differs by at most this from the object's.
 _LEAST_BRIGHTNESS, _HUE_TOLERANCE, _LEAST_PIXELS = 60, 0.10, 4
@@ -166,15 +165,15 @@ class ColourServo:
         """
         if self._start is None:
             raise InvalidInputError("colour servo: act before reset; call reset with the start")
-        if CAMERA not in observation.images:
-            raise UnknownNameError("camera", CAMERA, list(observation.images))
+        if HEAD_CAMERA not in observation.images:
+            raise UnknownNameError("camera", HEAD_CAMERA, list(observation.images))
         thing, plan = _PLANS[self._start.task]
         now = observation.action_reached[-1]
         chunk_index = (observation.first_step + len(observation) - 1) // CHUNK_STEPS
         if self._place_m is None:
             poses = poses_from_actions(now[None], self._start.anchor)
             self._place_m = thing_place_m(
-                observation.images[CAMERA][-1],
+                observation.images[HEAD_CAMERA][-1],
                 thing,
                 poses.Ts_world_camera_head[0],
                 self._start.K_head,

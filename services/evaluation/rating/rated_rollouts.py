@@ -12,11 +12,11 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.images import encode_jpeg
 from dextouch.schemas import EpisodeAttributes, is_rollout
+from dextouch.streams import HEAD_CAMERA
 from services.evaluation.rating.rating_queue import RatedRollout, token_of
 from services.evaluation.rating.rubrics import Rubric
 from services.evaluation.reporting.pictures import touch_image
 
-CAMERA: Final = "camera_head"
 IMAGE_HEIGHT_PX: Final = 384
 _BACKGROUND: Final = 24
 
@@ -39,7 +39,7 @@ def rated_rollouts(
         episode = store.open(episode_id)
         about = episode.attributes
         is_wanted = _is_rated(about) if study is None else study in _studies(about)
-        if is_wanted and about.task in tasks and CAMERA in episode.streams:
+        if is_wanted and about.task in tasks and HEAD_CAMERA in episode.streams:
             found.append(
                 RatedRollout(
                     token_of(episode_id),
@@ -54,7 +54,7 @@ def rated_rollouts(
         of_study = "" if study is None else f" of the study {study!r}"
         raise InvalidInputError(
             f"store {store.root}: has no episode of {', '.join(sorted(tasks))} that is a "
-            f"rollout{of_study} with the stream {CAMERA}, expected at least one; takes of "
+            f"rollout{of_study} with the stream {HEAD_CAMERA}, expected at least one; takes of "
             "operators are not rated"
         )
     return found
@@ -109,8 +109,8 @@ class RolloutPictures:
             raise NotFoundError(
                 f"step {step}: the rollout has the steps 0 … {episode.num_steps - 1}"
             )
-        window = episode.window(step, 1, cameras=(CAMERA,))
-        return encode_jpeg(side_by_side(window.images[CAMERA][0], window.tactile_kpa[0]))
+        window = episode.window(step, 1, cameras=(HEAD_CAMERA,))
+        return encode_jpeg(side_by_side(window.images[HEAD_CAMERA][0], window.tactile_kpa[0]))
 
 
 def side_by_side(

@@ -3,20 +3,20 @@
 import numpy as np
 
 from dextouch.episodes import EpisodeReader
-from services.evaluation.demonstrations import CAMERA
+from dextouch.streams import HEAD_CAMERA
 from services.evaluation.reporting.pictures import ActionPicture, EpisodePicture
 
 
 def episode_picture(reader: EpisodeReader, *, num_moments: int = 8) -> EpisodePicture:
     """Evenly spaced moments of a whole episode, including the first and the last."""
-    window = reader.window(0, num_steps=reader.num_steps, cameras=(CAMERA,))
+    window = reader.window(0, num_steps=reader.num_steps, cameras=(HEAD_CAMERA,))
     steps = np.unique(np.linspace(0, reader.num_steps - 1, num_moments).round().astype(int))
     attributes = reader.attributes
     outcome = {True: "success", False: "failure", None: "outcome unknown"}[attributes.success]
     return EpisodePicture(
         f"{attributes.task}, {attributes.domain}, {attributes.origin}: {outcome}",
         _seconds(window.t_ref_ns)[steps],
-        window.images[CAMERA][steps],
+        window.images[HEAD_CAMERA][steps],
         window.tactile_kpa[steps],
     )
 

@@ -5,10 +5,9 @@ from typing import Final
 from pydantic import Field, model_validator
 
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import Domain
+from dextouch.schemas import MAX_OBJECTS, Domain
 
 # Largest number of objects of a task; unused slots are masked.
-MAX_OBJECTS: Final = 3
 # What models of older releases know.
 _ROBOT_ALONE: Final[tuple[Domain, ...]] = ("robot",)
 # The core runs once every four steps of the model grid, the rate of video latents.

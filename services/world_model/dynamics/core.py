@@ -17,10 +17,10 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile.layout import NUM_TAXELS
 from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import (
-    MAX_OBJECTS,
     STEPS_PER_LATENT,
     DynamicsConfig,
 )

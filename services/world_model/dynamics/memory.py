@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError, NonFiniteError
+from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile.layout import NUM_TAXELS
-from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
+from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import NUM_PADS, CoreState, SceneStart
 from services.world_model.dynamics.hand_motion import NUM_POINTS
 from services.world_model.dynamics.model import SceneMemory

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dextouch.geometry import pose_from_transform, transform, transform_from_pose
-from services.world_model.dynamics.configuration import MAX_OBJECTS
+from dextouch.schemas import MAX_OBJECTS
 
 # Objects farther than this from the world's origin count as absent.
 MAX_DISTANCE_M = 1.0

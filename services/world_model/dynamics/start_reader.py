@@ -13,7 +13,8 @@ from jaxtyping import Float32, Int64, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
-from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
+from dextouch.schemas import MAX_OBJECTS
+from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import NUM_PADS
 from services.world_model.dynamics.features import compressed
 from services.world_model.dynamics.hand_motion import NUM_POINTS

@@ -14,7 +14,7 @@ from jaxtyping import Float32, Float64
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import transform_from_pose
 from dextouch.hands.actions import AnchorPoses
-from services.world_model.dynamics.configuration import MAX_OBJECTS
+from dextouch.schemas import MAX_OBJECTS
 from services.world_model.dynamics.features import LOOKS, SLOT_SIZE, slot_features
 from services.world_model.dynamics.hand_motion import hand_motion
 

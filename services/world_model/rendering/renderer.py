@@ -23,7 +23,7 @@ from services.world_model.rendering.inputs import (
 )
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.precision import uses_bfloat16 as uses_bfloat16_here
-from services.world_model.rendering.scene_states import MAX_OBJECTS, SceneState, SceneStates
+from services.world_model.rendering.scene_states import MAX_DRAWN_OBJECTS, SceneState, SceneStates
 
 # Chosen: about 1.5 MB of working memory an image; larger blocks are not faster.
 _BLOCK_IMAGES: Final = 32
@@ -182,8 +182,8 @@ class Renderer:
             )
         if not (np.isfinite(K).all() and np.isfinite(boxes_m).all()):
             raise NonFiniteError("renderer: K_head or boxes contain NaN or infinity")
-        states = SceneStates.stack([start]).padded(MAX_OBJECTS)
-        padded_m = np.zeros((1, MAX_OBJECTS, 6))
+        states = SceneStates.stack([start]).padded(MAX_DRAWN_OBJECTS)
+        padded_m = np.zeros((1, MAX_DRAWN_OBJECTS, 6))
         padded_m[0, : len(boxes_m)] = boxes_m
         return Scenes(image[None], K[None], states, padded_m)
 
@@ -196,4 +196,4 @@ def _stacked(drawing: Drawing) -> SceneStates:
             f"renderer: states have {states.object_present.shape[1]} object slots but there are "
             f"{len(drawing.boxes_m)} boxes; expected equal numbers"
         )
-    return states.padded(MAX_OBJECTS)
+    return states.padded(MAX_DRAWN_OBJECTS)

@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float64, Int64
 
 from dextouch.errors import NonFiniteError, ShapeError
 
-MAX_OBJECTS = 4
+# Slots of the renderer's inputs, which its weights are trained with; one more than tasks may have.
+MAX_DRAWN_OBJECTS = 4
 
 
 @dataclass(frozen=True)
@@ -44,10 +45,10 @@ class SceneStates:
             raise ShapeError("scene states: got none, expected at least one to draw")
         shapes = {(np.shape(s.object_poses), np.shape(s.object_present)) for s in states}
         num_slots = len(states[0].object_present)
-        if shapes != {((num_slots, 7), (num_slots,))} or num_slots > MAX_OBJECTS:
+        if shapes != {((num_slots, 7), (num_slots,))} or num_slots > MAX_DRAWN_OBJECTS:
             raise ShapeError(
                 f"scene states: got object poses and presences of shapes {sorted(shapes)}, "
-                f"expected [K, 7] and [K] with one K ≤ {MAX_OBJECTS} in all of them"
+                f"expected [K, 7] and [K] with one K ≤ {MAX_DRAWN_OBJECTS} in all of them"
             )
         made = cls(
             np.stack([np.asarray(s.T_world_camera, dtype=np.float64) for s in states]),

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.episodes import (
-    HEAD_CAMERA,
     EpisodeGrid,
     EpisodeReader,
     EpisodeStore,
@@ -16,6 +15,7 @@ from dextouch.episodes import (
     select_episodes,
 )
 from dextouch.schemas import ActionKind, Domain
+from dextouch.streams import HEAD_CAMERA
 from services.world_model.training.dataset import EpisodeArrays
 
 # What an episode must have for windows to be cut from it.

@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 from torch.nn import functional
 
-from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
+from dextouch.schemas import MAX_OBJECTS
+from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.nested import combined
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import Reading, StartReader

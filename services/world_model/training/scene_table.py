@@ -10,10 +10,10 @@ from torch import Tensor
 
 from dextouch.episodes import EpisodeGrid, ObjectTrack
 from dextouch.errors import InvalidInputError
+from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile.layout import split_pads
 from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import (
-    MAX_OBJECTS,
     STEPS_PER_LATENT,
     DynamicsConfig,
 )

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from dextouch.errors import InvalidInputError
 from dextouch.metrics import tactile as tactile_metrics
+from dextouch.schemas import CHUNK_STEPS
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.training.reader_training import reader_errors
 from services.world_model.training.scene_table import SceneTable
 
-CHUNK_STEPS = 16
 # Start steps of rollouts, as far as they have images.
 STARTS = (0, 16, 32, 48, 64)
 _BATCH = 64

@@ -16,12 +16,11 @@ from dextouch.bridges.exports import Block, Reader, blocks, new_file
 from dextouch.episodes import EpisodeReader, is_keyframe
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import json_ready
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import HEAD_CAMERA, StreamDescriptor
 from dextouch.tactile import colour, hand_canvas
 from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, select_taxels
 
 APPLICATION: Final = "dextouch"
-HEAD_CAMERA: Final = "camera_head"
 FULL_SCALE_KPA: Final = 40.0
 AXIS_LENGTH_M: Final = 0.05
 POINT_RADIUS_M: Final = 0.004

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from dextouch.episodes.object_poses import ObjectTrack as ObjectTrack
     from dextouch.episodes.object_poses import has_object_poses as has_object_poses
     from dextouch.episodes.object_poses import object_track as object_track
-    from dextouch.episodes.reader import HEAD_CAMERA as HEAD_CAMERA
     from dextouch.episodes.reader import EpisodeReader as EpisodeReader
     from dextouch.episodes.reader import RecordingReader as RecordingReader
     from dextouch.episodes.rollout_episode import write_rollout as write_rollout

@@ -7,7 +7,8 @@ from typing import Final
 import numpy as np
 
 from dextouch.episodes.object_poses import has_object_poses
-from dextouch.episodes.reader import HEAD_CAMERA, EpisodeReader
+from dextouch.episodes.reader import EpisodeReader
+from dextouch.streams import HEAD_CAMERA
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,11 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from dextouch.episodes.object_poses import CAMERA, ObjectTrack
+from dextouch.episodes.object_poses import ObjectTrack
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.geometry import points_on_level, pose_from_transform, transform
 from dextouch.schemas import EpisodeAttributes, EpisodeClicks, SceneObject, SceneObjects
+from dextouch.streams import HEAD_CAMERA
 
 Pixel = tuple[float, float]
 # Of people's clicks, on each axis of the image.
@@ -121,9 +122,9 @@ def clicked_poses(
     for name in clicks.objects:
         if name not in names:
             raise UnknownNameError(f"object of episode {about.episode_id!r}", name, names)
-    sizes_px = [stream.shape[1::-1] for stream in about.streams if stream.name == CAMERA]
+    sizes_px = [stream.shape[1::-1] for stream in about.streams if stream.name == HEAD_CAMERA]
     if not sizes_px:
-        raise InvalidInputError(f"episode {about.episode_id!r}: has no {CAMERA} to click in")
+        raise InvalidInputError(f"episode {about.episode_id!r}: has no {HEAD_CAMERA} to click in")
     camera, T_world_camera = first_camera(about)
     poses = np.tile(_ABSENT_POSE, (len(listed), 1))
     known, sd_m = np.zeros(len(listed), dtype=np.bool_), np.zeros(len(listed))

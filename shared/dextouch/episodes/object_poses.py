@@ -15,11 +15,11 @@ from dextouch.geometry import (
 )
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import object_stream
+from dextouch.streams import HEAD_CAMERA
 
 # Ground truth, and what imagined worlds say: all objects in one stream, without gaps.
 OBJECT_POSES: Final = "object_poses"
 # Which camera sees markers, and is clicked in.
-CAMERA: Final = "camera_head"
 # Where the pose of an object is from; "none" of one that is known nowhere.
 ObjectSource = Literal["twin", "markers", "tracker", "clicks", "none"]
 # Between two sightings that are at most so far apart, an object is taken to have moved evenly ...
@@ -97,7 +97,7 @@ def object_track(
 
 
 def _measured_by(reader: EpisodeReader, name: str) -> ObjectSource:
-    return "markers" if reader.streams[object_stream(name)].device == CAMERA else "tracker"
+    return "markers" if reader.streams[object_stream(name)].device == HEAD_CAMERA else "tracker"
 
 
 def has_object_poses(reader: EpisodeReader) -> bool:

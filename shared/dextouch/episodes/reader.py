@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final, Literal, TypeVar, overload
+from typing import Literal, TypeVar, overload
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
@@ -28,10 +28,9 @@ from dextouch.schemas import (
     RecordingAttributes,
     StreamContent,
 )
-from dextouch.streams import SampleBatch
+from dextouch.streams import HEAD_CAMERA, SampleBatch
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
-HEAD_CAMERA: Final = "camera_head"
 # Half a step, for a free-running camera at the model rate, plus some jitter.
 OWN_IMAGE_SHARE = 0.6
 # Tolerated share of dropped images; images of every second step miss more.

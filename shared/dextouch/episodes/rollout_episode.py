@@ -5,10 +5,9 @@ from typing import Final
 
 import numpy as np
 
-from dextouch.episodes.reader import HEAD_CAMERA
 from dextouch.episodes.store import EpisodeStore
 from dextouch.schemas import EpisodeAttributes, Observation
-from dextouch.streams import StreamDescriptor, StreamKind
+from dextouch.streams import HEAD_CAMERA, StreamDescriptor, StreamKind
 from dextouch.tactile.layout import SIDES
 
 NS_PER_S: Final = 1_000_000_000

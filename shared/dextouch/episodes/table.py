@@ -17,13 +17,14 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from dextouch.episodes.format import KINDS
 from dextouch.episodes.needs import ACTIONS, OUTCOME, Need
 from dextouch.episodes.object_poses import ObjectTrack, object_track
-from dextouch.episodes.reader import HEAD_CAMERA, OWN_IMAGE_SHARE, EpisodeReader
+from dextouch.episodes.reader import OWN_IMAGE_SHARE, EpisodeReader
 from dextouch.episodes.splits import Split, is_in, recording_of, scene_of, split_of
 from dextouch.episodes.store import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.images import scaled_square, square_of_at_most
 from dextouch.schemas import ActionKind, Domain, EpisodeAttributes, Observation, Origin
+from dextouch.streams import HEAD_CAMERA
 
 TRUE_ORIGINS: Final[tuple[Origin, ...]] = ("recorded", "twin")
 

@@ -109,6 +109,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.recordings import StreamContent as StreamContent
     from dextouch.schemas.recordings import UploadList as UploadList
     from dextouch.schemas.recordings import UploadSummary as UploadSummary
+    from dextouch.schemas.rollouts import CHUNK_STEPS as CHUNK_STEPS
     from dextouch.schemas.rollouts import MAX_SEED as MAX_SEED
     from dextouch.schemas.rollouts import ActionKind as ActionKind
     from dextouch.schemas.rollouts import Doubt as Doubt
@@ -121,6 +122,7 @@ if TYPE_CHECKING:
     from dextouch.schemas.rollouts import WorldDescription as WorldDescription
     from dextouch.schemas.rollouts import WorldKind as WorldKind
     from dextouch.schemas.rollouts import WorldList as WorldList
+    from dextouch.schemas.scene_objects import MAX_OBJECTS as MAX_OBJECTS
     from dextouch.schemas.scene_objects import ClickedAt as ClickedAt
     from dextouch.schemas.scene_objects import EpisodeClicks as EpisodeClicks
     from dextouch.schemas.scene_objects import MarkerDictionary as MarkerDictionary

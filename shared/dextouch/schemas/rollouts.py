@@ -12,6 +12,9 @@ from dextouch.frozen_model import FrozenModel
 ActionKind = Literal["measured", "commanded"]
 WorldKind = Literal["twin", "model", "baseline", "robot"]
 MAX_SEED = 2**63 - 1
+# Steps of an action chunk at the model rate of 15 Hz, as in the paper: the usual length, which
+# policies, models in the paper's form and comparisons have.
+CHUNK_STEPS: Final = 16
 # Quality figures of imagined episodes, and the fields of `RolloutDoubt` that they hold.
 _QUALITY: Final = {
     "imagined_doubted_step": "step",

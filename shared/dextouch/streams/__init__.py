@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from dextouch.streams.packing import unpack as unpack
     from dextouch.streams.samples import ENCODED_UNITS as ENCODED_UNITS
     from dextouch.streams.samples import H264_UNIT as H264_UNIT
+    from dextouch.streams.samples import HEAD_CAMERA as HEAD_CAMERA
     from dextouch.streams.samples import JPEG_UNIT as JPEG_UNIT
     from dextouch.streams.samples import MAX_STREAMS as MAX_STREAMS
     from dextouch.streams.samples import NO_DEVICE_TIME as NO_DEVICE_TIME

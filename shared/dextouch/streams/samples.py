@@ -22,6 +22,8 @@ MIN_RATE_HZ = 1e-6
 # written. Those of older releases may have more.
 MAX_STREAMS = 100
 StreamKind = Literal["tactile", "keypoints", "pose", "image", "robot_state", "scalar"]
+# Stream of the camera on the head, whose images policies and world models see.
+HEAD_CAMERA = "camera_head"
 # Placeholders where a device provides no time stamp or no sequence number.
 NO_DEVICE_TIME = -1
 NO_SEQUENCE = -1

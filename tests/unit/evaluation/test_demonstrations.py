@@ -90,7 +90,7 @@ def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     flags = ["--episodes", url, "--output", str(output), "--json", str(figures)]
     training = ["--training.num-training-steps", "3", "--training.held-out-share", "0.5"]
     training += ["--training.development-share", "0.2"]
-    assert run_command(["train", "probe", *flags, *training]) == 0
+    assert run_command(["train", "judge", *flags, *training]) == 0
     assert "held_out_accuracy" in capsys.readouterr().out
     probe = SuccessProbe.load(output)
     assert probe.metadata.settings["instructions"] == toy.INSTRUCTIONS
@@ -98,7 +98,7 @@ def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("network", "trained"), [("probe", SuccessProbe), ("policy", BehaviourCloningPolicy)]
+    ("network", "trained"), [("judge", SuccessProbe), ("policy", BehaviourCloningPolicy)]
 )
 def test_what_a_station_recorded_can_be_trained_on(network, trained, tmp_path):
     store = EpisodeStore(tmp_path / "recorded")

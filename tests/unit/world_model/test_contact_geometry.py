@@ -8,6 +8,7 @@ import torch
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert, transform_from_pose
+from dextouch.streams import HEAD_CAMERA
 from services.world_model.checkpoints import read_checkpoint, write_checkpoint
 from services.world_model.dynamics.features import NEAR_M
 from services.world_model.dynamics.hand_motion import hand_motion
@@ -22,7 +23,7 @@ from services.world_model.scene_reader import SceneReader
 from services.world_model.training.dataset import WindowSampler, cut_window
 from services.world_model.training.distribution import Processes
 from services.world_model.training.self_forcing import own_context
-from services.world_model.world import CAMERA, ModelWorld
+from services.world_model.world import ModelWorld
 from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.world_model.conftest import make_metadata
 from tests.unit.world_model.test_world import make_start
@@ -143,7 +144,7 @@ def test_a_rollout_reads_the_objects_of_every_chunk(checkpoint, reader, toy_epis
     again = world.step(world.restore(world.snapshot(state)), actions, seed=0)
     np.testing.assert_array_equal(one.observation.tactile_kpa, again.observation.tactile_kpa)
     world.step(one.state, actions, seed=0)
-    np.testing.assert_array_equal(asked[-1][0], one.observation.images[CAMERA][-1])
+    np.testing.assert_array_equal(asked[-1][0], one.observation.images[HEAD_CAMERA][-1])
 
 
 def test_chained_training_is_refused(config, toy_episodes):

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
+from dextouch.schemas import MAX_OBJECTS
 from services.world_model.dynamics.commands import Commands
-from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
+from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import (
     RecurrentCore,
     SceneStart,

@@ -12,9 +12,9 @@ from dextouch.episodes import ObjectTrack, split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
-from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
+from dextouch.schemas import MAX_OBJECTS, EpisodeAttributes, StoredAnchor, matrix_rows
 from dextouch.serving import load_settings
-from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
+from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore, SceneStart
 from services.world_model.dynamics.features import SLOT_SIZE
 from services.world_model.dynamics.model import DynamicsModel

@@ -3,9 +3,10 @@
 import pytest
 import torch
 
+from dextouch.schemas import MAX_OBJECTS
 from services.world_model.dynamics import traces
 from services.world_model.dynamics.commands import Commands
-from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
+from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import NUM_PADS, CoreState, SceneStart
 from services.world_model.dynamics.features import LOOKS
 from services.world_model.dynamics.model import DynamicsModel

@@ -15,11 +15,12 @@ from dextouch.errors import (
     UnknownNameError,
 )
 from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld, World
 from services.world_model import world as world_module
 from services.world_model.network.inputs import build_inputs
 from services.world_model.training.dataset import cut_window
-from services.world_model.world import CAMERA, ModelWorld
+from services.world_model.world import ModelWorld
 
 
 @pytest.fixture
@@ -41,7 +42,7 @@ def make_start(episode, start=0, kind="commanded"):
         action_kind=kind,
         observation=Observation(
             first_step=0,
-            images={CAMERA: window.images[:1]},
+            images={HEAD_CAMERA: window.images[:1]},
             tactile_kpa=window.tactile_kpa[:1],
             action_reached=request.actions[:1],
             reached_is_measured=True,
@@ -52,7 +53,7 @@ def make_start(episode, start=0, kind="commanded"):
 
 
 def _equal(a, b):
-    return np.array_equal(a.images[CAMERA], b.images[CAMERA]) and np.array_equal(
+    return np.array_equal(a.images[HEAD_CAMERA], b.images[HEAD_CAMERA]) and np.array_equal(
         a.tactile_kpa, b.tactile_kpa
     )
 
@@ -125,7 +126,7 @@ def test_steps_are_numbered_and_touch_is_never_negative(world, toy_episode):
     observation = stepped.observation
     assert observation.first_step == 1
     assert len(observation) == 12
-    assert observation.images[CAMERA].shape == (12, 32, 32, 3)
+    assert observation.images[HEAD_CAMERA].shape == (12, 32, 32, 3)
     assert observation.tactile_kpa.min() >= 0
     assert not observation.reached_is_measured
     following = world.step(stepped.state, episode.actions["commanded"][13:17], seed=3)
@@ -163,7 +164,7 @@ def test_company_in_a_batch_changes_nothing_but_rounding(world, toy_episodes):
         alone = world.step(state, chunk, seed=index).observation
         many = together[index].observation
         np.testing.assert_allclose(alone.tactile_kpa, many.tactile_kpa, rtol=1e-5, atol=1e-5)
-        difference = alone.images[CAMERA].astype(int) - many.images[CAMERA].astype(int)
+        difference = alone.images[HEAD_CAMERA].astype(int) - many.images[HEAD_CAMERA].astype(int)
         assert np.abs(difference).max() <= 1
 
 
@@ -218,9 +219,9 @@ def test_starts_it_cannot_begin_from_are_refused(world, toy_episode):
         with pytest.raises(InvalidInputError, match="begins from an observation"):
             world.reset(replace(start, **{missing: None}))
     blind = replace(start.observation, images={})
-    with pytest.raises(UnknownNameError, match=CAMERA):
+    with pytest.raises(UnknownNameError, match=HEAD_CAMERA):
         world.reset(replace(start, observation=blind))
-    small = replace(start.observation, images={CAMERA: np.zeros((1, 16, 16, 3), np.uint8)})
+    small = replace(start.observation, images={HEAD_CAMERA: np.zeros((1, 16, 16, 3), np.uint8)})
     with pytest.raises(ShapeError):
         world.reset(replace(start, observation=small))
     numb = replace(start.observation, tactile_kpa=np.full((1, 2, 320), np.nan, np.float32))

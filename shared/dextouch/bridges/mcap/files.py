@@ -26,7 +26,7 @@ from dextouch.episodes import EpisodeReader, EpisodeStore, EpisodeWriter, Kind, 
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.images import encode_jpeg
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes, first_problems, json_ready
-from dextouch.streams import ENCODED_UNITS, StreamDescriptor, encoded_values
+from dextouch.streams import ENCODED_UNITS, HEAD_CAMERA, StreamDescriptor, encoded_values
 
 PROFILE: Final = "dextouch"
 BRIDGE_VERSION: Final = "1"
@@ -35,7 +35,6 @@ COUNTS: Final = "dextouch.num_samples"
 ATTRIBUTES_FILE: Final = "attributes.json"
 CALIBRATION_FILE: Final = "calibration.json"
 CHUNK_BYTES: Final = 1 << 20
-HEAD_CAMERA: Final = "camera_head"
 _SEQUENCE_BITS = 0xFFFF_FFFF
 MAX_ATTRIBUTES_BYTES: Final = 1 << 24
 _BLOCK_BYTES: Final = 1 << 24

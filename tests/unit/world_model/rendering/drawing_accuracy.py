@@ -15,12 +15,12 @@ from torch.nn import functional
 from benchmarks.evaluator.measuring import sharpness
 from dextouch.errors import InvalidInputError
 from dextouch.metrics.image import PEAK, decibels
+from dextouch.schemas import CHUNK_STEPS
 from services.world_model.rendering.clips import SceneClip, gather
 from services.world_model.rendering.inputs import Scenes, drawing_inputs
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.scene_states import SceneStates
 
-CHUNK_STEPS = 16
 _REACH_PX = 5
 _BATCH = 32
 
