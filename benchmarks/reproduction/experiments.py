@@ -99,10 +99,11 @@ class Sizes(FrozenModel):
     tokenizer_cpu_s: int = Field(default=60, ge=1)
     train_cpu_s: int = Field(default=300, ge=1)
     option_cpu_s: int = Field(default=120, ge=1)
-    reader_steps: int = Field(default=1000, ge=2)
-    core_steps: int = Field(default=1000, ge=2)
-    adapt_reader_steps: int = Field(default=1000, ge=1)
+    reader_steps: int = Field(default=600, ge=2)
+    core_steps: int = Field(default=2000, ge=2)
+    adapt_reader_steps: int = Field(default=600, ge=1)
     adapt_core_steps: int = Field(default=1000, ge=1)
+    core_batch: int = Field(default=32, ge=1)
     drawing_cpu_s: int = Field(default=30, ge=1)
     policy_steps: int = Field(default=3000, ge=1)
     num_starts: int = Field(default=10, ge=1)
@@ -219,10 +220,11 @@ class Experiments:
     def _scaling(self) -> Iterator[Step]:
         """State models with more and more human data."""
         for seed in self.seeds:
-            for column in ("0", HALF_TRAINING):
-                yield self._rolled_out(self._state_model(column, seed))
+            yield self._rolled_out(self._state_model("0", seed))
             for multiple in self.sizes.multiples:
                 yield self._rolled_out(self._with_human(multiple, seed))
+        for seed in self.seeds:
+            yield self._rolled_out(self._state_model(HALF_TRAINING, seed))
 
     def _with_human(self, multiple: int, seed: int) -> Step:
         count = multiple * self.sizes.robot_per_task * len(ROBOT_PRETRAINING)
@@ -240,7 +242,7 @@ class Experiments:
             f"train world-model --episodes data/robot/store --heldout data/robot-heldout/store "
             f"{flags} --seed {seed} --num-members 1 --jobs 1 "
             f"--reader.num-steps {sizes.reader_steps // share} "
-            f"--core.num-steps {sizes.core_steps // share} "
+            f"--core.num-steps {sizes.core_steps // share} --core.batch {sizes.core_batch} "
             f"--drawing.cpu-budget-s {sizes.drawing_cpu_s} --output {name}/{_MODEL}",
             _MODEL,
             needs=(self._data["robot"], self._data["robot-heldout"], *needs),
@@ -318,7 +320,7 @@ class Experiments:
             f"train adapt --init {ancestor.name}/{_MODEL} --episodes data/downstream/store "
             f"--splits B,C {flags[world]} --heldout data/downstream-heldout/store --seed {seed} "
             f"--jobs 1 --reader.num-steps {sizes.adapt_reader_steps} "
-            f"--core.num-steps {sizes.adapt_core_steps} "
+            f"--core.num-steps {sizes.adapt_core_steps} --core.batch {sizes.core_batch} "
             f"--drawing.cpu-budget-s {sizes.drawing_cpu_s} --output {name}/{_MODEL}",
             _MODEL,
             needs=(*(s for n, s in self._data.items() if n.startswith("downstream")), ancestor),
