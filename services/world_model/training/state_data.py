@@ -113,10 +113,17 @@ def configured(data: StateData, settings: StateTrainSettings) -> DynamicsConfig:
     """The configuration of a model of some episodes.
 
     Raises:
-        InvalidInputError: images of several sizes, or tasks whose episodes differ in their objects.
+        InvalidInputError: images of several sizes, tasks whose episodes differ in their objects, or
+            that no episode of training has.
     """
     episodes = data.episodes
     tasks, num_objects = vocabulary(episodes)
+    untrained = set(tasks) - {episode.task for episode in data.training}
+    if untrained:
+        raise InvalidInputError(
+            f"training: tasks {sorted(untrained)} are held out and not trained on; record more "
+            "scenes of them, or leave them out with --tasks"
+        )
     sides = {episode.image_size_px[0] for episode in episodes}
     if len(sides) != 1:
         raise InvalidInputError(

@@ -70,7 +70,7 @@ from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.transfer import Base
 
 # Increment when a change of training gives other weights for the same settings and data.
-READER_VERSION, CORE_VERSION, RENDERER_VERSION = 6, 9, 3
+READER_VERSION, CORE_VERSION, RENDERER_VERSION = 6, 10, 3
 # Largest number of episodes the renderer is trained on; it samples few of their images anyway.
 MAX_CLIPS = 1500
 _SEED_STRIDE = 1000
@@ -239,7 +239,8 @@ class _Work:
             include={"seed", "heldout_share", "labelled_share", *names, *self._drawn_by}
         )
         base = "" if self.base is None else f"{self.settings.learn} {self.base.checkpoint.digest}"
-        text = f"{version} {chosen} {self.data_hash} {base}"
+        domains = ",".join(self.config.domains)
+        text = f"{version} {chosen} {self.data_hash} {base} {domains}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -127,6 +127,8 @@ def test_of_both_domains_robots_are_held_out():
     settings = StateTrainSettings(episodes=("takes",))
     assert configured(data, settings).domains == ("robot", "human")
     assert configured(StateData([person(1)], [person(2)]), settings).domains == ("robot",)
+    with pytest.raises(InvalidInputError, match=r"tasks \['press'\] are held out and not trained"):
+        configured(StateData([person(1)], [episode(2)]), settings)
 
 
 @pytest.fixture
