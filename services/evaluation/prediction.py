@@ -118,7 +118,7 @@ def _object_error(pairs: Pairs) -> float:
     errors_m = [np.zeros(0)]
     for scene, future in pairs:
         first_m, last_m, said_m = scene.first_objects_m, scene.truth.objects_m, future.objects_m
-        if first_m is None or last_m is None or said_m is None:
+        if first_m is None or last_m is None or said_m is None or said_m.shape != last_m.shape:
             continue
         # False where a position is not known.
         moved = np.linalg.norm(last_m - first_m, axis=1) >= _MOVED_M

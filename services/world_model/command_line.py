@@ -10,8 +10,10 @@ from typing import Any, Final
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dextouch.command_line import CommandParser, ProgressLines, write_result
+from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.serving import load_settings
 from dextouch.serving.configuration_file import (
+    CommandSettings,
     configuration_path,
     read_configuration,
     section_of,
@@ -21,6 +23,7 @@ from services.networks.weight_files import digest_of
 from services.world_model.checkpoints import list_checkpoints, read_checkpoint, read_metadata
 from services.world_model.distillation_settings import DistillCommand
 from services.world_model.plan import plan_table
+from services.world_model.presets import PRESETS
 from services.world_model.settings import (
     AdaptCommand,
     AdaptStateCommand,
@@ -42,8 +45,11 @@ STATE: Final = "state"
 
 def run_train(arguments: list[str]) -> int:
     """Train the form that --preset names; print the report and optionally write it to a file."""
-    preset = _flag(arguments, "--preset") or _configured_preset()
+    preset = _flag(arguments, "preset", TrainCommand) or STATE
+    if preset not in (STATE, *PRESETS):
+        raise UnknownNameError("preset", preset, [STATE, *PRESETS])
     if preset == STATE:
+        _refuse_other_settings()
         return _train_state(load_settings(TrainStateCommand, arguments))
     settings = load_settings(TrainCommand, arguments)
     if settings.plan:
@@ -52,25 +58,37 @@ def run_train(arguments: list[str]) -> int:
     return _train(settings, settings.json_path)
 
 
-def _configured_preset() -> str:
-    """The preset that the environment or the configuration file names."""
+def _refuse_other_settings() -> None:
+    """Refuse settings of the paper's form without a preset: nothing would read them.
+
+    Raises:
+        InvalidInputError: the configuration file has some.
+    """
     path, section = configuration_path(), section_of(TrainCommand)
-    kept = {} if path is None else read_configuration(path).get(section, {})
-    named: str = os.environ.get(f"DEXTOUCH_{section.upper()}_PRESET") or kept.get("preset", STATE)
-    return named
+    if path is not None and read_configuration(path).get(section, {"preset": STATE}) != {
+        "preset": STATE
+    }:
+        raise InvalidInputError(
+            f"{path}: [{section}] has settings of the paper's form, and no preset of it is named; "
+            f'add preset = "tiny" there, or move them to [{section_of(TrainStateCommand)}]'
+        )
 
 
-def _flag(arguments: list[str], name: str) -> str | None:
-    """Value of one flag, before it is known which command the others are of."""
+def _flag(arguments: list[str], name: str, *classes: type[CommandSettings]) -> str | None:
+    """One setting, before it is known which command the others are of: a flag, or configured."""
     parser = CommandParser(add_help=False, allow_abbrev=False)
-    parser.add_argument(name, dest="value")
+    parser.add_argument(f"--{name}", dest="value")
     value: str | None = parser.parse_known_args(arguments)[0].value
+    path = configuration_path()
+    for section in map(section_of, classes):
+        kept = {} if path is None else read_configuration(path).get(section, {})
+        value = value or os.environ.get(f"DEXTOUCH_{section}_{name}".upper()) or kept.get(name)
     return value
 
 
 def run_adapt(arguments: list[str]) -> int:
     """Adapt a checkpoint to new tasks; print the report and optionally write it to a file."""
-    init = _flag(arguments, "--init")
+    init = _flag(arguments, "init", AdaptStateCommand, AdaptCommand)
     if init is None or is_state_checkpoint(Path(init)):
         return _train_state(load_settings(AdaptStateCommand, arguments))
     settings = load_settings(AdaptCommand, arguments)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import Field, model_validator
 
-from dextouch.episodes import Split, scene_of, split_of_scene
+from dextouch.episodes import Split, scene_fraction, scene_of, split_of_scene
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import EpisodeAttributes
 from services.networks.weight_files import (
@@ -56,11 +56,11 @@ class StateMetadata(FrozenModel):
     """Provenance and measured accuracy of a state model, stored in its checkpoint.
 
     `training_seeds` are the first and last seed of every task, of the scenes in `training_splits`
-    (all splits if empty); `training_scenes` are `scene_digest` of those without a seed, which a
-    station recorded. `object_sources` are the numbers of training episodes whose object poses are
-    from the twin, markers, trackers or clicks, and of those without any ("none"). `sets` are the
-    episodes by domain, those of the models that it started from included; files of older releases
-    have none.
+    (all splits if empty) but the share `heldout_share`, by hash; `training_scenes` are
+    `scene_digest` of those without a seed, which a station recorded. `object_sources` are the
+    numbers of training episodes whose object poses are from the twin, markers, trackers or clicks,
+    and of those without any ("none"). `sets` are the episodes by domain, those of the models that
+    it started from included; files of older releases have none.
     """
 
     format_version: int = FORMAT_VERSION
@@ -78,6 +78,7 @@ class StateMetadata(FrozenModel):
     num_training_episodes: int
     training_seeds: dict[str, tuple[int, int]]
     training_splits: tuple[Split, ...] = ()
+    heldout_share: float | None = Field(default=None, exclude_if=not_)
     training_scenes: tuple[str, ...] = Field(default=(), exclude_if=not_)
     data_hash: str
     object_sources: dict[str, int] = Field(default={}, exclude_if=not_)
@@ -94,7 +95,9 @@ class StateMetadata(FrozenModel):
         """Whether a scene of the twin may be one of the training scenes."""
         low, high = self.training_seeds.get(task, (0, -1))
         splits = self.training_splits
-        return low <= seed <= high and (not splits or split_of_scene(task, seed) in splits)
+        is_heldout = scene_fraction(f"{task}/{seed}") < (self.heldout_share or 0.0)
+        is_in_splits = not splits or split_of_scene(task, seed) in splits
+        return low <= seed <= high and is_in_splits and not is_heldout
 
     @model_validator(mode="after")
     def _names_and_boxes_fit_the_tasks(self) -> "StateMetadata":

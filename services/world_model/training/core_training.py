@@ -83,6 +83,9 @@ def train_core(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         core = initial or RecurrentCore(config)
+        if core.human is not None and not bool(data.table.human.any()):
+            # Weights that no example reaches would decay.
+            core.human.requires_grad_(requires_grad=False)
         describe(core, data.table, widens=initial is not None)
 
         def loss() -> Tensor:
@@ -102,8 +105,10 @@ def describe(core: RecurrentCore, table: SceneTable, *, widens: bool = False) ->
         table: training episodes.
         widens: whether the range that the core already has is kept, and widened.
     """
-    core.boxes_m.copy_(table.boxes_m)
-    core.movable.copy_(table.movable())
+    # Tasks without episodes keep what the core knows of them.
+    seen = torch.bincount(table.task, minlength=len(core.boxes_m)) > 0
+    core.boxes_m[seen] = table.boxes_m[seen]
+    core.movable[seen] = table.movable()[seen]
     rows = torch.arange(0, len(table), max(1, len(table) // _FIT_EPISODES))
     commands = table.commands(rows, 0, torch.zeros(len(rows), dtype=torch.bool))
     wrist_m = commands.points_m[:, :, -1, :, 0]

@@ -58,9 +58,9 @@ class SceneTable:
     measurement, and `clicked_sd_m` is the standard deviation of clicked positions, 0 of others.
     `images` are those of the steps `image_steps`, where `shown`; `in_contact` marks
     pads in contact; `sent` are commanded hands where available and measured ones elsewhere, as
-    given by `commanded`. `human` marks episodes in which a person acts, and `chance` is how
-    likely an episode is drawn, relative to others. `labelled` marks episodes whose object poses are
-    trained on; `boxes_m` are the usual boxes of each task's objects in their
+    given by `commanded`. `human` marks episodes in which a person acts, and `human_share` is their
+    share in what is drawn, NaN if it follows from their number. `labelled` marks episodes whose
+    object poses are trained on; `boxes_m` are the usual boxes of each task's objects in their
     frames (middle, half sizes), and `size` factors of their width and height.
     """
 
@@ -79,7 +79,7 @@ class SceneTable:
     success: Float32[Tensor, " episodes"]
     task: Int64[Tensor, " episodes"]
     human: Bool[Tensor, " episodes"]
-    chance: Float32[Tensor, " episodes"]
+    human_share: Float32[Tensor, ""]
     labelled: Bool[Tensor, " episodes"]
     length: Int64[Tensor, " episodes"]
     objects_known: Bool[Tensor, "episodes steps objects"]
@@ -140,11 +140,19 @@ class SceneTable:
     def drawn(
         self, able: Int64[Tensor, " rows"], count: int, generator: torch.Generator
     ) -> Int64[Tensor, " count"]:
-        """Random episodes of some, each as often as its chance says."""
-        chance = self.chance[able]
-        if bool((chance == chance[0]).all()):
+        """Random episodes of some, a share of them human if there are both.
+
+        Args:
+            able: indices of the episodes to draw from.
+            count: how many to draw, with replacement.
+            generator: source of randomness.
+        """
+        is_human, share = self.human[able], self.human_share
+        num_human = is_human.sum()
+        if bool(share.isnan()) or not 0 < int(num_human) < len(able):
             return able[torch.randint(len(able), (count,), generator=generator)]
-        return able[torch.multinomial(chance, count, replacement=True, generator=generator)]
+        of_each = torch.where(is_human, share / num_human, (1 - share) / (len(able) - num_human))
+        return able[torch.multinomial(of_each, count, replacement=True, generator=generator)]
 
     def knows_all(self, step: int) -> Bool[Tensor, " episodes"]:
         """Episodes in which the poses of all objects are known at a step."""
@@ -311,7 +319,7 @@ def scene_table(
         success=torch.tensor([float(episode.success) for episode in episodes]),
         task=torch.tensor([config.tasks.index(episode.task) for episode in episodes]),
         human=torch.tensor([episode.domain == "human" for episode in episodes]),
-        chance=_chances([episode.domain == "human" for episode in episodes], human_share),
+        human_share=torch.tensor(torch.nan if human_share is None else human_share),
         labelled=torch.tensor(list(labelled) or [True] * len(episodes)),
         length=torch.tensor(lengths),
         objects_known=torch.from_numpy(known),
@@ -320,15 +328,6 @@ def scene_table(
         size=torch.from_numpy(np.stack([_size(e, boxes_m[e.task]) for e in episodes])),
         boxes_m=_padded(boxes_m, config),
     )
-
-
-def _chances(human: Sequence[bool], human_share: float | None) -> Float32[Tensor, " episodes"]:
-    """Chance of every episode to be drawn; equal ones without a share or a second domain."""
-    is_human = torch.tensor(human)
-    if human_share is None or bool(is_human.all()) or not bool(is_human.any()):
-        return torch.ones(len(human))
-    share = (human_share / is_human.sum(), (1 - human_share) / (~is_human).sum())
-    return torch.where(is_human, *share) * len(human)
 
 
 def _whole(episode: EpisodeGrid) -> int:

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import structlog
+
 from dextouch.episodes import (
     SPLITS,
     EpisodeGrid,
@@ -13,15 +15,18 @@ from dextouch.episodes import (
     scene_fraction,
     split_by_scene,
 )
-from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import Domain, ObjectClicks, load_object_clicks
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.settings import StateTrainSettings
 from services.world_model.state_checkpoints import scene_digest
 from services.world_model.training.domains import check_tasks, subset_by_hash
-from services.world_model.training.scene_episodes import load_scene_episodes
+from services.world_model.training.scene_episodes import SceneGrid, load_scene_episodes
 from services.world_model.training.scene_table import vocabulary
 from services.world_model.training.transfer import Base
+from services.world_model.training_set import learned_tasks
+
+logger = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,8 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
 
     Raises:
         NotFoundError: an empty store, none that can be used, or clicks on an unknown episode.
-        ConflictError: an id is in two stores, or two episodes are of one recording.
+        ConflictError: an id is in two stores, two episodes are of one recording, or model rates
+            differ.
         InvalidInputError: held-out scenes that are trained on, or too few episodes.
     """
     clicks = None if settings.clicks is None else load_object_clicks(settings.clicks)
@@ -71,16 +77,46 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
     training = subset_by_hash(training, settings.robot_episodes, what="robot")
     if settings.human and settings.human_episodes != 0:
         people = load(*settings.human, splits=settings.splits, domain="human")
+        people = _elsewhere(people, heldout)
         training += subset_by_hash(people, settings.human_episodes, what="human")
-    robots = [episode for episode in heldout if episode.domain == "robot"]
-    data = StateData(training, robots or heldout)
-    both = {one.scene for one in training} & {one.scene for one in data.heldout}
+    if len({episode.domain for episode in training}) > 1:
+        heldout = [episode for episode in heldout if episode.domain == "robot"]
+        if not heldout:
+            raise InvalidInputError(
+                "training: no robot is held out, and rollouts are of robots; choose another "
+                "--heldout store, or a larger --heldout-share"
+            )
+    data = StateData(training, heldout)
+    _check_together(data)
+    return data
+
+
+def _elsewhere(people: list[SceneGrid], heldout: Sequence[EpisodeGrid]) -> list[SceneGrid]:
+    """People in scenes that are not held out of the robots' ones."""
+    scenes = {episode.scene for episode in heldout}
+    kept = [episode for episode in people if episode.scene not in scenes]
+    if len(kept) < len(people):
+        reason = "people in scenes that are held out of the robots'"
+        logger.warning("skipped_episodes", reason=reason, count=len(people) - len(kept))
+    return kept
+
+
+def _check_together(data: StateData) -> None:
+    """Check what holds for all stores of a run; each is read for itself."""
+    both = {one.scene for one in data.training} & {one.scene for one in data.heldout}
     if both:
         raise InvalidInputError(
             f"training: scenes {sorted(both)[:3]} are trained on and held out, expected disjoint "
             "ones; use another --heldout store"
         )
-    return data
+    counts = Counter(episode.episode_id for episode in data.episodes)
+    twice = [name for name, count in counts.items() if count > 1]
+    rates_hz = sorted({episode.about.model_rate_hz for episode in data.episodes})
+    if twice or len(rates_hz) > 1:
+        raise ConflictError(
+            f"training: the episodes have model rates of {rates_hz} Hz, and {twice[:3]} are in two "
+            "stores; expected one rate, and each episode once"
+        )
 
 
 def check_new(data: StateData, settings: StateTrainSettings, base: Base | None) -> None:
@@ -89,16 +125,21 @@ def check_new(data: StateData, settings: StateTrainSettings, base: Base | None) 
     Raises:
         InvalidInputError: it has, or as `check_tasks`.
     """
-    known = () if base is None else base.checkpoint.metadata.dynamics.tasks
-    check_tasks(data.episodes, settings, known)
-    if base is None or settings.heldout is None:
+    if base is None:
+        check_tasks(data.episodes, settings)
         return
     about = base.checkpoint.metadata
+    check_tasks(data.episodes, settings, {*about.dynamics.tasks, *learned_tasks(about.sets)})
+    if about.dynamics.has_humans and {one.domain for one in data.training} == {"human"}:
+        raise InvalidInputError(
+            "training: the initial checkpoint tells people from robots, and there are no robots "
+            "among the episodes, of which rollouts are; add some"
+        )
     seen = [one.episode_id for one in data.heldout if about.may_have_seen_episode(one.about)]
     if seen:
         raise InvalidInputError(
             f"training: the initial checkpoint may have been trained on {len(seen)} of the "
-            f"held-out episodes {seen[:3]}; use a held-out store that it has not seen"
+            f"held-out episodes {seen[:3]}; hold out others with --heldout STORE"
         )
 
 
@@ -138,6 +179,12 @@ def configured(data: StateData, settings: StateTrainSettings) -> DynamicsConfig:
     )
 
 
+def drawn_episodes(data: StateData) -> Sequence[EpisodeGrid]:
+    """Episodes that a renderer is trained on: of robots, as rollouts are, if there are any."""
+    robots = [episode for episode in data.training if episode.domain == "robot"]
+    return robots or data.training
+
+
 def check_drawable(episodes: Sequence[EpisodeGrid]) -> None:
     """Refuse what no renderer can be trained on, before hours of training other parts.
 
@@ -168,10 +215,7 @@ def labelled_episodes(episodes: Sequence[EpisodeGrid], settings: StateTrainSetti
     Raises:
         InvalidInputError: a task has none.
     """
-    # Training scenes lie above the held-out share, if some of them are held out.
-    least = 0.0 if settings.heldout else settings.heldout_share
-    share = least + (1 - least) * settings.labelled_share
-    labelled = [has_poses(e) and scene_fraction(e.scene) <= share for e in episodes]
+    labelled = [has_poses(e) and scene_fraction(e.scene) <= _share(e, settings) for e in episodes]
     known = {episode.task for episode, yes in zip(episodes, labelled, strict=True) if yes}
     without = {episode.task for episode in episodes} - known
     if without:
@@ -181,6 +225,13 @@ def labelled_episodes(episodes: Sequence[EpisodeGrid], settings: StateTrainSetti
             "--heldout-share, or click the objects of more episodes"
         )
     return labelled
+
+
+def _share(episode: EpisodeGrid, settings: StateTrainSettings) -> float:
+    """Fraction up to which scenes are labelled; held-out ones have the smallest fractions."""
+    is_split = settings.heldout is None and not (settings.human and episode.domain == "human")
+    least = settings.heldout_share if is_split else 0.0
+    return least + (1 - least) * settings.labelled_share
 
 
 def object_sources(episodes: Sequence[EpisodeGrid]) -> dict[str, int]:
@@ -205,6 +256,16 @@ def recorded_scenes(episodes: Sequence[EpisodeGrid], base: Base | None) -> tuple
     known = set() if base is None else set(base.checkpoint.metadata.training_scenes)
     own = {scene_digest(episode.scene) for episode in episodes if episode.about.seed is None}
     return tuple(sorted(known | own))
+
+
+def heldout_share(settings: StateTrainSettings, base: Base | None) -> float | None:
+    """Share of scenes that neither the run nor its base was trained on, by hash; None without."""
+    if settings.heldout is not None or settings.human:
+        return None
+    if base is None:
+        return settings.heldout_share
+    known = base.checkpoint.metadata.heldout_share
+    return None if known is None else min(known, settings.heldout_share)
 
 
 def trained_splits(settings: StateTrainSettings, base: Base | None) -> tuple[Split, ...]:

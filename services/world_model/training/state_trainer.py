@@ -12,6 +12,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from dextouch.episodes import (
 from dextouch.errors import InvalidInputError
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.networks.weight_files import read_tensors, write_tensors
-from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.configuration import STEPS_PER_LATENT, DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.start_reader import Reading, StartReader
@@ -34,7 +35,7 @@ from services.world_model.recorded_commands import flags_of, last_name
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.precision import uses_bfloat16
 from services.world_model.rendering.training import RendererProgress, train_renderer
-from services.world_model.settings import StateTrainSettings
+from services.world_model.settings import StateAdaptSettings, StateTrainSettings
 from services.world_model.state_checkpoints import (
     StateBounds,
     StateMetadata,
@@ -56,9 +57,12 @@ from services.world_model.training.scene_table import (
     usual_boxes_m,
 )
 from services.world_model.training.state_data import (
+    StateData,
     check_drawable,
     check_new,
     configured,
+    drawn_episodes,
+    heldout_share,
     labelled_episodes,
     load_state_data,
     object_sources,
@@ -109,8 +113,8 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     base = None if settings.init is None else Base(settings.init)
     check_new(data, settings, base)
     if base is not None:
-        config = base.configured(config)
         settings = _with_base(base, config, settings)
+        config = base.configured(config, keeps_tasks=settings.learn == "success")
     parts = settings.output.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
     image_px = None if settings.image_px == USUAL_IMAGE_PX else settings.image_px
@@ -124,13 +128,16 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         human_share=settings.share_of_human,
     )
     if settings.learn == "all":
-        check_drawable(training)
+        check_drawable(drawn_episodes(data))
     codec = _codec(table, config, base)
     reads_starts = settings.labelled_share < 1 or not all(
         bool(table.knows_all(step).all()) for step in start_steps(table)
     )
     table_file = parts / "table.safetensors"
     save_file({**table.tensors(), **_prefixed(codec)}, table_file)
+    horizon_latents = (int(table.length[~table.human | table.human.all()].max()) - 1) // (
+        STEPS_PER_LATENT
+    )
     del table
     work = _Work(settings, config, parts, hashed, reads_starts)
     _train_parts(work)
@@ -141,15 +148,11 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         dynamics=config,
         num_members=settings.num_members,
         renderer=settings.renderer,
-        object_names={e.task: e.object_names for e in data.episodes},
-        object_boxes_m={
-            task: tuple(tuple(map(float, row)) for row in boxes_m)
-            for task, boxes_m in usual_boxes_m(data.episodes).items()
-        },
+        **_objects(data, config, base),
         bounds=StateBounds(
             disagreement_m=measured.disagreement_m,
             distance=measured.distance,
-            horizon_latents=measured.num_latents,
+            horizon_latents=horizon_latents,
             of_chunks=True,
         )
         if base is None or settings.learn == "all"
@@ -160,6 +163,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         num_training_episodes=len(training),
         training_seeds=seed_ranges(training, base),
         training_splits=trained_splits(settings, base),
+        heldout_share=heldout_share(settings, base),
         training_scenes=recorded_scenes(training, base),
         data_hash=hashed,
         object_sources=object_sources(training),
@@ -239,9 +243,24 @@ class _Work:
             include={"seed", "heldout_share", "labelled_share", *names, *self._drawn_by}
         )
         base = "" if self.base is None else f"{self.settings.learn} {self.base.checkpoint.digest}"
-        domains = ",".join(self.config.domains)
-        text = f"{version} {chosen} {self.data_hash} {base} {domains}"
+        # Which scenes are labelled depends on whether some of them are held out.
+        is_split = self.settings.heldout is None
+        text = f"{version} {chosen} {self.data_hash} {base} {self.config.domains} {is_split}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _objects(data: StateData, config: DynamicsConfig, base: Base | None) -> dict[str, Any]:
+    """Names and usual boxes of every task's objects; of tasks without episodes the base's."""
+    names = {one.task: one.object_names for one in data.episodes}
+    boxes_m = {
+        task: tuple(tuple(map(float, row)) for row in rows)
+        for task, rows in usual_boxes_m(data.episodes).items()
+    }
+    if base is not None:
+        about = base.checkpoint.metadata
+        for task in set(config.tasks) - names.keys():
+            names[task], boxes_m[task] = about.object_names[task], about.object_boxes_m[task]
+    return {"object_names": names, "object_boxes_m": boxes_m}
 
 
 def _with_base(
@@ -251,7 +270,7 @@ def _with_base(
     about = base.checkpoint.metadata
     if settings.learn == "success" and not base.has_tasks_of(config):
         raise InvalidInputError(
-            f"--learn success: the episodes have tasks {', '.join(config.tasks)}, expected those "
+            f"--learn success: the episodes have tasks {', '.join(config.tasks)}, expected some "
             f"of --init, {', '.join(about.dynamics.tasks)}; --learn readers trains start readers "
             "for other tasks"
         )
@@ -303,7 +322,7 @@ def _train_parts(work: _Work) -> None:
 def _train_renderer(work: _Work) -> None:
     torch.set_num_threads(1)
     settings = work.settings
-    episodes = load_state_data(settings).training
+    episodes = drawn_episodes(load_state_data(settings))
     rng = np.random.default_rng(settings.seed)
     episodes = [
         e for e, known in zip(episodes, labelled_episodes(episodes, settings), strict=True) if known
@@ -451,4 +470,5 @@ def _command(settings: StateTrainSettings) -> str:
         flags.append(f"--heldout={last_name(settings.heldout)}")
     files = {"init": settings.init, "clicks": settings.clicks}
     flags += [f"--{name}={path.name}" for name, path in files.items() if path is not None]
-    return " ".join(["dextouch train world-model", *flags, *flags_of(given)])
+    command = "adapt" if isinstance(settings, StateAdaptSettings) else "world-model"
+    return " ".join([f"dextouch train {command}", *flags, *flags_of(given)])

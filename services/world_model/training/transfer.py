@@ -1,5 +1,6 @@
 """A state model that a training starts from: what it keeps, and what is trained of it."""
 
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 
@@ -13,8 +14,8 @@ from services.world_model.dynamics.core import RecurrentCore, direction_free_inp
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.state_checkpoints import StateCheckpoint, read_state_checkpoint
 
-# Weights of a reader that belong to its tasks.
-_OF_TASKS = {"task.weight", "height_mean"}
+# Tensors of a reader or a core with a row for every task.
+_OF_TASKS = {"task.weight", "height_mean", "boxes_m", "movable"}
 # Weights of a core that predict success.
 _SUCCESS = "success."
 
@@ -38,8 +39,12 @@ class Base:
         """
         return read_state_checkpoint(self._path)
 
-    def configured(self, config: DynamicsConfig) -> DynamicsConfig:
-        """A configuration with the shape of the base's networks.
+    def configured(self, config: DynamicsConfig, *, keeps_tasks: bool) -> DynamicsConfig:
+        """A configuration with the shape of the base's networks, for the tasks of another one.
+
+        Args:
+            config: of the episodes.
+            keeps_tasks: whether the tasks stay the base's, of which the episodes have some.
 
         Raises:
             InvalidInputError: images of another size.
@@ -50,14 +55,18 @@ class Base:
                 f"--init {self._path.name}: reads images of {own.image_px} px, the episodes have "
                 f"{config.image_px} px; record them with its size"
             )
+        if keeps_tasks:
+            return own
         domains = own.domains if own.has_humans else config.domains
         of_data = {"tasks": config.tasks, "num_objects": config.num_objects, "domains": domains}
         return own.model_copy(update=of_data)
 
     def has_tasks_of(self, config: DynamicsConfig) -> bool:
-        """Whether the base has the same tasks and objects."""
+        """Whether the base has all of these tasks, with as many objects."""
         own = self.checkpoint.metadata.dynamics
-        return (own.tasks, own.num_objects) == (config.tasks, config.num_objects)
+        counts = dict(zip(own.tasks, own.num_objects, strict=True))
+        wanted = zip(config.tasks, config.num_objects, strict=True)
+        return all(counts.get(task) == count for task, count in wanted)
 
     def reader(self, config: DynamicsConfig, member: int, *, seed: int) -> StartReader:
         """A member's reader; weights of tasks that the base does not know are fresh."""
@@ -67,7 +76,19 @@ class Base:
         known = self.checkpoint.dynamics.readers()[member].state_dict()
         kept = {name: value for name, value in known.items() if name not in _OF_TASKS}
         reader.load_state_dict(kept, strict=False)
+        self._copy_tasks(config, reader.state_dict(), known)
         return reader
+
+    @torch.no_grad()
+    def _copy_tasks(
+        self, config: DynamicsConfig, to: Mapping[str, Tensor], known: Mapping[str, Tensor]
+    ) -> None:
+        """Copy the rows of tasks that the base knows, of tensors with a row for every task."""
+        own = self.checkpoint.metadata.dynamics.tasks
+        for name in _OF_TASKS & to.keys():
+            for row, task in enumerate(config.tasks):
+                if task in own:
+                    to[name][row].copy_(known[name][own.index(task)])
 
     def core(
         self, config: DynamicsConfig, member: int, *, seed: int, learns_all: bool
@@ -87,6 +108,7 @@ class Base:
             if learns_all or not name.startswith(_SUCCESS)
         }
         core.load_state_dict(_with_humans(kept, core), strict=False)
+        self._copy_tasks(config, core.state_dict(), known.state_dict())
         core.lowest.copy_(known.lowest)
         core.highest.copy_(known.highest)
         if learns_all:

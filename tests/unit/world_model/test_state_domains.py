@@ -1,13 +1,15 @@
 """State models of robots and people: what they share, what is drawn, and what a run holds out."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.episodes import EpisodeStore, scene_fraction
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnknownNameError
+from dextouch.serving import load_settings
 from services.twin.episodes import record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
@@ -33,7 +35,7 @@ from services.world_model.state_checkpoints import (
 from services.world_model.training.core_training import CoreData, _draw, core_loss, touch_latents
 from services.world_model.training.scene_table import scene_table
 from services.world_model.training.state_data import StateData, configured, load_state_data
-from services.world_model.training.state_trainer import train_state
+from services.world_model.training.state_trainer import _command, train_state
 from services.world_model.training.transfer import Base
 from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.world_model.conftest import checkpoint  # noqa: F401 (fixture)
@@ -95,9 +97,8 @@ def test_a_share_of_what_is_drawn_is_human():
     table = scene_table(episodes, BOTH, human_share=0.25)
     drawn = table.drawn(able, 8000, generator)
     assert set(drawn.tolist()) == set(able.tolist())
-    # 2 of the 4 robots are able, so that each is as likely as among all.
-    share = (0.25 / 12 * 12) / (0.25 / 12 * 12 + 0.75 / 4 * 2)
-    assert table.human[drawn].float().mean() == pytest.approx(share, abs=0.02)
+    # Two of the four robots are able; their share stays that of robots.
+    assert table.human[drawn].float().mean() == pytest.approx(0.25, abs=0.02)
     plain = scene_table(episodes, BOTH)
     drawn = plain.drawn(able, 8000, generator)
     assert plain.human[drawn].float().mean() == pytest.approx(12 / 14, abs=0.02)
@@ -179,6 +180,59 @@ def test_subsets_of_both_domains_leave_what_is_held_out(stores):
         load_state_data(settings_of(stores, heldout=str(stores / "robot")))
 
 
+def test_people_of_held_out_scenes_are_left_out(stores):
+    # The same seeds in both domains, of one task.
+    stage = Stage("stand_bottle", "human", TwinSettings())
+    store = EpisodeStore(stores / "same")
+    for seed in range(4):
+        write_episode(store, record(stage, seed, OPTIONS))
+    given = {"human": (str(store.root),), "heldout": None, "heldout_share": 0.4}
+    data = load_state_data(settings_of(stores, **given))
+    held_out = {one.scene for one in data.heldout}
+    assert held_out
+    people = [one.scene for one in data.training if one.domain == "human"]
+    assert set(people) == {f"stand_bottle/{seed}" for seed in range(4)} - held_out
+
+
+def test_each_episode_counts_once(stores):
+    for name in ("human", "more"):
+        if name == "human":
+            taken = record(Stage("stack_bowls", "human", TwinSettings()), 9, OPTIONS)
+            about = taken.attributes.model_copy(update={"episode_id": "robot-1"})
+            write_episode(EpisodeStore(stores / name), dataclasses.replace(taken, attributes=about))
+    with pytest.raises(ConflictError, match=r"\['robot-1'\] are in two stores"):
+        load_state_data(settings_of(stores))
+
+
+def test_an_adaptation_can_be_repeated_by_its_command():
+    given = {"episodes": ("new",), "init": Path("/models/both.safetensors")}
+    settings = AdaptStateCommand(**given, seed=3)
+    command = _command(settings)
+    assert command.startswith("dextouch train adapt --episodes=new --init=both.safetensors")
+    again = load_settings(AdaptStateCommand, command.split()[3:])
+    given["init"] = Path("both.safetensors")
+    assert again == AdaptStateCommand(**given, seed=3)
+
+
+def test_known_tasks_keep_their_rows(base):
+    own = base.checkpoint.metadata.dynamics
+    wider = own.model_copy(update={"tasks": ("press", *own.tasks), "num_objects": (1, 1)})
+    reader = base.reader(wider, 1, seed=0)
+    known = base.checkpoint.dynamics.readers()[1]
+    assert torch.equal(reader.task.weight[1], known.task.weight[0])
+    assert not torch.equal(reader.task.weight[0], known.task.weight[0])
+
+
+def test_a_share_that_is_held_out_by_hash_is_known(base):
+    about = base.checkpoint.metadata
+    seeds = {"training_seeds": {"stand_bottle": (0, 99)}, "heldout_share": 0.3}
+    one = about.model_copy(update=seeds)
+    unseen = [seed for seed in range(100) if not one.may_have_seen("stand_bottle", seed)]
+    expected = [n for n in range(100) if scene_fraction(f"stand_bottle/{n}") < 0.3]
+    assert unseen == expected
+    assert 15 < len(unseen) < 45
+
+
 def test_a_model_of_both_domains_is_trained_adapted_and_read(stores, tmp_path):
     small = {
         "num_members": 1,
@@ -199,13 +253,29 @@ def test_a_model_of_both_domains_is_trained_adapted_and_read(stores, tmp_path):
         ("robot", True, {"stand_bottle": 2}, None),
     ]
     assert "--human=human --heldout=more" in about.command
-    with pytest.raises(InvalidInputError, match=r"trained on tasks \['stand_bottle'\]"):
-        train_state(settings_of(stores, init=output, new_tasks=True, human=(), **small))
+    for tasks, new in ((("stand_bottle",), True), ((), True)):
+        given = {"init": output, "new_tasks": new, "human": (), "tasks": tasks}
+        with pytest.raises(InvalidInputError, match=r"trained on tasks \['stand_bottle'\]"):
+            train_state(settings_of(stores, **given, **small))
+    again = {"init": output, "human": (), "heldout": None, "heldout_share": 0.5}
+    with pytest.raises(InvalidInputError, match=r"may have been trained on \d of the held-out"):
+        train_state(settings_of(stores, **again, **small))
+    people = {"init": output, "episodes": (str(stores / "human"),), "human": (), "heldout": None}
+    with pytest.raises(InvalidInputError, match="there are no robots among the episodes"):
+        train_state(settings_of(stores, **people, heldout_share=0.5, **small))
     again = tmp_path / "again.safetensors"
-    changes = {"init": output, "output": again, "human": (), "heldout": None, "heldout_share": 0.3}
-    train_state(settings_of(stores, **changes, **small))
+    changes = {"init": output, "output": again, "human": ()}
+    train_state(settings_of(stores, **changes, **small, learn="success"))
     adapted = read_state_checkpoint(again).metadata
     assert adapted.dynamics.domains == ("robot", "human")
+    # Of the tasks of the base, the robots have one.
+    assert adapted.dynamics.tasks == ("stack_bowls", "stand_bottle")
+    assert adapted.object_boxes_m == about.object_boxes_m
+    for name in ("boxes_m", "movable"):
+        old, new = (
+            getattr(read_state_checkpoint(path).dynamics.core, name) for path in (output, again)
+        )
+        assert torch.equal(old, new), name
     inherited = [one for one in adapted.sets if one.checkpoint]
     assert len(inherited) == 3
     assert len({one.checkpoint for one in inherited}) == 1
@@ -222,7 +292,8 @@ def base(tmp_path_factory):
 
 def test_a_core_that_learns_of_people_begins_as_it_was(base):
     own = base.checkpoint.metadata.dynamics
-    config = base.configured(own.model_copy(update={"domains": ("robot", "human")}))
+    both = own.model_copy(update={"domains": ("robot", "human")})
+    config = base.configured(both, keeps_tasks=False)
     assert config.has_humans
     core = base.core(config, 1, seed=0, learns_all=True).eval()
     assert all(weight.requires_grad for weight in core.parameters())
@@ -266,7 +337,7 @@ def loaded(monkeypatch):
     return run
 
 
-def test_the_preset_names_the_form(loaded, monkeypatch):
+def test_the_preset_names_the_form(loaded, monkeypatch, tmp_path):
     train = command_line.run_train
     assert loaded(train, "--episodes", "takes") is TrainStateCommand
     assert loaded(train, "--preset=state", "--width", "64") is TrainStateCommand
@@ -274,10 +345,24 @@ def test_the_preset_names_the_form(loaded, monkeypatch):
     monkeypatch.setenv("DEXTOUCH_WORLD_MODEL_TRAIN_PRESET", "tiny")
     assert loaded(train, "--episodes", "takes") is TrainCommand
     assert loaded(train, "--preset", "state") is TrainStateCommand
+    monkeypatch.delenv("DEXTOUCH_WORLD_MODEL_TRAIN_PRESET")
+    with pytest.raises(UnknownNameError, match="paper-video-only, state, tiny"):
+        train(["--preset", "foo"])
+    path = tmp_path / "dextouch.toml"
+    monkeypatch.setenv("DEXTOUCH_CONFIG", str(path))
+    path.write_text("[world_model_train]\nseed = 3\n")
+    with pytest.raises(InvalidInputError, match="no preset of it is named"):
+        train(["--episodes", "takes"])
+    path.write_text('[world_model_train]\nseed = 3\npreset = "tiny"\n')
+    assert loaded(train, "--episodes", "takes") is TrainCommand
 
 
-def test_the_checkpoint_names_the_form_that_is_adapted(loaded, base, checkpoint, tmp_path):  # noqa: F811
+@pytest.mark.usefixtures("checkpoint")
+def test_the_checkpoint_names_the_form_that_is_adapted(loaded, base, tmp_path, monkeypatch):
     adapt = command_line.run_adapt
     assert loaded(adapt, "--init", str(base._path)) is AdaptStateCommand
     assert loaded(adapt, "--help") is AdaptStateCommand
-    assert loaded(adapt, f"--init={tmp_path / 'untrained.safetensors'}") is AdaptCommand
+    paper = str(tmp_path / "untrained.safetensors")
+    assert loaded(adapt, f"--init={paper}") is AdaptCommand
+    monkeypatch.setenv("DEXTOUCH_WORLD_MODEL_ADAPT_INIT", paper)
+    assert loaded(adapt, "--episodes", "new") is AdaptCommand

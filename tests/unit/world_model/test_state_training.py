@@ -280,7 +280,7 @@ def test_a_table_survives_its_tensors(table):
     back = SceneTable.from_tensors(table.tensors())
     assert back.image_steps == table.image_steps
     for name, tensor in table.tensors().items():
-        assert (back.tensors()[name] == tensor).all()
+        assert torch.allclose(back.tensors()[name], tensor, rtol=0, atol=0, equal_nan=True)
 
 
 def test_commands_begin_where_hands_are_measured(config):
