@@ -283,7 +283,7 @@ def test_an_id_can_be_used_again_after_it_was_deleted(place):
 
 
 def test_what_is_not_there(store):
-    for ask in (store.open, store.delete, store.revision, store.migrate):
+    for ask in (store.open, store.delete, store.revision):
         with pytest.raises(NotFoundError, match="nothing-here"):
             ask("nothing-here")
     with pytest.raises(NotFoundError, match="is not being written"):
@@ -294,11 +294,6 @@ def test_what_is_not_there(store):
     assert store.list() == []
     assert store.recover() == ()
     assert store.sweep() == 0
-
-
-def test_current_groups_need_no_migration(made, store):
-    made.write(store)
-    assert store.migrate(EPISODE) is False
 
 
 def test_recover_completes_what_a_dead_writer_left(store, place):

@@ -213,11 +213,12 @@ def encode_commit(record: CommitRecord) -> tuple[bytes, str]:
     return canonical_json({"record": plain, "sha256": digest}), digest
 
 
-def open_commit(data: bytes, *, what: str) -> tuple[dict[str, Any], str, object]:
-    """The fields of a record of any format version, its sha256, and the version.
+def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
+    """Inverse of `encode_commit`.
 
     Raises:
-        CorruptDataError: damaged bytes.
+        StorageError: written by another version of the format.
+        CorruptDataError: not a valid commit record.
     """
     try:
         outer = json.loads(data)
@@ -228,26 +229,10 @@ def open_commit(data: bytes, *, what: str) -> tuple[dict[str, Any], str, object]
         raise CorruptDataError(f"{what}: {COMMIT_FILE} is damaged ({error})") from error
     if not whole:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} does not match its own sha256")
-    return plain, digest, version
-
-
-def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
-    """Inverse of `encode_commit`.
-
-    Raises:
-        StorageError: written by another version of the format.
-        CorruptDataError: not a valid commit record.
-    """
-    plain, digest, version = open_commit(data, what=what)
     if version != FORMAT_VERSION:
-        older = isinstance(version, int) and 1 <= version < FORMAT_VERSION
-        advice = (
-            "upgrade it with `dextouch store migrate`"
-            if older
-            else "read it with the release that wrote it"
-        )
         raise StorageError(
-            f"{what}: got format version {version!r}, expected {FORMAT_VERSION}; {advice}",
+            f"{what}: {COMMIT_FILE} has format version {version!r}, expected {FORMAT_VERSION}; "
+            "read it with the release that wrote it",
             format_version=version,
         )
     try:

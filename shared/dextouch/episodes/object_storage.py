@@ -21,7 +21,6 @@ from dextouch.episodes.format import (
     attributes_id,
     decode_commit,
 )
-from dextouch.episodes.migration import is_current
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
 from dextouch.episodes.staged_group import (
     STAGING,
@@ -274,15 +273,6 @@ class ObjectStorage:
             self._bucket.remove([key])
         else:
             self._bucket.put(key, content)
-
-    def migrate(self, kind: Kind, item_id: str) -> bool:
-        """Refuse a group of an older version: keys cannot be replaced atomically."""
-        if is_current(self.group(kind, item_id), what=f"{kind} {item_id}"):
-            return False
-        raise StorageError(
-            f"{kind} {item_id!r}: has an older version, which cannot be migrated in "
-            f"{self._address}; copy it to a local store, migrate it there and write it here again"
-        )
 
     def recover(self) -> builtins.list[RecoveredGroup]:
         """Commit the stages of terminated writers, and complete interrupted uploads.

@@ -149,8 +149,7 @@ def _publish(
     """Publish a stage with a valid commit record, under another id if its own is taken."""
     attributes = read_committed(stage, record.kind)
     if attributes_id(attributes) != record.id or is_taken(record.kind, record.id):
-        # A group that can be recomputed has no `stage.json`, nor has a migration that was
-        # interrupted before it put its group into place.
+        # A group that can be recomputed has no `stage.json`.
         if not (stage / STAGE_FILE).is_file():
             return None
         record = change_attributes(stage, record, _as_recovered(attributes, is_taken))
@@ -193,8 +192,7 @@ def _whole_commit(stage: Path) -> CommitRecord | None:
     try:
         return None if data is None else decode_commit(data, what=stage.name)[0]
     except StorageError:
-        # Torn by the crash: its content is recovered from the logs. Or of an older version,
-        # which a migration put aside.
+        # Torn by the crash: its content is recovered from the logs.
         return None
 
 

@@ -2,8 +2,6 @@
 
 import builtins
 import re
-import shutil
-import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,9 +19,8 @@ from dextouch.episodes.format import (
     check_id,
 )
 from dextouch.episodes.group_contents import read_group, read_live
-from dextouch.episodes.migration import OldGroup, is_current
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
-from dextouch.episodes.reviews import CLICKS_FILE, REMARK_FILES, REVIEW_FILE, read_remark
+from dextouch.episodes.reviews import CLICKS_FILE, REVIEW_FILE, read_remark
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.staged_group import STAGING, new_stage, stages_of, unheld_folders
 from dextouch.episodes.staging_recovery import (
@@ -44,7 +41,7 @@ from dextouch.episodes.trash import (
     remove_for_good,
     restore_from_trash,
 )
-from dextouch.episodes.writer import EpisodeWriter, write_blocks
+from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
@@ -250,18 +247,6 @@ class EpisodeStore:
             )
         return self.root
 
-    def migrate(self, item_id: str, *, kind: Kind = "episode") -> bool:
-        """Upgrade a group of an older format version; False if it is current.
-
-        The new group replaces the old one atomically; its lineage names the old content.
-
-        Raises:
-            NotFoundError: no such id.
-            CorruptDataError: damaged; the group is unchanged.
-            StorageError: of a newer version, or of an older one in object storage.
-        """
-        return self._storage.migrate(*_check(kind, item_id))
-
     def recover(self) -> tuple[RecoveredGroup, ...]:
         """Commit the recordings of terminated writers, as far as they were written.
 
@@ -397,32 +382,6 @@ class _LocalStorage:
             except FileNotFoundError as error:
                 # Deleted meanwhile: an item without the file has none to remove either.
                 raise self._missing(kind, item_id) from error
-
-    def migrate(self, kind: Kind, item_id: str) -> bool:
-        """Replace a group of an older format version atomically; its lineage names the old one."""
-        files = self.group(kind, item_id)
-        if is_current(files, what=f"{kind} {item_id}"):
-            return False
-        old = OldGroup(files, kind)
-        staging, number = self.root / STAGING, uuid.uuid4().hex
-        # Committed beside the store first: after a kill between the two renames below, `recover`
-        # finds a complete group whose place is free.
-        whole, before = (
-            staging / f"migrated-{item_id}-{number}",
-            staging / f"old-{item_id}-{number}",
-        )
-        streams = ((stream.name, old.blocks(stream)) for stream in old.attributes.streams)
-        write_blocks(new_stage(self.root, kind, item_id), whole, old.attributes, streams)
-        remarks = {name: files.get(name) for name in REMARK_FILES}
-        with disk_errors(f"migrate {item_id}"):
-            for name, content in remarks.items():
-                if content is not None:
-                    replace_file(whole / name, content)
-            files.folder.rename(before)
-            whole.rename(files.folder)
-            sync_folder(files.folder.parent)
-            shutil.rmtree(before)
-        return True
 
     def recover(self) -> builtins.list[RecoveredGroup]:
         stages = unheld_folders(self.root / STAGING)

@@ -252,15 +252,6 @@ def test_repair_from_a_copy_and_by_salvage(store, word, tmp_path):
     assert (status, "e-1  left" in out) == (1, True)
 
 
-def test_migrate_says_what_it_did(store, word):
-    status, out, _ = word("migrate")
-    assert (status, out) == (0, "0 migrated, 0 failed\n")
-    flip(store.root / "episodes" / "e-1" / "commit.json")
-    status, out, _ = word("migrate")
-    assert status == 1
-    assert "e-1  FAILED" in out
-
-
 def derived_of(store, recording_id, episode_id):
     lineage = LineageEntry(kind="recording", id=recording_id)
     write_episode(store, episode_id, lineage=[lineage.model_dump()])

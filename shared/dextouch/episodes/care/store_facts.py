@@ -38,7 +38,7 @@ _ATTRIBUTES = {
 _SAMPLES = (".part", ".journal", ".log")
 _WORD = "A-Za-z0-9_-"
 _AROUND = {
-    STAGING: re.compile(r"(episode|recording|migrated|old|deleted)-(.+)-[0-9a-f]{32}"),
+    STAGING: re.compile(r"(episode|recording)-(.+)-[0-9a-f]{32}"),
     TRASH: re.compile(r"(episode|recording|upload|stage)\.(.+)\.[0-9]+"),
 }
 
