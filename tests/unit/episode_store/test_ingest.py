@@ -117,8 +117,8 @@ def test_a_station_may_change_its_version_in_an_upload(ingest, store, attributes
     assert_complete(store, batch_of, 10)
 
 
-def test_an_upload_that_an_older_release_began_goes_on(ingest, store):
-    shutil.copytree(GOLDEN / "spool_v1", store.root / ".uploads" / "take-1")
+def test_an_upload_that_an_earlier_process_began_goes_on(ingest, store):
+    shutil.copytree(GOLDEN / "spool_v2", store.root / ".uploads" / "take-1")
     streams = SpoolReader(store.root / ".uploads" / "take-1").streams
     for name, stream in streams.items():
         assert ingest.status("take-1").next_batch[name] == 3

@@ -40,7 +40,7 @@ from dextouch.episodes.shards import (
     decode_rows,
 )
 from dextouch.episodes.sources import LocalFile, LocalGroup
-from dextouch.episodes.spool_log import body_at, body_of, find_records, open_log, read_batch
+from dextouch.episodes.spool_log import body_at, find_records, open_log, read_batch
 from dextouch.episodes.spool_seal import read_seal
 from dextouch.episodes.staged_group import new_stage
 from dextouch.episodes.staging_recovery import free_id, ids_below
@@ -275,7 +275,6 @@ def _holds(streams: Sequence[StreamDescriptor], row: np.void, body: bytes | None
         return False
     descriptor = streams[int(row["stream"])]
     try:
-        body = body_of(descriptor, row, body, where="log")
         check_batch(descriptor, decode_body(descriptor, body, int(row["num_samples"])))
     except (CorruptDataError, InvalidInputError):
         return False
