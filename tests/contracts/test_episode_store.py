@@ -174,7 +174,6 @@ def test_nothing_is_seen_before_commit(store, place):
         assert place.again().list(kind="recording") == []
         assert store.sweep() == 0
         assert store.recover() == ()
-        assert store.live("take-1").num_samples("force") > 0
     np.testing.assert_array_equal(place.again().recording("take-1").read("force").values, values)
     assert place.keys(".staging") == []
 
@@ -286,8 +285,6 @@ def test_what_is_not_there(store):
     for ask in (store.open, store.delete, store.revision):
         with pytest.raises(NotFoundError, match="nothing-here"):
             ask("nothing-here")
-    with pytest.raises(NotFoundError, match="is not being written"):
-        store.live("nothing-here")
     for wrong in ("../up", "a/b", "", "A"):
         with pytest.raises(InvalidInputError, match="expected 1 … 128"):
             store.open(wrong)

@@ -47,18 +47,11 @@ from dextouch.system_files import is_system_file
 
 STAGING = ".staging"
 STAGE_FILE = "stage.json"
-# Stage names end in a hexadecimal uuid4.
-_STAGE_NUMBER = "[0-9a-f]" * 32
 
 
 def new_stage(root: Path, kind: Kind, item_id: str) -> Path:
     """A unique path for a new stage; the folder is not created."""
     return root / STAGING / f"{kind}-{item_id}-{uuid.uuid4().hex}"
-
-
-def stages_of(root: Path, kind: Kind, item_id: str) -> list[Path]:
-    """The stages of an id, sorted by name."""
-    return sorted((root / STAGING).glob(f"{kind}-{item_id}-{_STAGE_NUMBER}"))
 
 
 def unheld_folders(parent: Path) -> Iterator[Path]:

@@ -18,11 +18,11 @@ from dextouch.episodes.format import (
     attributes_id,
     check_id,
 )
-from dextouch.episodes.group_contents import read_group, read_live
+from dextouch.episodes.group_contents import read_group
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.reviews import CLICKS_FILE, REVIEW_FILE, read_remark
 from dextouch.episodes.sources import GroupFiles, LocalGroup
-from dextouch.episodes.staged_group import STAGING, new_stage, stages_of, unheld_folders
+from dextouch.episodes.staged_group import STAGING, new_stage, unheld_folders
 from dextouch.episodes.staging_recovery import (
     RecoveredGroup,
     ids_below,
@@ -139,17 +139,6 @@ class EpisodeStore:
             NotFoundError: no such id.
         """
         return self._storage.group(*_check(kind, item_id))
-
-    def live(self, recording_id: str) -> RecordingReader:
-        """Open a snapshot of an unfinished recording; call again for later samples.
-
-        Raises:
-            NotFoundError: no local writer is writing this id.
-        """
-        stages = stages_of(self.root, *_check("recording", recording_id))
-        if not stages:
-            raise NotFoundError(f"recording {recording_id!r}: is not being written")
-        return RecordingReader(read_live(stages[-1], "recording", RecordingAttributes))
 
     def exists(self, item_id: str, *, kind: Kind = "episode") -> bool:
         """Whether an id is committed."""

@@ -6,13 +6,10 @@ import struct
 from pathlib import Path
 
 import google_crc32c
-import numpy as np
 import pytest
 
 from dextouch.episodes.journal import JournalWriter, read_payload, read_rows
 from dextouch.errors import CorruptDataError, StorageFullError
-from dextouch.schemas import RecordingAttributes
-from dextouch.streams import StreamDescriptor
 
 PAYLOADS = [b"a" * 10, b"bc" * 6, b"defg" * 5]
 OFFSETS = [0, 10, 22]
@@ -71,29 +68,6 @@ def test_rows_around_a_hole_are_refused(tmp_path, rows):
 def test_a_first_row_begins_at_the_first_byte(tmp_path, rows):
     write_log(tmp_path, [row(2, PAYLOADS[0])], b"??" + PAYLOADS[0])
     assert len(read_rows(tmp_path, "force")) == 0
-
-
-def test_the_live_view_ends_before_a_payload_that_is_not_there_yet(store):
-    force = StreamDescriptor(
-        name="force", kind="scalar", shape=(2,), dtype="float32", unit="N", nominal_rate_hz=10
-    )
-    attributes = RecordingAttributes(
-        recording_id="take-1",
-        task="t",
-        instruction="",
-        domain="human",
-        station="bench",
-        streams=(force,),
-    )
-    writer = store.writer(kind="recording", attributes=attributes)
-    writer.append("force", values=np.ones((15, 2), "f4"), t_host_ns=np.arange(15))
-    (part,) = (store.root / ".staging").glob("*/force.part")
-    part.write_bytes(part.read_bytes()[:-1])
-    batch = store.live("take-1").read("force")
-    assert batch.t_host_ns.tolist() == list(range(10))
-    assert (batch.values == 1).all()
-    writer.discard()
-    writer.__exit__(None, None, None)
 
 
 def test_short_writes_go_on_where_they_ended(tmp_path, monkeypatch):

@@ -107,7 +107,7 @@ def inspect_group(
             Finding(f"{contents.what}: {path} belongs to no array; move it away", foreign=True)
             for path in _foreign_paths(files.folder, contents.entries)
         ]
-    if findings and contents.opened is not None:
+    if findings:
         contents.opened.check_present()
     return ItemReport(kind, files.item_id, len(contents.entries), sum(sizes), tuple(findings))
 
