@@ -82,7 +82,7 @@ def _parser() -> argparse.ArgumentParser:
         commands,
         kind,
         "repair",
-        "complete interrupted items, repair or salvage damaged ones",
+        "repair or salvage damaged items",
         "take-7 --from /mnt/copy",
     )
     _add_ids(repairing)

@@ -3,16 +3,16 @@
 from dataclasses import asdict
 
 from dextouch.episodes import EpisodeStore, GroupFiles, Kind
-from dextouch.episodes.care import LEFT, RepairReport, repair_group, repair_unfinished
+from dextouch.episodes.care import LEFT, RepairReport, repair_group, repair_uploads
 from dextouch.errors import NotFoundError
 from services.episode_store.commands.context import EXIT_DAMAGED, Context, Outcome
 
 
 def repair(context: Context) -> Outcome:
-    """Complete interrupted items, repair damaged ones from a copy, and salvage the rest."""
+    """Repair damaged items from a copy, and salvage the rest."""
     root, options = context.need_local_root(), context.options
     copies = EpisodeStore(options.source) if options.source else None
-    reports = [] if options.ids else repair_unfinished(root)
+    reports = [] if options.ids else repair_uploads(root)
     for kind, item_id in context.items():
         reports.append(repair_group(root, kind, item_id, copy=_copy(copies, kind, item_id)))
     for report in reports:

@@ -128,7 +128,7 @@ def stream_arrays(descriptor: StreamDescriptor, kind: Kind) -> dict[str, ArrayEn
     name, codec = descriptor.name, codec_of(descriptor)
     half_second = max(1, round(descriptor.nominal_rate_hz * CHUNK_SECONDS))
     rows = min(half_second, max(1, CHUNK_BYTES // descriptor.sample_bytes()))
-    # Stamps use the same chunk length as values, so that a kill never separates the two.
+    # A whole number of the values' storage chunks.
     stamp_rows = half_second // rows * rows if codec == "zstd" else GOP_IMAGES
     time, no_hash = f"{name}_time", "0" * 64
     axes = (f"{name}_axis{axis}" for axis in range(1, 1 + len(descriptor.shape)))

@@ -1,6 +1,5 @@
 """Store of episodes and recordings in a folder or a bucket: open, list, write, delete by id."""
 
-import builtins
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,15 +21,7 @@ from dextouch.episodes.group_contents import read_group
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.reviews import CLICKS_FILE, REVIEW_FILE, read_remark
 from dextouch.episodes.sources import GroupFiles, LocalGroup
-from dextouch.episodes.staged_group import STAGING, new_stage, unheld_folders
-from dextouch.episodes.staging_recovery import (
-    RecoveredGroup,
-    ids_below,
-    raise_first,
-    recover_all,
-    recover_stage,
-    sweep_stages,
-)
+from dextouch.episodes.staged_group import new_stage, sweep_stages
 from dextouch.episodes.stream_writer import WriteOptions
 from dextouch.episodes.trash import (
     TrashEntry,
@@ -236,23 +227,24 @@ class EpisodeStore:
             )
         return self.root
 
-    def recover(self) -> tuple[RecoveredGroup, ...]:
-        """Commit the recordings of terminated writers, as far as they were written.
+    def complete_uploads(self) -> tuple[tuple[Kind, str], ...]:
+        """Upload groups whose upload was interrupted after their commit; their kinds and ids.
 
-        They have `recovered` set and are truncated to complete storage chunks. Stages that are not
-        recoverable are left to `sweep`, those of running writers are not touched. Interrupted
-        uploads are completed.
+        Only a store in a bucket has any: what is committed in a folder is in its place.
 
         Raises:
-            CorruptDataError: damage other than a torn tail; that stage is unchanged, all others are
-                completed. Notes name them, and other failures.
+            StorageError, UnavailableError: an upload failed, others are completed; try again later.
+                Notes name what was uploaded, and other failures.
         """
-        return tuple(self._storage.recover())
+        if isinstance(self._storage, _LocalStorage):
+            return ()
+        return tuple(self._storage.complete_uploads())
 
     def sweep(self) -> int:
-        """Remove stages of crashed writers that cannot be recovered, and return their number.
+        """Remove what killed writers have left, and return the number of stages and groups.
 
-        Stages that `recover` can complete are kept.
+        Stages of running writers are not touched. In a bucket, groups without a commit record are
+        removed once they are a day old; what waits to be uploaded is kept.
         """
         return self._storage.sweep()
 
@@ -372,15 +364,9 @@ class _LocalStorage:
                 # Deleted meanwhile: an item without the file has none to remove either.
                 raise self._missing(kind, item_id) from error
 
-    def recover(self) -> builtins.list[RecoveredGroup]:
-        stages = unheld_folders(self.root / STAGING)
-        found, failures = recover_all(stages, lambda stage: recover_stage(stage, self.root))
-        raise_first(failures, found)
-        return found
-
     def sweep(self) -> int:
         with disk_errors("sweep"):
-            return sweep_stages(self.root, ids_below(self.root))
+            return sweep_stages(self.root)
 
     def _folder(self, kind: Kind, item_id: str) -> Path:
         return self.root / f"{kind}s" / item_id
