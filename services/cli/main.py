@@ -38,8 +38,7 @@ COMMANDS = {
     ),
     "station calibrate": Command("calibrate gloves, cameras and latencies", "cli.calibrate:main"),
     "store": Command(
-        "list, show, verify, clicks, repair, migrate, delete, deletions, restore, purge, enrol, "
-        "serve",
+        "list, show, verify, clicks, repair, delete, deletions, restore, purge, enrol, serve",
         "episode_store.command_line:main",
     ),
     "store serve": Command("serve the store over HTTP", "episode_store.app:main"),

@@ -36,7 +36,7 @@ ENROLMENTS_FILE = "enrolments.json"
 
 
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
-    """Create the application of one store; recovers data of crashed writers at startup."""
+    """Create the application of one store; at startup it clears up after killed writers."""
     store = EpisodeStore(settings.store_url)
     catalog = Catalog(store)
     objects = None if settings.objects is None else load_object_clicks(settings.objects)
@@ -52,7 +52,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        _recover(store)
+        _clear_up(store)
         # The first listing of a large store takes seconds, so it is warmed up in the background.
         threading.Thread(target=_warm_up, args=(catalog,), name="warm-up", daemon=True).start()
         watch.start()
@@ -85,16 +85,14 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     return app
 
 
-def _recover(store: EpisodeStore) -> None:
-    """Commit the stages of terminated writers and remove unrecoverable ones."""
+def _clear_up(store: EpisodeStore) -> None:
+    """Complete interrupted uploads to a bucket, and remove the stages of killed writers."""
     try:
-        for group in store.recover():
-            logger.warning(
-                "recording_recovered", kind=group.kind, id=group.item_id, lost=dict(group.lost)
-            )
+        for kind, item_id in store.complete_uploads():
+            logger.warning("upload_completed", kind=kind, id=item_id)
     except StorageError as error:
-        # The service still serves everything else; `dextouch store repair` reports details.
-        logger.error("recovery_failed", error=error.message)  # noqa: TRY400
+        # The service still serves everything else, and tries again when it next starts.
+        logger.error("uploads_not_completed", error=error.message)  # noqa: TRY400
     try:
         removed = store.sweep()
     except StorageError as error:

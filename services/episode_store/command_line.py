@@ -42,7 +42,6 @@ _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
     "restore": delete.restore,
     "purge": delete.purge,
     "repair": repair.repair,
-    "migrate": repair.migrate,
 }
 
 
@@ -83,14 +82,13 @@ def _parser() -> argparse.ArgumentParser:
         commands,
         kind,
         "repair",
-        "complete interrupted items, repair or salvage damaged ones",
+        "repair or salvage damaged items",
         "take-7 --from /mnt/copy",
     )
     _add_ids(repairing)
     repairing.add_argument(
         "--from", dest="source", metavar="URL", help="intact copy of the store to repair from"
     )
-    _add_ids(_command(commands, kind, "migrate", "upgrade items of older format versions"))
     does = "move items to the trash, or delete them permanently"
     _add_delete(_command(commands, kind, "delete", does, "take-7 take-8"))
     _add_deletions(_command(commands, shared, "deletions", _DELETIONS))

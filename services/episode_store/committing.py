@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from dextouch.episodes import ContentDigest, EpisodeStore, WriteOptions
+from dextouch.episodes import ContentDigest, EpisodeStore
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import ConflictError, DexTouchError, UnavailableError
 from dextouch.schemas import (
@@ -72,10 +72,7 @@ def commit_spool(
         StorageFullError: no space; nothing is written, the spool is kept.
     """
     reader = SpoolReader(spool)
-    # Not recoverable: the spool has all data, and a recording recovered from a partial copy would
-    # block the id of the complete one.
-    options = WriteOptions(recoverable=False)
-    with store.writer(kind="recording", attributes=attributes, options=options) as writer:
+    with store.writer(kind="recording", attributes=attributes) as writer:
         for name, descriptor in reader.streams.items():
             fitting = max(1, min(COPY_SAMPLES, COPY_BYTES // descriptor.sample_bytes()))
             num_samples = COPY_IMAGES if descriptor.unit in ENCODED_UNITS else fitting

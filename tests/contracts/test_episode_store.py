@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dextouch.episodes import EpisodeStore, WriteOptions
+from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
@@ -99,10 +99,9 @@ def reference(made, tmp_path_factory):
     return made.write(EpisodeStore(tmp_path_factory.mktemp("reference")))
 
 
-def begin_recording(store, recording_id="take-1", num_samples=40, options=None):
+def begin_recording(store, recording_id="take-1", num_samples=40):
     writer = store.writer(
         kind="recording",
-        options=options,
         attributes=RecordingAttributes(
             recording_id=recording_id,
             station="s1",
@@ -173,32 +172,17 @@ def test_nothing_is_seen_before_commit(store, place):
     with writer:
         assert place.again().list(kind="recording") == []
         assert store.sweep() == 0
-        assert store.recover() == ()
-        assert store.live("take-1").num_samples("force") > 0
     np.testing.assert_array_equal(place.again().recording("take-1").read("force").values, values)
     assert place.keys(".staging") == []
 
 
-def test_an_exception_keeps_a_take(store, place):
-    writer, values = begin_recording(store, num_samples=37)
-    with pytest.raises(RuntimeError, match="glove fell off"), writer:
-        raise RuntimeError("glove fell off")
-    reader = place.again().recording("take-1")
-    reader.verify()
-    assert reader.attributes.recovered
-    np.testing.assert_array_equal(reader.read("force").values, values)
-    assert store.recover() == ()
-    assert list((store.root / ".staging").iterdir()) == []
-
-
-def test_an_exception_leaves_nothing_of_a_discarded_take(store, place):
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_an_exception_leaves_nothing_of_a_take(store, place, error):
     writer, _ = begin_recording(store)
-    writer.discard()
-    with pytest.raises(RuntimeError, match="glove fell off"), writer:
-        raise RuntimeError("glove fell off")
+    with pytest.raises(error, match="glove fell off"), writer:
+        raise error("glove fell off")
     assert place.keys("recordings") == []
-    assert store.recover() == ()
-    assert list((store.root / ".staging").iterdir()) == []
+    assert nothing_waits(store)
 
 
 def test_of_two_writers_of_one_id_the_first_to_commit_wins(place):
@@ -215,25 +199,8 @@ def test_of_two_writers_of_one_id_the_first_to_commit_wins(place):
     reader.verify()
 
 
-def test_a_take_whose_id_was_taken_meanwhile_is_kept_under_another(place):
-    late, values = begin_recording(place.store, num_samples=17)
-    with begin_recording(place.again(), num_samples=4)[0]:
-        pass
-    with pytest.raises(ConflictError, match="exists already") as caught:
-        late.__exit__(None, None, None)
-    reader = place.again().recording("take-1-recovered-1")
-    reader.verify()
-    assert reader.attributes.recovered
-    np.testing.assert_array_equal(reader.read("force").values, values)
-    said = "kept as 'take-1-recovered-1', marked as recovered"
-    assert said in " ".join(caught.value.__notes__)
-    assert place.again().recording("take-1").num_samples("force") == 4
-    assert nothing_waits(place.store)
-
-
-def test_of_a_writer_that_keeps_nothing_nothing_is_left_when_its_id_was_taken(place):
-    options = WriteOptions(recoverable=False)
-    late, _ = begin_recording(place.store, options=options)
+def test_nothing_is_left_of_a_writer_whose_id_was_taken(place):
+    late, _ = begin_recording(place.store)
     with begin_recording(place.again(), num_samples=4)[0]:
         pass
     with pytest.raises(ConflictError, match="exists already"):
@@ -244,25 +211,10 @@ def test_of_a_writer_that_keeps_nothing_nothing_is_left_when_its_id_was_taken(pl
 
 def nothing_waits(store):
     """Neither a stage nor an upload is left on this machine."""
-    return store.recover() == () and not any(
+    return store.complete_uploads() == () and not any(
         (store.root / folder).is_dir() and any((store.root / folder).iterdir())
         for folder in (".staging", ".outbox/recordings")
     )
-
-
-@pytest.mark.parametrize("order", ["damaged first", "damaged last"])
-def test_a_damaged_stage_does_not_keep_others_from_being_recovered(store, place, order):
-    damaged, whole = ("a", "b") if order == "damaged first" else ("b", "a")
-    for recording_id in (damaged, whole):
-        die(begin_recording(store, recording_id)[0])
-    (journal,) = store.root.glob(f".staging/recording-{damaged}-*/force.journal")
-    data = bytearray(journal.read_bytes())
-    data[10] ^= 1
-    journal.write_bytes(data)
-    with pytest.raises(CorruptDataError, match=f"recording-{damaged}|'force'") as caught:
-        store.recover()
-    assert place.again().list(kind="recording") == [whole]
-    assert f"recovered: recording {whole!r}" in " ".join(caught.value.__notes__)
 
 
 def test_an_id_can_be_used_again_after_it_was_deleted(place):
@@ -283,46 +235,33 @@ def test_an_id_can_be_used_again_after_it_was_deleted(place):
 
 
 def test_what_is_not_there(store):
-    for ask in (store.open, store.delete, store.revision, store.migrate):
+    for ask in (store.open, store.delete, store.revision):
         with pytest.raises(NotFoundError, match="nothing-here"):
             ask("nothing-here")
-    with pytest.raises(NotFoundError, match="is not being written"):
-        store.live("nothing-here")
     for wrong in ("../up", "a/b", "", "A"):
         with pytest.raises(InvalidInputError, match="expected 1 … 128"):
             store.open(wrong)
     assert store.list() == []
-    assert store.recover() == ()
+    assert store.complete_uploads() == ()
     assert store.sweep() == 0
 
 
-def test_current_groups_need_no_migration(made, store):
-    made.write(store)
-    assert store.migrate(EPISODE) is False
-
-
-def test_recover_completes_what_a_dead_writer_left(store, place):
-    writer, values = begin_recording(store)
-    die(writer)
-    (recovered,) = store.recover()
-    assert (recovered.kind, recovered.item_id) == ("recording", "take-1")
-    reader = place.again().recording("take-1")
-    assert reader.attributes.recovered
-    kept = reader.read("force").values
-    assert len(kept) >= 35
-    np.testing.assert_array_equal(kept, values[: len(kept)])
-    assert store.recover() == ()
-
-
-def test_recover_finds_another_id_if_its_own_was_taken(store, place):
-    writer, _ = begin_recording(store)
-    die(writer)
-    with begin_recording(place.again(), num_samples=5)[0]:
+def test_a_sweep_removes_what_a_dead_writer_left_and_nothing_else(store, place):
+    with begin_recording(store, "whole")[0]:
         pass
-    (recovered,) = store.recover()
-    assert recovered.item_id == "take-1-recovered-1"
-    assert place.again().list(kind="recording") == ["take-1", "take-1-recovered-1"]
-    assert place.again().recording("take-1").num_samples("force") == 5
+    running, _ = begin_recording(store, "running")
+    die(begin_recording(store)[0])
+    assert store.sweep() == 1
+    assert len(list((store.root / ".staging").iterdir())) == 1
+    with running:
+        pass
+    assert place.again().list(kind="recording") == ["running", "whole"]
+    # Its id is free.
+    writer, values = begin_recording(place.again())
+    with writer:
+        pass
+    np.testing.assert_array_equal(store.recording("take-1").read("force").values, values)
+    assert store.sweep() == 0
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,12 @@ import json
 import os
 import signal
 import sys
-import threading
 import time
 from pathlib import Path
 
 import numpy as np
 
-from dextouch.episodes import EpisodeStore, GopEncoder
+from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolWriter
 from tests.system import take_source
 
@@ -27,30 +26,27 @@ FILE_EVENTS = frozenset({"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir
 
 
 class Counters:
-    """How many samples of each stream were handed over and encoded, in a file that outlives us."""
+    """How many samples of each stream were handed over, in a file that outlives us."""
 
     def __init__(self, path, *, create=False):
-        size = (3, len(take_source.STREAM_NAMES))
+        size = (2, len(take_source.STREAM_NAMES))
         if create:
             np.zeros(size, np.int64).tofile(path)
         self._table = np.memmap(path, dtype=np.int64, mode="r+", shape=size)
 
-    def add(self, kind, name, number=1):
-        self._table[kind, take_source.STREAM_NAMES.index(name)] += number
+    def add(self, name, number=1):
+        self._table[0, take_source.STREAM_NAMES.index(name)] += number
 
-    def get(self, kind, name):
-        return int(self._table[kind, take_source.STREAM_NAMES.index(name)])
+    def get(self, name):
+        return int(self._table[0, take_source.STREAM_NAMES.index(name)])
 
     @property
     def file_events(self):
-        return int(self._table[2, 0])
+        return int(self._table[1, 0])
 
     @file_events.setter
     def file_events(self, number):
-        self._table[2, 0] = number
-
-
-APPENDED, ENCODED = 0, 1
+        self._table[1, 0] = number
 
 
 def main():
@@ -61,7 +57,7 @@ def main():
         order = json.loads(line)
         pid = os.fork()
         if pid == 0:
-            work = {"live": write_take, "commit": write_take, "spool": spool, "recover": recover}
+            work = {"live": write_take, "commit": write_take, "spool": spool, "sweep": sweep}
             work[order["mode"]](order, images, jpegs)
             say("done")
             signal.pause()
@@ -76,7 +72,6 @@ def write_take(order, images, _jpegs):
         with open_writer(store, recording_id) as writer:
             for _, name, k in take_source.schedule(SAVED_SECONDS):
                 writer.append(name, **take_source.block(name, number, k, 1, images))
-    count_encoded(counters)
     live = order["mode"] == "live"
     with open_writer(store, FLIGHT) as writer:
         say(f"recording {os.getpid()}")
@@ -85,7 +80,7 @@ def write_take(order, images, _jpegs):
             if live:
                 time.sleep(max(0.0, start_s + due_s - time.monotonic()))
             writer.append(name, **take_source.block(name, order["seed"], k, 1, images))
-            counters.add(APPENDED, name)
+            counters.add(name)
         if not live:
             kill_at_file_event(order["kill_at"], counters)
 
@@ -106,27 +101,14 @@ def spool(order, _images, jpegs):
             continue
         time.sleep(max(0.0, start_s + due_s - time.monotonic()))
         writer.append(name, take_source.spool_batch(name, order["seed"], k, SPOOL_BLOCK, jpegs))
-        counters.add(APPENDED, name, SPOOL_BLOCK)
+        counters.add(name, SPOOL_BLOCK)
 
 
-def recover(order, _images, _jpegs):
-    """The recovery of what an earlier process left, itself killed."""
+def sweep(order, _images, _jpegs):
+    """The removal of what an earlier process left, itself killed."""
     say(f"recording {os.getpid()}")
     kill_at_file_event(order["kill_at"], Counters(order["counters"]))
-    EpisodeStore(order["root"]).recover()
-
-
-def count_encoded(counters):
-    """Count the images that leave the encoders, whose threads are named after their streams."""
-    encode = GopEncoder.encode
-
-    def counted(self, image):
-        access_unit = encode(self, image)
-        name = threading.current_thread().name.removeprefix("encode-").rsplit("_", 1)[0]
-        counters.add(ENCODED, name)
-        return access_unit
-
-    GopEncoder.encode = counted
+    EpisodeStore(order["root"]).sweep()
 
 
 def kill_at_file_event(number, counters):

@@ -1,4 +1,4 @@
-"""One process of a busy store: it records take after take, or it reads what others record.
+"""One process of a busy store: it records take after take, or it reads what others recorded.
 
 The recorder says in a file that all have mapped where it stands; readers say in the end, as JSON,
 what they compared.
@@ -32,9 +32,9 @@ JOINTS = slice(JOINTS_LEFT.start, JOINTS_RIGHT.stop)
 
 
 class Board:
-    """Where the recorder stands: which take, whether it can be followed, which still exist."""
+    """Where the recorder stands: which takes still exist, and whether it has ended."""
 
-    FIELDS = ("current", "followable", "first_kept", "stop")
+    FIELDS = ("first_kept", "stop")
 
     def __init__(self, path, *, create=False):
         if create:
@@ -54,15 +54,14 @@ def take_id(number):
 
 
 def record(store, board, images, seconds):
-    """Live takes, one after the other, each then also as an episode; old ones are deleted.
+    """Takes at their own pace, each then also as an episode; old ones are deleted.
 
     Two at least, however slow the machine: readers are to see one end and another begin.
     """
     stop_s = time.monotonic() + seconds
     number = 0
     while time.monotonic() < stop_s or number < 2:
-        board.set(current=number)
-        record_take(store, board, images, number)
+        record_take(store, images, number)
         write_episode(store, number, images)
         if number >= NUM_KEPT:
             old = number - NUM_KEPT
@@ -74,15 +73,13 @@ def record(store, board, images, seconds):
     return {"takes": number}
 
 
-def record_take(store, board, images, number):
+def record_take(store, images, number):
     attributes = take_source.attributes(take_id(number))
     with store.writer(kind="recording", attributes=attributes) as writer:
         start_s = time.monotonic()
         for due_s, name, k in take_source.schedule(TAKE_SECONDS):
             time.sleep(max(0.0, start_s + due_s - time.monotonic()))
             writer.append(name, **take_source.block(name, number, k, 1, images))
-            board.set(followable=1)
-        board.set(followable=0)
 
 
 def touch_kpa(number, side, first, num_samples):
@@ -132,45 +129,21 @@ def write_episode(store, number, images):
 
 
 class Reader:
-    """Follows the take that is being recorded, and reads windows of those that are finished."""
+    """Reads rows and windows of the takes that are finished."""
 
     def __init__(self, store, board, images, seed):
         self._store, self._board, self._images = store, board, images
         self._expected, self._rng = take_source.Expected(images), random.Random(seed)
-        self.counts = {"live": 0, "rows": 0, "recordings": 0, "windows": 0, "gone": 0}
-        self._followed = {}
+        self.counts = {"rows": 0, "recordings": 0, "windows": 0, "gone": 0}
 
     def run(self):
         while not self._board.get("stop"):
-            self.follow()
             for kind, check in (
                 ("recording", self.check_recording),
                 ("episode", self.check_window),
             ):
                 self._finished(kind, check)
         return self.counts
-
-    def follow(self):
-        number, followable = self._board.get("current"), self._board.get("followable")
-        if not followable:
-            return
-        try:
-            self._compare_live(number)
-        except (NotFoundError, StorageError):
-            # It may be closed at any moment, but not come to harm while it goes on.
-            if self._board.get("followable") and self._board.get("current") == number:
-                raise
-            self.counts["gone"] += 1
-
-    def _compare_live(self, number):
-        live = self._store.live(take_id(number))
-        name = self._rng.choice(STREAM_NAMES)
-        stop = live.num_samples(name)
-        if self._board.get("followable") and self._board.get("current") == number:
-            assert stop >= self._followed.get((number, name), 0), f"{name}: rows vanished"
-            self._followed[number, name] = stop
-        self._rows(live, name, number, stop)
-        self.counts["live"] += stop > 0
 
     def _finished(self, kind, check):
         ids = self._store.list(kind=kind)

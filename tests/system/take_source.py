@@ -5,7 +5,6 @@ row is all zero, so a row that was filled in shows.
 """
 
 import heapq
-from functools import cache
 from itertools import count
 
 import numpy as np
@@ -165,9 +164,3 @@ class _Encoded:
             image = self._images[image_number(self._name, np.int64(number))]
             self._units.append(self._encoder.encode(image))
         return self._units[:num_images]
-
-
-@cache
-def chunk_rows(name):
-    """Samples a storage chunk: what may still be in the memory of a writer."""
-    return 8 if name in CAMERAS else RATES_HZ[name] // 2

@@ -1,4 +1,4 @@
-"""One process records, four read what it records while it does: no row is ever wrong."""
+"""One process records, four read what it has finished meanwhile: no row is ever wrong."""
 
 import json
 import subprocess
@@ -52,20 +52,19 @@ def check_together(folder, seconds):
     total = {name: sum(reader[name] for reader in readers) for name in readers[0]}
     for reader in readers:
         assert reader["rows"] > 0, readers
-    assert total["live"] > 0
     assert total["recordings"] > 0
     assert total["windows"] > 0
-    # Reading what is just closed or deleted fails in the open, and is not what readers mostly do.
-    assert total["gone"] < 0.2 * (total["live"] + total["recordings"] + total["windows"]), total
+    # Reading what is just deleted fails in the open, and is not what readers mostly do.
+    assert total["gone"] < 0.2 * (total["recordings"] + total["windows"]), total
     return {**recorder, **total}
 
 
-def test_readers_follow_a_recorder(tmp_path):
+def test_readers_beside_a_recorder(tmp_path):
     check_together(tmp_path, 6.0)
 
 
 @pytest.mark.slow
-def test_readers_follow_a_recorder_for_5_minutes(tmp_path, capsys):
+def test_readers_beside_a_recorder_for_5_minutes(tmp_path, capsys):
     found = check_together(tmp_path, 300.0)
     with capsys.disabled():
         sys.stdout.write(f"\none recorder and {NUM_READERS} readers: {found}\n")

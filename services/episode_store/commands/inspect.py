@@ -28,7 +28,6 @@ from dextouch.episodes.care import (
     inspect_group,
     inspect_stage,
     inspect_upload,
-    interrupted_takes,
     open_contents,
     unfinished_folders,
 )
@@ -72,12 +71,7 @@ def list_items(context: Context) -> Outcome:
         found, num_in_all = _list_kind(context, catalog, each)
         result |= found | {"num_matching": result["num_matching"] + found["num_matching"]}
         totals.append(f"{num_in_all} {each}" + "s" * (num_in_all != 1))
-    if kind != "episode" and root is not None:
-        interrupted = list(interrupted_takes(root))
-        result["unfinished"] = [name for _, name in interrupted]
-        for what, name in interrupted:
-            context.say(f"{name}  {what}  interrupted; `dextouch store repair` completes it")
-    if not result["num_matching"] and not result.get("unfinished"):
+    if not result["num_matching"]:
         context.say(f"nothing matches, of {' and '.join(totals)}")
     return result, 0
 

@@ -1,18 +1,18 @@
-"""Commands `repair` and `migrate`."""
+"""Command `repair`."""
 
 from dataclasses import asdict
 
 from dextouch.episodes import EpisodeStore, GroupFiles, Kind
-from dextouch.episodes.care import LEFT, RepairReport, repair_group, repair_unfinished
-from dextouch.errors import InvalidInputError, NotFoundError, StorageError
+from dextouch.episodes.care import LEFT, RepairReport, repair_group, repair_uploads
+from dextouch.errors import NotFoundError
 from services.episode_store.commands.context import EXIT_DAMAGED, Context, Outcome
 
 
 def repair(context: Context) -> Outcome:
-    """Complete interrupted items, repair damaged ones from a copy, and salvage the rest."""
+    """Repair damaged items from a copy, and salvage the rest."""
     root, options = context.need_local_root(), context.options
     copies = EpisodeStore(options.source) if options.source else None
-    reports = [] if options.ids else repair_unfinished(root)
+    reports = [] if options.ids else repair_uploads(root)
     for kind, item_id in context.items():
         reports.append(repair_group(root, kind, item_id, copy=_copy(copies, kind, item_id)))
     for report in reports:
@@ -38,18 +38,3 @@ def _say_report(context: Context, report: RepairReport) -> None:
         context.say(f"  {name}: {count} samples lost")
     for note in report.notes:
         context.say(f"  {note}")
-
-
-def migrate(context: Context) -> Outcome:
-    """Upgrade groups of older format versions; failed ones are unchanged and listed."""
-    migrated, failed = [], {}
-    for kind, item_id in context.items():
-        try:
-            if context.store.migrate(item_id, kind=kind):
-                migrated.append(item_id)
-                context.say(f"{item_id}  migrated")
-        except (StorageError, NotFoundError, InvalidInputError) as error:
-            failed[item_id] = error.message
-            context.say(f"{item_id}  FAILED  {error.message}")
-    context.say(f"{len(migrated)} migrated, {len(failed)} failed")
-    return {"migrated": migrated, "failed": failed}, EXIT_DAMAGED if failed else 0

@@ -123,14 +123,9 @@ def _sync_file(path: Path) -> None:
         os.close(descriptor)
 
 
-def partial_name(name: str) -> str:
-    """Temporary name of a file while `replace_file` writes it."""
-    return name + ".partial"
-
-
 def replace_file(path: Path, data: bytes, *, mode: int = 0o644) -> None:
     """Replace the contents of a file atomically; `mode` are its permissions."""
-    partial = path.with_name(partial_name(path.name))
+    partial = path.with_name(path.name + ".partial")
     partial.unlink(missing_ok=True)
     write_file(partial, data, mode=mode)
     partial.replace(path)

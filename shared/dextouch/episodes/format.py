@@ -128,7 +128,7 @@ def stream_arrays(descriptor: StreamDescriptor, kind: Kind) -> dict[str, ArrayEn
     name, codec = descriptor.name, codec_of(descriptor)
     half_second = max(1, round(descriptor.nominal_rate_hz * CHUNK_SECONDS))
     rows = min(half_second, max(1, CHUNK_BYTES // descriptor.sample_bytes()))
-    # Stamps use the same chunk length as values, so that a kill never separates the two.
+    # A whole number of the values' storage chunks.
     stamp_rows = half_second // rows * rows if codec == "zstd" else GOP_IMAGES
     time, no_hash = f"{name}_time", "0" * 64
     axes = (f"{name}_axis{axis}" for axis in range(1, 1 + len(descriptor.shape)))
@@ -213,11 +213,12 @@ def encode_commit(record: CommitRecord) -> tuple[bytes, str]:
     return canonical_json({"record": plain, "sha256": digest}), digest
 
 
-def open_commit(data: bytes, *, what: str) -> tuple[dict[str, Any], str, object]:
-    """The fields of a record of any format version, its sha256, and the version.
+def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
+    """Inverse of `encode_commit`.
 
     Raises:
-        CorruptDataError: damaged bytes.
+        StorageError: written by another version of the format.
+        CorruptDataError: not a valid commit record.
     """
     try:
         outer = json.loads(data)
@@ -228,26 +229,10 @@ def open_commit(data: bytes, *, what: str) -> tuple[dict[str, Any], str, object]
         raise CorruptDataError(f"{what}: {COMMIT_FILE} is damaged ({error})") from error
     if not whole:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} does not match its own sha256")
-    return plain, digest, version
-
-
-def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
-    """Inverse of `encode_commit`.
-
-    Raises:
-        StorageError: written by another version of the format.
-        CorruptDataError: not a valid commit record.
-    """
-    plain, digest, version = open_commit(data, what=what)
     if version != FORMAT_VERSION:
-        older = isinstance(version, int) and 1 <= version < FORMAT_VERSION
-        advice = (
-            "upgrade it with `dextouch store migrate`"
-            if older
-            else "read it with the release that wrote it"
-        )
         raise StorageError(
-            f"{what}: got format version {version!r}, expected {FORMAT_VERSION}; {advice}",
+            f"{what}: {COMMIT_FILE} has format version {version!r}, expected {FORMAT_VERSION}; "
+            "read it with the release that wrote it",
             format_version=version,
         )
     try:

@@ -1,13 +1,10 @@
-"""Attributes and arrays of a committed group, or of one that is still being written."""
+"""Attributes and arrays of a committed group."""
 
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Generic, TypeVar
-
-import numpy as np
 
 from dextouch.episodes.format import (
     COMMIT_FILE,
@@ -21,14 +18,11 @@ from dextouch.episodes.format import (
     sha256_hex,
     shard_path,
     stream_arrays,
-    with_rows,
 )
 from dextouch.episodes.image_codecs import ImageChunks
-from dextouch.episodes.journal import log_paths, part_path, read_rows
 from dextouch.episodes.shards import ShardReader, decode_rows
-from dextouch.episodes.sources import GroupFiles, LocalFile, LocalGroup, OpenedGroup
-from dextouch.episodes.staged_group import read_stage
-from dextouch.errors import CorruptDataError, NotFoundError, StorageError
+from dextouch.episodes.sources import GroupFiles, OpenedGroup
+from dextouch.errors import CorruptDataError, StorageError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 
 A = TypeVar("A", EpisodeAttributes, RecordingAttributes)
@@ -38,7 +32,7 @@ MAX_IMAGE_PIXELS = 139_264 * 256
 
 @dataclass
 class GroupContents(Generic[A]):
-    """A committed group, or one that is being written, which has no content hash."""
+    """A committed group, as it was when it was opened."""
 
     files: GroupFiles
     kind: Kind
@@ -46,8 +40,8 @@ class GroupContents(Generic[A]):
     entries: dict[str, ArrayEntry]
     content_sha256: str
     what: str
+    opened: OpenedGroup
     _shards: dict[str, ShardReader] = field(default_factory=dict)
-    opened: OpenedGroup | None = None
 
     def shard(self, name: str) -> ShardReader:
         """Reader of one array; its shard index is cached."""
@@ -69,8 +63,7 @@ class GroupContents(Generic[A]):
             NotFoundError: the group was deleted or replaced since it was opened.
         """
         for number, error in self._inspect_array(name, progress):
-            if self.opened is not None:
-                self.opened.check_present(error)
+            self.opened.check_present(error)
             yield number, error
 
     def _inspect_array(
@@ -122,21 +115,6 @@ def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> b
     return payload
 
 
-class _GrowingFile(LocalFile):
-    """Part file of an array that is being written."""
-
-    def read(self, offset: int, length: int) -> memoryview:
-        """Bytes offset … offset + length − 1.
-
-        Raises:
-            NotFoundError: its writer has finished in the meantime.
-        """
-        data = super().read(offset, length)
-        if not data and self.size() is None:
-            raise NotFoundError(f"{self.path}: was finished meanwhile; open what was committed")
-        return data
-
-
 def read_group(files: GroupFiles, model: type[A]) -> GroupContents[A]:
     """Open a committed group; arrays are read lazily.
 
@@ -174,9 +152,7 @@ def _read_group(opened: OpenedGroup, commit: bytes, kind: Kind, model: type[A]) 
     except MALFORMED as error:
         raise StorageError(f"{what}: attributes are invalid ({error})") from error
     _check_arrays(expected, record.arrays, what)
-    return GroupContents(
-        files, kind, attributes, record.arrays, content_sha256, what, opened=opened
-    )
+    return GroupContents(files, kind, attributes, record.arrays, content_sha256, what, opened)
 
 
 def _check_arrays(
@@ -211,37 +187,3 @@ def _check_arrays(
 
 def _layout(entry: ArrayEntry) -> tuple[object, ...]:
     return entry.dtype, entry.shape[1:], entry.codec
-
-
-def read_live(stage: Path, kind: Kind, model: type[A]) -> GroupContents[A]:
-    """Snapshot of a stage: storage chunks that are complete in all arrays of a stream.
-
-    Raises:
-        NotFoundError: the stage does not exist, or cannot be read while it is written.
-        CorruptDataError: damage in a journal.
-    """
-    attributes = read_stage(stage)
-    if not isinstance(attributes, model):
-        raise NotFoundError(f"{stage.name}: is being written in a way that cannot be followed")
-    entries: dict[str, ArrayEntry] = {}
-    shards: dict[str, ShardReader] = {}
-    what = f"{kind} {stage.name}"
-    if any((stage / name).is_dir() for s in attributes.streams for name in stream_arrays(s, kind)):
-        raise NotFoundError(f"{stage.name}: is being finished; open what is committed in a moment")
-    for stream in attributes.streams:
-        arrays = stream_arrays(stream, kind)
-        rows = {
-            name: read_rows(stage, name)
-            for name in arrays
-            if all(path.is_file() for path in log_paths(stage, name))
-        }
-        whole = len(rows) == len(arrays)
-        count = min(int(r["num_rows"].sum()) for r in rows.values()) if whole else 0
-        for name, entry in arrays.items():
-            entries[name] = with_rows(entry, count)
-            columns = (rows[name]["offset"], rows[name]["length"]) if count else ((), ())
-            index = np.stack([np.asarray(c, dtype=np.uint64) for c in columns], axis=1)
-            source = _GrowingFile(part_path(stage, name))
-            where = f"{what}: array {name!r}"
-            shards[name] = ShardReader(source, entries[name], what=where, index=index)
-    return GroupContents(LocalGroup(stage), kind, attributes, entries, "", what, shards)

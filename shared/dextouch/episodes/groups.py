@@ -212,11 +212,8 @@ class GroupReader(Generic[A]):
         Raises:
             CorruptDataError: the first damaged array, by name.
             StorageError: the storage cannot be read.
-            InvalidInputError: a group that is still being written.
         """
         contents = self._contents
-        if not contents.content_sha256:
-            raise InvalidInputError(f"{self._what}: is still being written")
         sizes: list[int] = []
         for name in contents.entries:
             for _, error in contents.inspect_array(name, progress=sizes.append):

@@ -9,7 +9,6 @@ import shutil
 import threading
 import uuid
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 
 from dextouch.episodes.files import disk_errors, write_file
@@ -19,30 +18,15 @@ from dextouch.episodes.format import (
     Attributes,
     Kind,
     attributes_id,
-    decode_commit,
 )
-from dextouch.episodes.migration import is_current
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
-from dextouch.episodes.staged_group import (
-    STAGING,
-    new_stage,
-    read_committed,
-    unheld_folders,
-    write_stage,
-)
-from dextouch.episodes.staging_recovery import (
-    RecoveredGroup,
-    raise_first,
-    recover_all,
-    recover_stage,
-    samples_of,
-    sweep_stages,
-)
+from dextouch.episodes.staged_group import new_stage, sweep_stages, unheld_folders
 from dextouch.episodes.stream_writer import WriteOptions
 from dextouch.episodes.uploads import delete_group, group_key, sweep_orphans, upload_group
 from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import (
     ConflictError,
+    DexTouchError,
     InvalidInputError,
     NotFoundError,
     StorageError,
@@ -172,26 +156,22 @@ class ObjectGroup:
 class UploadingWriter(EpisodeWriter):
     """Writes a group to the outbox in the work folder and uploads it on commit.
 
-    After an interrupted upload the group stays in the outbox, from where `recover` uploads it.
+    After an interrupted upload the group stays in the outbox, from where `complete_uploads` uploads
+    it.
     """
 
     upload: Callable[[], None]
-    complete: Callable[[Path], RecoveredGroup | None]
 
     def _commit(self) -> None:
         super()._commit()
-        # The stage's lock is still held, so a concurrent `recover` skips it.
+        # The stage's lock is still held, so a concurrent `complete_uploads` skips it.
         try:
             self.upload()
         except ConflictError:
-            # Back among the stages, where recovery gives it another id or removes it.
+            # Back among the stages, where it is removed.
             with disk_errors(f"move {self._target}"):
                 self._target.rename(self._stage)
             raise
-
-    def _complete(self) -> RecoveredGroup | None:
-        # Groups that could not be uploaded stay in the outbox.
-        return self.complete(self._stage) if self._stage.exists() else None
 
 
 class ObjectStorage:
@@ -222,14 +202,13 @@ class ObjectStorage:
         target = self._outbox / f"{kind}s" / item_id
         if target.exists():
             raise ConflictError(
-                f"{kind} {item_id!r} waits in {target} to be uploaded; `recover` completes it"
+                f"{kind} {item_id!r} waits in {target} to be uploaded; `complete_uploads` does so"
             )
         if self.exists(kind, item_id):
             raise ConflictError(f"{kind} {item_id!r} exists already; choose another id")
         stage = new_stage(self.root, kind, item_id)
         writer = UploadingWriter(stage=stage, target=target, attributes=attributes, options=options)
         writer.upload = lambda: self._upload(kind, target)
-        writer.complete = self._complete
         return writer
 
     def group(self, kind: Kind, item_id: str) -> ObjectGroup:
@@ -275,38 +254,33 @@ class ObjectStorage:
         else:
             self._bucket.put(key, content)
 
-    def migrate(self, kind: Kind, item_id: str) -> bool:
-        """Refuse a group of an older version: keys cannot be replaced atomically."""
-        if is_current(self.group(kind, item_id), what=f"{kind} {item_id}"):
-            return False
-        raise StorageError(
-            f"{kind} {item_id!r}: has an older version, which cannot be migrated in "
-            f"{self._address}; copy it to a local store, migrate it there and write it here again"
-        )
-
-    def recover(self) -> builtins.list[RecoveredGroup]:
-        """Commit the stages of terminated writers, and complete interrupted uploads.
-
-        Raises:
-            StorageError, UnavailableError: the bucket cannot be reached; try again later.
-        """
+    def complete_uploads(self) -> builtins.list[tuple[Kind, str]]:
+        """Upload what waits in the outbox; see `EpisodeStore.complete_uploads`."""
         if not self.root.is_dir():
             return []
         self._own_work_folder()
-        _, failures = recover_all(unheld_folders(self.root / STAGING), self._recover_stage)
-        found: builtins.list[RecoveredGroup] = []
+        done: builtins.list[tuple[Kind, str]] = []
+        failures: builtins.list[DexTouchError] = []
         for kind in KINDS:
-            waiting = unheld_folders(self._outbox / f"{kind}s")
-            uploaded, failed = recover_all(waiting, partial(self._deliver, kind))
-            found += uploaded
-            failures += failed
-        raise_first(failures, found)
-        return found
+            for folder in unheld_folders(self._outbox / f"{kind}s"):
+                try:
+                    if self._deliver(kind, folder):
+                        done.append((kind, folder.name))
+                except DexTouchError as error:
+                    failures.append(error)
+        if failures:
+            for other in failures[1:]:
+                failures[0].add_note(f"also: {other.message}")
+            if done:
+                names = ", ".join(f"{kind} {item_id!r}" for kind, item_id in done)
+                failures[0].add_note(f"uploaded: {names}")
+            raise failures[0]
+        return done
 
     def sweep(self) -> int:
-        """Remove stages that cannot be recovered, and objects of abandoned uploads."""
+        """Remove abandoned stages, and objects of abandoned uploads."""
         with disk_errors("sweep"):
-            removed = sweep_stages(self.root, self._is_taken)
+            removed = sweep_stages(self.root)
         return removed + sweep_orphans(self._bucket)
 
     def _upload(self, kind: Kind, folder: Path) -> None:
@@ -314,51 +288,30 @@ class ObjectStorage:
             upload_group(self._bucket, kind, folder)
         except (StorageError, UnavailableError) as error:
             raise type(error)(
-                f"{error.message}; {kind} {folder.name!r} waits in {folder}, `recover` uploads it"
+                f"{error.message}; {kind} {folder.name!r} waits in {folder}, `complete_uploads` "
+                "uploads it"
             ) from error
         except KeyboardInterrupt as interrupt:
             if (folder / COMMIT_FILE).exists():
                 interrupt.add_note(
-                    f"{kind} {folder.name!r} waits in {folder}, `recover` uploads it"
+                    f"{kind} {folder.name!r} waits in {folder}, `complete_uploads` uploads it"
                 )
             raise
 
-    def _deliver(self, kind: Kind, folder: Path) -> RecoveredGroup | None:
-        """Upload a group that no writer holds; a recording gets another id if its own is taken."""
+    def _deliver(self, kind: Kind, folder: Path) -> bool:
+        """Upload a group that no writer holds; False if there is none, or its id was taken."""
         if not (folder / COMMIT_FILE).exists():
             # The remainder of a group that was uploaded.
             with disk_errors(f"remove {folder}"):
                 shutil.rmtree(folder)
-            return None
-        with disk_errors(f"read {folder}"):
-            record = decode_commit((folder / COMMIT_FILE).read_bytes(), what=folder.name)[0]
-        attributes = read_committed(folder, kind)
+            return False
         try:
             self._upload(kind, folder)
         except ConflictError:
-            if kind == "episode":
-                # It can be written again, and its writer is gone.
-                shutil.rmtree(folder, ignore_errors=True)
-                return None
-            stage = new_stage(self.root, kind, folder.name)
-            write_stage(folder, attributes)
-            with disk_errors(f"move {folder}"):
-                stage.parent.mkdir(parents=True, exist_ok=True)
-                folder.rename(stage)
-            return self._complete(stage)
-        return RecoveredGroup(kind, folder.name, samples_of(record, attributes))
-
-    def _complete(self, stage: Path) -> RecoveredGroup | None:
-        group = self._recover_stage(stage)
-        if group is not None:
-            self._upload(group.kind, self._outbox / f"{group.kind}s" / group.item_id)
-        return group
-
-    def _recover_stage(self, stage: Path) -> RecoveredGroup | None:
-        return recover_stage(stage, self._outbox, self._is_taken)
-
-    def _is_taken(self, kind: Kind, item_id: str) -> bool:
-        return (self._outbox / f"{kind}s" / item_id).exists() or self.exists(kind, item_id)
+            # It can be written again: a recording from its spool or file, an episode from that.
+            shutil.rmtree(folder, ignore_errors=True)
+            return False
+        return True
 
     def _own_work_folder(self) -> None:
         """Refuse a work folder of another address, whose groups belong to another bucket."""

@@ -1,4 +1,4 @@
-"""Zarr v3 shard files: reader of rows or encoded storage chunks, and writer from a log.
+"""Zarr v3 shard files: reader and writer of rows or encoded storage chunks.
 
 A shard has the standard `sharding_indexed` layout: concatenated encoded storage chunks, then
 (offset, length) of each as uint64, then crc32c of that index. Every storage chunk ends in its own
@@ -7,6 +7,7 @@ crc32c, so a flipped bit or a truncated file is always detected.
 
 import hashlib
 import math
+import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,9 +18,8 @@ import numpy as np
 import zstandard
 from jaxtyping import Shaped
 
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes.files import disk_errors, write_all
 from dextouch.episodes.format import ZSTD_LEVEL, ArrayEntry, shard_path, with_rows
-from dextouch.episodes.journal import JournalWriter, part_path, read_payload, read_rows
 from dextouch.episodes.sources import ByteSource, OpenedGroup
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 
@@ -100,10 +100,10 @@ class ShardReader:
     """Reads rows or storage chunks of one array; the index is cached.
 
     Args:
-        source: the shard file, or the part file of a shard that is being written.
+        source: the shard file.
         entry: dtype, shape and codec of the array.
         what: names the array in errors.
-        index: (offset, length) of each storage chunk, for a file that has no index yet.
+        index: (offset, length) of each storage chunk, for a file whose own index is damaged.
         group: that the file belongs to; without it, its deletion cannot be told from damage.
     """
 
@@ -275,15 +275,17 @@ def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.nd
 
 
 class ShardWriter:
-    """Appends rows; buffers at most one storage chunk, everything before survives a kill.
+    """Appends rows to a new shard of a stage; buffers at most one storage chunk.
 
-    The entry of the array has 0 rows and no hash yet. With `sync`, `append` waits until complete
-    storage chunks are synced to disk.
+    The entry of the array has 0 rows and no hash yet.
+
+    Raises:
+        StorageError: the file cannot be created.
     """
 
-    def __init__(self, stage: Path, name: str, entry: ArrayEntry, *, sync: bool) -> None:
+    def __init__(self, stage: Path, name: str, entry: ArrayEntry) -> None:
         self.num_rows = 0
-        self._stage, self._name, self._entry, self._sync = stage, name, entry, sync
+        self._name, self._entry = name, entry
         self._dtype = np.dtype(entry.dtype).newbyteorder("<")
         self._chunk = (
             np.zeros((entry.chunk_rows, *entry.shape[1:]), dtype=self._dtype)
@@ -292,10 +294,19 @@ class ShardWriter:
         )
         self._num_pending = 0
         self._sha256 = hashlib.sha256()
-        self._log = JournalWriter(stage, name)
+        # Offset and length of each storage chunk.
+        self._index: list[tuple[int, int]] = []
+        path = stage / name / shard_path(len(entry.shape))
+        with disk_errors(f"create array {name}"):
+            path.parent.mkdir(parents=True)
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
 
     def append(self, rows: np.ndarray) -> None:
-        """Append rows [n, *row_shape] of the array's dtype (checked by the caller)."""
+        """Append rows [n, *row_shape] of the array's dtype (checked by the caller).
+
+        Raises:
+            StorageFullError: no space; nothing can be appended afterwards.
+        """
         self.num_rows += len(rows)
         while len(rows):
             taken = rows[: len(self._chunk) - self._num_pending]
@@ -306,71 +317,46 @@ class ShardWriter:
                 self._write_rows()
 
     def append_encoded(self, payload: bytes, num_rows: int) -> None:
-        """Append one encoded storage chunk of an image codec."""
+        """Append one encoded storage chunk of an image codec; raises as `append`."""
         self.num_rows += num_rows
         self._sha256.update(payload)
-        self._log_chunk(payload, num_rows)
+        self._write_chunk(payload)
 
-    def flush(self) -> None:
-        """Write the last, partial storage chunk; nothing may be appended afterwards."""
+    def finish(self) -> ArrayEntry:
+        """Complete the shard and return the array's entry of the commit record.
+
+        Raises:
+            StorageFullError: no space; the shard stays incomplete.
+        """
         if self._num_pending:
             self._chunk[self._num_pending :] = 0
             self._write_rows()
-
-    def flush_until(self, num_rows: int) -> None:
-        """Truncate the log of a `zstd` array to `num_rows` rows after an interrupted append.
-
-        Relies on the log only: an interrupt may fall between a write and its bookkeeping.
-        """
-        if self._entry.codec != "zstd":
-            return
-        rows = read_rows(self._stage, self._name)
-        ends = np.cumsum(rows["num_rows"], dtype=np.int64)
-        num_whole = int(np.searchsorted(ends, num_rows, side="right"))
-        chunk = self._chunk
-        if num_whole < len(rows):
-            # Rows of the interrupted append completed this storage chunk.
-            payload = read_payload(self._stage, self._name, rows[num_whole])
-            chunk = decode_rows(payload[:-CRC_BYTES], self._entry, what=self._name).copy()
-        self._log.truncate(num_whole)
-        num_waiting = num_rows - (int(ends[num_whole - 1]) if num_whole else 0)
-        if num_waiting:
-            chunk[num_waiting:] = 0
-            self._log.append(with_crc(compress(chunk.tobytes())), num_waiting)
-
-    def finish(self) -> ArrayEntry:
-        """Turn the log into the shard and return the array's entry of the commit record."""
-        self.flush()
-        finish_shard(self._stage, self._name, self._entry, self._log)
+        index = np.array(self._index, dtype="<u8").reshape(-1, 2).tobytes()
+        self._write(with_crc(index))
+        self.close()
         entry = with_rows(self._entry, self.num_rows)
         return entry.model_copy(update={"sha256": self._sha256.hexdigest()})
 
     def close(self) -> None:
-        """Close the files; without a prior `finish` they remain a log."""
-        self._log.close()
+        """Close the file; without a prior `finish` it is no shard."""
+        # Forgotten before it is closed: after an interrupt between the two the number may already
+        # be that of another file.
+        file, self._file = self._file, -1
+        if file >= 0:
+            os.close(file)
 
     def _write_rows(self) -> None:
         data = self._chunk.tobytes()
         num_rows = self._num_pending
-        self._log_chunk(compress(data), num_rows)
+        self._write_chunk(compress(data))
         self._sha256.update(memoryview(data)[: num_rows * (len(data) // len(self._chunk))])
         self._num_pending = 0
 
-    def _log_chunk(self, payload: bytes, num_rows: int) -> None:
-        self._log.append(with_crc(payload), num_rows)
-        if self._sync:
-            self._log.sync()
+    def _write_chunk(self, payload: bytes) -> None:
+        data = with_crc(payload)
+        self._write(data)
+        self._index.append((sum(self._index[-1]) if self._index else 0, len(data)))
 
-
-def finish_shard(stage: Path, name: str, entry: ArrayEntry, log: JournalWriter) -> None:
-    """Append the shard's index to a log's part file and rename it to the shard.
-
-    The journal is kept until the whole group is committed, for recovery after a crash.
-    """
-    data = np.array(log.index, dtype="<u8").reshape(-1, 2).tobytes()
-    log.write_tail(data + google_crc32c.value(data).to_bytes(4, "little"))
-    log.close()
-    target = stage / name / shard_path(len(entry.shape))
-    with disk_errors(f"close array {name}"):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        part_path(stage, name).rename(target)
+    def _write(self, data: bytes) -> None:
+        with disk_errors(f"write array {self._name}", advice="free space on the disk of the store"):
+            write_all(self._file, data)

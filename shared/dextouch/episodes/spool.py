@@ -113,7 +113,7 @@ class SpoolReader:
         """The bytes of samples start … stop-1 as they lie in the log; raises as `read`."""
         rows, skipped = self._span(stream_name, start, stop)
         descriptor, count = self.streams[stream_name], int(rows["num_samples"].sum())
-        body = b"".join(read_bodies(self.path, descriptor, rows))
+        body = b"".join(read_bodies(self.path, rows))
         if count == stop - start:
             return body
         ends = [0, *sample_ends(descriptor, body, count, where=self._where)]
@@ -131,7 +131,7 @@ class SpoolReader:
             raise InvalidInputError(
                 f"{stream_name}: got append {number}, expected within 0 … {len(rows) - 1}"
             )
-        (body,) = read_bodies(self.path, self.streams[stream_name], rows[number : number + 1])
+        (body,) = read_bodies(self.path, rows[number : number + 1])
         return body
 
     def scan(self) -> LogRecords:

@@ -2,8 +2,7 @@
 
 A record is a header with its own offset and checksum, followed by the body of a batch
 (`dextouch.streams.batch`). All streams share one file, so that a single sync covers them. A torn
-tail differs from damage in that no valid header follows it. Records of format 1, whose bodies hold
-columns, are read, and followed by those of today.
+tail differs from damage in that no valid header follows it.
 """
 
 import hashlib
@@ -13,7 +12,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO
 
@@ -28,16 +26,11 @@ from dextouch.streams import (
     SampleBatch,
     StreamDescriptor,
     decode_body,
-    encode_body,
-    encoded_values,
 )
 
 LOG_FILE = "batches.log"
 LOG_MAGIC = b"DXTBLOG\x02"
-_LOG_MAGICS = (LOG_MAGIC, b"DXTBLOG\x01")
-_MARK = b"DXT"
-# Marks of records, and whether their bodies hold columns.
-_LAYOUTS = {b"DXTS": 0, b"DXTR": 1}
+_RECORD_MAGIC = b"DXTS"
 # Magic, offset of the record, samples of its stream before it, stream, samples, length and crc32c
 # of the body; then the crc32c of the header.
 _HEADER = struct.Struct("<4sQQIIII")
@@ -51,7 +44,8 @@ RECORD_ROW = np.dtype(
         ("num_samples", "<u4"),
         ("length", "<u4"),
         ("body_crc32c", "<u4"),
-        ("in_columns", "<u4"),
+        # Always 0; the seal of a closed spool covers it.
+        ("zero", "<u4"),
     ]
 )
 _ROW = struct.Struct("<QQIIIII")
@@ -134,19 +128,26 @@ def find_records(data: LogBytes) -> LogRecords:
 
     Raises:
         CorruptDataError: the bytes are not a log.
+        StorageError: a log of another version of the format.
     """
     magic = data.read(0, len(LOG_MAGIC))
     # Written and synced before the spool appears, so that no crash leaves less of it.
-    if magic not in _LOG_MAGICS:
+    if magic[:-1] == LOG_MAGIC[:-1] and magic != LOG_MAGIC:
+        raise StorageError(
+            f"{data.what}: {LOG_FILE} has format version {magic[-1]}, expected {LOG_MAGIC[-1]}; "
+            "read it with the release that wrote it",
+            format_version=magic[-1],
+        )
+    if magic != LOG_MAGIC:
         raise CorruptDataError(f"{data.what}: begins with {magic!r}, expected {LOG_MAGIC!r}")
     # Packed rows: those of one minute of a station take 2 MB, against 14 MB as tuples.
     rows, gaps, place = bytearray(), [], len(LOG_MAGIC)
     while place < len(data):
         row = _header_at(data, place)
         if row is None:
-            following = data.find(_MARK, place + 1)
+            following = data.find(_RECORD_MAGIC, place + 1)
             while following >= 0 and _header_at(data, following) is None:
-                following = data.find(_MARK, following + 1)
+                following = data.find(_RECORD_MAGIC, following + 1)
             gaps.append((place, following if following >= 0 else len(data)))
             place = gaps[-1][1]
         else:
@@ -160,6 +161,7 @@ def read_records(folder: Path) -> LogRecords:
 
     Raises:
         CorruptDataError: damage other than a torn tail, or a missing or foreign log.
+        StorageError: a log of another version of the format.
     """
     with open_log(folder) as data:
         records = find_records(data)
@@ -188,11 +190,11 @@ def body_at(data: LogBytes, row: np.void) -> bytes | None:
     return body if whole else None
 
 
-def read_bodies(folder: Path, descriptor: StreamDescriptor, rows: np.ndarray) -> Iterator[bytes]:
+def read_bodies(folder: Path, rows: np.ndarray) -> Iterator[bytes]:
     """Iterate over the bodies of records of one stream.
 
     Raises:
-        CorruptDataError: a body does not match its checksum, or is that of another stream.
+        CorruptDataError: a body does not match its checksum.
     """
     with open_log(folder) as data:
         for row in rows:
@@ -202,13 +204,17 @@ def read_bodies(folder: Path, descriptor: StreamDescriptor, rows: np.ndarray) ->
                     f"log of spool {folder.name!r}: the record at byte {int(row['offset'])} does "
                     "not match its checksum; the file is damaged, restore it from a copy"
                 )
-            yield body_of(descriptor, row, body, where=f"spool {folder.name!r}")
+            yield body
 
 
 def read_batch(folder: Path, descriptor: StreamDescriptor, rows: np.ndarray) -> SampleBatch:
-    """The samples in consecutive records of one stream, verified; raises as `read_bodies`."""
+    """The samples in consecutive records of one stream, verified.
+
+    Raises:
+        CorruptDataError: a body does not match its checksum, or is that of another stream.
+    """
     where, counts = f"spool {folder.name!r}", rows["num_samples"].tolist()
-    bodies = read_bodies(folder, descriptor, rows)
+    bodies = read_bodies(folder, rows)
     if descriptor.unit not in ENCODED_UNITS or not counts:
         return decode_body(descriptor, b"".join(bodies), sum(counts), where=where)
     # Images are large, and not copied once more.
@@ -216,46 +222,16 @@ def read_batch(folder: Path, descriptor: StreamDescriptor, rows: np.ndarray) -> 
     return SampleBatch(*map(np.concatenate, zip(*(vars(b).values() for b in found), strict=True)))
 
 
-def body_of(descriptor: StreamDescriptor, row: np.void, body: bytes, *, where: str) -> bytes:
-    """The body of a record; that of one of format 1, which holds columns, in today's layout.
-
-    Raises:
-        CorruptDataError: the record was written for another stream.
-    """
-    count = int(row["num_samples"])
-    # Of one sample both layouts are the same.
-    if not row["in_columns"] or count == 1:
-        return body
-    stamps, rest = body[: 24 * count], body[24 * count :]
-    is_encoded, ends = descriptor.unit in ENCODED_UNITS, [-1]
-    if not is_encoded:
-        ends = [count * descriptor.sample_bytes()]
-    elif len(rest) >= 4 * count:
-        lengths = np.frombuffer(rest, "<u4", count)
-        ends = [4 * count, *(4 * count + np.cumsum(lengths, dtype=np.int64)).tolist()]
-    if len(rest) != ends[-1]:
-        raise CorruptDataError(
-            f"{where}: a record of {len(body)} bytes is not that of {count} samples of "
-            f"{descriptor.name!r}; it was written for another stream"
-        )
-    if is_encoded:
-        values = encoded_values([rest[low:high] for low, high in pairwise(ends)])
-    else:
-        values = np.frombuffer(rest, descriptor.numpy_dtype()).reshape(count, *descriptor.shape)
-    hosts, devices, numbers = np.frombuffer(stamps, "<i8").reshape(3, count)
-    return encode_body(descriptor, SampleBatch(hosts, devices, numbers, values))
-
-
 def _header_at(data: LogBytes, place: int) -> tuple[int, ...] | None:
     """The header at an offset as a row of RECORD_ROW; None if invalid or its body is truncated."""
     header = data.read(place, HEADER_BYTES)
-    if len(header) < HEADER_BYTES or header[:4] not in _LAYOUTS:
+    if len(header) < HEADER_BYTES or header[:4] != _RECORD_MAGIC:
         return None
-    mark, offset, first, stream, num_samples, length, crc = _HEADER.unpack_from(header)
+    _, offset, first, stream, num_samples, length, crc = _HEADER.unpack_from(header)
     holds = google_crc32c.value(header[: _HEADER.size]) == _CRC.unpack_from(header, _HEADER.size)[0]
     if not holds or offset != place or place + HEADER_BYTES + length > len(data):
         return None
-    return offset, first, stream, num_samples, length, crc, _LAYOUTS[mark]
+    return offset, first, stream, num_samples, length, crc, 0
 
 
 class SpoolLogWriter:
@@ -274,7 +250,6 @@ class SpoolLogWriter:
         self._file = -1
         with disk_errors(f"open {self._what}"):
             self._file = os.open(folder / LOG_FILE, os.O_RDWR)
-            os.pwrite(self._file, LOG_MAGIC, 0)
             self._cut(self._end)
 
     def append(self, batch: EncodedBatch, *, stream: int, first_sample: int) -> int:
@@ -285,7 +260,7 @@ class SpoolLogWriter:
         """
         place, length = self._end, len(batch.body)
         counts = (first_sample, stream, batch.num_samples, length, batch.body_crc32c)
-        header = _HEADER.pack(b"DXTS", place, *counts)
+        header = _HEADER.pack(_RECORD_MAGIC, place, *counts)
         parts = (header, _CRC.pack(google_crc32c.value(header)), batch.body)
         try:
             with disk_errors(
@@ -299,7 +274,7 @@ class SpoolLogWriter:
         self._end = place + HEADER_BYTES + length
         self._rows_before = self._rows.copy()
         row = (place, first_sample, stream, batch.num_samples, length, batch.body_crc32c)
-        self._rows.update(_ROW.pack(*row, _LAYOUTS[b"DXTS"]))
+        self._rows.update(_ROW.pack(*row, 0))
         return place
 
     @property

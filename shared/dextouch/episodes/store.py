@@ -1,9 +1,6 @@
 """Store of episodes and recordings in a folder or a bucket: open, list, write, delete by id."""
 
-import builtins
 import re
-import shutil
-import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,20 +17,11 @@ from dextouch.episodes.format import (
     attributes_id,
     check_id,
 )
-from dextouch.episodes.group_contents import read_group, read_live
-from dextouch.episodes.migration import OldGroup, is_current
+from dextouch.episodes.group_contents import read_group
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
-from dextouch.episodes.reviews import CLICKS_FILE, REMARK_FILES, REVIEW_FILE, read_remark
+from dextouch.episodes.reviews import CLICKS_FILE, REVIEW_FILE, read_remark
 from dextouch.episodes.sources import GroupFiles, LocalGroup
-from dextouch.episodes.staged_group import STAGING, new_stage, stages_of, unheld_folders
-from dextouch.episodes.staging_recovery import (
-    RecoveredGroup,
-    ids_below,
-    raise_first,
-    recover_all,
-    recover_stage,
-    sweep_stages,
-)
+from dextouch.episodes.staged_group import new_stage, sweep_stages
 from dextouch.episodes.stream_writer import WriteOptions
 from dextouch.episodes.trash import (
     TrashEntry,
@@ -44,7 +32,7 @@ from dextouch.episodes.trash import (
     remove_for_good,
     restore_from_trash,
 )
-from dextouch.episodes.writer import EpisodeWriter, write_blocks
+from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
@@ -143,17 +131,6 @@ class EpisodeStore:
         """
         return self._storage.group(*_check(kind, item_id))
 
-    def live(self, recording_id: str) -> RecordingReader:
-        """Open a snapshot of an unfinished recording; call again for later samples.
-
-        Raises:
-            NotFoundError: no local writer is writing this id.
-        """
-        stages = stages_of(self.root, *_check("recording", recording_id))
-        if not stages:
-            raise NotFoundError(f"recording {recording_id!r}: is not being written")
-        return RecordingReader(read_live(stages[-1], "recording", RecordingAttributes))
-
     def exists(self, item_id: str, *, kind: Kind = "episode") -> bool:
         """Whether an id is committed."""
         return self._storage.exists(*_check(kind, item_id))
@@ -250,35 +227,24 @@ class EpisodeStore:
             )
         return self.root
 
-    def migrate(self, item_id: str, *, kind: Kind = "episode") -> bool:
-        """Upgrade a group of an older format version; False if it is current.
+    def complete_uploads(self) -> tuple[tuple[Kind, str], ...]:
+        """Upload groups whose upload was interrupted after their commit; their kinds and ids.
 
-        The new group replaces the old one atomically; its lineage names the old content.
-
-        Raises:
-            NotFoundError: no such id.
-            CorruptDataError: damaged; the group is unchanged.
-            StorageError: of a newer version, or of an older one in object storage.
-        """
-        return self._storage.migrate(*_check(kind, item_id))
-
-    def recover(self) -> tuple[RecoveredGroup, ...]:
-        """Commit the recordings of terminated writers, as far as they were written.
-
-        They have `recovered` set and are truncated to complete storage chunks. Stages that are not
-        recoverable are left to `sweep`, those of running writers are not touched. Interrupted
-        uploads are completed.
+        Only a store in a bucket has any: what is committed in a folder is in its place.
 
         Raises:
-            CorruptDataError: damage other than a torn tail; that stage is unchanged, all others are
-                completed. Notes name them, and other failures.
+            StorageError, UnavailableError: an upload failed, others are completed; try again later.
+                Notes name what was uploaded, and other failures.
         """
-        return tuple(self._storage.recover())
+        if isinstance(self._storage, _LocalStorage):
+            return ()
+        return tuple(self._storage.complete_uploads())
 
     def sweep(self) -> int:
-        """Remove stages of crashed writers that cannot be recovered, and return their number.
+        """Remove what killed writers have left, and return the number of stages and groups.
 
-        Stages that `recover` can complete are kept.
+        Stages of running writers are not touched. In a bucket, groups without a commit record are
+        removed once they are a day old; what waits to be uploaded is kept.
         """
         return self._storage.sweep()
 
@@ -398,41 +364,9 @@ class _LocalStorage:
                 # Deleted meanwhile: an item without the file has none to remove either.
                 raise self._missing(kind, item_id) from error
 
-    def migrate(self, kind: Kind, item_id: str) -> bool:
-        """Replace a group of an older format version atomically; its lineage names the old one."""
-        files = self.group(kind, item_id)
-        if is_current(files, what=f"{kind} {item_id}"):
-            return False
-        old = OldGroup(files, kind)
-        staging, number = self.root / STAGING, uuid.uuid4().hex
-        # Committed beside the store first: after a kill between the two renames below, `recover`
-        # finds a complete group whose place is free.
-        whole, before = (
-            staging / f"migrated-{item_id}-{number}",
-            staging / f"old-{item_id}-{number}",
-        )
-        streams = ((stream.name, old.blocks(stream)) for stream in old.attributes.streams)
-        write_blocks(new_stage(self.root, kind, item_id), whole, old.attributes, streams)
-        remarks = {name: files.get(name) for name in REMARK_FILES}
-        with disk_errors(f"migrate {item_id}"):
-            for name, content in remarks.items():
-                if content is not None:
-                    replace_file(whole / name, content)
-            files.folder.rename(before)
-            whole.rename(files.folder)
-            sync_folder(files.folder.parent)
-            shutil.rmtree(before)
-        return True
-
-    def recover(self) -> builtins.list[RecoveredGroup]:
-        stages = unheld_folders(self.root / STAGING)
-        found, failures = recover_all(stages, lambda stage: recover_stage(stage, self.root))
-        raise_first(failures, found)
-        return found
-
     def sweep(self) -> int:
         with disk_errors("sweep"):
-            return sweep_stages(self.root, ids_below(self.root))
+            return sweep_stages(self.root)
 
     def _folder(self, kind: Kind, item_id: str) -> Path:
         return self.root / f"{kind}s" / item_id

@@ -36,19 +36,11 @@ class WriteOptions(FrozenModel):
     """Settings of a writer.
 
     Attributes:
-        sync: sync every storage chunk to disk. Otherwise only committed groups survive a power
-            loss, while everything written survives a crash of the process.
         threads: whether images are encoded in background threads, one per camera.
-        recoverable: whether an interrupted group is kept: at once after an exception or Ctrl-C, by
-            `EpisodeStore.recover` after a kill or on a full disk. None: recordings only, since
-            episodes can be recomputed from their recording. False suits writers that can start
-            over, such as an import.
         video: quality of `h264` streams.
     """
 
-    sync: bool = False
     threads: bool = True
-    recoverable: bool | None = None
     video: VideoSettings = VideoSettings()
 
 
@@ -67,19 +59,14 @@ class StreamWriter:
         self._least_step_ns = 1 if kind == "episode" else 0
         # Whether values are numbers or encoded images, decided by the first block.
         self._plain: bool | None = None
-        # Whether a block was interrupted, after which arrays are misaligned; and the number of
-        # samples of all blocks before it.
+        # Whether a block was interrupted, after which arrays are misaligned.
         self._is_broken = False
-        self._num_whole = 0
         self._codec = codec_of(descriptor)
         self._dtype = descriptor.numpy_dtype()
         self._images = _EncodedImages(descriptor, options.video)
         self._queue: _ImageQueue | None = None
         entries = stream_arrays(descriptor, kind)
-        self.arrays = {
-            name: ShardWriter(stage, name, entry, sync=options.sync)
-            for name, entry in entries.items()
-        }
+        self.arrays = {name: ShardWriter(stage, name, entry) for name, entry in entries.items()}
 
     def append(self, values: np.ndarray, stamps: Stamps) -> None:
         """Append a block with all stamps of the kind; raises as `EpisodeWriter.append`."""
@@ -160,14 +147,13 @@ class StreamWriter:
                 array.append_encoded(payload, num_images)
         for stamp, column in stamps.items():
             self.arrays[f"{self.descriptor.name}_{stamp}"].append(column)
-        self._num_whole += len(values)
         self._is_broken = False
 
     def _check_unbroken(self) -> None:
         if self._is_broken:
             raise StorageError(
                 f"{self.descriptor.name}: a block was interrupted, and nothing can follow it; "
-                "leave the writer's context, which keeps or removes the blocks before it"
+                "leave the writer's context, which removes what was written, and write it again"
             )
 
     def finish(self) -> dict[str, ArrayEntry]:
@@ -179,8 +165,9 @@ class StreamWriter:
         if self._queue is not None:
             self._queue.drain()
         self._check_unbroken()
-        self._flush()
         name = self.descriptor.name
+        for payload, num_images in self._images.rest():
+            self.arrays[name].append_encoded(payload, num_images)
         entries = {name: array.finish() for name, array in self.arrays.items()}
         entries[name] = entries[name].model_copy(update={"encoder": self._images.encoder})
         counts = {array: entry.shape[0] for array, entry in entries.items()}
@@ -188,34 +175,10 @@ class StreamWriter:
             raise StorageError(f"{name}: a block was written partially ({counts}); write it again")
         return entries
 
-    def _flush(self) -> None:
-        """Write the last, partial storage chunks; nothing may be appended afterwards."""
-        for payload, num_images in self._images.rest():
-            self.arrays[self.descriptor.name].append_encoded(payload, num_images)
-        for array in self.arrays.values():
-            array.flush()
-
-    def keep(self) -> None:
-        """Write all buffered samples, except those of an interrupted block, and close the files.
-
-        Raises:
-            StorageError: a disk failure; earlier data is kept.
-        """
-        try:
-            if self._queue is not None:
-                self._queue.stop(drop=False)
-            if not self._is_broken:
-                self._flush()
-            else:
-                for array in self.arrays.values():
-                    array.flush_until(self._num_whole)
-        finally:
-            self.close()
-
     def close(self) -> None:
         """Stop the thread and close the files, discarding buffered samples."""
         if self._queue is not None:
-            self._queue.stop(drop=True)
+            self._queue.stop()
         for array in self.arrays.values():
             array.close()
 
@@ -304,9 +267,9 @@ class _ImageQueue:
         while self._waiting:
             self._take_oldest()
 
-    def stop(self, *, drop: bool) -> None:
-        """End the thread, after discarding or writing the queued blocks."""
-        self._thread.shutdown(cancel_futures=drop)
+    def stop(self) -> None:
+        """End the thread and discard the queued blocks."""
+        self._thread.shutdown(cancel_futures=True)
 
     def _copy(self, values: np.ndarray) -> np.ndarray:
         if values.dtype == object:

@@ -14,18 +14,16 @@ from typing import Literal, get_args
 
 from dextouch.episodes.files import disk_errors, folder_bytes, sync_folder
 from dextouch.episodes.format import COMMIT_FILE, KINDS
-from dextouch.episodes.staged_group import STAGING
 from dextouch.errors import ConflictError, NotFoundError, UnknownNameError
 
 TRASH = ".trash"
-# Besides groups: unfinished uploads and stages that were too damaged to be recovered.
-TrashKind = Literal["episode", "recording", "upload", "stage"]
+# Besides groups: unfinished uploads that were damaged.
+TrashKind = Literal["episode", "recording", "upload"]
 TRASH_KINDS: tuple[TrashKind, ...] = get_args(TrashKind)
 HOMES: dict[TrashKind, str] = {
     "episode": "episodes",
     "recording": "recordings",
     "upload": ".uploads",
-    "stage": STAGING,
 }
 _NAME = re.compile(rf"({'|'.join(TRASH_KINDS)})\.([a-z0-9_-]+)\.([0-9]{{1,20}})")
 

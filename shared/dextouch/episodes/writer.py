@@ -3,7 +3,6 @@
 import os
 import shutil
 from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -17,16 +16,9 @@ from dextouch.episodes.format import (
     kind_of,
     stream_arrays,
 )
-from dextouch.episodes.staged_group import commit_stage, write_stage
-from dextouch.episodes.staging_recovery import RecoveredGroup, recover_stage
+from dextouch.episodes.staged_group import commit_stage
 from dextouch.episodes.stream_writer import StreamWriter, WriteOptions
-from dextouch.errors import (
-    ConflictError,
-    DexTouchError,
-    InvalidInputError,
-    StorageError,
-    UnknownNameError,
-)
+from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.streams import (
     ENCODED_UNITS,
     MAX_STREAMS,
@@ -43,17 +35,15 @@ class EpisodeWriter:
     """Writes one episode or recording to a stage and publishes it on commit.
 
     Use it as a context manager (from `EpisodeStore.writer`): leaving it normally commits. After an
-    exception, Ctrl-C included, appended samples are kept if the writer is `recoverable`, as
-    recordings are by default: the take is committed as far as it was written, with `recovered` set.
-    Where that is impossible, as on a full disk, its stage is kept and `EpisodeStore.recover`
-    completes it later; a note on the exception says which of the two. Other writers leave nothing
-    behind after an exception. Streams listed in the attributes are added at the start.
+    exception, Ctrl-C included, nothing is left, and of a killed writer only a stage that
+    `EpisodeStore.sweep` removes. A take is kept by its spool (`dextouch.episodes.spool`) until it
+    is committed. Streams listed in the attributes are added at the start.
 
     Args:
         stage: new folder on the store's file system.
         target: where the group appears at commit.
         attributes: of an episode or a recording.
-        options: durability and speed.
+        options: quality and speed.
     """
 
     def __init__(
@@ -62,10 +52,6 @@ class EpisodeWriter:
         self._stage, self._target, self._options = stage, target, options
         self._attributes, self._kind = attributes, kind_of(attributes)
         self._streams: dict[str, StreamWriter] = {}
-        keep = self._kind == "recording" if options.recoverable is None else options.recoverable
-        # Whether `stage.json` must be written before the next sample.
-        self._unannounced, self._recoverable = keep, keep
-        self._is_discarded = False
         with disk_errors(f"create {stage}"):
             # Lock held as long as the writer lives, so that a sweep does not consider the stage
             # abandoned.
@@ -74,8 +60,7 @@ class EpisodeWriter:
             for descriptor in attributes.streams:
                 self.add_stream(descriptor)
         except BaseException:
-            self.discard()
-            self._leave(interrupted=True, error=None)
+            self._leave()
             raise
 
     def add_stream(self, descriptor: StreamDescriptor) -> None:
@@ -106,7 +91,6 @@ class EpisodeWriter:
         self._streams[descriptor.name] = StreamWriter(
             self._stage, descriptor, self._kind, self._options
         )
-        self._unannounced = self._recoverable
 
     def append(
         self,
@@ -132,15 +116,11 @@ class EpisodeWriter:
 
         Raises:
             UnknownNameError: no such stream.
-            InvalidInputError: stamps of the other kind or out of order, values of another dtype or
-                shape, or a writer that was discarded.
+            InvalidInputError: stamps of the other kind or out of order, or values of another dtype
+                or shape.
             StorageFullError: the disk is full.
             StorageError: an earlier block of the stream was interrupted.
         """
-        if self._is_discarded:
-            raise InvalidInputError(
-                f"{name}: a sample for {attributes_id(self._attributes)!r}, which was discarded"
-            )
         if name not in self._streams:
             raise UnknownNameError("stream", name, list(self._streams))
         given = {
@@ -160,9 +140,6 @@ class EpisodeWriter:
                 f"{name}: got stamps {sorted(stamps)}, expected {list(STAMPS[self._kind])} "
                 f"in a block of {self._kind}"
             )
-        if self._unannounced:
-            write_stage(self._stage, self._with_streams())
-            self._unannounced = False
         self._streams[name].append(values, stamps)
 
     def set_attributes(self, attributes: Attributes) -> None:
@@ -179,7 +156,6 @@ class EpisodeWriter:
                 f"as {attributes_id(self._attributes)!r}"
             )
         self._attributes = attributes
-        self._unannounced = self._recoverable
 
     def __enter__(self) -> "EpisodeWriter":
         return self
@@ -191,62 +167,21 @@ class EpisodeWriter:
         trace: TracebackType | None,
     ) -> None:
         try:
-            if kind is None and not self._is_discarded:
+            if kind is None:
                 self._commit()
-        except BaseException as failure:
-            self._leave(interrupted=True, error=failure)
-            raise
-        self._leave(interrupted=kind is not None, error=error)
-
-    def discard(self) -> None:
-        """Discard everything written when the context is left, normally or not."""
-        self._is_discarded = True
-
-    def _leave(self, *, interrupted: bool, error: BaseException | None) -> None:
-        keep = interrupted and self._recoverable and not self._is_discarded
-        try:
-            if keep:
-                keep = self._keep(error)
         finally:
+            self._leave()
+
+    def _leave(self) -> None:
+        """Close the files and remove the stage, which a commit has moved away."""
+        try:
             for stream in self._streams.values():
                 stream.close()
-            # Also after another interrupt: a recoverable stage is kept until it is committed.
-            if not keep:
+        finally:
+            try:
                 shutil.rmtree(self._stage, ignore_errors=True)
-            os.close(self._lock)
-
-    def _keep(self, error: BaseException | None) -> bool:
-        """Commit the take as far as written; returns whether its stage is left to `recover`."""
-        what = f"{self._kind} {attributes_id(self._attributes)!r}"
-        for stream in self._streams.values():
-            # On a full disk, the storage chunks written so far are kept.
-            with suppress(StorageError):
-                stream.keep()
-        try:
-            with suppress(StorageError):
-                write_stage(self._stage, self._with_streams())
-            group = self._complete()
-        except DexTouchError as failure:
-            where = f" in {self._stage}" if self._stage.exists() else ""
-            told = (
-                f"{what}: what was appended is kept{where}, but could not be completed "
-                f"({failure.message}); EpisodeStore.recover completes it"
-            )
-        else:
-            if group is None:
-                return False
-            counts = ", ".join(f"{name}: {count}" for name, count in group.num_samples.items())
-            told = (
-                f"{what}: what was appended is kept as {group.item_id!r}, marked as recovered "
-                f"(samples of {counts})"
-            )
-        if error is not None:
-            error.add_note(told)
-        return self._stage.exists()
-
-    def _complete(self) -> RecoveredGroup | None:
-        """Commit the stage, as a writer to a bucket overrides; None if there is nothing to keep."""
-        return recover_stage(self._stage, self._target.parent.parent)
+            finally:
+                os.close(self._lock)
 
     def _commit(self) -> None:
         if not self._streams:
@@ -269,13 +204,12 @@ def write_blocks(
     attributes: Attributes,
     streams: Iterable[tuple[str, Iterable[Block]]],
 ) -> None:
-    """Write a group that can be written again: names of streams with blocks of their samples.
+    """Write a group of streams, by name, with blocks of their samples.
 
-    Stage and target are those of `EpisodeWriter`. After an exception nothing is left.
+    Stage and target are those of `EpisodeWriter`.
     """
-    options = WriteOptions(recoverable=False)
     with EpisodeWriter(
-        stage=stage, target=target, attributes=attributes, options=options
+        stage=stage, target=target, attributes=attributes, options=WriteOptions()
     ) as writer:
         for name, blocks in streams:
             for values, stamps in blocks:

@@ -115,12 +115,13 @@ class EpisodeAttributes(FrozenModel):
 
     `anchor` and `K_head` (pixels) belong to step 0; `streams` is completed by the writer;
     `calibration` holds named matrices such as `T_tracker_left_wrist_left`; `quality` named figures;
-    `recovered` marks an episode recovered after its writer crashed. `object_boxes_m` has one box
-    per object, centre and half sizes in the object's own frame. `event_times_s` is the time at
-    which each milestone of the task was first reached, in seconds from step 0; milestones never
-    reached are absent. `trace_id` is that of the recording, or of the client that ran the rollout.
-    If empty, these three are not written, so that older releases can read the episode; nor are
-    `complete` and `incomplete_cause` unless the recording was incomplete.
+    `recovered` marks an episode of an interrupted take, or of the intact samples of a damaged one.
+    `object_boxes_m` has one box per object, centre and half sizes in the object's own frame.
+    `event_times_s` is the time at which each milestone of the task was first reached, in seconds
+    from step 0; milestones never reached are absent. `trace_id` is that of the recording, or of
+    the client that ran the rollout. If empty, these three are not written, so that older releases
+    can read the episode; nor are `complete` and `incomplete_cause` unless the recording was
+    incomplete.
     """
 
     format_version: Literal[1] = FORMAT_VERSION

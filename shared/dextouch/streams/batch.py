@@ -2,14 +2,14 @@
 
 The body of a batch is its samples end to end, so that bodies end to end are a body, too. A sample
 is t_host_ns, t_device_ns and sequence as int64, then its values, or of an encoded image its length
-as u32 and its bytes. On the wire a header comes first; version 1 had a body of named columns, which
-is still read. All numbers are little endian. See docs/wire_format.md.
+as u32 and its bytes. On the wire a header comes first. All numbers are little endian. See
+docs/wire_format.md.
 """
 
 import struct
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import chain, pairwise
+from itertools import chain
 
 import google_crc32c
 import numpy as np
@@ -20,7 +20,6 @@ from dextouch.errors import (
     LimitExceededError,
     PacketError,
 )
-from dextouch.streams.packing import unpack
 from dextouch.streams.samples import (
     ENCODED_UNITS,
     SampleBatch,
@@ -37,7 +36,6 @@ _VERSION = struct.Struct("<4sH")
 # Magic, version, bytes of the stream's name, number of the batch, samples, length and crc32c of the
 # body; then the name, and the crc32c of all this.
 _HEADER = struct.Struct("<4sHHIIII")
-_HEADER_V1 = struct.Struct("<4sHHII")
 _CRC = struct.Struct("<I")
 _STAMPS = ("t_host_ns", "t_device_ns", "sequence")
 _IMAGE = struct.Struct("<qqqI")
@@ -192,12 +190,12 @@ def read_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> Enc
     """Validate a batch from an untrusted source.
 
     Args:
-        data: of `encode_batch` or `frame_body`, or of version 1.
+        data: of `encode_batch` or `frame_body`.
         descriptor: of the expected stream.
         number: expected batch number.
 
     Raises:
-        PacketError: not a batch of a known version, or damaged in transit.
+        PacketError: not a batch of this version, or damaged in transit.
         LimitExceededError: larger than allowed.
         InvalidInputError: a batch of another stream or number, or with wrong contents.
     """
@@ -205,23 +203,22 @@ def read_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> Enc
         raise LimitExceededError(
             f"batch: got {len(data)} bytes, expected at most {MAX_BATCH_BYTES}"
         )
-    if len(data) < _HEADER_V1.size:
-        raise PacketError(f"batch: got {len(data)} bytes, expected a header of {_HEADER_V1.size}")
+    if len(data) < _HEADER.size:
+        raise PacketError(f"batch: got {len(data)} bytes, expected a header of {_HEADER.size}")
     magic, version = _VERSION.unpack_from(data)
     if magic != MAGIC:
         raise PacketError(f"batch: begins with {magic!r}, expected {MAGIC!r}")
-    if version == 1:
-        return encode_samples(descriptor, _decode_v1(data, descriptor, number))
     if version != VERSION:
-        raise PacketError(f"batch: got version {version}, expected 1 or {VERSION}")
+        raise PacketError(
+            f"batch {number} of {descriptor.name!r}: got wire version {version}, expected "
+            f"{VERSION}; use a station and a store of the same release"
+        )
     return _read(data, descriptor, number)
 
 
 def _read(data: bytes, descriptor: StreamDescriptor, number: int) -> EncodedBatch:
-    place = _HEADER.size
-    if len(data) >= place:
-        _, _, name_bytes, got_number, num_samples, length, crc = _HEADER.unpack_from(data)
-        place += name_bytes + _CRC.size
+    _, _, name_bytes, got_number, num_samples, length, crc = _HEADER.unpack_from(data)
+    place = _HEADER.size + name_bytes + _CRC.size
     name = data[_HEADER.size : place - _CRC.size]
     if len(data) < place or data[place - _CRC.size : place] != _CRC.pack(
         google_crc32c.value(data[: place - _CRC.size])
@@ -247,7 +244,7 @@ def _check_body(body: bytes, length: int, crc32c: int) -> None:
 
 
 def _check_identity(
-    descriptor: StreamDescriptor, got_name: object, got_number: object, number: int
+    descriptor: StreamDescriptor, got_name: str, got_number: int, number: int
 ) -> None:
     if (got_name, got_number) != (descriptor.name, number):
         raise InvalidInputError(
@@ -263,51 +260,3 @@ def _check_count(what: str, count: int) -> None:
         raise LimitExceededError(
             f"{what}: got {count} samples in a batch, expected at most {MAX_BATCH_SAMPLES}"
         )
-
-
-def _decode_v1(data: bytes, descriptor: StreamDescriptor, number: int) -> SampleBatch:
-    """The batch in bytes of version 1, whose arrays agree in length."""
-    _, _, flags, length, crc = _HEADER_V1.unpack_from(data)
-    if flags:
-        raise PacketError(f"batch: got version 1 with flags {flags}, expected 0")
-    body = data[_HEADER_V1.size :]
-    _check_body(body, length, crc)
-    fields, arrays = unpack(body, max_bytes=MAX_BATCH_BYTES)
-    where = f"batch of {descriptor.name!r}"
-    if set(fields) != {"stream", "number"}:
-        raise InvalidInputError(
-            f"{where}: got fields {sorted(fields)}, expected ['number', 'stream']"
-        )
-    _check_identity(descriptor, fields["stream"], fields["number"], number)
-    is_encoded = descriptor.unit in ENCODED_UNITS
-    expected = {*_STAMPS, *(("image_bytes", "image_end") if is_encoded else ("values",))}
-    if set(arrays) != expected:
-        raise InvalidInputError(
-            f"{where}: got arrays {sorted(arrays)}, expected {sorted(expected)}"
-        )
-    values = _images_v1(arrays, where) if is_encoded else arrays["values"]
-    count = len(values) if values.ndim else 0
-    for stamp in _STAMPS:
-        column = arrays[stamp]
-        if column.dtype != np.int64 or column.shape != (count,):
-            raise InvalidInputError(
-                f"{where}: {stamp} is {column.dtype} {column.shape}, expected int64 [{count}] "
-                "like the values"
-            )
-    _check_count(descriptor.name, count)
-    return SampleBatch(arrays["t_host_ns"], arrays["t_device_ns"], arrays["sequence"], values)
-
-
-def _images_v1(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
-    data, ends = arrays["image_bytes"], arrays["image_end"]
-    if data.dtype != np.uint8 or data.ndim != 1 or ends.dtype != np.int64 or ends.ndim != 1:
-        raise InvalidInputError(f"{where}: image_bytes must be uint8 [bytes], image_end int64 [n]")
-    _check_count(where, len(ends))
-    bounds = np.concatenate([np.zeros(1, dtype=np.int64), ends])
-    # Compared, not subtracted: the difference of two forged numbers can overflow.
-    if (bounds[1:] <= bounds[:-1]).any() or int(bounds[-1]) != len(data):
-        raise InvalidInputError(
-            f"{where}: image_end must rise and end at {len(data)}, the number of bytes"
-        )
-    whole = data.tobytes()
-    return encoded_values([whole[start:end] for start, end in pairwise(bounds)])

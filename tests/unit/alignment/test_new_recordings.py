@@ -1,9 +1,7 @@
 """Recordings that arrive are aligned by themselves: each once, and failures are listed."""
 
 import asyncio
-import shutil
 from contextlib import asynccontextmanager
-from pathlib import Path
 
 import pytest
 from httpx import ASGITransport, AsyncClient
@@ -19,10 +17,10 @@ from services.alignment.options import AlignmentOptions
 from services.alignment.settings import AlignmentSettings
 from tests.unit.alignment.recordings import write_recording
 from tests.unit.alignment.test_service import FakeWorker
+from tests.unit.episodes.hostile_group import stamp_version
 
 LOOK_PERIOD_S = 0.01
 LIMIT_S = 120
-OLD_STORE = Path(__file__).parents[2] / "golden" / "store_v1"
 
 
 @pytest.fixture
@@ -185,20 +183,20 @@ async def test_a_recording_that_cannot_be_read_keeps_no_other_from_being_aligned
     store, worker, monkeypatch
 ):
     monkeypatch.setattr(new_recordings, "RETRY_S", 0.0)
-    old = store.root / "recordings" / "golden"
-    shutil.copytree(OLD_STORE / "recordings" / "golden", old)
+    write_recording(store, "old")
+    stamp_version(store, "recording", "old", 1)
     with capture_logs() as logs:
         async with served(store) as jobs:
             await looked(store, jobs)
             await looked_again(jobs)
             assert list(await jobs()) == ["last"]
-            (logged,) = [entry for entry in logs if entry.get("recording_id") == "golden"]
+            (logged,) = [entry for entry in logs if entry.get("recording_id") == "old"]
             assert (logged["event"], logged["log_level"]) == ("alignment_failed", "warning")
-            assert "dextouch store migrate" in logged["reason"]
-            store.migrate("golden", kind="recording")
+            assert "format version 1, expected 2" in logged["reason"]
+            stamp_version(store, "recording", "old", 2)
 
             async def asked():
-                return "golden" in await jobs()
+                return "old" in await jobs()
 
             await until(asked)
 

@@ -149,26 +149,26 @@ def test_a_store_of_recordings_alone_is_not_empty(store, word):
     assert word("list") == (0, RECORDING_ROW, "")
 
 
-def test_what_was_broken_off_is_seen(store, word):
-    """A take that was kept, one whose completion waits for space, and one that is being written."""
+def test_recovered_takes_are_marked(store, word):
+    attributes = recording_attributes("r-2", None).as_interrupted()
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        writer.append("force", values=np.ones((7, 2), "f4"), t_host_ns=np.arange(7))
+    row = "r-2  recording  stand_bottle  human  7 samples  not judged  recovered\n"
+    assert word("list", "--kind", "recording")[1] == RECORDING_ROW + row
+    assert word("show", "r-2")[1].splitlines()[1] == "not judged  recovered"
+
+
+def test_verify_tells_stages_of_running_and_of_killed_writers_apart(store, word):
     for name in ("r-2", "r-3"):
         writer = store.writer(kind="recording", attributes=recording_attributes(name, None))
-        writer.append("force", values=np.ones((7, 2), "f4"), t_host_ns=np.arange(7))
         if name == "r-2":
-            writer.__exit__(KeyboardInterrupt, None, None)
-    out = word("list", "--kind", "recording")[1]
-    row = "r-2  recording  stand_bottle  human  7 samples  not judged  recovered\n"
-    assert out == RECORDING_ROW + row
-    assert word("show", "r-2")[1].splitlines()[1] == "not judged  recovered"
-    for stream in writer._streams.values():
-        stream.close()
-    os.close(writer._lock)
-    *_, last = word("list")[1].splitlines()
-    assert last == "r-3  recording  interrupted; `dextouch store repair` completes it"
-    assert json.loads(word("list", "--json", "-")[1])["unfinished"] == ["r-3"]
-    assert word("repair")[0] == 0
-    *_, last = word("list")[1].splitlines()
-    assert last == "r-3  recording  stand_bottle  human  5 samples  not judged  recovered"
+            os.close(writer._lock)
+    said = word("verify")[1].splitlines()
+    for name, state in (("r-2", "unfinished"), ("r-3", "being written")):
+        (line,) = (line for line in said if line.startswith(f"recording-{name}-"))
+        assert line.endswith(f"  {state}  stage, 0 arrays, 0 bytes")
+    assert store.sweep() == 1
+    assert word("list", "--kind", "recording")[1] == RECORDING_ROW
 
 
 def test_delete_list_restore_purge(store, word, tmp_path):
@@ -250,15 +250,6 @@ def test_repair_from_a_copy_and_by_salvage(store, word, tmp_path):
     flip(store.root / "episodes" / "e-1" / "zarr.json")
     status, out, _ = word("repair", "e-1")
     assert (status, "e-1  left" in out) == (1, True)
-
-
-def test_migrate_says_what_it_did(store, word):
-    status, out, _ = word("migrate")
-    assert (status, out) == (0, "0 migrated, 0 failed\n")
-    flip(store.root / "episodes" / "e-1" / "commit.json")
-    status, out, _ = word("migrate")
-    assert status == 1
-    assert "e-1  FAILED" in out
 
 
 def derived_of(store, recording_id, episode_id):

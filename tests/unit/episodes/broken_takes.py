@@ -32,31 +32,20 @@ def record(writer, first, count=1):
     writer.append("force", values=values, t_host_ns=numbers)
 
 
-def kept_numbers(store, recording_id="take-1", *, broken_off=True):
-    """The numbers of the samples of `force`; stamps and values agree, and nothing is damaged."""
-    reader = store.recording(recording_id)
-    reader.verify()
-    assert reader.attributes.recovered
-    ledger = [(entry.stream, entry.event) for entry in reader.attributes.ledger]
-    marked = [stream.name for stream in reader.attributes.streams] if broken_off else []
-    assert ledger == [(name, "interrupted") for name in marked]
-    batch = reader.read("force")
-    assert batch.values[:, 0].tolist() == batch.t_host_ns.tolist()
-    return batch.t_host_ns.tolist()
+def assert_nothing_left(store):
+    """Neither a recording, nor a stage, nor anything that a sweep finds."""
+    assert store.list(kind="recording") == []
+    assert list((store.root / ".staging").iterdir()) == []
+    assert store.sweep() == 0
 
 
-def stages(store):
-    return list((store.root / ".staging").iterdir())
-
-
-def break_off(store, fill, *streams, error=RuntimeError, options=None):
-    """A take of some samples that an exception ends; what its user is told about it."""
+def break_off(store, fill, *streams, error=RuntimeError):
+    """A take of some samples that an exception ends."""
     with (
-        pytest.raises(error) as caught,
-        store.writer(kind="recording", attributes=take(*streams), options=options) as writer,
+        pytest.raises(error),
+        store.writer(kind="recording", attributes=take(*streams)) as writer,
     ):
         _fill_and_fail(writer, fill, error)
-    return " ".join(getattr(caught.value, "__notes__", []))
 
 
 def _fill_and_fail(writer, fill, error):

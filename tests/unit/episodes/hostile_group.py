@@ -50,6 +50,14 @@ def memory_bound():
         tracemalloc.stop()
 
 
+def stamp_version(store, kind, item_id, version):
+    """Have the commit record of a group say another format version, with its hash adapted."""
+    path = store.root / f"{kind}s" / item_id / "commit.json"
+    record = json.loads(path.read_bytes())["record"] | {"format_version": version}
+    digest = sha256_hex(canonical_json(record))
+    path.write_bytes(canonical_json({"record": record, "sha256": digest}))
+
+
 def shard_of(folder, name):
     return next(path for path in (folder / name / "c").rglob("*") if path.is_file())
 

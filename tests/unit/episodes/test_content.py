@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from dextouch.episodes import ContentDigest, EpisodeStore, GopEncoder, VideoSettings, WriteOptions
+from dextouch.episodes import ContentDigest, EpisodeStore, GopEncoder, VideoSettings
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values
 from tests.unit.episodes.spooled_batches import CAMERA, GLOVE, camera_batch, glove_batch
@@ -83,8 +83,7 @@ def test_a_recording_says_what_is_committed(tmp_path):
         streams=(*streams, GLOVE.model_copy(update={"name": "glove_right"})),
     )
     store = EpisodeStore(tmp_path)
-    options = WriteOptions(recoverable=False)
-    with store.writer(kind="recording", attributes=attributes, options=options) as writer:
+    with store.writer(kind="recording", attributes=attributes) as writer:
         for descriptor, batch, _ in CASES.values():
             writer.append(descriptor.name, **vars(batch))
     content = store.recording("take-1").content()

@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from dextouch.episodes import WriteOptions
 from dextouch.episodes.care import (
     DeletionRequest,
     delete_for_good,
@@ -76,22 +75,18 @@ def filled(store, made):
         spool = store.root / ".uploads" / f"{prefix}-upload"
         with SpoolWriter(spool, recording_attributes(spool.name, operator), sync=False) as writer:
             writer.append("force", batch())
-        leave_stage(store, f"{prefix}-stage", operator)
+        leave_stage(store, spool.name, operator)
     return store
 
 
 def leave_stage(store, recording_id, operator):
-    """A stage as a killed writer leaves it."""
-    writer = store.writer(
-        kind="recording",
-        attributes=recording_attributes(recording_id, operator),
-        options=WriteOptions(recoverable=True),
-    )
+    """A stage as a killed commit of an upload leaves it: its name says whose it is."""
+    attributes = recording_attributes(recording_id, operator)
+    writer = store.writer(kind="recording", attributes=attributes)
     writer.append("force", values=batch().values, t_host_ns=batch().t_host_ns)
     folder = next((store.root / ".staging").glob(f"*{recording_id}*"))
     folder.rename(store.root / "kept")
-    writer.discard()
-    writer.__exit__(None, None, None)
+    writer.__exit__(KeyboardInterrupt, None, None)
     (store.root / "kept").rename(folder)
 
 
@@ -112,7 +107,7 @@ def test_all_of_an_operator_goes_and_nothing_of_another(filled, tmp_path):
     assert receipt.complete
     assert receipt.remaining == ()
     assert sorted((v.place, v.id, v.reason) for v in receipt.deleted) == [
-        (".staging", "a-stage", "operator"),
+        (".staging", "a-upload", "same id"),
         (".trash", "a-deleted", "operator"),
         (".uploads", "a-upload", "operator"),
         ("episodes", "a-episode", "made from recording a-take"),
@@ -188,7 +183,9 @@ def test_an_interrupted_deletion_is_completed_by_repeating_it(
 
     def die(folder):
         if len(calls) == num_removed:
-            next(p for p in folder.rglob("*.json")).unlink()
+            # A stage has no attributes.
+            files = [*folder.rglob("*.json"), *(p for p in folder.rglob("*") if p.is_file())]
+            files[0].unlink()
             raise KeyboardInterrupt
         calls.append(folder)
         real(folder)
@@ -207,8 +204,8 @@ def test_an_interrupted_deletion_is_completed_by_repeating_it(
         "a-imagined",
         "a-deleted",
         "a-upload",
-        "a-stage",
     }
+    assert ".staging" in {v.place for v in receipt.deleted}
     assert "a-take" in receipt.before["recordings"]
     left = everything(filled.root)
     assert left == of_other(left)
@@ -224,11 +221,11 @@ def test_what_a_writer_holds_is_listed_until_it_lets_go(filled, tmp_path):
         ".uploads/a-upload",
         ".uploads/a-upload/recording.json",
     }
-    assert "a-upload" not in {v.id for v in receipt.deleted}
+    assert ".uploads" not in {v.place for v in receipt.deleted}
     writer.abandon()
     receipt = delete_for_good(filled.root, request, tmp_path / "r.json")
     assert receipt.complete
-    assert {"a-upload", "a-take"} <= {v.id for v in receipt.deleted}
+    assert {".uploads", "recordings"} <= {v.place for v in receipt.deleted}
 
 
 def test_damaged_things_that_name_the_operator_go_too(filled, tmp_path):

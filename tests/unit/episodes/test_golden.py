@@ -1,6 +1,7 @@
-"""The format on disk: version 2 is read and written as ever, version 1 is brought over."""
+"""The format on disk: version 2 is read and written as ever, others are refused."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from dextouch.errors import CorruptDataError, StorageError
 from dextouch.hands.actions import IDENTITY_POSE_9D
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 from dextouch.streams import StreamDescriptor, encoded_values
+from tests.unit.episodes.hostile_group import stamp_version
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 FORCE = StreamDescriptor(
@@ -121,13 +123,6 @@ def golden():
     return EpisodeStore(GOLDEN / "store_v2")
 
 
-@pytest.fixture
-def old(tmp_path):
-    """A copy of what version 1 once wrote."""
-    shutil.copytree(GOLDEN / "store_v1", tmp_path / "old")
-    return EpisodeStore(tmp_path / "old")
-
-
 def check_content(store):
     reader = store.open("golden")
     reader.verify()
@@ -170,52 +165,21 @@ def test_video_of_version_2_is_read(golden):
     np.testing.assert_array_equal(again, images[9:])
 
 
-def test_version_1_is_brought_over(old):
-    with pytest.raises(StorageError, match="store migrate"):
-        old.open("golden")
-    before = (old.root / "episodes" / "golden" / "commit.json").read_bytes()
-    review = {"verdict": "rejected", "reviewed_at": "2026-05-04T12:00:00Z"}
-    (old.root / "episodes" / "golden" / "review.json").write_text(json.dumps(review))
-    assert old.migrate("golden")
-    assert old.review("golden").verdict == "rejected"
-    assert old.migrate("golden", kind="recording")
-    check_content(old)
-    (lineage,) = old.open("golden").attributes.lineage
-    assert (lineage.kind, lineage.id) == ("episode", "golden")
-    assert lineage.sha256 == json.loads(before)["sha256"]
-    assert not old.migrate("golden")
-    assert list((old.root / ".staging").iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["camera_head", "camera_head_end", "force", "force_t_ref_ns"])
-def test_damage_of_version_1_is_not_brought_over(old, name):
-    shard = next(p for p in (old.root / "episodes/golden" / name / "c").rglob("*") if p.is_file())
-    data = bytearray(shard.read_bytes())
-    data[3] ^= 1
-    shard.write_bytes(data)
-    with pytest.raises(CorruptDataError, match=name):
-        old.migrate("golden")
-    with pytest.raises(StorageError, match="version 1"):
-        old.open("golden")
-
-
-def test_a_kill_in_the_middle_of_a_migration_is_mended(old, monkeypatch):
-    real = Path.rename
-
-    def die(path, target):
-        if "migrated-" in path.name:
-            raise KeyboardInterrupt
-        return real(path, target)
-
-    monkeypatch.setattr(Path, "rename", die)
-    with pytest.raises(KeyboardInterrupt):
-        old.migrate("golden")
-    monkeypatch.undo()
-    assert old.list() == []
-    assert old.sweep() == 1
-    (group,) = old.recover()
-    assert (group.kind, group.item_id) == ("episode", "golden")
-    old.open("golden").verify()
+@pytest.mark.parametrize("kind", ["episode", "recording"])
+@pytest.mark.parametrize("version", [1, 3, "2"])
+def test_another_version_is_refused_with_what_to_do(golden, tmp_path, kind, version):
+    shutil.copytree(golden.root, tmp_path / "other")
+    store = EpisodeStore(tmp_path / "other")
+    stamp_version(store, kind, "golden", version)
+    told = (
+        f"{kind} golden: commit.json has format version {version!r}, expected 2; "
+        "read it with the release that wrote it"
+    )
+    with pytest.raises(StorageError, match=f"^{re.escape(told)}$") as caught:
+        store.open("golden") if kind == "episode" else store.recording("golden")
+    assert not isinstance(caught.value, CorruptDataError)
+    # The store lists it, so that its owner sees that it is there.
+    assert "golden" in store.list(kind=kind)
 
 
 def test_attributes_are_found_by_other_readers(golden):

@@ -149,14 +149,13 @@ def test_a_kill_during_the_upload_loses_nothing(url, store, tmp_path, deadly):
     made = episode_of()
     with pytest.raises(ConflictError, match=r"waits in .* to be uploaded"):
         made.write(store)
-    (recovered,) = store.recover()
-    assert (recovered.kind, recovered.item_id) == ("episode", EPISODE)
+    assert store.complete_uploads() == (("episode", EPISODE),)
     assert not any((work / ".outbox" / "episodes").iterdir())
     reader = other.open(EPISODE)
     reader.verify()
     for name, values in made.values.items():
         np.testing.assert_array_equal(reader.read(name).values, values)
-    assert store.recover() == ()
+    assert store.complete_uploads() == ()
 
 
 def test_the_claim_comes_first_and_the_commit_record_last(store, monkeypatch, made):
@@ -202,21 +201,21 @@ def test_what_could_not_be_uploaded_waits(s3_server, store, made):
         name = descriptor.name
         writer.append(name, values=made.values[name], t_ref_ns=made.stamps_ns[name])
     with s3_server.checking_credentials():
-        with pytest.raises(StorageError, match=r"refused.*`recover` uploads it"):
+        with pytest.raises(StorageError, match=r"refused.*`complete_uploads` uploads it"):
             writer.__exit__(None, None, None)
         with pytest.raises(StorageError, match="refused"):
-            store.recover()
+            store.complete_uploads()
     # A sweep takes nothing that can still be uploaded.
     assert store.sweep() == 0
-    assert [group.item_id for group in store.recover()] == [EPISODE]
+    assert store.complete_uploads() == (("episode", EPISODE),)
     assert store.open(EPISODE).verify().num_arrays == 2 * len(made.values)
 
 
-def begin_take(store, num_samples):
+def begin_take(store, num_samples, recording_id="take-1"):
     writer = store.writer(
         kind="recording",
         attributes=RecordingAttributes(
-            recording_id="take-1",
+            recording_id=recording_id,
             task="t",
             instruction="",
             domain="human",
@@ -230,21 +229,33 @@ def begin_take(store, num_samples):
     return writer
 
 
-def test_a_take_that_waits_gets_another_id_if_its_own_is_taken(s3_server, store, url, tmp_path):
+def test_a_take_that_waits_is_dropped_if_its_id_is_taken(s3_server, store, url, tmp_path):
+    """Its upload has all of it and is finished anew, as its station then finds another id."""
     writer = begin_take(store, 17)
     with s3_server.checking_credentials(), pytest.raises(StorageError, match="refused"):
         writer.__exit__(None, None, None)
     other = EpisodeStore(url, CREDENTIALS | {"work_folder": str(tmp_path / "other")})
     with begin_take(other, 4):
         pass
-    (group,) = store.recover()
-    assert (group.item_id, group.num_samples) == ("take-1-recovered-1", {"force": 17})
-    reader = other.recording("take-1-recovered-1")
-    reader.verify()
-    assert reader.attributes.recovered
-    assert reader.read("force").t_host_ns.tolist() == list(range(17))
+    assert store.complete_uploads() == ()
+    assert other.list(kind="recording") == ["take-1"]
     assert other.recording("take-1").num_samples("force") == 4
-    assert store.recover() == ()
+    assert not any((store.root / ".outbox" / "recordings").iterdir())
+
+
+def test_one_upload_that_fails_does_not_keep_others_from_being_completed(s3_server, store, bucket):
+    writers = [begin_take(store, 17, recording_id) for recording_id in ("a", "b")]
+    with s3_server.checking_credentials():
+        for writer in writers:
+            with pytest.raises(StorageError, match="refused"):
+                writer.__exit__(None, None, None)
+    bucket.put("recordings/a/claim", b"0" * 64)
+    with pytest.raises(UnavailableError, match="recording 'a': something else") as caught:
+        store.complete_uploads()
+    assert store.list(kind="recording") == ["b"]
+    assert caught.value.__notes__ == ["uploaded: recording 'b'"]
+    bucket.remove(["recordings/a/claim"])
+    assert store.complete_uploads() == (("recording", "a"),)
 
 
 @pytest.mark.parametrize("place", ["force/c/0/0", "/commit.json"])
@@ -262,9 +273,9 @@ def test_ctrl_c_during_the_upload_says_where_the_take_waits(store, monkeypatch, 
             writer.__exit__(None, None, None)
     waiting = store.root / ".outbox" / "recordings" / "take-1"
     told = " ".join(getattr(caught.value, "__notes__", []))
-    assert f"recording 'take-1' waits in {waiting}, `recover` uploads it" in told
+    assert f"recording 'take-1' waits in {waiting}, `complete_uploads` uploads it" in told
     assert waiting.is_dir()
-    assert [group.item_id for group in store.recover()] == ["take-1"]
+    assert store.complete_uploads() == (("recording", "take-1"),)
     assert store.recording("take-1").verify().num_arrays == 4
 
 
@@ -283,7 +294,7 @@ def test_ctrl_c_while_an_uploaded_take_is_removed_here_costs_nothing(store, monk
         patch.setattr("dextouch.episodes.uploads.shutil.rmtree", interrupted)
         with pytest.raises(KeyboardInterrupt):
             writer.__exit__(None, None, None)
-    assert store.recover() == ()
+    assert store.complete_uploads() == ()
     assert not any((store.root / ".outbox" / "recordings").iterdir())
     assert store.recording("take-1").verify().num_arrays == 4
 
@@ -298,7 +309,7 @@ def test_an_upload_under_a_foreign_claim_waits_and_overwrites_nothing(store, buc
     assert store.sweep() == 0
     assert sweep_orphans(bucket, now=datetime.now(UTC) + ORPHAN_AGE + timedelta(minutes=1)) == 1
     assert list(bucket.list("episodes")) == []
-    assert [group.item_id for group in store.recover()] == [EPISODE]
+    assert store.complete_uploads() == (("episode", EPISODE),)
     store.open(EPISODE).verify()
 
 

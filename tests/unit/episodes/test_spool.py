@@ -264,7 +264,7 @@ def test_a_log_inside_an_image_is_not_read_as_one(path):
 def test_a_foreign_or_missing_log_is_refused(path):
     fill(path, close=False)
     file = path / LOG_FILE
-    file.write_bytes(b"DXTBLOG\x03" + file.read_bytes()[8:])
+    file.write_bytes(b"DXTBLOB\x02" + file.read_bytes()[8:])
     with pytest.raises(CorruptDataError, match="expected"):
         recover(path)
     file.unlink()

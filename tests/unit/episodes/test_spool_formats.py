@@ -1,19 +1,17 @@
-"""Formats of the spool: logs written by hand, golden ones, and those of version 1."""
+"""The format of the spool: logs written by hand, a golden one, and those of other versions."""
 
 import hashlib
 import json
+import re
 import shutil
 import struct
 
 import google_crc32c
-import numpy as np
 import pytest
 
 from dextouch.episodes import spool
 from dextouch.episodes.spool_log import LOG_FILE
-from dextouch.errors import (
-    CorruptDataError,
-)
+from dextouch.errors import CorruptDataError, StorageError
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import encode_body
 from tests.unit.episodes.spooled_batches import (
@@ -31,43 +29,28 @@ def path(tmp_path):
     return tmp_path / "spool" / "take-1"
 
 
-def columns(batch):
-    """The body of a record of format 1."""
-    return b"".join(
-        np.asarray(column).astype(dtype).tobytes()
-        for column, dtype in zip(vars(batch).values(), ("<i8", "<i8", "<i8", "<u2"), strict=True)
-    )
-
-
-def rows(batch):
-    """The body of a record of format 2."""
+def body_of(batch):
+    """The body of a record: its samples end to end."""
     return b"".join(
         struct.pack("<qqq360H", host, device, number, *values)
         for host, device, number, values in zip(*vars(batch).values(), strict=True)
     )
 
 
-FORMATS = {"1": (b"DXTBLOG\x01", b"DXTR", columns), "2": (b"DXTBLOG\x02", b"DXTS", rows)}
-
-
-def record(version, place, batch, *, first_sample, stream=0):
+def record(place, batch, *, first_sample, stream=0):
     """A record of a log as docs/episode_format.md describes it, of a stream of numbers."""
-    _, mark, layout = FORMATS[version]
-    body = layout(batch)
+    body = body_of(batch)
     counts = (stream, len(batch), len(body), google_crc32c.value(body))
-    header = struct.pack("<4sQQIIII", mark, place, first_sample, *counts)
+    header = struct.pack("<4sQQIIII", b"DXTS", place, first_sample, *counts)
     return header + struct.pack("<I", google_crc32c.value(header)) + body
 
 
-@pytest.mark.parametrize("version", FORMATS)
 @pytest.mark.parametrize("first_sample", [0, 1, 2, 3, 2**63])
-def test_a_log_written_by_hand_is_read_if_its_samples_follow_each_other(
-    path, first_sample, version
-):
+def test_a_log_written_by_hand_is_read_if_its_samples_follow_each_other(path, first_sample):
     spool.SpoolWriter(path, ATTRIBUTES).abandon()
-    data = FORMATS[version][0]
-    data += record(version, len(data), glove_batch(0, 2), first_sample=0)
-    data += record(version, len(data), glove_batch(2, 3), first_sample=first_sample)
+    data = b"DXTBLOG\x02"
+    data += record(len(data), glove_batch(0, 2), first_sample=0)
+    data += record(len(data), glove_batch(2, 3), first_sample=first_sample)
     (path / LOG_FILE).write_bytes(data)
     if first_sample == 2:
         assert_same(spool.SpoolReader(path).read("glove_left"), glove_batch(0, 5))
@@ -77,10 +60,9 @@ def test_a_log_written_by_hand_is_read_if_its_samples_follow_each_other(
             read()
 
 
-@pytest.mark.parametrize("version", FORMATS)
-def test_the_golden_spool_of_a_format_is_read_and_goes_on(tmp_path, version):
+def test_the_golden_spool_is_read_and_goes_on(tmp_path):
     """A station or an upload may be older than this release."""
-    shutil.copytree(GOLDEN / f"spool_v{version}", path := tmp_path / "take-1")
+    shutil.copytree(GOLDEN / "spool_v2", path := tmp_path / "take-1")
     reader = spool.SpoolReader(path)
     for name, stream in reader.streams.items():
         assert_same(reader.read(name), golden_batch(stream, 0, 6))
@@ -126,9 +108,31 @@ def test_checksums_and_the_seal_are_as_documented(path):
     }
 
 
+@pytest.mark.parametrize("version", [1, 3])
+def test_a_log_of_another_version_is_refused_and_kept(path, version):
+    with spool.SpoolWriter(path, ATTRIBUTES) as writer:
+        writer.append("glove_left", glove_batch(0, 5))
+    file = path / LOG_FILE
+    file.write_bytes(b"DXTBLOG" + bytes([version]) + file.read_bytes()[8:])
+    before = {each.name: each.read_bytes() for each in path.iterdir()}
+    told = (
+        f"log of spool 'take-1': batches.log has format version {version}, expected 2; "
+        "read it with the release that wrote it"
+    )
+    asks = (
+        lambda: spool.SpoolReader(path).read("glove_left"),
+        lambda: spool.SpoolWriter.resume(path),
+    )
+    for ask in asks:
+        with pytest.raises(StorageError, match=f"^{re.escape(told)}$") as caught:
+            ask()
+        assert not isinstance(caught.value, CorruptDataError)
+    assert {each.name: each.read_bytes() for each in path.iterdir()} == before
+
+
 @pytest.mark.parametrize("stream", ["glove_left", "camera_head"])
-def test_an_old_record_of_another_stream_is_refused(tmp_path, stream):
-    shutil.copytree(GOLDEN / "spool_v1", path := tmp_path / "take-1")
+def test_a_record_of_another_stream_is_refused(tmp_path, stream):
+    shutil.copytree(GOLDEN / "spool_v2", path := tmp_path / "take-1")
     attributes = spool.read_attributes(path)
     other = {"glove_left": {"shape": (5,)}, "camera_head": {"unit": "rgb8"}}[stream]
     streams = tuple(

@@ -1,8 +1,6 @@
 """Writing whole, reading slices, and refusing all that is damaged or does not fit."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -302,44 +300,6 @@ def test_a_full_disk_is_said_and_nothing_appears(made, store, file_size_limit):
     with file_size_limit(4096), pytest.raises(StorageFullError, match="no space left"):
         made.write(store)
     assert store.list() == []
-
-
-CHILD = """
-import sys
-import numpy as np
-from dextouch.episodes import EpisodeStore
-from dextouch.schemas.recordings import RecordingAttributes
-
-attributes = RecordingAttributes.model_validate_json(sys.argv[2])
-with EpisodeStore(sys.argv[1]).writer(kind="recording", attributes=attributes) as writer:
-    writer.append("force", values=np.ones((90, 2), "f4"), t_host_ns=np.arange(90))
-    print("written", flush=True)
-    sys.stdin.read()
-"""
-
-
-def test_what_a_killed_writer_left_is_recovered(store):
-    attributes = recording_attributes(streams=(scalar_stream(),))
-    child = subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(store.root), attributes.model_dump_json()],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    )
-    assert child.stdout.readline() == b"written\n"
-    assert store.sweep() == 0
-    child.kill()
-    child.communicate()
-    assert store.list(kind="recording") == []
-    # Kept until somebody recovers it.
-    assert store.sweep() == 0
-    (group,) = store.recover()
-    assert group.num_samples == {"force": 90}
-    reader = store.recording("take-1")
-    reader.verify()
-    assert reader.attributes.recovered
-    assert reader.read("force").t_host_ns.tolist() == list(range(90))
-    assert (reader.read("force").values == 1).all()
-    assert list((store.root / ".staging").iterdir()) == []
 
 
 def test_a_refused_block_leaves_no_trace(made, store):

@@ -20,7 +20,6 @@ from dextouch.episodes.image_codecs import GopDecoder, ImageChunks, pack_chunk, 
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,
-    NotFoundError,
     ShapeError,
     StorageFullError,
     UnknownNameError,
@@ -209,29 +208,6 @@ def test_a_full_disk_in_the_encoders_thread_is_said(store, file_size_limit):
     assert store.list(kind="recording") == []
 
 
-def test_a_live_take_is_followed(store):
-    images = moving_images(30)
-    options = WriteOptions(threads=False)
-    glove = StreamDescriptor(
-        name="force", kind="scalar", shape=(2,), dtype="float32", unit="N", nominal_rate_hz=10
-    )
-    take = attributes(camera(), glove)
-    with store.writer(kind="recording", attributes=take, options=options) as writer:
-        counts = []
-        for index, image in enumerate(images):
-            writer.append("camera_head", values=image[None], t_host_ns=stamps(1, index))
-            writer.append("force", values=np.full((1, 2), index, "f4"), t_host_ns=stamps(1, index))
-            live = store.live("take-1")
-            counts.append((live.num_samples("camera_head"), live.num_samples("force")))
-            force = live.read("force")
-            assert (force.values[:, 0] == force.t_host_ns).all()
-        got = live.images("camera_head")
-        with pytest.raises(InvalidInputError, match="still being written"):
-            live.verify()
-    assert counts == [((n + 1) // 8 * 8, (n + 1) // 5 * 5) for n in range(30)]
-    np.testing.assert_array_equal(got, store.recording("take-1").images("camera_head", 0, 24))
-
-
 def test_a_forged_size_is_refused_before_it_is_decoded():
     large = GopEncoder(4096, 4096, rate_hz=30.0, settings=VideoSettings())
     unit = large.encode(np.zeros((4096, 4096, 3), np.uint8))
@@ -267,23 +243,6 @@ def test_encoded_images_are_asked_of_encoded_streams_only(store):
     reader = write(EpisodeStore(store.root), moving_images(3), unit="rgb8")
     with pytest.raises(InvalidInputError, match="rgb8"):
         reader.encoded_images("camera_head", 0, 1)
-
-
-def test_a_live_view_of_a_take_that_was_finished_says_so(store):
-    writer = store.writer(
-        kind="recording",
-        attributes=attributes(camera()),
-        options=WriteOptions(threads=False),
-    )
-    with writer:
-        writer.append("camera_head", values=moving_images(16), t_host_ns=stamps(16))
-        live = store.live("take-1")
-        before = live.images("camera_head", 0, 8)
-    with pytest.raises(NotFoundError, match="finished meanwhile"):
-        live.images("camera_head", 8, 16)
-    with pytest.raises(NotFoundError, match="not being written"):
-        store.live("take-1")
-    np.testing.assert_array_equal(before, store.recording("take-1").images("camera_head", 0, 8))
 
 
 def test_a_stage_that_was_swept_before_it_was_held_is_made_again(tmp_path, monkeypatch):

@@ -22,7 +22,7 @@ from dextouch.bridges.mcap.messages import (
     raw_encoding,
 )
 from dextouch.bridges.mcap.records import records
-from dextouch.episodes import EpisodeReader, EpisodeStore, EpisodeWriter, Kind, WriteOptions
+from dextouch.episodes import EpisodeReader, EpisodeStore, EpisodeWriter, Kind
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.images import encode_jpeg
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes, first_problems, json_ready
@@ -219,9 +219,7 @@ def import_mcap(path: Path, store: EpisodeStore) -> str:
     """
     attributes, counts = _about(path)
     kind: Kind = "episode" if isinstance(attributes, EpisodeAttributes) else "recording"
-    # A killed import is repeated from its file; a partial one must not look like a recovered take.
-    options = WriteOptions(recoverable=False)
-    with store.writer(kind=kind, attributes=attributes, options=options) as writer:
+    with store.writer(kind=kind, attributes=attributes) as writer:
         streams = {
             f"/{stream.name}": _Stream(MessageCodec(stream), writer, is_episode=kind == "episode")
             for stream in attributes.streams

@@ -21,13 +21,12 @@ if TYPE_CHECKING:
     from dextouch.episodes.care.inspection import inspect_group as inspect_group
     from dextouch.episodes.care.inspection import inspect_stage as inspect_stage
     from dextouch.episodes.care.inspection import inspect_upload as inspect_upload
-    from dextouch.episodes.care.inspection import interrupted_takes as interrupted_takes
     from dextouch.episodes.care.inspection import is_held as is_held
     from dextouch.episodes.care.inspection import open_contents as open_contents
     from dextouch.episodes.care.inspection import unfinished_folders as unfinished_folders
     from dextouch.episodes.care.repair import LEFT as LEFT
     from dextouch.episodes.care.repair import RepairReport as RepairReport
     from dextouch.episodes.care.repair import repair_group as repair_group
-    from dextouch.episodes.care.repair import repair_unfinished as repair_unfinished
+    from dextouch.episodes.care.repair import repair_uploads as repair_uploads
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)

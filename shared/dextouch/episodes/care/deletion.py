@@ -29,7 +29,7 @@ INTENTS = ".deletions"
 # Rounds of search and removal; more are needed only under constant uploads.
 _MAX_ROUNDS = 5
 _MAX_HEADER_BYTES = 64 << 20
-_VERSION = re.compile(r"-(salvaged|recovered)-[0-9]+")
+_VERSION = re.compile(r"-salvaged-[0-9]+")
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def plan_deletion(
             found.append(_victim(facts, reason))
             if spreads:
                 grown = True
-                # And earlier versions, left behind by a repair or a migration.
+                # And earlier versions, left behind by a repair.
                 versions = [(k, i, h) for k, i, h in facts.lineage if _is_version(facts, k, i)]
                 names |= {(facts.kind, facts.item_id), *((k, i) for k, i, _ in versions)}
                 hashes |= {facts.sha256, *(h for _, _, h in versions)} - {None}

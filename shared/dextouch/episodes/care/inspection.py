@@ -17,19 +17,15 @@ from dextouch.episodes.format import (
     STAMPS,
     ArrayEntry,
     Kind,
-    attributes_id,
-    kind_of,
     shard_path,
-    stream_arrays,
 )
 from dextouch.episodes.group_contents import GroupContents, read_group
-from dextouch.episodes.journal import damaged_payload, log_paths, part_path, read_rows, scan_rows
 from dextouch.episodes.reviews import REMARK_FILES
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.spool import SpoolReader, read_attributes
 from dextouch.episodes.spool_log import body_at, find_records, open_log
 from dextouch.episodes.spool_seal import RECORDING_FILE
-from dextouch.episodes.staged_group import STAGE_FILE, STAGING, read_stage
+from dextouch.episodes.staged_group import STAGING
 from dextouch.episodes.trash import HOMES
 from dextouch.errors import NotFoundError, StorageError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
@@ -107,7 +103,7 @@ def inspect_group(
             Finding(f"{contents.what}: {path} belongs to no array; move it away", foreign=True)
             for path in _foreign_paths(files.folder, contents.entries)
         ]
-    if findings and contents.opened is not None:
+    if findings:
         contents.opened.check_present()
     return ItemReport(kind, files.item_id, len(contents.entries), sum(sizes), tuple(findings))
 
@@ -191,32 +187,8 @@ def _inspect_batches(folder: Path, names: list[str]) -> ItemReport:
 
 
 def inspect_stage(folder: Path) -> ItemReport:
-    """Inspect the stage of a running or terminated writer."""
-    try:
-        attributes = read_stage(folder)
-    except StorageError as error:
-        return ItemReport("stage", folder.name, findings=(Finding(error.message),))
-    if attributes is None:
-        return ItemReport("stage", folder.name, busy=is_held(folder))
-    kind = kind_of(attributes)
-    names = [name for stream in attributes.streams for name in stream_arrays(stream, kind)]
-    findings, num_bytes = [], 0
-    present = [n for n in names if all(p.is_file() for p in log_paths(folder, n))]
-    for name in present:
-        try:
-            num_rows = len(read_rows(folder, name))
-            found = scan_rows(folder, name, part_path(folder, name))
-            rows, hold = (column[:num_rows] for column in found)
-            num_bytes += int(rows["length"][hold].sum())
-            # Neither data that a live writer has not written yet nor a torn tail is damage.
-            for number in np.flatnonzero(~hold & np.logical_or.accumulate(hold[::-1])[::-1]):
-                what = f"row {number}: {damaged_payload(name, rows[number])}"
-                findings.append(Finding(f"stage {folder.name}: {what}", name, int(number)))
-        except StorageError as error:
-            findings.append(Finding(f"stage {folder.name}: {error.message}", name))
-    return ItemReport(
-        "stage", folder.name, len(present), num_bytes, tuple(findings), is_held(folder)
-    )
+    """Say whether a stage is that of a running writer; a sweep removes it otherwise."""
+    return ItemReport("stage", folder.name, busy=is_held(folder))
 
 
 def is_held(folder: Path) -> bool:
@@ -235,21 +207,3 @@ def unfinished_folders(root: Path) -> Iterator[tuple[str, Path]]:
         with disk_errors(f"list {name}"):
             paths = sorted(folder.iterdir()) if folder.is_dir() else []
         yield from ((kind, path) for path in paths if not is_system_file(path.name))
-
-
-def interrupted_takes(root: Path) -> Iterator[tuple[str, str]]:
-    """Kind and id of each take that a repair can complete: its stage is held by no writer.
-
-    A damaged one has kind "stage" and the name of its folder.
-    """
-    for what, folder in unfinished_folders(root):
-        if what != "stage" or not (folder / STAGE_FILE).is_file() or is_held(folder):
-            continue
-        try:
-            attributes = read_stage(folder)
-        except StorageError:
-            attributes = None
-        if attributes is None:
-            yield "stage", folder.name
-        else:
-            yield kind_of(attributes), attributes_id(attributes)

@@ -17,7 +17,6 @@ from dextouch.episodes.care.inspection import (
 from dextouch.episodes.care.salvage import (
     group_streams,
     spool_streams,
-    stage_streams,
     write_salvaged,
 )
 from dextouch.episodes.files import disk_errors, replace_file
@@ -42,13 +41,12 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.spool import read_attributes
-from dextouch.episodes.staged_group import STAGING, read_stage, unheld_folders
-from dextouch.episodes.staging_recovery import recover_stage
+from dextouch.episodes.staged_group import unheld_folders
 from dextouch.episodes.trash import TrashKind, put_into_trash
 from dextouch.errors import ConflictError, CorruptDataError, DexTouchError, StorageError
 from dextouch.schemas import LineageEntry
 
-WHOLE, MENDED, SALVAGED, RECOVERED, LEFT = "whole", "mended", "salvaged", "recovered", "left"
+WHOLE, MENDED, SALVAGED, LEFT = "whole", "mended", "salvaged", "left"
 
 
 @dataclass(frozen=True)
@@ -56,9 +54,8 @@ class RepairReport:
     """Result of the repair of one item.
 
     `action` is `whole` (nothing to do), `mended` (restored as it was before the damage), `salvaged`
-    (the readable samples are in `new_id`, the damaged group in the trash), `recovered` (an
-    interrupted take was committed as far as it was written) or `left` (unchanged, `notes` say why).
-    `lost` counts the samples that a salvage or a recovery dropped.
+    (the readable samples are in `new_id`, the damaged group in the trash) or `left` (unchanged,
+    `notes` say why). `lost` counts the samples that a salvage dropped.
     """
 
     kind: str
@@ -92,19 +89,13 @@ def repair_group(
     return _salvage(root, kind, files.folder, notes)
 
 
-def repair_unfinished(root: Path) -> list[RepairReport]:
-    """Commit the stages of terminated writers, and salvage damaged stages and uploads.
+def repair_uploads(root: Path) -> list[RepairReport]:
+    """Salvage damaged uploads.
 
-    Intact uploads are unchanged, since their station continues them. The readable samples of
-    damaged ones become a recording `ID-salvaged-N`, so that the station can send everything again.
+    Intact ones are unchanged, since their station continues them. The readable samples of damaged
+    ones become a recording `ID-salvaged-N`, so that the station can send everything again.
     """
     reports = []
-    for stage in unheld_folders(root / STAGING):
-        try:
-            if group := recover_stage(stage, root):
-                reports.append(RepairReport(group.kind, group.item_id, RECOVERED, lost=group.lost))
-        except CorruptDataError as error:
-            reports.append(_salvage(root, "stage", stage, (error.message,)))
     for spool in unheld_folders(root / UPLOADS):
         if findings := inspect_upload(spool).findings:
             notes = tuple(finding.message for finding in findings)
@@ -120,11 +111,6 @@ def _salvage(root: Path, kind: TrashKind, folder: Path, notes: tuple[str, ...]) 
         if kind == "upload":
             attributes = read_attributes(folder)
             streams = spool_streams(folder, attributes)
-        elif kind == "stage":
-            attributes = read_stage(folder)
-            if attributes is None:
-                return RepairReport(kind, folder.name, LEFT, notes=notes)
-            streams = stage_streams(folder, attributes)
         else:
             attributes, entries, sha256 = _known(LocalGroup(folder), kind)
             streams = group_streams(folder, attributes, entries)

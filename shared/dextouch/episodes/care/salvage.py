@@ -1,9 +1,10 @@
-"""Salvage of the readable samples of a damaged group, stage or spool into a new group.
+"""Salvage of the readable samples of a damaged group or spool into a new group.
 
 Nothing is filled in: a damaged storage chunk or sample is dropped with its stamps, and counted as
 `lost_to_damage`.
 """
 
+import itertools
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,17 +23,15 @@ from dextouch.episodes.format import (
     STAMPS,
     ArrayEntry,
     Attributes,
+    Kind,
     attributes_id,
     codec_of,
     kind_of,
     shard_path,
-    stream_arrays,
     with_counts,
-    with_rows,
 )
 from dextouch.episodes.group_contents import hashed_bytes
 from dextouch.episodes.image_codecs import ImageChunks
-from dextouch.episodes.journal import part_path, scan_rows
 from dextouch.episodes.shards import (
     CRC_BYTES,
     INDEX_ENTRY_BYTES,
@@ -40,10 +39,9 @@ from dextouch.episodes.shards import (
     decode_rows,
 )
 from dextouch.episodes.sources import LocalFile, LocalGroup
-from dextouch.episodes.spool_log import body_at, body_of, find_records, open_log, read_batch
+from dextouch.episodes.spool_log import body_at, find_records, open_log, read_batch
 from dextouch.episodes.spool_seal import read_seal
 from dextouch.episodes.staged_group import new_stage
-from dextouch.episodes.staging_recovery import free_id, ids_below
 from dextouch.episodes.writer import Block, write_blocks
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.schemas import LineageEntry
@@ -132,28 +130,6 @@ def group_streams(
     return _streams(attributes, array)
 
 
-def stage_streams(stage: Path, attributes: Attributes) -> list[SalvagedStream]:
-    """The readable samples of an abandoned stage."""
-    kind = kind_of(attributes)
-    layouts = {n: e for s in attributes.streams for n, e in stream_arrays(s, kind).items()}
-
-    def array(name: str) -> _SalvagedArray:
-        entry = layouts[name]
-        # A writer or a recovery that died during its commit has closed some shards.
-        closed = stage / name / shard_path(len(entry.shape))
-        path = closed if closed.is_file() else part_path(stage, name)
-        rows, hold = scan_rows(stage, name, path)
-        numbers = np.flatnonzero(hold)
-        index = np.zeros((len(rows), 2), dtype=np.uint64)
-        index[hold] = np.stack([rows["offset"][hold], rows["length"][hold]], axis=1)
-        count = 0
-        if len(numbers):
-            count = int(numbers[-1]) * entry.chunk_rows + int(rows["num_rows"][numbers[-1]])
-        return _SalvagedArray(path, with_rows(entry, count), index[: -(-count // entry.chunk_rows)])
-
-    return _streams(attributes, array)
-
-
 def spool_streams(spool: Path, attributes: Attributes) -> list[SalvagedStream]:
     """The readable samples of a spool, batch by batch."""
     with open_log(spool) as data:
@@ -199,7 +175,7 @@ def write_salvaged(
         with suppress(StorageError):
             if source in open_contents(LocalGroup(folder), kind).attributes.lineage:
                 return folder.name, lost
-    free = free_id(kind, item_id, "salvaged", ids_below(root))
+    free = _free_id(root, kind, item_id)
     lineage = (*attributes.lineage, source)
     update = {f"{kind}_id": free, "recovered": True, "lineage": lineage}
     write_blocks(
@@ -209,6 +185,12 @@ def write_salvaged(
         ((stream.descriptor.name, stream.blocks()) for stream in streams),
     )
     return free, lost
+
+
+def _free_id(root: Path, kind: Kind, item_id: str) -> str:
+    """The first id `ID-salvaged-1`, `ID-salvaged-2` … that is not in use."""
+    names = (f"{item_id[:112]}-salvaged-{number}" for number in itertools.count(1))
+    return next(name for name in names if not (root / f"{kind}s" / name).exists())
 
 
 def _streams(
@@ -275,7 +257,6 @@ def _holds(streams: Sequence[StreamDescriptor], row: np.void, body: bytes | None
         return False
     descriptor = streams[int(row["stream"])]
     try:
-        body = body_of(descriptor, row, body, where="log")
         check_batch(descriptor, decode_body(descriptor, body, int(row["num_samples"])))
     except (CorruptDataError, InvalidInputError):
         return False

@@ -16,7 +16,7 @@ from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE
 from dextouch.episodes.reviews import REVIEW_FILE
 from dextouch.episodes.spool_seal import RECORDING_FILE
-from dextouch.episodes.staged_group import STAGE_FILE, STAGING
+from dextouch.episodes.staged_group import STAGING
 from dextouch.episodes.trash import TRASH
 from dextouch.system_files import is_system_file
 
@@ -32,14 +32,13 @@ MAX_BYTES = 16 << 20
 # Files with attributes, and the keys under which they lie.
 _ATTRIBUTES = {
     METADATA_FILE: ("attributes", ATTRIBUTES_KEY),
-    STAGE_FILE: ("attributes",),
     RECORDING_FILE: (),
 }
-_SAMPLES = (".part", ".journal", ".log")
+_SAMPLES = ".log"
 _WORD = "A-Za-z0-9_-"
 _AROUND = {
-    STAGING: re.compile(r"(episode|recording|migrated|old|deleted)-(.+)-[0-9a-f]{32}"),
-    TRASH: re.compile(r"(episode|recording|upload|stage)\.(.+)\.[0-9]+"),
+    STAGING: re.compile(r"(episode|recording)-(.+)-[0-9a-f]{32}"),
+    TRASH: re.compile(r"(episode|recording|upload)\.(.+)\.[0-9]+"),
 }
 
 
@@ -107,8 +106,6 @@ def _named(name: str, place: str) -> tuple[str, str]:
     match = _AROUND[place].fullmatch(name) if place in _AROUND else None
     if match is None:
         return PLACES[place], name.removesuffix(".new")
-    if match[1] == "stage":
-        return _named(match[2], STAGING)
     return {"upload": "recording"}.get(match[1], match[1]), match[2]
 
 
@@ -118,7 +115,7 @@ def small_files(folder: Path) -> Iterator[Path]:
         yield folder
     with disk_errors(f"look through {folder.name}"):
         for path in sorted(folder.iterdir()) if folder.is_dir() else []:
-            if path.suffix not in _SAMPLES and path.is_file() and path.stat().st_size <= MAX_BYTES:
+            if path.suffix != _SAMPLES and path.is_file() and path.stat().st_size <= MAX_BYTES:
                 yield path
 
 

@@ -1,15 +1,12 @@
-"""Uploads and stages that are damaged before they are finished: what holds becomes a recording."""
-
-import shutil
+"""Uploads that are damaged before they are finished: what holds becomes a recording."""
 
 import numpy as np
 import pytest
 
-from dextouch.episodes import GopEncoder, VideoSettings, WriteOptions
-from dextouch.episodes.care import inspect_stage, inspect_upload, repair_unfinished
+from dextouch.episodes import GopEncoder, VideoSettings
+from dextouch.episodes.care import inspect_upload, repair_uploads
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.episodes.spool_log import HEADER_BYTES, LOG_FILE, LOG_MAGIC
-from dextouch.errors import CorruptDataError
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values
 from tests.unit.episodes.hostile_group import flip
@@ -59,7 +56,7 @@ def test_a_damaged_upload_is_salvaged(store, spool, place, told):
     report = inspect_upload(spool)
     assert report.damaged
     assert told in report.findings[0].message
-    (result,) = repair_unfinished(store.root)
+    (result,) = repair_uploads(store.root)
     assert (result.kind, result.action, result.lost) == ("upload", "salvaged", {"force": 1})
     reader = store.recording("take-1-salvaged-1")
     reader.verify()
@@ -103,7 +100,7 @@ def test_of_video_in_an_upload_whole_groups_are_kept(store, number, lost):
     start = len(LOG_MAGIC) + 9 * RECORD + sum(camera_record + len(unit) for unit in units[:number])
     flip(spool / LOG_FILE, len(LOG_MAGIC) + HEADER_BYTES + 27)
     flip(spool / LOG_FILE, start + camera_record + 6)
-    (result,) = repair_unfinished(store.root)
+    (result,) = repair_uploads(store.root)
     torn = number == 19
     assert result.lost == {"force": 1} | ({} if torn else {"camera": lost})
     reader = store.recording("take-1-salvaged-1")
@@ -121,7 +118,7 @@ def test_whole_and_torn_uploads_are_left_to_their_station(store, spool):
     assert not inspect_upload(spool).damaged
     flip(file, -RECORD)
     assert not inspect_upload(spool).damaged
-    assert repair_unfinished(store.root) == []
+    assert repair_uploads(store.root) == []
 
 
 @pytest.mark.parametrize("lost_bytes", [3, RECORD, 30 * RECORD])
@@ -133,111 +130,9 @@ def test_what_a_closed_upload_has_lost_is_named(store, spool, lost_bytes):
     file.write_bytes(file.read_bytes()[:-lost_bytes])
     (finding,) = inspect_upload(spool).findings
     assert f"expected {8 + 50 * RECORD}" in finding.message
-    (result,) = repair_unfinished(store.root)
+    (result,) = repair_uploads(store.root)
     num_lost = -(-lost_bytes // RECORD)
     assert (result.action, result.lost) == ("salvaged", {"force": num_lost})
     reader = store.recording("take-1-salvaged-1")
     assert reader.num_samples("force") == 50 - num_lost
     assert [entry.count for entry in reader.attributes.ledger] == [num_lost]
-
-
-@pytest.fixture
-def stage(store):
-    """What a killed writer leaves, with two storage chunks of five rows in its journals."""
-    options = WriteOptions(recoverable=True)
-    writer = store.writer(kind="recording", attributes=recording_attributes(), options=options)
-    part = batch(0, 17)
-    writer.append(
-        "force",
-        values=part.values,
-        t_host_ns=part.t_host_ns,
-        t_device_ns=part.t_device_ns,
-        sequence=part.sequence,
-    )
-    (stage,) = (store.root / ".staging").iterdir()
-    shutil.copytree(stage, store.root / "kept")
-    writer.discard()
-    writer.__exit__(None, None, None)
-    (store.root / "kept").rename(stage)
-    return stage
-
-
-def test_a_whole_stage_is_recovered(store, stage):
-    assert not inspect_stage(stage).damaged
-    (result,) = repair_unfinished(store.root)
-    assert (result.action, result.item_id) == ("recovered", "take-1")
-    assert store.recording("take-1").num_samples("force") == 15
-
-
-TWO_FORCES = (FORCE, FORCE.model_copy(update={"name": "other"}))
-
-
-@pytest.fixture
-def stage_of_two(store):
-    """As `stage`, with a second stream of ten samples."""
-    attributes = recording_attributes().model_copy(update={"streams": TWO_FORCES})
-    writer = store.writer(
-        kind="recording", attributes=attributes, options=WriteOptions(recoverable=True)
-    )
-    for name, count in (("force", 17), ("other", 10)):
-        writer.append(name, **vars(batch(0, count)))
-    (stage,) = (store.root / ".staging").iterdir()
-    shutil.copytree(stage, store.root / "kept")
-    writer.discard()
-    writer.__exit__(None, None, None)
-    (store.root / "kept").rename(stage)
-    return stage
-
-
-def zero(path, start=0):
-    data = path.read_bytes()
-    path.write_bytes(data[:start] + bytes(len(data) - start))
-
-
-# Payloads of a column, and the rows of a journal behind its eight first bytes.
-ZEROED = [
-    *((f"{name}.part", 0) for name in ("force", "force_t_host_ns", "force_sequence")),
-    ("force_sequence.journal", 8),
-]
-
-
-@pytest.mark.parametrize(("file", "start"), ZEROED)
-def test_a_column_that_a_power_cut_zeroed_is_named_as_a_loss(store, stage_of_two, file, start):
-    """Of the stream 15 samples are written."""
-    zero(stage_of_two / file, start)
-    (result,) = repair_unfinished(store.root)
-    assert (result.action, result.lost) == ("recovered", {"force": 15})
-    reader = store.recording("take-1")
-    assert (reader.num_samples("force"), reader.num_samples("other")) == (0, 10)
-    events = {(e.stream, e.event): e.count for e in reader.attributes.ledger}
-    assert events["force", "incomplete_samples"] == 15
-    assert ("other", "incomplete_samples") not in events
-
-
-@pytest.mark.parametrize(("file", "start"), ZEROED)
-def test_a_take_whose_only_stream_lost_a_column_is_kept(store, stage, file, start):
-    zero(stage / file, start)
-    with pytest.raises(CorruptDataError, match=r"although there were \{'force': 15\}"):
-        store.recover()
-    assert store.sweep() == 0
-    (result,) = repair_unfinished(store.root)
-    assert (result.action, result.kind) == ("left", "stage")
-    assert "force" in result.notes[0]
-    assert stage.is_dir()
-
-
-@pytest.mark.parametrize(
-    ("file", "place"), [("force.part", 30), ("force.journal", 10), ("force_sequence.part", 9)]
-)
-def test_a_damaged_stage_is_salvaged(store, stage, file, place):
-    flip(stage / file, place)
-    assert inspect_stage(stage).damaged
-    with pytest.raises(CorruptDataError):
-        store.recover()
-    (result,) = repair_unfinished(store.root)
-    assert (result.kind, result.action, result.lost) == ("stage", "salvaged", {"force": 5})
-    reader = store.recording("take-1-salvaged-1")
-    reader.verify()
-    assert reader.read("force").sequence.tolist() == list(range(5, 15))
-    np.testing.assert_array_equal(reader.read("force").values, batch(5, 10).values)
-    assert [entry.kind for entry in store.trash_list()] == ["stage"]
