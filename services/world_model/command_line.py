@@ -11,10 +11,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dextouch.command_line import CommandParser, ProgressLines, write_result
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.serving import load_settings
-from dextouch.serving.configuration_file import (
+from dextouch.serving import (
     CommandSettings,
     configuration_path,
+    load_settings,
     read_configuration,
     section_of,
 )

@@ -11,6 +11,8 @@ import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import structlog
+
 from dextouch.episodes.files import disk_errors, write_file
 from dextouch.episodes.format import (
     COMMIT_FILE,
@@ -32,6 +34,8 @@ from dextouch.errors import (
     StorageError,
     UnavailableError,
 )
+
+logger = structlog.get_logger(__name__)
 
 _OUTBOX = ".outbox"
 _OWNER_FILE = "uploads_to"
@@ -309,6 +313,7 @@ class ObjectStorage:
             self._upload(kind, folder)
         except ConflictError:
             # It can be written again: a recording from its spool or file, an episode from that.
+            logger.warning("upload_removed", kind=kind, item=folder.name, reason="its id was taken")
             shutil.rmtree(folder, ignore_errors=True)
             return False
         return True
