@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import structlog
 from jaxtyping import Float32, UInt8
 
 from dextouch.episodes import (
@@ -22,6 +23,8 @@ from dextouch.schemas import Observation, RolloutDoubt, is_rollout, rollout_doub
 from dextouch.streams import HEAD_CAMERA
 from services.evaluation.starts import start_digest
 from services.networks.training_settings import USUAL_IMAGE_PX
+
+logger = structlog.get_logger(__name__)
 
 NUM_SEEN_STEPS: Final = 3
 # Share of an object's usual size. Start readers err by 4 to 7 % (`python -m benchmarks starts`).
@@ -71,6 +74,11 @@ class Ending:
     doubted: str | None = None
     success_probability: float | None = None
     size_deviation: float | None = None
+
+    @property
+    def shows_scene(self) -> bool:
+        """Whether there are images or poses of objects, as judging needs."""
+        return self.images is not None or self.object_poses is not None
 
     @property
     def has_unusual_sizes(self) -> bool:
@@ -127,7 +135,8 @@ class Ending:
 class EndingEpisode:
     """One episode of known outcome with the endings used for training.
 
-    `endings` holds the observations at some steps, including the last step; `success` is the real
+    `endings` holds the observations at some steps, the last one among them, if images or poses of
+    objects were recorded there; `success` is the real
     outcome of these actions, also for an imagined episode. `event_times_s` is when each milestone
     was first reached, None where that is unknown.
     """
@@ -188,6 +197,7 @@ def read_ending_episode(reader: EpisodeReader, *, image_px: int = USUAL_IMAGE_PX
     ends = (early_step(grid.scene, last), middle_step(grid.scene, last), last - 1, last)
     endings = {end: _read_ending(grid, touch_kpa, end) for end in ends}
     endings[last] = endings[last].with_doubt(RolloutDoubt.from_quality(about.quality))
+    endings = {end: ending for end, ending in endings.items() if ending.shows_scene}
     times = about.event_times_s
     # None noted in a true failure means none reached.
     is_known = times or not (about.success or about.origin == "imagined" or is_rollout(about))
@@ -252,7 +262,12 @@ def read_ending_episodes(
     readers = select_episodes(
         stores, domain="robot", tasks=tasks, splits=splits, origins=(), needs=JUDGED
     )
-    return [read_ending_episode(reader, image_px=image_px) for reader in readers]
+    episodes = [read_ending_episode(reader, image_px=image_px) for reader in readers]
+    judged = [episode for episode in episodes if episode.last_step in episode.endings]
+    if len(judged) < len(episodes):
+        reason = "without images of their last steps or poses of their objects there"
+        logger.warning("skipped_episodes", reason=reason, count=len(episodes) - len(judged))
+    return judged
 
 
 def milestones_of(episodes: Iterable[EndingEpisode]) -> dict[str, tuple[str, ...]]:

@@ -99,6 +99,7 @@ def _examples(item: EndingEpisode, shape: ProbeShape) -> list[_Example]:
     return [
         _Example(item.endings[step], part, success, item.reached(names, step))
         for step, part, success in steps
+        if step in item.endings
     ]
 
 
@@ -117,15 +118,19 @@ def _weights(examples: Sequence[_Example], imagined_share: float) -> Float64[np.
 
 
 def _group_weights(examples: Sequence[_Example], what: str) -> Float64[np.ndarray, " n"]:
-    """Weights of the endings of one task and kind, which sum to one and a little more."""
+    """Weights of the endings of one task and kind, which sum to one and a little more.
+
+    Where no early steps are shown, final failures have their share of the weight.
+    """
     part = np.array([e.part for e in examples])
     success = np.array([bool(e.success) for e in examples])
     weight = np.zeros(len(examples))
     middle = MIDDLE_SHARE if (part == "middle").any() else 0.0
+    early = EARLY_SHARE if (part == "early").any() else 0.0
     for word, chosen, share in (
         ("successful", (part == "final") & success, 0.5),
-        ("failed", (part == "final") & ~success, 0.5 * (1 - EARLY_SHARE)),
-        ("early", part == "early", 0.5 * EARLY_SHARE),
+        ("failed", (part == "final") & ~success, 0.5 * (1 - early)),
+        ("early", part == "early", 0.5 * early),
         ("middle", part == "middle", middle),
     ):
         if share and not chosen.any():

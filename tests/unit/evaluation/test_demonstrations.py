@@ -69,10 +69,15 @@ def test_the_last_three_steps_of_sparse_images_are_enough_for_the_probe(tmp_path
     (episode,) = read_ending_episodes(store)
     np.testing.assert_array_equal(episode.final.images, item.images[[78, 79, 80]])
     assert episode.start_digest == item.start_digest
-    # Steps that were not drawn are judged by touch, never by the images of others.
-    for step in (episode.early_step, episode.middle_step, 79):
-        assert episode.endings[step].images is None
-        assert episode.endings[step].tactile_kpa.shape == (3, 2, 320)
+    # Steps of which there are neither images nor poses are left out, not shown by others' images.
+    assert set(episode.endings) == {80}
+
+
+def test_takes_whose_end_shows_nothing_are_left_out(tmp_path):
+    store = EpisodeStore(tmp_path)
+    write(store, toy.demonstration("reach", 2), shown=SPARSE)
+    write(store, toy.demonstration("reach", 4), shown=range(40))
+    assert [one.episode_id for one in read_ending_episodes(store)] == ["reach-2-0"]
 
 
 def test_pictures_of_an_episode(url):
@@ -103,7 +108,7 @@ def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
 def test_what_a_station_recorded_can_be_trained_on(network, trained, tmp_path):
     store = EpisodeStore(tmp_path / "recorded")
     for item in toy.demonstrations(range(40), noise_m=0.03):
-        write(store, item, origin="recorded", seed=None)
+        write(store, item, shown=SPARSE, origin="recorded", seed=None)
     output = tmp_path / "trained.safetensors"
     flags = ["--episodes", str(store.root), "--output", str(output)]
     training = ["--training.num-training-steps", "3", "--training.held-out-share", "0.4"]
