@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dextouch.episodes import data_hash, split_by_scene
+from dextouch.errors import InvalidInputError
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
 from services.evaluation.demonstrations import instructions_of
 from services.evaluation.endings import EndingEpisode, milestones_of
@@ -84,6 +85,21 @@ class ProbeSets:
                 (e.start_digest for e in others), trained_on=trained_on, what="the success probe"
             )
 
+    def check_measurable(self) -> None:
+        """Check before training that every task can be measured.
+
+        Raises:
+            InvalidInputError: the held-out true takes of a task have one outcome only.
+        """
+        for task in sorted({e.task for e in self.training}):
+            outcomes = [e.success for e in self.held_out if e.task == task and not e.imagined]
+            if len(set(outcomes)) < 2:
+                raise InvalidInputError(
+                    f"success probe: {len(outcomes)} true takes of {task!r} are held out, "
+                    f"{sum(outcomes)} of them successful; expected both outcomes: choose a larger "
+                    "--training.held-out-share, or give --held-out STORE"
+                )
+
 
 def train_success_probe(
     episodes: Sequence[EndingEpisode],
@@ -121,6 +137,7 @@ def train_success_probe(
     )
     network = ProbeNetwork(shape)
     learned = labelled_endings(sets.training, shape, imagined_share=settings.imagined_share)
+    sets.check_measurable()
     orders = [
         (network.of(task), learned.of_task(index), settings, f"probe {task}")
         for index, task in enumerate(shape.tasks)

@@ -9,6 +9,7 @@ from dextouch.clients.policy import PolicyStart
 from dextouch.episodes import EpisodeStore, select_episodes
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from services.cli.main import run_command
+from services.evaluation.command_line import run_train_probe
 from services.evaluation.endings import read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.cloning_episodes import (
@@ -114,6 +115,15 @@ def test_what_a_station_recorded_can_be_trained_on(network, trained, tmp_path):
     training = ["--training.num-training-steps", "3", "--training.held-out-share", "0.4"]
     assert run_command(["train", network, *flags, *training]) == 0
     assert set(trained.load(output).metadata.training_episodes) <= set(store.list())
+
+
+def test_a_judge_that_nothing_would_measure_is_refused_before_it_is_trained(tmp_path):
+    store = EpisodeStore(tmp_path / "recorded")
+    for item in toy.demonstrations(range(40), noise_m=0.03):
+        write(store, item)
+    flags = ["--episodes", str(store.root), "--output", str(tmp_path / "judge.safetensors")]
+    with pytest.raises(InvalidInputError, match=r"are held out.* --training\.held-out-share"):
+        run_train_probe([*flags, "--training.held-out-share", "0.02"])
 
 
 def test_policies_can_be_trained_from_the_command_line(url, tmp_path, capsys):
