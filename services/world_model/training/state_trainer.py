@@ -9,7 +9,7 @@ import multiprocessing
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -70,7 +70,7 @@ from services.world_model.training.state_data import (
     seed_ranges,
     trained_splits,
 )
-from services.world_model.training.state_evaluation import evaluate_dynamics
+from services.world_model.training.state_evaluation import StateFigures, evaluate_dynamics
 from services.world_model.training.transfer import Base
 
 # Increment when a change of training gives other weights for the same settings and data.
@@ -117,8 +117,8 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         config = base.configured(config, keeps_tasks=settings.learn == "success")
     parts = settings.output.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
-    image_px = None if settings.image_px == USUAL_IMAGE_PX else settings.image_px
-    hashed = data_hash((episode.content_sha256 for episode in training), image_px=image_px)
+    contents = (episode.content_sha256 for episode in training)
+    hashed = data_hash(contents, image_px=_unusual_px(settings))
     # Before training, so that invalid episodes are found at once.
     heldout_table = scene_table(heldout, config)
     table = scene_table(
@@ -135,48 +135,14 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     )
     table_file = parts / "table.safetensors"
     save_file({**table.tensors(), **_prefixed(codec)}, table_file)
-    horizon_latents = (int(table.length[~table.human | table.human.all()].max()) - 1) // (
-        STEPS_PER_LATENT
-    )
+    horizon_latents = _horizon_latents(table)
     del table
     work = _Work(settings, config, parts, hashed, reads_starts)
     _train_parts(work)
     dynamics, renderer, cpu_s = _assembled(work, codec)
     measured = evaluate_dynamics(dynamics, heldout_table)
-    metadata = StateMetadata(
-        name=settings.name,
-        dynamics=config,
-        num_members=settings.num_members,
-        renderer=settings.renderer,
-        **_objects(data, config, base),
-        bounds=StateBounds(
-            disagreement_m=measured.disagreement_m,
-            distance=measured.distance,
-            horizon_latents=horizon_latents,
-            of_chunks=True,
-        )
-        if base is None or settings.learn == "all"
-        else base.checkpoint.metadata.bounds,
-        command=command,
-        seed=settings.seed,
-        training_cpu_s=round(cpu_s, 1),
-        num_training_episodes=len(training),
-        training_seeds=seed_ranges(training, base),
-        training_splits=trained_splits(settings, base),
-        heldout_share=heldout_share(settings, base),
-        training_scenes=recorded_scenes(training, base),
-        data_hash=hashed,
-        object_sources=object_sources(training),
-        sets=training_sets(
-            training,
-            heldout,
-            human_share=settings.share_of_human,
-            image_px=image_px,
-            inherited=() if base is None else base.checkpoint.metadata.sets,
-            ancestor=None if base is None else base.checkpoint.digest,
-        ),
-        metrics=measured.figures,
-    )
+    measured = replace(measured, num_latents=horizon_latents)
+    metadata = _metadata(work, data, measured, command=command, cpu_s=cpu_s)
     digest = write_state_checkpoint(settings.output, dynamics, renderer, metadata)
     table_file.unlink()
     return StateReport(
@@ -188,6 +154,58 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         len(heldout),
         measured.figures,
     )
+
+
+def _metadata(
+    work: "_Work", data: StateData, measured: StateFigures, *, command: str, cpu_s: float
+) -> StateMetadata:
+    """Provenance and accuracy of a trained model."""
+    settings, base = work.settings, work.base
+    return StateMetadata(
+        name=settings.name,
+        dynamics=work.config,
+        num_members=settings.num_members,
+        renderer=settings.renderer,
+        **_objects(data, work.config, base),
+        bounds=StateBounds(
+            disagreement_m=measured.disagreement_m,
+            distance=measured.distance,
+            horizon_latents=measured.num_latents,
+            of_chunks=True,
+        )
+        if base is None or settings.learn == "all"
+        else base.checkpoint.metadata.bounds,
+        command=command,
+        seed=settings.seed,
+        training_cpu_s=round(cpu_s, 1),
+        num_training_episodes=len(data.training),
+        training_seeds=seed_ranges(data.training, base),
+        training_splits=trained_splits(settings, base),
+        heldout_share=heldout_share(settings, base),
+        training_scenes=recorded_scenes(data.training, base),
+        data_hash=work.data_hash,
+        object_sources=object_sources(data.training),
+        sets=training_sets(
+            data.training,
+            data.heldout,
+            human_share=settings.share_of_human,
+            image_px=_unusual_px(settings),
+            inherited=() if base is None else base.checkpoint.metadata.sets,
+            ancestor=None if base is None else base.checkpoint.digest,
+        ),
+        metrics=measured.figures,
+    )
+
+
+def _horizon_latents(table: SceneTable) -> int:
+    """Latent steps of the longest training episode, of robots if there are any."""
+    own = table.length[~table.human | table.human.all()]
+    return (int(own.max()) - 1) // STEPS_PER_LATENT
+
+
+def _unusual_px(settings: StateTrainSettings) -> int | None:
+    """Side of the images, for hashes; None if it is the usual one."""
+    return None if settings.image_px == USUAL_IMAGE_PX else settings.image_px
 
 
 @dataclass(frozen=True)

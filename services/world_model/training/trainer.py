@@ -88,12 +88,7 @@ def train_on(
         check_unseen(heldout, tokenizer)
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else read_checkpoint(settings.init)
-    known = (
-        set()
-        if ancestor is None
-        else {*ancestor.metadata.tasks, *learned_tasks(ancestor.metadata.sets)}
-    )
-    check_tasks((*trained, *heldout), settings, known)
+    check_tasks((*trained, *heldout), settings, _known_tasks(ancestor))
     prints = {episode.fingerprint() for episode in trained}
     names = {episode.episode_id for episode in trained}
     if ancestor is not None:
@@ -152,6 +147,13 @@ def train_on(
         metrics=metrics,
         log=log,
     )
+
+
+def _known_tasks(ancestor: Checkpoint | None) -> set[str]:
+    """Tasks that a checkpoint and its ancestors were trained on."""
+    if ancestor is None:
+        return set()
+    return {*ancestor.metadata.tasks, *learned_tasks(ancestor.metadata.sets)}
 
 
 def _data_hash(

@@ -29,7 +29,8 @@ INTENTS = ".deletions"
 # Rounds of search and removal; more are needed only under constant uploads.
 _MAX_ROUNDS = 5
 _MAX_HEADER_BYTES = 64 << 20
-_VERSION = re.compile(r"-salvaged-[0-9]+")
+# Those that earlier releases completed after a crash are named `recovered`.
+_VERSION = re.compile(r"-(salvaged|recovered)-[0-9]+")
 
 
 @dataclass(frozen=True)
