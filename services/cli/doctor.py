@@ -45,7 +45,6 @@ _OPTIONAL = {
     "rerun": "shows the .rrd files of the player's command: rerun FILE.rrd",
     "pyarrow": "LeRobot datasets",
     "mcap": "MCAP files",
-    "numcodecs": "UMI files",
     "obstore": "stores in a bucket, s3://…",
     "diffusers": "the full-size world model",
 }

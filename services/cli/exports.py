@@ -27,6 +27,7 @@ _EXPORT_HELP = """\
 formats:
   lerobot  a LeRobotDataset v3.0 folder: episodes on a frame grid, video, parquet
   umi      one zip with a Zarr v2 replay buffer: episodes on the model grid
+           (cannot be imported)
   mcap     one file per episode or recording, every sample; opens in Foxglove
   rrd      one file per episode or recording, every sample; opens in Rerun (cannot be imported)
 
@@ -41,7 +42,6 @@ _IMPORT_HELP = """\
 examples:
   dextouch import --format mcap take.mcap
   dextouch import --format mcap takes/
-  dextouch import --format umi robot.zarr.zip
   dextouch import --format lerobot data/lerobot --id-prefix theirs-
 
 What each format keeps and loses: docs/bridges.md
@@ -214,10 +214,6 @@ def _import(options: argparse.Namespace) -> Report:
             raise NotFoundError(f"{path}: holds no .mcap file")
         names = progress(files, "import mcap", len(files))
         ids = [import_mcap(file, store) for file in names]
-    elif options.format == "umi":
-        from dextouch.bridges.umi import import_umi
-
-        ids = import_umi(path, store)
     else:
         from dextouch.bridges.lerobot import ImportOptions, import_lerobot
 
@@ -275,7 +271,7 @@ def import_main(argv: Sequence[str]) -> int:
     parser = _parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
     add = parser.add_argument
     add("path", type=Path, metavar="PATH", help="file or folder to read")
-    add("--format", required=True, choices=("lerobot", "mcap", "umi"), help="input format")
+    add("--format", required=True, choices=("lerobot", "mcap"), help="input format")
     add("--id-prefix", default="", metavar="TEXT", help="lerobot: prefix of every id")
     images = "lerobot: unit of stored images (%(default)s)"
     add("--images", choices=("h264", "jpeg", "rgb8"), default="h264", help=images)

@@ -13,7 +13,7 @@ _PACKAGES = {
     "full": "diffusers transformers",
     "twin": "mujoco",
     "gym": "gymnasium",
-    "export": "pyarrow mcap foxglove_schemas_protobuf numcodecs",
+    "export": "pyarrow mcap foxglove_schemas_protobuf",
     "rerun": "rerun",
     "s3": "obstore",
 }

@@ -53,7 +53,7 @@ COMMANDS = {
     "export": Command(
         "write LeRobot, MCAP, Rerun or UMI files from a store", "cli.exports:export_main"
     ),
-    "import": Command("read LeRobot, MCAP or UMI files into a store", "cli.exports:import_main"),
+    "import": Command("read LeRobot or MCAP files into a store", "cli.exports:import_main"),
     "align": Command("convert recordings to synchronized episodes", "alignment.command_line:main"),
     "align serve": Command("serve alignment over HTTP", "alignment.app:main"),
     "train": Command("train the world model, its judge of success, or a policy"),

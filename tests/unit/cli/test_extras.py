@@ -51,7 +51,7 @@ COMMANDS = (
     "store list",
     "export --format mcap nothing --to x.mcap",
     "export --format lerobot nothing --to x",
-    "import --format umi nothing.zip",
+    "import --format mcap nothing.mcap",
     "align run --all",
     "align serve --help",
     "train data --count 0",
@@ -88,7 +88,7 @@ def run_without(folder, packages, lines):
     [
         ((), set(COMMANDS)),
         # Reading a file needs no more until there is one.
-        (("store",), set(COMMANDS) - {"import --format umi nothing.zip"}),
+        (("store",), set(COMMANDS) - {"import --format mcap nothing.mcap"}),
         (
             ("store", "station", "serve"),
             {

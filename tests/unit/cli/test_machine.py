@@ -153,7 +153,6 @@ def test_what_only_one_purpose_needs_is_listed_with_it(doctors_ports):
         "rerun": "rerun FILE.rrd",
         "pyarrow": "LeRobot",
         "mcap": "MCAP",
-        "numcodecs": "UMI",
         "obstore": "bucket",
     }.items():
         assert [what for what in named if what.startswith(f"{package} ") and purpose in what]
