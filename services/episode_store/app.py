@@ -9,7 +9,7 @@ from fastapi import FastAPI
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.care import DeletionRecords
-from dextouch.errors import StorageError
+from dextouch.errors import DexTouchError
 from dextouch.schemas import load_object_clicks
 from dextouch.serving import ServedFolder, create_service_app, serve
 from services.episode_store.catalog import Catalog
@@ -19,6 +19,7 @@ from services.episode_store.enrolment import Enrolments
 from services.episode_store.enrolment_routes import enrolment_router
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
+from services.episode_store.pending_uploads import PendingUploads
 from services.episode_store.playback import playback_router
 from services.episode_store.reading import content_router
 from services.episode_store.routes import (
@@ -36,7 +37,7 @@ ENROLMENTS_FILE = "enrolments.json"
 
 
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
-    """Create the application of one store; at startup it clears up after killed writers."""
+    """Create the application of one store; it clears up after killed writers."""
     store = EpisodeStore(settings.store_url)
     catalog = Catalog(store)
     objects = None if settings.objects is None else load_object_clicks(settings.objects)
@@ -48,17 +49,19 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     metrics = UploadMetrics()
     deletions = DeletionRecords(store.root)
     watch = DeletionWatch(deletions, ingest.drop_deleted, limits.end)
+    pending = PendingUploads(store)
     enrolments = Enrolments(settings.enrolments or store.root / ENROLMENTS_FILE)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        _clear_up(store)
+        pending.start()
         # The first listing of a large store takes seconds, so it is warmed up in the background.
         threading.Thread(target=_warm_up, args=(catalog,), name="warm-up", daemon=True).start()
         watch.start()
         try:
             yield
         finally:
+            pending.stop()
             watch.stop()
             ingest.close()
 
@@ -85,28 +88,10 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     return app
 
 
-def _clear_up(store: EpisodeStore) -> None:
-    """Complete interrupted uploads to a bucket, and remove the stages of killed writers."""
-    try:
-        for kind, item_id in store.complete_uploads():
-            logger.warning("upload_completed", kind=kind, id=item_id)
-    except StorageError as error:
-        # The service still serves everything else, and tries again when it next starts.
-        logger.error("uploads_not_completed", error=error.message)  # noqa: TRY400
-    try:
-        removed = store.sweep()
-    except StorageError as error:
-        # Such as a read-only folder, which can still be read.
-        logger.warning("sweep_failed", reason=error.message)
-        return
-    if removed:
-        logger.info("unfinished_writes_removed", count=removed)
-
-
 def _warm_up(catalog: Catalog) -> None:
     try:
         catalog.warm_up()
-    except StorageError as error:
+    except DexTouchError as error:
         logger.warning("warm_up_failed", reason=error.message)
 
 

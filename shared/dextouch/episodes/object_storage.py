@@ -197,16 +197,19 @@ class ObjectStorage:
         """Writer of a new group.
 
         Raises:
-            ConflictError: the id exists already, or its upload is pending.
+            ConflictError: the id exists already.
             InvalidInputError: the work folder belongs to another address.
-            StorageError, UnavailableError: the bucket cannot be reached; nothing was written.
+            UnavailableError: an earlier upload of this id is pending, or the bucket cannot be
+                reached; nothing was written.
+            StorageError: the bucket refused.
         """
         item_id = attributes_id(attributes)
         self._own_work_folder()
         target = self._outbox / f"{kind}s" / item_id
         if target.exists():
-            raise ConflictError(
-                f"{kind} {item_id!r} waits in {target} to be uploaded; `complete_uploads` does so"
+            raise UnavailableError(
+                f"{kind} {item_id!r} waits in {target} to be uploaded; `complete_uploads` does so, "
+                "as does the store's service while it runs"
             )
         if self.exists(kind, item_id):
             raise ConflictError(f"{kind} {item_id!r} exists already; choose another id")

@@ -147,7 +147,7 @@ def test_a_kill_during_the_upload_loses_nothing(url, store, tmp_path, deadly):
     with pytest.raises(NotFoundError):
         other.open(EPISODE)
     made = episode_of()
-    with pytest.raises(ConflictError, match=r"waits in .* to be uploaded"):
+    with pytest.raises(UnavailableError, match=r"waits in .* to be uploaded"):
         made.write(store)
     assert store.complete_uploads() == (("episode", EPISODE),)
     assert not any((work / ".outbox" / "episodes").iterdir())

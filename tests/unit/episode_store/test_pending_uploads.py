@@ -1,0 +1,79 @@
+"""A service whose bucket is away: it starts, and uploads what waits when the bucket is back."""
+
+import time
+
+import pytest
+from fastapi.testclient import TestClient
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import StorageError, UnavailableError
+from services.episode_store.app import create_app
+from services.episode_store.pending_uploads import PendingUploads
+from services.episode_store.settings import EpisodeStoreSettings
+from tests.contracts.s3_server import CREDENTIALS, running_s3
+from tests.unit.episodes.conftest import episode_of
+
+# Port 9 (discard) answers nobody on a loopback device.
+AWAY = "s3://takes/unit?endpoint=http://127.0.0.1:9&allow_http=true&region=us-east-1&max_retries=0"
+
+
+@pytest.fixture(scope="module")
+def s3_server():
+    with running_s3() as server:
+        yield server
+
+
+@pytest.fixture
+def store(s3_server, tmp_path):
+    url = s3_server.url(f"pending/{tmp_path.name}")
+    return EpisodeStore(url, CREDENTIALS | {"work_folder": str(tmp_path / "work")})
+
+
+def fail_to_upload(s3_server, store, made):
+    """Write an episode whose upload is refused, so that it waits."""
+    writer = store.writer(attributes=made.attributes)
+    for descriptor in made.descriptors:
+        writer.add_stream(descriptor)
+        name = descriptor.name
+        writer.append(name, values=made.values[name], t_ref_ns=made.stamps_ns[name])
+    with s3_server.checking_credentials(), pytest.raises(StorageError, match="waits in"):
+        writer.__exit__(None, None, None)
+
+
+def wait_until(holds, deadline_s=20.0):
+    end = time.monotonic() + deadline_s
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_a_service_starts_while_its_bucket_is_away(tmp_path, monkeypatch):
+    for name, value in CREDENTIALS.items():
+        monkeypatch.setenv(f"AWS_{name}".upper(), value)
+    monkeypatch.chdir(tmp_path)
+    app = create_app(EpisodeStoreSettings(store_url=f"{AWAY}&work_folder={tmp_path / 'work'}"))
+    with TestClient(app, base_url="http://127.0.0.1") as client:
+        assert client.get("/healthz").status_code == 200
+
+
+def test_what_failed_is_uploaded_when_the_bucket_is_back(s3_server, store):
+    made = episode_of()
+    pending = PendingUploads(store, period_s=0.05)
+    fail_to_upload(s3_server, store, made)
+    with s3_server.checking_credentials():
+        with pytest.raises(StorageError, match="refused"):
+            pending.try_all()
+        pending.start()
+        time.sleep(0.2)
+    try:
+        wait_until(lambda: store.list() == [made.attributes.episode_id])
+    finally:
+        pending.stop()
+    assert store.open(made.attributes.episode_id).verify()
+
+
+def test_a_take_that_waits_is_no_conflict(s3_server, store):
+    made = episode_of()
+    fail_to_upload(s3_server, store, made)
+    with pytest.raises(UnavailableError, match="waits in"):
+        made.write(store)
