@@ -18,7 +18,6 @@ from dextouch.episodes.object_bucket import Bucket
 from dextouch.episodes.object_storage import BLOCK_BYTES
 from dextouch.episodes.uploads import ORPHAN_AGE, sweep_orphans
 from dextouch.errors import (
-    ConflictError,
     InvalidInputError,
     NotFoundError,
     StorageError,
