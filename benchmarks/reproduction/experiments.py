@@ -86,12 +86,14 @@ class Sizes(FrozenModel):
     """Amounts of data and training; the defaults take some hours on two cores.
 
     The paper has 5 h of robot and up to 100 h of human data, that is 20 times as much. `multiples`
-    are human episodes as multiples of the robot episodes, `adapt_half` the robot and the human
-    episodes of WM-Mix.
+    are human episodes as multiples of the robot episodes, `pretraining_per_task` robot episodes
+    with mistakes for the model that is adapted, `adapt_half` the robot and the human episodes of
+    WM-Mix.
     """
 
     robot_per_task: int = Field(default=4, ge=2)
     multiples: tuple[int, ...] = (1, 5, 10)
+    pretraining_per_task: int = Field(default=200, ge=2)
     heldout_per_task: int = Field(default=6, ge=1)
     downstream_per_task: int = Field(default=84, ge=3)
     adapt_robot: int = Field(default=200, ge=1)
@@ -101,8 +103,10 @@ class Sizes(FrozenModel):
     option_cpu_s: int = Field(default=120, ge=1)
     reader_steps: int = Field(default=600, ge=2)
     core_steps: int = Field(default=2000, ge=2)
-    adapt_reader_steps: int = Field(default=600, ge=1)
-    adapt_core_steps: int = Field(default=1000, ge=1)
+    pretraining_reader_steps: int = Field(default=1000, ge=2)
+    pretraining_core_steps: int = Field(default=4000, ge=2)
+    adapt_reader_steps: int = Field(default=1000, ge=1)
+    adapt_core_steps: int = Field(default=2000, ge=1)
     core_batch: int = Field(default=32, ge=1)
     drawing_cpu_s: int = Field(default=30, ge=1)
     policy_steps: int = Field(default=3000, ge=1)
@@ -113,6 +117,7 @@ class Sizes(FrozenModel):
 QUICK: Final = Sizes(
     robot_per_task=8,
     multiples=(1,),
+    pretraining_per_task=8,
     heldout_per_task=1,
     downstream_per_task=24,
     adapt_robot=8,
@@ -122,6 +127,8 @@ QUICK: Final = Sizes(
     option_cpu_s=4,
     reader_steps=4,
     core_steps=4,
+    pretraining_reader_steps=4,
+    pretraining_core_steps=4,
     adapt_reader_steps=2,
     adapt_core_steps=2,
     drawing_cpu_s=1,
@@ -176,6 +183,7 @@ class Experiments:
         amounts = {
             "robot": (sizes.robot_per_task, f"robot-pretraining {moving}"),
             "cans": (sizes.robot_per_task, f"{_CANS} --exact"),
+            "pretraining": (sizes.pretraining_per_task, "robot-pretraining"),
             "human": (human, f"human-pretraining {by_devices} {moving}"),
             "downstream": (sizes.downstream_per_task, "downstream"),
             "downstream-human": (downstream_human, f"downstream {by_devices}"),
@@ -227,25 +235,45 @@ class Experiments:
             yield self._rolled_out(self._state_model(HALF_TRAINING, seed))
 
     def _with_human(self, multiple: int, seed: int) -> Step:
-        count = multiple * self.sizes.robot_per_task * len(ROBOT_PRETRAINING)
-        flags = f"--human data/human/store --human-episodes {count}"
-        return self._state_model(f"{multiple}x", seed, flags, needs=(self._data["human"],))
+        return self._state_model(f"{multiple}x", seed, num_human=self._num_human(multiple))
 
-    def _state_model(
-        self, column: str, seed: int, flags: str = "", *, needs: tuple[Step, ...] = ()
-    ) -> Step:
+    def _num_human(self, multiple: int) -> int:
+        return multiple * self.sizes.robot_per_task * len(ROBOT_PRETRAINING)
+
+    def _state_model(self, column: str, seed: int, *, num_human: int = 0) -> Step:
         """One member of a state model, trained for as many steps in every column but one."""
-        sizes, name = self.sizes, f"scaling/{folder_of(column)}/seed-{seed}/model"
-        share = 2 if column == HALF_TRAINING else 1
+        sizes, share = self.sizes, 2 if column == HALF_TRAINING else 1
+        return self._pretrained(
+            f"scaling/{folder_of(column)}/seed-{seed}/model",
+            seed,
+            steps=(sizes.reader_steps // share, sizes.core_steps // share),
+            num_human=num_human,
+        )
+
+    def _pretrained(
+        self,
+        name: str,
+        seed: int,
+        *,
+        steps: tuple[int, int],
+        robot: str = "robot",
+        num_human: int = 0,
+        flags: str = "",
+    ) -> Step:
+        """A state model of one member, with numbers of steps of its start reader and its core."""
+        needs = [self._data[robot], self._data["robot-heldout"]]
+        if num_human:
+            needs.append(self._data["human"])
+            flags += f" --human data/human/store --human-episodes {num_human}"
         return _step(
             name,
-            f"train world-model --episodes data/robot/store --heldout data/robot-heldout/store "
+            f"train world-model --episodes data/{robot}/store --heldout data/robot-heldout/store "
             f"{flags} --seed {seed} --num-members 1 --jobs 1 "
-            f"--reader.num-steps {sizes.reader_steps // share} "
-            f"--core.num-steps {sizes.core_steps // share} --core.batch {sizes.core_batch} "
-            f"--drawing.cpu-budget-s {sizes.drawing_cpu_s} --output {name}/{_MODEL}",
+            f"--reader.num-steps {steps[0]} "
+            f"--core.num-steps {steps[1]} --core.batch {self.sizes.core_batch} "
+            f"--drawing.cpu-budget-s {self.sizes.drawing_cpu_s} --output {name}/{_MODEL}",
             _MODEL,
-            needs=(self._data["robot"], self._data["robot-heldout"], *needs),
+            needs=tuple(needs),
         )
 
     def _rolled_out(self, model: Step, *, data: str = "robot") -> Step:
@@ -305,9 +333,16 @@ class Experiments:
                 yield self._predicted(model, baselines, data="cans")
 
     def _adapted(self, world: str, seed: int) -> Step:
-        """WM-Robot or WM-Mix, from the model that saw the most human data."""
+        """WM-Robot or WM-Mix, from a model of robot episodes with mistakes and all human ones."""
         sizes = self.sizes
-        ancestor = self._with_human(max(sizes.multiples), seed)
+        ancestor = self._pretrained(
+            f"evaluator/pretrained/seed-{seed}/model",
+            seed,
+            steps=(sizes.pretraining_reader_steps, sizes.pretraining_core_steps),
+            robot="pretraining",
+            num_human=self._num_human(max(sizes.multiples)),
+            flags="--human-share 0.2",
+        )
         flags = {
             "WM-Robot": f"--robot-episodes {sizes.adapt_robot}",
             "WM-Mix": f"--robot-episodes {sizes.adapt_half} --human-episodes {sizes.adapt_half} "
