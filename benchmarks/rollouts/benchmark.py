@@ -13,7 +13,7 @@ from benchmarks.figures import Figure, Requirement
 from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.rollouts.crowd import Crowd, crowd
-from benchmarks.rollouts.watcher import watched
+from benchmarks.rollouts.watcher import listing_s, watched
 from benchmarks.rollouts.ways import MAX_CHUNKS, Chunk, Way, compared, opened
 from benchmarks.rollouts.worlds import MAX_STEPS, StillWorld, resting_actions
 from benchmarks.rounds import interleaved
@@ -28,6 +28,7 @@ ALL: Final = ReturnSelector(steps="all")
 MAX_OVER_ECHO: Final = {"HTTP": 1.5, "WebSocket": 1.3}
 MAX_DURABLE_MS: Final = 1.0
 MAX_WATCHED: Final = 1.1
+MAX_LISTING_MS: Final = 2.0
 MIN_BATCHED: Final = 3.0
 MAX_TAIL: Final = 3.0
 # Those with a requirement, and others for comparison.
@@ -45,8 +46,9 @@ WATCHED: Final = Way("HTTP", "16 raw images, watched", ALL, is_watched=True)
 DURABLE: Final = Way("HTTP", "last image, in Redis", LAST, server="durable")
 DEVICES: Final = ("device", "batch device")
 NUM_ROLLOUTS: Final = 32
-USUAL: Final = {"rounds": 15, "chunks": 200, "crowd_chunks": 60}
-QUICK: Final = {"rounds": 3, "chunks": 20, "crowd_chunks": 3}
+NUM_LISTINGS: Final = 101
+USUAL: Final = {"rounds": 15, "chunks": 200, "crowd_chunks": 60, "watched_rollouts": 10_000}
+QUICK: Final = {"rounds": 3, "chunks": 20, "crowd_chunks": 3, "watched_rollouts": 100}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -55,6 +57,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--chunks", type=int, help="chunks of each way in a round (200; quick 20)")
     parser.add_argument(
         "--crowd-chunks", type=int, help=f"chunks of each of {NUM_ROLLOUTS} rollouts (60; quick 3)"
+    )
+    parser.add_argument(
+        "--watched-rollouts", type=int, help="open rollouts of a listing (10000; quick 100)"
     )
 
 
@@ -81,6 +86,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         times_s, sizes = timed(urls, ways, plan, bar)
         with bar("32 rollouts", len(DEVICES)) as step:
             crowds = {world: _crowd(urls, world, plan, step) for world in DEVICES}
+        listings_s = _listings_s(urls, plan["watched_rollouts"])
     finally:
         child.close()
     bare_s = {selector: bare_step_s(selector) for selector in (LAST, JPEG, ALL)}
@@ -91,12 +97,16 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         options=plan,
         tables=[_table(times_s, over, sizes), _crowd_table(crowds)],
         panels=[],
-        requirements=_requirements(times_s, over, crowds),
+        requirements=[
+            *_requirements(times_s, over, crowds),
+            *_listing_requirements(listings_s, plan["watched_rollouts"]),
+        ],
         data={
             "seconds": {name: list(figure.values) for name, figure in times_s.items()},
             "bytes": {_name(way): size for way, size in sizes.items()},
             "bare_step_seconds": {_name(way): bare_s[way.selector] for way in ways},
             "crowds": {world: found._asdict() for world, found in crowds.items()},
+            "listing_seconds": listings_s,
         },
         notes=[
             "the world computes nothing; client and server are processes of their own; medians of "
@@ -130,6 +140,31 @@ def timed(
     with bar("rounds", plan["rounds"] * len(subjects)) as step:
         found = interleaved(subjects, plan["rounds"], on_step=step)
     return {name: Figure.of(values) for name, values in found.items()}, sizes
+
+
+def _listings_s(urls: Mapping[str, str], num_rollouts: int) -> dict[str, list[float]]:
+    """Times of listing one open rollout, by where rollouts are kept."""
+    kept = {"in memory": "ours", "in Redis": DURABLE.server}
+    return {
+        where: listing_s(urls[server], num_rollouts=num_rollouts, num_listings=NUM_LISTINGS)
+        for where, server in kept.items()
+        if server in urls
+    }
+
+
+def _listing_requirements(
+    listings_s: Mapping[str, list[float]], num_rollouts: int
+) -> list[Requirement]:
+    return [
+        Requirement(
+            f"GET /v1/watch?limit=1, {num_rollouts} rollouts {where}, with a new connection, p50",
+            1e3 * statistics.median(times_s),
+            "at most",
+            MAX_LISTING_MS,
+            "ms",
+        )
+        for where, times_s in listings_s.items()
+    ]
 
 
 def bare_step_s(selector: ReturnSelector) -> float:

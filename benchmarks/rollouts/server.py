@@ -132,8 +132,8 @@ def main() -> None:
         "batch device": BatchDevice(),
     }
     with bare_servers() as bare, redis_url() as url:
-        # Each round begins new ones.
-        limits = WorldServiceSettings().limits.model_copy(update={"max_rollouts": 10_000})
+        # Each round begins new ones, and listing is measured among ten thousand.
+        limits = WorldServiceSettings().limits.model_copy(update={"max_rollouts": 30_000})
         apps = {"ours": create_world_app(worlds, WorldServiceSettings(limits=limits))}
         if url is not None:
             durable = WorldServiceSettings(state_url=url, limits=limits)

@@ -1,4 +1,4 @@
-"""Child process that watches the newest rollout of a service, as an open dashboard does."""
+"""Watching a service as an open dashboard does: in a child process, and the time of a listing."""
 
 import json
 import sys
@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
+from benchmarks.rollouts.ways import START, connection
 from dextouch.serving import ChildProcess, serve_parent
 
 PERIOD_S: Final = 0.2
@@ -23,6 +24,21 @@ def watched(url: str) -> Iterator[None]:
         yield
     finally:
         child.close()
+
+
+def listing_s(url: str, *, num_rollouts: int, num_listings: int) -> list[float]:
+    """Times of `GET /v1/watch?limit=1` while a service has this many further open rollouts."""
+    start = json.dumps(START | {"world": "still"}).encode()
+    times_s = []
+    with connection(url) as post:
+        for _ in range(num_rollouts):
+            post("/v1/rollouts?cameras=", start, "application/json")
+    for _ in range(num_listings):
+        started_s = time.perf_counter()
+        with urllib.request.urlopen(f"{url}/v1/watch?limit=1") as answer:  # noqa: S310 - our own
+            answer.read()
+        times_s.append(time.perf_counter() - started_s)
+    return times_s
 
 
 def _watch(url: str) -> None:

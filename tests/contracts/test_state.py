@@ -72,6 +72,59 @@ async def test_of_many_new_values_only_as_many_as_allowed_are_kept(state, key):
     assert (await state.get(key + ":z")).value == b"z"
 
 
+async def test_a_group_lists_its_newest_notes(state, key):
+    async def add(name):
+        assert await state.add(f"{key}:{name}", b"", limits={key: 9}, ttl_s=60.0)
+
+    async def note(name, version=1, text=None):
+        await state.set(
+            f"{key}:{name}",
+            b"long" * 1000,
+            note=(text or name).encode(),
+            expected_version=version,
+            ttl_s=60.0,
+        )
+
+    assert await state.newest_notes(key, 5) == ([], 0)
+    for name in ("a", "b", "c", "silent"):
+        await add(name)
+    for name in ("b", "a", "c"):
+        await note(name)
+    # A second note changes the text and not the order; other keys are in no group.
+    await note("b", 2, "b again")
+    await state.set(f"{key}:other", b"", note=b"other", expected_version=0, ttl_s=60.0)
+    assert await state.newest_notes(key, 5) == ([b"c", b"a", b"b again"], 3)
+    assert await state.newest_notes(key, 1) == ([b"c"], 3)
+    assert await state.note(f"{key}:b") == b"b again"
+    assert await state.note(f"{key}:silent") == await state.note(f"{key}:none") == b""
+    await state.delete(f"{key}:c")
+    assert await state.newest_notes(key, 5) == ([b"a", b"b again"], 2)
+
+
+async def test_expired_values_leave_their_groups(state, key):
+    assert await state.add(key + ":lasting", b"", limits={key: 2}, ttl_s=60.0)
+    assert await state.add(key + ":brief", b"", limits={key: 2}, ttl_s=60.0)
+    await state.set(key + ":lasting", b"", note=b"lasting", expected_version=1, ttl_s=60.0)
+    await state.set(key + ":brief", b"", note=b"brief", expected_version=1, ttl_s=0.02)
+    assert not await state.add(key + ":more", b"", limits={key: 2}, ttl_s=60.0)
+    await asyncio.sleep(0.05)
+    assert await state.newest_notes(key, 5) == ([b"lasting"], 1)
+    assert await state.add(key + ":more", b"", limits={key: 2}, ttl_s=60.0)
+
+
+async def test_redis_keeps_nothing_of_what_is_gone(redis_url, key):
+    store = open_state(redis_url)
+    for name, ttl_s in (("deleted", 60.0), ("expired", 0.02)):
+        assert await store.add(f"{key}:{name}", b"", limits={key + name: 2}, ttl_s=ttl_s)
+        await store.set(f"{key}:{name}", b"", note=b"x", expected_version=1, ttl_s=ttl_s)
+    await store.delete(f"{key}:deleted")
+    while left := await store._call("KEYS", f"*{key}*"):
+        # Sorted sets expire with the last of their keys.
+        assert all(b"expired" in name for name in left)
+        await asyncio.sleep(0.005)
+    await store.close()
+
+
 async def test_delete_makes_room_for_a_new_thing(state, key):
     await state.set(key + ":b", b"1", expected_version=0, ttl_s=60.0)
     await state.set(key + ":a", b"2", expected_version=0, ttl_s=60.0)

@@ -3,8 +3,10 @@
 import asyncio
 import math
 import time
+from collections import defaultdict
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import redis.asyncio
@@ -16,6 +18,10 @@ from redis.exceptions import TimeoutError as RedisTimeoutError
 from dextouch.errors import ConflictError, InvalidInputError, StorageError, UnavailableError
 
 REDIS_PREFIX = "dextouch:state:"
+# Sorted sets of the keys of a group: all of them by when they expire, and those with a note by when
+# they got it. Listing and counting a group reads no other keys.
+LIVE_PREFIX = "dextouch:live:"
+NOTED_PREFIX = "dextouch:noted:"
 CONNECT_TIMEOUT_S = 2.0
 ANSWER_TIMEOUT_S = 10.0
 
@@ -33,11 +39,18 @@ class Versioned:
 
 
 class MemoryState:
-    """Expiring values of one process, with compare-and-set writes, so that no update is lost."""
+    """Expiring values of one process, with compare-and-set writes, so that no update is lost.
+
+    A value that is added (`add`) belongs to groups, whose size is limited and which are listed.
+    """
 
     def __init__(self, *, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
         self._entries: dict[str, tuple[Versioned, float]] = {}
+        self._groups_of: dict[str, tuple[str, ...]] = {}
+        # Keys of each group: all, and those with a note in the order in which they got it.
+        self._live: defaultdict[str, set[str]] = defaultdict(set)
+        self._noted: defaultdict[str, dict[str, None]] = defaultdict(dict)
         # No entry expires earlier.
         self._expires_s = math.inf
 
@@ -52,14 +65,20 @@ class MemoryState:
         stored = await self.get(key)
         return 0 if stored is None else stored.version
 
-    async def notes(self, prefix: str) -> dict[str, bytes]:
-        """Notes of all keys that begin with a prefix, without their values."""
+    async def note(self, key: str) -> bytes:
+        """The note, without the value; empty when absent or expired."""
+        stored = await self.get(key)
+        return b"" if stored is None else stored.note
+
+    async def newest_notes(self, group: str, limit: int) -> tuple[list[bytes], int]:
+        """Notes of the keys of a group that got theirs last, the newest first, and how many have.
+
+        Takes a time that depends on `limit` alone.
+        """
         self._expire()
-        return {
-            key: stored.note
-            for key, (stored, _) in self._entries.items()
-            if stored.note and key.startswith(prefix)
-        }
+        noted = self._noted.get(group, {})
+        newest = islice(reversed(noted), limit)
+        return [self._entries[key][0].note for key in newest], len(noted)
 
     async def set(
         self,
@@ -77,7 +96,7 @@ class MemoryState:
             key: of the entry.
             value: its first part.
             tail: its second part, such as megabytes that are not to be copied behind the first.
-            note: a few bytes about it, which `notes` lists without reading the value.
+            note: a few bytes about it, which `newest_notes` lists without reading the value.
             expected_version: that the new value was computed from.
             ttl_s: seconds until it expires.
 
@@ -96,17 +115,21 @@ class MemoryState:
         until_s = self._clock_s() + _checked_ttl(ttl_s)
         self._expires_s = min(self._expires_s, until_s)
         self._entries[key] = (written, until_s)
+        if note:
+            for group in self._groups_of.get(key, ()):
+                self._noted[group].setdefault(key)
         return written.version
 
     async def add(self, key: str, value: bytes, *, limits: Mapping[str, int], ttl_s: float) -> bool:
-        """Write a new value unless a limit is reached; False if one is.
+        """Write a new value into groups unless a limit is reached; False if one is.
 
-        Counting and writing are atomic, so concurrent callers never exceed a limit.
+        Counting and writing are atomic, so concurrent callers never exceed a limit. The value is in
+        its groups until it is deleted or expires.
 
         Args:
             key: of the value.
             value: to write.
-            limits: for beginnings of keys, the number of live keys that may begin so.
+            limits: its groups, with the number of live keys that each may have.
             ttl_s: time to live.
 
         Raises:
@@ -114,19 +137,19 @@ class MemoryState:
         """
         # No await between counting and writing, hence atomic in one event loop.
         self._expire()
-        is_full = any(
-            sum(other.startswith(within) for other in self._entries) >= limit
-            for within, limit in limits.items()
-        )
+        is_full = any(len(self._live.get(group, ())) >= limit for group, limit in limits.items())
         if key not in self._entries and is_full:
             return False
         await self.set(key, value, expected_version=0, ttl_s=ttl_s)
+        self._groups_of[key] = tuple(limits)
+        for group in limits:
+            self._live[group].add(key)
         return True
 
     async def delete(self, key: str) -> bool:
         """Delete a key; False if absent."""
         self._expire()
-        return self._entries.pop(key, None) is not None
+        return self._remove(key)
 
     async def ping(self) -> None:
         """Always succeeds; drops what has expired, also where nobody asks for it again."""
@@ -134,7 +157,16 @@ class MemoryState:
 
     async def close(self) -> None:
         """Drop all values."""
-        self._entries.clear()
+        for key in list(self._entries):
+            self._remove(key)
+
+    def _remove(self, key: str) -> bool:
+        for group in self._groups_of.pop(key, ()):
+            self._live[group].discard(key)
+            self._noted[group].pop(key, None)
+            if not self._live[group]:
+                del self._live[group], self._noted[group]
+        return self._entries.pop(key, None) is not None
 
     def _expire(self) -> None:
         now_s = self._clock_s()
@@ -142,42 +174,112 @@ class MemoryState:
             return
         gone = [key for key, (_, until_s) in self._entries.items() if until_s <= now_s]
         for key in gone:
-            del self._entries[key]
+            self._remove(key)
         self._expires_s = min((until_s for _, until_s in self._entries.values()), default=math.inf)
 
 
+# Functions of all scripts. The score of a key in `live` is when it expires, in ms of the server.
+_SCRIPT_COMMON = f"""
+local function now_ms()
+  local time = redis.call('TIME')
+  return time[1] * 1000 + math.floor(time[2] / 1000)
+end
+local function indexes(group)
+  return '{LIVE_PREFIX}' .. group, '{NOTED_PREFIX}' .. group
+end
+local function forget(group, keys)
+  local live, noted = indexes(group)
+  for _, key in ipairs(keys) do
+    redis.call('ZREM', live, key)
+    redis.call('ZREM', noted, key)
+  end
+end
+local function forget_expired(group)
+  local live = indexes(group)
+  forget(group, redis.call('ZRANGEBYSCORE', live, '-inf', now_ms()))
+end
+local function outlive(index, until_ms)
+  if redis.call('PTTL', index) < until_ms - now_ms() then
+    redis.call('PEXPIREAT', index, until_ms)
+  end
+end
+"""
+
 # KEYS[1] key · ARGV: expected version, value, tail, time to live in ms, note
 # → {1, new} or {0, stored}
-COMPARE_AND_SET = """
-local version = tonumber(redis.call('HGET', KEYS[1], 'version') or '0')
+COMPARE_AND_SET = (
+    _SCRIPT_COMMON
+    + """
+local stored = redis.call('HMGET', KEYS[1], 'version', 'groups')
+local version = tonumber(stored[1] or '0')
 if version ~= tonumber(ARGV[1]) then return {0, version} end
+local until_ms = now_ms() + ARGV[4]
 redis.call('HSET', KEYS[1], 'version', version + 1, 'value', ARGV[2], 'tail', ARGV[3],
   'note', ARGV[5])
-redis.call('PEXPIRE', KEYS[1], ARGV[4])
+redis.call('PEXPIREAT', KEYS[1], until_ms)
+for _, group in ipairs(stored[2] and cmsgpack.unpack(stored[2]) or {}) do
+  local live, noted = indexes(group)
+  redis.call('ZADD', live, until_ms, KEYS[1])
+  outlive(live, until_ms)
+  if ARGV[5] ~= '' then
+    if not redis.call('ZSCORE', noted, KEYS[1]) then
+      local last = redis.call('ZREVRANGE', noted, 0, 0, 'WITHSCORES')
+      redis.call('ZADD', noted, tonumber(last[2] or '0') + 1, KEYS[1])
+    end
+    outlive(noted, until_ms)
+  end
+end
 return {1, version + 1}
 """
+)
 
-# KEYS[1] key · ARGV: value, time to live in ms, then pairs of a pattern of keys and their limit
+# KEYS[1] key · ARGV: value, time to live in ms, then pairs of a group and its limit
 # → -1: stored already, 0: no room, 1: written
-ADD = """
+ADD = (
+    _SCRIPT_COMMON
+    + """
 if redis.call('EXISTS', KEYS[1]) == 1 then return -1 end
+local groups = {}
 for i = 3, #ARGV, 2 do
-  if #redis.call('KEYS', ARGV[i]) >= tonumber(ARGV[i + 1]) then return 0 end
+  forget_expired(ARGV[i])
+  if redis.call('ZCARD', (indexes(ARGV[i]))) >= tonumber(ARGV[i + 1]) then return 0 end
+  table.insert(groups, ARGV[i])
 end
-redis.call('HSET', KEYS[1], 'version', 1, 'value', ARGV[1])
-redis.call('PEXPIRE', KEYS[1], ARGV[2])
+local until_ms = now_ms() + ARGV[2]
+redis.call('HSET', KEYS[1], 'version', 1, 'value', ARGV[1], 'groups', cmsgpack.pack(groups))
+redis.call('PEXPIREAT', KEYS[1], until_ms)
+for _, group in ipairs(groups) do
+  local live = indexes(group)
+  redis.call('ZADD', live, until_ms, KEYS[1])
+  outlive(live, until_ms)
+end
 return 1
 """
+)
 
-# ARGV: pattern of keys → key, note, key, note …
-NOTES = """
-local found = {}
-for _, key in ipairs(redis.call('KEYS', ARGV[1])) do
-  local note = redis.call('HGET', key, 'note')
-  if note and note ~= '' then table.insert(found, key) table.insert(found, note) end
+# KEYS[1] key → 1: deleted, 0: absent
+DELETE = (
+    _SCRIPT_COMMON
+    + """
+local groups = redis.call('HGET', KEYS[1], 'groups')
+for _, group in ipairs(groups and cmsgpack.unpack(groups) or {}) do forget(group, {KEYS[1]}) end
+return redis.call('DEL', KEYS[1])
+"""
+)
+
+# ARGV: group, limit → how many keys have a note, then notes, the newest first
+NEWEST_NOTES = (
+    _SCRIPT_COMMON
+    + """
+forget_expired(ARGV[1])
+local _, noted = indexes(ARGV[1])
+local found = {redis.call('ZCARD', noted)}
+for _, key in ipairs(redis.call('ZREVRANGE', noted, 0, ARGV[2] - 1)) do
+  table.insert(found, redis.call('HGET', key, 'note') or '')
 end
 return found
 """
+)
 
 
 class RedisState:
@@ -204,7 +306,8 @@ class RedisState:
         self._where = url.rsplit("@", 1)[-1]
         self._compare_and_set = self._client.register_script(COMPARE_AND_SET)
         self._add = self._client.register_script(ADD)
-        self._notes = self._client.register_script(NOTES)
+        self._delete = self._client.register_script(DELETE)
+        self._newest_notes = self._client.register_script(NEWEST_NOTES)
 
     async def get(self, key: str) -> Versioned | None:
         """See MemoryState."""
@@ -219,11 +322,14 @@ class RedisState:
         """See MemoryState."""
         return int(await self._call("HGET", REDIS_PREFIX + key, "version") or 0)
 
-    async def notes(self, prefix: str) -> dict[str, bytes]:
+    async def note(self, key: str) -> bytes:
         """See MemoryState."""
-        found = await self._answer(self._notes(args=[_literal(REDIS_PREFIX + prefix) + "*"]))
-        keys = [key.decode().removeprefix(REDIS_PREFIX) for key in found[::2]]
-        return dict(zip(keys, found[1::2], strict=True))
+        return await self._call("HGET", REDIS_PREFIX + key, "note") or b""
+
+    async def newest_notes(self, group: str, limit: int) -> tuple[list[bytes], int]:
+        """See MemoryState."""
+        count, *notes = await self._answer(self._newest_notes(args=[group, limit]))
+        return [note for note in notes if note], int(count)
 
     async def set(
         self,
@@ -246,8 +352,8 @@ class RedisState:
     async def add(self, key: str, value: bytes, *, limits: Mapping[str, int], ttl_s: float) -> bool:
         """See MemoryState."""
         counted: list[Argument] = []
-        for within, limit in limits.items():
-            counted += [_literal(REDIS_PREFIX + within) + "*", limit]
+        for group, limit in limits.items():
+            counted += [group, limit]
         added = await self._run(self._add, key, value, _milliseconds(ttl_s), *counted)
         if added < 0:
             stored = await self.get(key)
@@ -256,7 +362,7 @@ class RedisState:
 
     async def delete(self, key: str) -> bool:
         """See MemoryState."""
-        return bool(await self._call("DEL", REDIS_PREFIX + key))
+        return bool(await self._run(self._delete, key))
 
     async def ping(self) -> None:
         """Raise UnavailableError when the server cannot be reached."""
@@ -326,8 +432,3 @@ def _checked_ttl(ttl_s: float) -> float:
 
 def _milliseconds(ttl_s: float) -> int:
     return max(1, round(_checked_ttl(ttl_s) * 1e3))
-
-
-def _literal(text: str) -> str:
-    """Escape a text to a Redis pattern that matches only itself."""
-    return "".join("\\" + letter if letter in "*?[]^\\" else letter for letter in text)

@@ -27,12 +27,14 @@ from dextouch.errors import (
 from dextouch.schemas import Doubt, Observation, ReturnSelector, RolloutInfo, answer_parts
 from dextouch.serving import StateStore, Versioned
 
-KEY_PREFIX = "rollout:"
-RECORD_FORMAT = 2
+# The group of all rollouts in the state store, and the beginning of their keys.
+GROUP = "rollout:"
+RECORD_FORMAT = 3
 # Time that a start may wait for others and for its world; after a crash its slot is held that long.
 PLACE_TTL_S = 600.0
 # Of an id, the beginning that all rollouts of one API key share.
 OWNER_LETTERS = 8
+ID_LETTERS: Final = 32
 # More images are encoded as JPEG beside the event loop; JPEG takes some 15 ms for a megabyte.
 MAX_INLINE_IMAGE_BYTES: Final = 2**16
 
@@ -60,10 +62,9 @@ class WatchNote:
     def from_bytes(note: bytes) -> "tuple[dict[str, Any], int, WatchNote]":
         """Progress, time of the write on the host clock (ns), and the note."""
         info, written_host_ns, known = msgpack.unpackb(note)
-        # A process of an earlier version writes no trace.
-        client, key, begun_host_ns, doubt, success, *trace_id = known
+        client, key, begun_host_ns, doubt, success, trace_id = known
         doubted = None if doubt is None else Doubt.model_validate(doubt)
-        shown = WatchNote(client, key, begun_host_ns, doubted, success, *trace_id)
+        shown = WatchNote(client, key, begun_host_ns, doubted, success, trace_id)
         return info, written_host_ns, shown
 
 
@@ -125,8 +126,7 @@ class RolloutRecord:
                 f"rollout {info['id']}: got {len(stored.tail)} bytes of its newest response, "
                 f"expected {num_bytes}; start a new one"
             )
-        # A process of an earlier version writes none.
-        note = WatchNote.from_bytes(stored.note)[2] if stored.note else WatchNote()
+        note = WatchNote.from_bytes(stored.note)[2]
         shown = RolloutInfo.model_validate(info)
         return RolloutRecord(shown, snapshot, sha256, stored.tail, stored.version, note)
 
@@ -134,7 +134,20 @@ class RolloutRecord:
 def new_rollout_id(owner: str) -> str:
     """An id that cannot be guessed, for a rollout begun with the key of this name."""
     of_owner = hashlib.sha256(owner.encode()).hexdigest()[:OWNER_LETTERS]
-    return of_owner + secrets.token_hex(12)
+    return of_owner + secrets.token_hex((ID_LETTERS - OWNER_LETTERS) // 2)
+
+
+def watch_id_of(rollout_id: str) -> str:
+    """Name of a rollout for those who watch; it gives nobody the rollout's id.
+
+    Records are stored under it, so that both ids find them.
+    """
+    name = hashlib.sha256(f"watch {rollout_id}".encode()).hexdigest()
+    return rollout_id[:OWNER_LETTERS] + name[: ID_LETTERS - OWNER_LETTERS]
+
+
+def _key_of(rollout_id: str) -> str:
+    return GROUP + watch_id_of(rollout_id)
 
 
 class RecordStore:
@@ -146,7 +159,7 @@ class RecordStore:
 
     async def read(self, rollout_id: str) -> RolloutRecord:
         """The newest record; raises NotFoundError where unknown, deleted or expired."""
-        stored = await self._store.get(KEY_PREFIX + rollout_id)
+        stored = await self._store.get(_key_of(rollout_id))
         # Without a value while it is only placed.
         if stored is None or not stored.value:
             raise _unknown(rollout_id)
@@ -154,7 +167,7 @@ class RecordStore:
 
     async def is_newest(self, record: RolloutRecord) -> bool:
         """Whether nobody has written since, without reading what is stored."""
-        return await self._store.version(KEY_PREFIX + record.info.id) == record.version
+        return await self._store.version(_key_of(record.info.id)) == record.version
 
     @asynccontextmanager
     async def place(
@@ -164,10 +177,10 @@ class RecordStore:
 
         Ids of rollouts that were begun with one key start with the same `OWNER_LETTERS` letters.
         """
-        key, ttl_s = KEY_PREFIX + rollout_id, max(self._ttl_s, PLACE_TTL_S)
-        limits, per_key = {KEY_PREFIX: limit}, ""
+        key, ttl_s = _key_of(rollout_id), max(self._ttl_s, PLACE_TTL_S)
+        limits, per_key = {GROUP: limit}, ""
         if limit_per_key is not None:
-            limits[KEY_PREFIX + rollout_id[:OWNER_LETTERS]] = limit_per_key
+            limits[GROUP + rollout_id[:OWNER_LETTERS]] = limit_per_key
             per_key = f", or of {limit_per_key} of one key,"
         async with AsyncExitStack() as failed:
             # Also where the reply is lost although the slot was written.
@@ -191,7 +204,7 @@ class RecordStore:
         """Replace the version that the record was computed from, and return the new one."""
         info = record.info.model_dump(mode="json")
         return await self._store.set(
-            KEY_PREFIX + record.info.id,
+            _key_of(record.info.id),
             record.to_bytes(info),
             tail=record.payload,
             note=record.note.to_bytes(info),
@@ -199,14 +212,17 @@ class RecordStore:
             ttl_s=self._ttl_s,
         )
 
-    async def notes(self) -> dict[str, bytes]:
-        """Notes of all rollouts by id."""
-        found = await self._store.notes(KEY_PREFIX)
-        return {key.removeprefix(KEY_PREFIX): note for key, note in found.items()}
+    async def newest_notes(self, limit: int) -> tuple[list[bytes], int]:
+        """Notes of the rollouts that began last, the newest first, and the number of all."""
+        return await self._store.newest_notes(GROUP, limit)
+
+    async def note(self, watch_id: str) -> bytes:
+        """Note of the rollout that watchers know by this name; empty if there is none."""
+        return await self._store.note(GROUP + watch_id)
 
     async def delete(self, rollout_id: str) -> None:
         """Forget a rollout; raises NotFoundError where unknown, deleted or expired."""
-        if not await self._store.delete(KEY_PREFIX + rollout_id):
+        if not await self._store.delete(_key_of(rollout_id)):
             raise _unknown(rollout_id)
 
 

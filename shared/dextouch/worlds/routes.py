@@ -48,9 +48,9 @@ from dextouch.serving import (
     timed,
 )
 from dextouch.streams import unpack
-from dextouch.worlds.records import Answer
+from dextouch.worlds.records import ID_LETTERS, Answer
 from dextouch.worlds.rollouts import RolloutService
-from dextouch.worlds.watching import WATCH_ID_LETTERS, RolloutWatch
+from dextouch.worlds.watching import RolloutWatch
 
 MAX_BODY_BYTES = 2**28
 # Room for 1000 rows of float64, or some hundred rows as JSON.
@@ -89,7 +89,7 @@ ANSWER: dict[str, Any] = {"content": {MSGPACK: {}, JSON: {}}}
 Selector = Annotated[ReturnSelector, Query()]
 # The name of the caller's key.
 Owner = Annotated[str, Depends(RequireScope(SCOPE))]
-WatchId = Annotated[str, Path(pattern=f"^[0-9a-f]{{{WATCH_ID_LETTERS}}}$")]
+WatchId = Annotated[str, Path(pattern=f"^[0-9a-f]{{{ID_LETTERS}}}$")]
 
 
 class ChunkShortcut:

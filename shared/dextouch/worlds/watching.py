@@ -11,16 +11,11 @@ from typing import Any, Final
 from dextouch.errors import NotFoundError
 from dextouch.schemas import WatchedRollout, WatchedRollouts
 from dextouch.streams import pack, unpack
-from dextouch.worlds.records import RecordStore, WatchNote
+from dextouch.worlds.records import RecordStore, WatchNote, watch_id_of
 
-WATCH_ID_LETTERS: Final = 32
+_TAG_LETTERS: Final = 32
 _MAX_BYTES: Final = 2**30
 _NS: Final = 1e-9
-
-
-def watch_id_of(rollout_id: str) -> str:
-    """Name of a rollout for those who watch; it gives nobody the rollout's id."""
-    return hashlib.sha256(f"watch {rollout_id}".encode()).hexdigest()[:WATCH_ID_LETTERS]
 
 
 class RolloutWatch:
@@ -36,10 +31,9 @@ class RolloutWatch:
 
     async def listed(self, limit: int) -> WatchedRollouts:
         """Open rollouts, the newest first."""
-        notes = await self._records.notes()
-        found = [_watched(*WatchNote.from_bytes(note)) for note in notes.values()]
-        found.sort(key=lambda one: (one.age_s, one.watch_id))
-        return WatchedRollouts(rollouts=tuple(found[:limit]), num_open=len(found))
+        notes, num_open = await self._records.newest_notes(limit)
+        found = tuple(_watched(*WatchNote.from_bytes(note)) for note in notes)
+        return WatchedRollouts(rollouts=found, num_open=num_open)
 
     async def newest(self, watch_id: str, known: str = "") -> tuple[str, bytes | None]:
         """The newest response as the rollout's client got it, and a tag of it.
@@ -49,26 +43,25 @@ class RolloutWatch:
         Raises:
             NotFoundError: unknown, deleted or expired.
         """
-        notes = await self._records.notes()
-        rollout_id = next((one for one in notes if watch_id_of(one) == watch_id), None)
-        if rollout_id is None:
+        note = await self._records.note(watch_id)
+        if not note:
             raise NotFoundError(
                 f"watched rollout {watch_id!r}: unknown, deleted or expired; list the open ones "
                 "again",
                 got=watch_id,
             )
         # Time and progress of the newest write, which differ for every two of them.
-        tag = hashlib.sha256(notes[rollout_id]).hexdigest()[:WATCH_ID_LETTERS]
+        tag = hashlib.sha256(note).hexdigest()[:_TAG_LETTERS]
         if tag == known:
             return tag, None
         async with self._reading:
-            record = await self._records.read(rollout_id)
+            info, written_host_ns, _ = WatchNote.from_bytes(note)
+            record = await self._records.read(info["id"])
             if not record.payload:
                 raise NotFoundError(
                     f"watched rollout {watch_id!r}: has no response yet; wait for its next chunk",
                     got=watch_id,
                 )
-            _, written_host_ns, _ = WatchNote.from_bytes(notes[rollout_id])
             shown = _watched(record.info.model_dump(mode="json"), written_host_ns, record.note)
             rollout = shown.model_dump(mode="json")
             return tag, await asyncio.to_thread(_shown, record.payload, rollout)

@@ -20,6 +20,7 @@ from dextouch.errors import (
 from dextouch.schemas import MAX_SEED, ReturnSelector, RolloutStart, jpeg_images
 from dextouch.serving.state import MemoryState
 from dextouch.worlds import records
+from dextouch.worlds.records import watch_id_of
 from dextouch.worlds.rollouts import chunk_seed
 from tests.unit.worlds.begun import ALL, START, begin, decoded, service
 from tests.unit.worlds.fakes import (
@@ -232,7 +233,7 @@ async def test_a_record_of_another_version_is_refused():
     store = MemoryState()
     made = service(store)
     rollout_id = await begin(made)
-    key = f"rollout:{rollout_id}"
+    key = f"rollout:{watch_id_of(rollout_id)}"
     for value, tail, says in [
         (msgpack.packb({"fields": {}, "arrays": {}}), b"", "another version"),
         ((await store.get(key)).value, b"x", "got 1 bytes"),
