@@ -137,6 +137,7 @@ def new_rollout_id(owner: str) -> str:
     return of_owner + secrets.token_hex((ID_LETTERS - OWNER_LETTERS) // 2)
 
 
+@lru_cache(maxsize=4096)
 def watch_id_of(rollout_id: str) -> str:
     """Name of a rollout for those who watch; it gives nobody the rollout's id.
 
