@@ -9,7 +9,7 @@ from pydantic import Field
 
 from benchmarks.reproduction.steps import Step
 from dextouch.frozen_model import FrozenModel
-from services.twin.tasks.registry import DOWNSTREAM, HUMAN_PRETRAINING, ROBOT_PRETRAINING
+from services.twin.names import DOWNSTREAM, HUMAN_PRETRAINING, ROBOT_PRETRAINING
 
 Table = Literal[
     "tokenizer", "options", "instruction", "design", "scaling", "evaluator", "generation"

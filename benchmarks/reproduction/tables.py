@@ -33,7 +33,7 @@ from dextouch.errors import NotFoundError
 from services.evaluation.prediction import MODEL
 from services.evaluation.scores import REAL
 from services.networks.weight_files import notes_of
-from services.twin.tasks.registry import DOWNSTREAM
+from services.twin.names import DOWNSTREAM
 
 PAPER: Final = json.loads((Path(__file__).parent / "paper.json").read_text(encoding="utf-8"))
 NOT_AVAILABLE: Final = "n/a"

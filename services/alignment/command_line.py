@@ -7,14 +7,13 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain
-from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress as Bars
 from rich.progress import TaskID
 
-from dextouch.command_line import CommandParser, ProgressLines, add_json, write_result
+from dextouch.command_line import ProgressLines, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, disk_errors
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.free_text import printable
@@ -23,10 +22,11 @@ from dextouch.schemas import json_ready, load_scene_objects
 from dextouch.serving import load_settings
 from services.alignment.jobs import AlignmentWorker, check_recording, episode_id_of
 from services.alignment.options import AlignmentOptions
+from services.alignment.parser import align_parser
 from services.alignment.report import AlignmentReport, report_line, report_of, report_page
 from services.alignment.retargeting import HandRetargeter, RetargetStatus
 from services.alignment.retargeting.hand_profile import calibrated_profile
-from services.alignment.settings import AlignmentSettings, usable_cores
+from services.alignment.settings import AlignmentSettings
 from services.alignment.synchronization.progress import Progress
 
 NS_PER_S = 1e9
@@ -37,18 +37,6 @@ Outcome = tuple[str, AlignmentReport | DexTouchError]
 EXIT_REFUSED = 3
 # Width of a report that is not printed at a terminal.
 PAGE_WIDTH = 110
-EPILOG = """examples:
-  dextouch align run take-7 take-8           align two recordings in parallel
-  dextouch align run --all --workers 2       align all recordings without an episode
-  dextouch align run --all --objects objects.json
-                                             with the poses of objects that have markers
-  dextouch align report take-7               clock fits, retargeting errors, omitted parts
-  dextouch align retarget take-7 --model hand.urdf --mapping hand.toml --to joints.npz
-                                             joint angles of another robot hand
-  dextouch align serve --port 8082           run the HTTP service
-
-An episode's id is derived from the recording and the options: aligning again finds it and writes
-nothing, so an interrupted run can simply be started again."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -58,90 +46,10 @@ def main(argv: Sequence[str]) -> int:
         0, or 3 if a recording was refused, with the reason on stderr.
     """
     settings = load_settings(AlignmentSettings, [])
-    parsed = _parser(settings).parse_args(list(argv))
+    parsed = align_parser(settings).parse_args(list(argv))
     if getattr(parsed, "objects", None) is not None:
         settings = settings.model_copy(update={"objects": parsed.objects})
     return COMMANDS[parsed.command](parsed, settings)
-
-
-def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
-    parser = CommandParser(
-        prog="dextouch align",
-        description="Convert recordings to synchronized, retargeted episodes in the same store.",
-        epilog=EPILOG,
-    )
-    shared = CommandParser(add_help=False)
-    shared.add_argument(
-        "--store", default=settings.store_url, metavar="URL", help="the store (%(default)s)"
-    )
-    shared.add_argument(
-        "--objects",
-        type=Path,
-        metavar="FILE",
-        help="JSON file of the tasks' objects, whose poses are measured by markers or trackers",
-    )
-    add_json(shared)
-    commands = parser.add_subparsers(
-        dest="command", required=True, metavar="{run,report,retarget,markers,serve}"
-    )
-    running = commands.add_parser(
-        "run",
-        parents=[shared],
-        help="align recordings",
-        description="Align recordings; those that have an episode are left as they are.",
-        epilog=EPILOG,
-    )
-    running.add_argument("recordings", nargs="*", metavar="ID", help="of a recording")
-    running.add_argument("--all", action="store_true", help="all recordings without an episode")
-    running.add_argument(
-        "--workers",
-        type=_positive,
-        default=usable_cores(),
-        metavar="N",
-        help="recordings at once, each in a process of its own (default: one a processor)",
-    )
-    report = commands.add_parser(
-        "report",
-        parents=[shared],
-        help="report on an aligned recording",
-        description="Show clocks, retargeting and what was left out of an episode, and why.",
-        epilog="example:\n  dextouch align report take-7 --json report.json",
-    )
-    report.add_argument("id", metavar="ID", help="of a recording or of its episode")
-    other = commands.add_parser(
-        "retarget",
-        parents=[shared],
-        help="retarget a recording to another robot hand",
-        description="Joint angles of any robot hand that follow the tracked hand of an episode, "
-        "written as NPZ: joint_names, t_ref_ns, joints_rad, status, tip_error_m.",
-        epilog="example:\n  dextouch align retarget take-7 --model allegro_right.urdf \\\n"
-        "    --mapping allegro_right.toml --to take-7_allegro.npz\n\n"
-        "The mapping is described in docs/hands.md.",
-    )
-    other.add_argument("id", metavar="ID", help="of an episode, or of its recording")
-    other.add_argument("--model", type=Path, required=True, metavar="FILE", help="URDF or MJCF")
-    other.add_argument(
-        "--mapping", type=Path, required=True, metavar="FILE", help="TOML: fingers, joints, wrist"
-    )
-    other.add_argument("--to", type=Path, required=True, metavar="FILE", help="NPZ to write")
-    sheet = commands.add_parser(
-        "markers",
-        help="make a sheet of the objects' markers to print",
-        description="Write the markers of a file of objects as SVG in true size: print it at 100 % "
-        "and measure one side.",
-        epilog="example:\n  dextouch align markers --objects objects.json --to markers.svg",
-    )
-    sheet.add_argument("--objects", type=Path, required=True, metavar="FILE", help="of the objects")
-    sheet.add_argument("--to", type=Path, required=True, metavar="FILE", help="SVG to write")
-    commands.add_parser("serve", help="run the HTTP service (serve --help lists its settings)")
-    return parser
-
-
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"got {number}, expected at least 1")
-    return number
 
 
 def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:

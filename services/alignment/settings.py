@@ -7,7 +7,6 @@ from pathlib import Path
 from pydantic import Field, SecretStr
 
 from dextouch.data_folder import data_folder, default_spool, default_store
-from dextouch.schemas import load_scene_objects
 from dextouch.serving import ServiceSettings, service_config
 from services.alignment.options import AlignmentOptions
 
@@ -88,6 +87,8 @@ class AlignmentSettings(ServiceSettings):
         """
         if self.objects is None:
             return self.options
+        from dextouch.schemas import load_scene_objects
+
         return self.options.model_copy(update={"objects": load_scene_objects(self.objects)})
 
     @property

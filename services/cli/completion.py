@@ -1,7 +1,6 @@
 """Command `dextouch completion`: prints a script that completes commands and flags in a shell."""
 
 import argparse
-import importlib
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -33,7 +32,7 @@ def command_tree(targets: Mapping[str, tuple[str, str]]) -> argparse.ArgumentPar
         for one in above:
             parser = _inner(parser).choices[one]
         does, target = targets[name]
-        own = _parser_of(target)
+        own = _parser_of(name) if target else None
         inner = _inner(parser)
         if word in inner.choices:
             # The parser above names it in its help.
@@ -56,17 +55,12 @@ def _inner(parser: argparse.ArgumentParser) -> "argparse._SubParsersAction[Comma
     return parser.add_subparsers(dest="command", parser_class=CommandParser)
 
 
-def _parser_of(target: str) -> argparse.ArgumentParser | None:
-    """Parser of a command; None for a group, or where a package is missing."""
-    module, _, function = target.partition(":")
-    if not module:
-        return None
-
-    def show_help() -> None:
-        getattr(importlib.import_module(f"services.{module}"), function)(["--help"])
+def _parser_of(name: str) -> argparse.ArgumentParser | None:
+    """Parser of a command; None where a package is missing."""
+    from services.cli.main import run_command
 
     try:
-        return parser_behind(show_help)
+        return parser_behind(lambda: run_command([*name.split(), "--help"]))
     except (ModuleNotFoundError, DexTouchError):
         return None
 

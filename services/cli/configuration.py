@@ -29,15 +29,15 @@ from dextouch.serving import (
 
 # Settings class of each section, imported when it is asked for.
 SECTIONS: Final = {
-    "up": "cli.up:UpSettings",
+    "up": "cli.up_settings:UpSettings",
     "acquisition": "acquisition.settings:AcquisitionSettings",
     "episode_store": "episode_store.settings:EpisodeStoreSettings",
     "alignment": "alignment.settings:AlignmentSettings",
     "dashboard": "dashboard.settings:DashboardSettings",
-    "twin": "twin.serving:TwinServiceSettings",
+    "twin": "twin.settings:TwinServiceSettings",
     "world_model": "world_model.settings:WorldModelSettings",
     "rating": "evaluation.rating.settings:RatingSettings",
-    "studies": "evaluation.studies.app:StudyServiceSettings",
+    "studies": "evaluation.studies.settings:StudyServiceSettings",
     "rating_report": "evaluation.rating.settings:RatingReportSettings",
     "evaluation_run": "evaluation.settings:RunSettings",
     "evaluation_train_policy": "evaluation.settings:TrainPolicySettings",

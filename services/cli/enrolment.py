@@ -7,22 +7,17 @@ from collections.abc import Sequence
 from contextlib import closing
 from datetime import datetime
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 from urllib.parse import quote
 
 from pydantic import BaseModel, SecretStr, ValidationError
 
-from dextouch.clients import HttpLink
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.data_folder import default_enrolment
 from dextouch.errors import UnavailableError
-from dextouch.schemas import (
-    EnrolmentToken,
-    StationEnrolments,
-    StationKey,
-    first_problems,
-)
-from services.acquisition.enrolment import Enrolment, check_writable, write_enrolment
+
+if TYPE_CHECKING:
+    from dextouch.clients import HttpLink
 
 FormT = TypeVar("FormT", bound=BaseModel)
 KEY_VARIABLE: Final = "DEXTOUCH_KEY"
@@ -49,6 +44,10 @@ def station_enrol_main(argv: Sequence[str]) -> int:
     )
     add_json(parser)
     options = parser.parse_args(list(argv))
+    from dextouch.clients import HttpLink
+    from dextouch.schemas import StationKey
+    from services.acquisition.enrolment import Enrolment, check_writable, write_enrolment
+
     path, url = options.output or default_enrolment(), options.url.rstrip("/")
     check_writable(path)
     with closing(HttpLink(url)) as link:
@@ -72,6 +71,8 @@ def store_enrol_main(argv: Sequence[str]) -> int:
         "enrol", "Get a one-time token with which a station gets a key of its own.", "desk_3"
     )
     options = parser.parse_args(list(argv))
+    from dextouch.schemas import EnrolmentToken
+
     with _link(options) as link:
         got = _ask(link, EnrolmentToken, "POST", PATH, {"station": options.station})
     command = f"dextouch station enrol {options.url} {got.token}"
@@ -84,6 +85,8 @@ def store_stations_main(argv: Sequence[str]) -> int:
     """List the enrolments of a store."""
     parser = _administration("stations", "List enrolled, waiting and revoked stations.")
     options = parser.parse_args(list(argv))
+    from dextouch.schemas import StationEnrolments
+
     with _link(options) as link:
         listed = _ask(link, StationEnrolments, "GET", PATH)
     for one in listed.enrolments:
@@ -101,6 +104,8 @@ def store_revoke_main(argv: Sequence[str]) -> int:
         "revoke", "Refuse the key of an enrolled station, or its unused token, at once.", "desk_3"
     )
     options = parser.parse_args(list(argv))
+    from dextouch.schemas import StationEnrolments
+
     path = f"{PATH}/{quote(options.station, safe='')}/revoke"
     with _link(options) as link:
         listed = _ask(link, StationEnrolments, "POST", path)
@@ -129,17 +134,21 @@ def _administration(name: str, does: str, usual: str = "") -> CommandParser:
     return parser
 
 
-def _link(options: argparse.Namespace) -> closing[HttpLink]:
+def _link(options: argparse.Namespace) -> "closing[HttpLink]":
+    from dextouch.clients import HttpLink
+
     return closing(HttpLink(options.url, api_key=options.key or os.environ.get(KEY_VARIABLE)))
 
 
 def _ask(
-    link: HttpLink, form: type[FormT], method: str, path: str, body: dict[str, str] | None = None
+    link: "HttpLink", form: type[FormT], method: str, path: str, body: dict[str, str] | None = None
 ) -> FormT:
     reply = link.request(method, path, body=None if body is None else json.dumps(body).encode())
     try:
         return form.model_validate_json(reply.body)
     except ValidationError as error:
+        from dextouch.schemas import first_problems
+
         raise UnavailableError(
             f"unexpected response to {method} {path} ({first_problems(error)}); is this the "
             "address of an episode store?"

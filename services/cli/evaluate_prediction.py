@@ -1,25 +1,16 @@
-"""Measure how well a world model predicts the images and touch of held-out robot episodes.
+"""Measure predicted images and touch on held-out episodes (`dextouch evaluate prediction`)."""
 
-Every figure stands beside those of simple baselines: a repeated first step, the first image warped
-by the camera's known motion, no touch, the model's codecs alone, and the model with other actions.
-Windows of one chunk begin at true steps, as in the paper; rollouts continue from predictions.
-"""
-
-import argparse
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, needs, select_episodes
 from dextouch.errors import UnknownNameError
 from services.cli.generate import refuse_trained_episodes
-from services.cli.training_data import comma_separated
+from services.cli.parsers import prediction_parser
 from services.cli.twin_geometry import TwinGeometry
 from services.evaluation.prediction import (
     ALL_TASKS,
-    BASELINES,
-    DEFAULT_BASELINES,
     GEOMETRY,
     MODEL,
     Metric,
@@ -28,23 +19,18 @@ from services.evaluation.prediction import (
     described,
     measure_prediction,
 )
+from services.evaluation.prediction_names import BASELINES
 from services.evaluation.prediction_scenes import Scene, read_rollout, read_windows
 
 _HORIZONS: dict[str, Callable[[EpisodeReader], list[Scene]]] = {
     "windows": read_windows,
     "rollouts": lambda reader: [read_rollout(reader)],
 }
-_EPILOG = """\
-examples:
-  dextouch evaluate prediction --episodes runs/heldout
-  dextouch evaluate prediction --episodes runs/heldout --checkpoint runs/paper.safetensors \\
-    --horizon windows --metrics psnr,contact_f1 --json runs/prediction.json
-"""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Run `dextouch evaluate prediction`."""
-    options = _parser().parse_args(list(arguments))
+    options = prediction_parser().parse_args(list(arguments))
     from services.world_model.shipped_checkpoints import default_checkpoint
     from services.world_model.world import open_world
 
@@ -107,22 +93,3 @@ def _table(found: PredictionResult, metrics: Mapping[str, Metric]) -> str:
     about += [f"{name}: {BASELINES[name]}" for name in sources if name != MODEL]
     about += [f"{name} is missing: {reason}" for name, reason in found.missing.items()]
     return "\n".join([*lines, "", *about])
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = CommandParser(prog="dextouch evaluate prediction", description=__doc__, epilog=_EPILOG)
-    add = parser.add_argument
-    add("--episodes", required=True, metavar="STORE", help="store of held-out episodes")
-    add("--checkpoint", type=Path, metavar="PATH", help="world model (default: the package's)")
-    add("--tasks", type=comma_separated, default=(), help="comma-separated (default: the model's)")
-    add("--horizon", choices=list(_HORIZONS), help="only windows or only rollouts (default: both)")
-    names = f"comma-separated, of {', '.join(all_metrics())} (default: all)"
-    add("--metrics", type=comma_separated, default=(), help=names)
-    weights = "folder of pretrained networks for the metrics that need them (docs/evaluation.md)"
-    add("--weights", type=Path, metavar="PATH", help=weights)
-    names = f"comma-separated, of {', '.join(BASELINES)} (default: without instructions)"
-    add("--baselines", type=comma_separated, default=DEFAULT_BASELINES, help=names)
-    steps = "network calls per chunk of a flow-matching model"
-    add("--sampling-steps", type=int, metavar="N", help=steps)
-    add_json(parser)
-    return parser

@@ -1,7 +1,6 @@
 """Commands `dextouch export` and `dextouch import` for formats of other tools."""
 
 import argparse
-import math
 import shutil
 import sys
 import uuid
@@ -9,12 +8,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from dextouch.command_line import CommandParser, add_json, progress, write_result
-from dextouch.data_folder import default_store
+from dextouch.command_line import progress, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader, is_rejected
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 from dextouch.system_files import is_system_file
+from services.cli.parsers import JOINT_FORMATS, export_parser, import_parser
 
 Reader = EpisodeReader | RecordingReader
 Report = dict[str, object]
@@ -22,34 +21,6 @@ Report = dict[str, object]
 DamagedImages = dict[str, dict[str, list[int]]]
 # Of damaged images, in a message; the JSON report has all.
 MAX_NAMED = 20
-
-_EXPORT_HELP = """\
-formats:
-  lerobot  a LeRobotDataset v3.0 folder: episodes on a frame grid, video, parquet
-  umi      one zip with a Zarr v2 replay buffer: episodes on the model grid
-           (cannot be imported)
-  mcap     one file per episode or recording, every sample; opens in Foxglove
-  rrd      one file per episode or recording, every sample; opens in Rerun (cannot be imported)
-
-examples:
-  dextouch export --format mcap stand-bottle-0003 --to take.mcap
-  dextouch export --format mcap --kind recording --operator p17 --to takes/
-  dextouch export --format lerobot --task stand_bottle --to data/lerobot
-  dextouch export --format umi --domain robot --to robot.zarr.zip
-  dextouch export --format rrd stand-bottle-0003 --to take.rrd
-"""
-_IMPORT_HELP = """\
-examples:
-  dextouch import --format mcap take.mcap
-  dextouch import --format mcap takes/
-  dextouch import --format lerobot data/lerobot --id-prefix theirs-
-
-What each format keeps and loses: docs/bridges.md
-"""
-
-
-# Formats with one file per episode or recording, and those with all episodes together.
-_SINGLE, _JOINT = ("mcap", "rrd"), ("umi", "lerobot")
 
 
 def _export_one(reader: Reader, path: Path, options: argparse.Namespace) -> int:
@@ -167,7 +138,7 @@ def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
 
 def _export(options: argparse.Namespace) -> Report:
     store, to, form = EpisodeStore(options.store), options.to, options.format
-    if form in _JOINT and options.kind == "recording":
+    if form in JOINT_FORMATS and options.kind == "recording":
         raise InvalidInputError(
             f"format {form!r} holds episodes only; export recordings as mcap or rrd"
         )
@@ -176,7 +147,7 @@ def _export(options: argparse.Namespace) -> Report:
     shown = progress(ids, f"export {form}", len(ids))
     damaged: DamagedImages = {}
     report["damaged_images"] = damaged
-    if form in _JOINT:
+    if form in JOINT_FORMATS:
         left_out: list[str] = []
         num_steps = _export_all(_episodes(store, shown, damaged, left_out), options)
         print(f"{to}  {len(ids) - len(left_out)} episodes  {num_steps} steps")
@@ -226,63 +197,13 @@ def _import(options: argparse.Namespace) -> Report:
 
 def export_main(argv: Sequence[str]) -> int:
     """Run `dextouch export`."""
-    parser = _parser("export", "Write episodes or recordings for other tools.", _EXPORT_HELP)
-    add = parser.add_argument
-    forms = sorted([*_SINGLE, *_JOINT])
-    add("ids", nargs="*", metavar="ID", help="default: all that match the filters")
-    add("--format", required=True, choices=forms, help="output format")
-    to = "file; mcap and rrd: or a folder"
-    add("--to", required=True, type=Path, metavar="PATH", help=to)
-    kinds = ("episode", "recording")
-    add("--kind", choices=kinds, default="episode", help="kind of the ids (%(default)s)")
-    add("--task", metavar="TASK", help="only episodes of this task")
-    add("--domain", choices=("human", "robot"), help="only episodes of this domain")
-    add("--operator", metavar="P", help="only items of this operator")
-    rejected = "also items that were rejected in review; ids that are given always are"
-    add("--with-rejected", action="store_true", help=rejected)
-    add("--force", action="store_true", help="replace existing files")
-    quality = "mcap: encode rgb8 images as JPEG (default: lossless)"
-    add("--jpeg-quality", type=int, metavar="1…100", help=quality)
-    rate = "lerobot: frames per second (default: model rate)"
-    add("--fps", type=_whole_fps, metavar="N", help=rate)
-    name = "lerobot: name of the data set (%(default)s)"
-    add("--repo-id", default="dextouch/export", metavar="USER/NAME", help=name)
-    options = parser.parse_args(list(argv))
+    options = export_parser().parse_args(list(argv))
     write_result(options.json, _export(options))
     return 0
 
 
-def _whole_fps(text: str) -> int:
-    """Frames per second of a LeRobot dataset, whose format counts whole ones."""
-    try:
-        rate_hz = float(text)
-    except ValueError:
-        rate_hz = math.nan
-    if not math.isfinite(rate_hz) or rate_hz != round(rate_hz):
-        near = f"; {round(rate_hz)} is the nearest" if math.isfinite(rate_hz) else ""
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}, expected a whole number, since LeRobot counts whole frames{near}"
-        )
-    return round(rate_hz)
-
-
 def import_main(argv: Sequence[str]) -> int:
     """Run `dextouch import`."""
-    parser = _parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
-    add = parser.add_argument
-    add("path", type=Path, metavar="PATH", help="file or folder to read")
-    add("--format", required=True, choices=("lerobot", "mcap"), help="input format")
-    add("--id-prefix", default="", metavar="TEXT", help="lerobot: prefix of every id")
-    images = "lerobot: unit of stored images (%(default)s)"
-    add("--images", choices=("h264", "jpeg", "rgb8"), default="h264", help=images)
-    options = parser.parse_args(list(argv))
+    options = import_parser().parse_args(list(argv))
     write_result(options.json, _import(options))
     return 0
-
-
-def _parser(word: str, does: str, more: str) -> argparse.ArgumentParser:
-    parser = CommandParser(prog=f"dextouch {word}", description=does, epilog=more)
-    store = "the store (%(default)s)"
-    parser.add_argument("--store", metavar="URL", default=default_store(), help=store)
-    add_json(parser)
-    return parser

@@ -1,10 +1,4 @@
-"""Generate demonstrations: a world model predicts images and touch for recorded robot actions.
-
-Every imagined episode keeps the first observation and the actions of its source, a robot episode
-that the world model was not trained on; later images and touch are predicted. Its `success` is that
-of the source. Training commands skip imagined episodes, except `dextouch train policy --imagined`.
-Existing results are kept, so an interrupted run can be repeated.
-"""
+"""Generate demonstrations from the actions of recorded ones (`dextouch generate`)."""
 
 import argparse
 from collections.abc import Sequence
@@ -13,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from dextouch.command_line import write_result
-from dextouch.episodes import SPLITS, EpisodeReader, EpisodeStore, needs
+from dextouch.episodes import EpisodeReader, EpisodeStore, needs
 from dextouch.errors import ConflictError
 from dextouch.streams import HEAD_CAMERA
-from services.cli.imagined_data import chosen_episodes, imagination_parser, imagine, positive
+from services.cli.imagined_data import chosen_episodes, imagine
+from services.cli.parsers import generate_parser
 from services.evaluation.reporting import PredictionPicture, ReportPictures, write_report
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
@@ -24,17 +19,11 @@ from services.world_model.training.dataset import fingerprint
 from services.world_model.training.episodes import read_episode
 
 _NUM_MOMENTS = 8
-_EPILOG = """\
-example:
-  dextouch train world-model --episodes runs/episodes --splits B,C --output runs/robot.safetensors
-  dextouch generate --episodes runs/episodes --split A --checkpoint runs/robot.safetensors \\
-    --store runs/generated --strips runs/generated.html
-"""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Run `dextouch generate`."""
-    options = _parser().parse_args(list(arguments))
+    options = generate_parser().parse_args(list(arguments))
     source = EpisodeStore(options.episodes)
     wanted = chosen_sources(source, options)
     # What a killed run left unfinished.
@@ -123,15 +112,3 @@ def _picture(source: EpisodeStore, imagined: EpisodeReader) -> PredictionPicture
         true.tactile_kpa[shown],
         predicted.tactile_kpa[shown],
     )
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = imagination_parser(prog="dextouch generate", description=__doc__, epilog=_EPILOG)
-    add = parser.add_argument
-    add("--split", choices=SPLITS, help="only scenes of this split (default: all)")
-    add("--count", type=positive, metavar="N", help="largest number of episodes, over all tasks")
-    add("--with-failures", action="store_true", help="also imagine episodes that failed")
-    add("--strips", type=Path, metavar="PATH", help="HTML page of recorded and imagined images")
-    shown = "episodes on that page (%(default)s)"
-    add("--num-strips", type=positive, default=12, metavar="N", help=shown)
-    return parser

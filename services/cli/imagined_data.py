@@ -1,12 +1,6 @@
-"""Predict the robot episodes of a store with the world model, to train the success probe on them.
-
-Each imagined episode has the outcome of the same actions in the twin. The success probe is trained
-on real and imagined episodes, so that its probabilities are valid for imagined endings, and
-evaluated on those of other seeds. A state model renders only the images that the probe uses.
-"""
+"""Predict the robot episodes of a store with the world model (`dextouch train imagined`)."""
 
 import argparse
-import os
 from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,7 +9,7 @@ import torch
 from rich.progress import track
 
 from dextouch.clients import RolloutClient
-from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.command_line import write_result
 from dextouch.episodes import (
     EpisodeReader,
     EpisodeStore,
@@ -27,11 +21,11 @@ from dextouch.episodes import (
 from dextouch.schemas import EpisodeAttributes
 from dextouch.serving import configure_logging
 from dextouch.worlds import WorldServiceSettings, create_world_app
+from services.cli.parsers import imagined_parser
 from services.cli.servers import served
-from services.cli.training_data import comma_separated, in_processes
+from services.cli.training_data import in_processes
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.generation.demonstrations import SHORT_CHUNK_STEPS, imagine_episode, whole_steps
-from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
 
@@ -104,39 +98,8 @@ def judged_steps(episode: EpisodeReader) -> set[int]:
     return {step for end in ends for step in range(end - NUM_SEEN_STEPS + 1, end + 1)}
 
 
-def seed_range(text: str) -> range:
-    """Parse seeds given as FIRST:LAST+1, for argparse."""
-    first, _, stop = text.partition(":")
-    if not (first.isdecimal() and stop.isdecimal() and int(first) < int(stop)):
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected FIRST:LAST+1 such as 0:100")
-    return range(int(first), int(stop))
-
-
-def positive(text: str) -> int:
-    """Parse a number of processes, for argparse."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a number of at least 1")
-    return int(text)
-
-
-def imagination_parser(**about: str) -> CommandParser:
-    """Parser of a command that imagines episodes; `imagine` takes what it parses."""
-    parser = CommandParser(**about)
-    add = parser.add_argument
-    add("--episodes", required=True, metavar="URL", help="store of the episodes to imagine")
-    add("--store", required=True, metavar="URL", help="store for the imagined episodes")
-    model = "world model (default: the package's)"
-    add("--checkpoint", type=Path, default=default_checkpoint(), metavar="PATH", help=model)
-    add("--tasks", type=comma_separated, metavar="TASK,…", help="default: all")
-    add("--seeds", type=seed_range, metavar="FIRST:LAST+1", help="default: all")
-    jobs = "processes (default: one per core)"
-    add("--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help=jobs)
-    add_json(parser)
-    return parser
-
-
 def imagine(options: argparse.Namespace, wanted: Sequence[str], *, only_judged: bool) -> list[str]:
-    """Imagine these episodes with the options of `imagination_parser`; returns the new ids."""
+    """Imagine these episodes with the options of `parsers.imagined_parser`; returns the new ids."""
     part = partial(
         imagine_all,
         episodes=options.episodes,
@@ -150,12 +113,7 @@ def imagine(options: argparse.Namespace, wanted: Sequence[str], *, only_judged: 
 
 def main(argv: Sequence[str]) -> int:
     """Run `dextouch train imagined`."""
-    parser = imagination_parser(
-        prog="dextouch train imagined",
-        description=__doc__,
-        epilog="example:\n  dextouch train imagined --episodes runs/episodes --store runs/imagined",
-    )
-    options = parser.parse_args(list(argv))
+    options = imagined_parser().parse_args(list(argv))
     chosen = chosen_episodes(EpisodeStore(options.episodes), options.tasks, options.seeds)
     wanted = [about.episode_id for about in chosen]
     count = len(imagine(options, wanted, only_judged=True))

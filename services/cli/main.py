@@ -1,11 +1,12 @@
 """Entry point `dextouch COMMAND`: dispatches to commands and prints errors as one line."""
 
+import argparse
 import importlib
 import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from dextouch import __version__
 from dextouch.command_line import messages_aside
@@ -16,22 +17,36 @@ from services.cli.standard_streams import StandardStreams
 
 
 class Command(NamedTuple):
-    """A command: its summary, and `module:function` of `services`; a bare group has none."""
+    """A command: its summary, and `module:function` of `services`; a bare group has none.
+
+    Its help imports nothing else than `flags`: the section of its settings, `module:NAME_parser`,
+    which makes its parser, or `module:NAME_settings`, which finds the class of its settings from
+    the arguments.
+    """
 
     does: str
     target: str = ""
+    flags: str = ""
 
 
 COMMANDS = {
-    "demo": Command("record, align, predict and evaluate on this machine", "cli.demo.command:main"),
-    "up": Command("run every service in one process, with a dashboard", "cli.up:main"),
+    "demo": Command(
+        "record, align, predict and evaluate on this machine",
+        "cli.demo.command:main",
+        "cli.demo.settings:demo_parser",
+    ),
+    "up": Command("run every service in one process, with a dashboard", "cli.up:main", "up"),
     "doctor": Command("check what this machine can do and what is missing", "cli.doctor:main"),
     "twin": Command(
-        "record ground-truth episodes in the physics twin, or serve it", "twin.command_line:main"
+        "record ground-truth episodes in the physics twin, or serve it",
+        "twin.command_line:main",
+        "twin.parser:twin_parser",
     ),
-    "twin serve": Command("serve rollouts in the twin", "twin.serving:serve"),
+    "twin serve": Command("serve rollouts in the twin", "twin.serving:serve", "twin"),
     "station": Command("record and calibrate a station's devices"),
-    "station serve": Command("record gloves, trackers and cameras", "acquisition.app:main"),
+    "station serve": Command(
+        "record gloves, trackers and cameras", "acquisition.app:main", "acquisition"
+    ),
     "station enrol": Command(
         "exchange a one-time token for the station's key of the store",
         "cli.enrolment:station_enrol_main",
@@ -40,8 +55,9 @@ COMMANDS = {
     "store": Command(
         "list, show, verify, clicks, repair, delete, deletions, restore, purge, enrol, serve",
         "episode_store.command_line:main",
+        "episode_store.parser:store_parser",
     ),
-    "store serve": Command("serve the store over HTTP", "episode_store.app:main"),
+    "store serve": Command("serve the store over HTTP", "episode_store.app:main", "episode_store"),
     "store enrol": Command(
         "get a one-time token with which a station gets its key",
         "cli.enrolment:store_enrol_main",
@@ -51,75 +67,108 @@ COMMANDS = {
         "revoke the key of an enrolled station", "cli.enrolment:store_revoke_main"
     ),
     "export": Command(
-        "write LeRobot, MCAP, Rerun or UMI files from a store", "cli.exports:export_main"
+        "write LeRobot, MCAP, Rerun or UMI files from a store",
+        "cli.exports:export_main",
+        "cli.parsers:export_parser",
     ),
-    "import": Command("read LeRobot or MCAP files into a store", "cli.exports:import_main"),
-    "align": Command("convert recordings to synchronized episodes", "alignment.command_line:main"),
-    "align serve": Command("serve alignment over HTTP", "alignment.app:main"),
+    "import": Command(
+        "read LeRobot or MCAP files into a store",
+        "cli.exports:import_main",
+        "cli.parsers:import_parser",
+    ),
+    "align": Command(
+        "convert recordings to synchronized episodes",
+        "alignment.command_line:main",
+        "alignment.parser:default_parser",
+    ),
+    "align serve": Command("serve alignment over HTTP", "alignment.app:main", "alignment"),
     "train": Command("train the world model, its judge of success, or a policy"),
-    "train data": Command("record training episodes in the twin", "cli.training_data:main"),
+    "train data": Command(
+        "record training episodes in the twin",
+        "cli.training_data:main",
+        "cli.parsers:training_data_parser",
+    ),
     "train tokenizer": Command(
         "train a tactile tokenizer for the paper's form of the world model",
         "cli.train_tokenizer:main",
+        "world_model_train_tokenizer",
     ),
     "train world-model": Command(
         "train a world model on episodes of robots and people, of either form",
         "world_model.command_line:run_train",
+        "world_model.forms:train_settings",
     ),
     "train distill": Command(
         "train a world model in the paper's form to sample in few steps",
         "world_model.command_line:run_distill",
+        "world_model_distill",
     ),
     "train adapt": Command(
         "adapt a world model of either form to new tasks",
         "world_model.command_line:run_adapt",
+        "world_model.forms:adapt_settings",
     ),
     "train imagined": Command(
-        "predict the episodes of a store with the world model", "cli.imagined_data:main"
+        "predict the episodes of a store with the world model",
+        "cli.imagined_data:main",
+        "cli.parsers:imagined_parser",
     ),
     "train policy": Command(
         "train a closed-loop policy on demonstrations",
         "evaluation.command_line:run_train_policy",
+        "evaluation_train_policy",
     ),
     "train judge": Command(
         "train the judge of success on true and imagined episodes",
         "evaluation.command_line:run_train_probe",
+        "evaluation_train_probe",
     ),
     "generate": Command(
-        "generate demonstrations from the actions of recorded ones", "cli.generate:main"
+        "generate demonstrations from the actions of recorded ones",
+        "cli.generate:main",
+        "cli.parsers:generate_parser",
     ),
     "checkpoint": Command(
         "show the provenance and accuracy of a world model",
         "world_model.command_line:run_show",
+        "world_model_show",
     ),
-    "serve": Command("serve the world model's rollouts", "world_model.command_line:run_serve"),
+    "serve": Command(
+        "serve the world model's rollouts", "world_model.command_line:run_serve", "world_model"
+    ),
     "evaluate": Command(
         "score policies in real and imagined worlds",
         "evaluation.command_line:run_evaluation",
+        "evaluation_run",
     ),
     "evaluate prediction": Command(
-        "measure predicted images and touch on held-out episodes", "cli.evaluate_prediction:main"
+        "measure predicted images and touch on held-out episodes",
+        "cli.evaluate_prediction:main",
+        "cli.parsers:prediction_parser",
     ),
     "evaluate recorded": Command(
         "score policies from recorded first observations, and how far to trust it",
         "cli.evaluate_recorded:main",
+        "cli.parsers:recorded_parser",
     ),
     "study": Command(
         "score policies in several worlds, defined in a file and resumable",
         "cli.study.command:main",
+        "cli.parsers:study_parser",
     ),
     "study serve": Command(
-        "serve the results of studies to the dashboard", "evaluation.studies.app:main"
+        "serve the results of studies to the dashboard", "evaluation.studies.app:main", "studies"
     ),
     "rate": Command("score rollouts by human raters, and measure their agreement"),
     "rate serve": Command(
-        "serve the page on which raters mark rollouts", "evaluation.rating.app:main"
+        "serve the page on which raters mark rollouts", "evaluation.rating.app:main", "rating"
     ),
     "rate report": Command(
         "print scores and the agreement of raters",
         "evaluation.rating.command_line:report_main",
+        "rating_report",
     ),
-    "dashboard": Command("serve the operators' page", "dashboard.app:main"),
+    "dashboard": Command("serve the operators' page", "dashboard.app:main", "dashboard"),
     "config": Command("show the effective settings, or an example of dextouch.toml"),
     "config show": Command(
         "show the effective settings and where each comes from", "cli.configuration:show_main"
@@ -183,14 +232,31 @@ def find_command(words: Sequence[str]) -> tuple[str, list[str]]:
 def run_command(words: Sequence[str]) -> int:
     """Run a command line without the program's name, and return its exit status."""
     name, arguments = find_command(words)
-    module, _, function = COMMANDS[name].target.partition(":")
-    if not module:
+    command = COMMANDS[name]
+    if not command.target:
         print(_group_usage(name))
         return 0
-    command: Callable[[list[str]], int | None] = getattr(
-        importlib.import_module(f"services.{module}"), function
-    )
-    return command(arguments) or 0
+    if command.flags and not {"-h", "--help"}.isdisjoint(arguments):
+        _show_help(command.flags, arguments)
+    return _found(command.target)(arguments) or 0
+
+
+def _found(place: str) -> Any:  # noqa: ANN401 - functions and classes
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(f"services.{module}"), name)
+
+
+def _show_help(flags: str, arguments: list[str]) -> None:
+    """Print the help of a command, and exit."""
+    from dextouch.serving import load_settings
+    from services.cli.configuration import SECTIONS
+
+    found = _found(SECTIONS.get(flags, flags))
+    if not isinstance(found, type):
+        found = found(arguments) if flags.endswith("_settings") else found()
+    if isinstance(found, argparse.ArgumentParser):
+        found.parse_args(arguments)
+    load_settings(found, ["--help"])
 
 
 def main(argv: Sequence[str] | None = None) -> int:

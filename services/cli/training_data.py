@@ -1,17 +1,5 @@
-"""Record twin episodes for training and testing networks.
+"""Record twin episodes for training and testing networks (`dextouch train data`)."""
 
-The data set covers the factors that decide success: errors of a few millimetres, misses, takes that
-stop or never start, retreats, pushes, slipping grasps, wandering hands, and actions of another
-scene. `--mix` selects their shares. With `--policy` every episode is a rollout of that policy in
-the twin instead. Interrupted runs resume: existing episodes are kept.
-
-Human takes are recorded like those of a person: the twin's hands are played to mock devices, whose
-packets go through the drivers, the recorder and alignment to actions of the robot. With
-`--path station`, robot takes are recorded so, too, and nothing but the outcome comes from the twin:
-the poses of objects are measured by markers on them, which the head camera sees.
-"""
-
-import argparse
 import hashlib
 import json
 import multiprocessing
@@ -25,17 +13,17 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Final, Literal, TypeVar, get_args
+from typing import Any, Final, TypeVar
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from dextouch.clients import Policy, PolicyStart
-from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, DeviceError, InvalidInputError, UnknownNameError
 from dextouch.schemas import RolloutStart, SceneObjects
 from dextouch.serving import configure_logging
+from services.cli.parsers import training_data_parser
 from services.evaluation.policies.asking import action_chunk, ask
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.progress import Progress
@@ -43,25 +31,22 @@ from services.twin.bounding_boxes import object_boxes_m
 from services.twin.data_mix import MIXES, Mix, options_of
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TruthEpisode, episode_id, record, write_episode
-from services.twin.hands import DOMAINS, Domain
 from services.twin.markers import Markers, marked_objects
+from services.twin.names import DOMAINS, Domain, StreamChoice, TakePath
 from services.twin.settings import TwinSettings
 from services.twin.sizes import Sizes
 from services.twin.stage import Stage
-from services.twin.take_options import STREAM_CHOICES, PlayedActions, StreamChoice, TakeOptions
-from services.twin.tasks import EVALUATED, TASK_NAMES, TASK_SETS, named_tasks
+from services.twin.take_options import PlayedActions, TakeOptions
+from services.twin.tasks import EVALUATED, TASK_NAMES, named_tasks
 from services.twin.world import TwinWorld
 
 CAMERAS = ("camera_head",)
-DEFAULT_MIX = "evaluator"
 MAX_LABEL = 32
 # Markers of 3 cm are 20 px wide in such images.
 _MARKED_IMAGE_PX: Final = 400
 _VARIED_DRAW, _SIZES_DRAW = 103, 104
 # How a take becomes an episode: written as it is; by devices, drivers, recorder and alignment, with
 # the twin's labels; or the same without them, objects being measured by the markers on them.
-TakePath = Literal["direct", "devices", "station"]
-TAKE_PATHS: Final[tuple[TakePath, ...]] = get_args(TakePath)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -377,62 +362,9 @@ def log_warnings() -> None:
     configure_logging(service="train_data", log_format="auto", level="warning")
 
 
-def comma_separated(text: str) -> tuple[str, ...]:
-    """Parse names, for argparse."""
-    return tuple(name for name in text.split(",") if name)
-
-
-def _keywords(text: str) -> dict[str, Any]:
-    try:
-        return TypeAdapter(dict[str, Any]).validate_json(text)
-    except ValidationError as error:
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a JSON object") from error
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = CommandParser(
-        prog="dextouch train data",
-        description=__doc__,
-        epilog="example:\n  dextouch train data --store runs/episodes --count 20 --images 4",
-    )
-    add = parser.add_argument
-    add("--store", required=True, help="folder of the episode store")
-    add("--first", type=int, default=0, help="first seed (%(default)s)")
-    add("--count", type=int, default=130, help="seeds per task (%(default)s)")
-    tasks = f"tasks, or sets of tasks: {', '.join(TASK_SETS)} (default: {','.join(EVALUATED)})"
-    add("--tasks", type=comma_separated, default=EVALUATED, metavar="A,B", help=tasks)
-    add("--domains", type=comma_separated, default=("robot",), help="robot,human (robot)")
-    path = (
-        "write takes as they are, by devices and alignment with the twin's labels, or as a station "
-        "records them, with poses from markers (robot: direct, human: devices)"
-    )
-    add("--path", choices=TAKE_PATHS, help=path)
-    mixes = parser.add_mutually_exclusive_group()
-    kinds = "kinds of takes (%(default)s)"
-    mixes.add_argument("--mix", choices=list(MIXES), default=DEFAULT_MIX, help=kinds)
-    for name, effect in (("exact", "without errors"), ("ladder", "with errors of 0 … 40 mm")):
-        short = mixes.add_argument(f"--{name}", dest="mix", action="store_const", const=name)
-        short.help = f"only scripts {effect}"
-    add("--miss-fraction", type=float, help="share of misses (default: the mix's)")
-    add("--still-fraction", type=float, help="share of takes that stop or never start")
-    add("--policy", metavar="[NAME=]MODULE:FACTORY", help="record rollouts of this policy instead")
-    arguments = "arguments of the factory, as a JSON object"
-    add("--policy-arguments", type=_keywords, default={}, help=arguments)
-    images = "images of every N-th step (%(default)s)"
-    add("--images", type=int, default=1, metavar="N", help=images)
-    looks = "share of scenes with other colours, light and head camera (%(default)s)"
-    add("--varied", type=float, default=0.0, metavar="SHARE", help=looks)
-    sizes = "share of takes whose objects are wider, narrower, higher or lower (%(default)s)"
-    add("--resized", type=float, default=0.0, metavar="SHARE", help=sizes)
-    add("--streams", choices=STREAM_CHOICES, default="training", help="(%(default)s)")
-    add("--jobs", type=int, help="processes (default: one per core)")
-    add_json(parser)
-    return parser
-
-
 def main(argv: Sequence[str]) -> int:
     """Run `dextouch train data`; returns 1 if an episode could not be recorded."""
-    arguments = _parser().parse_args(list(argv))
+    arguments = training_data_parser().parse_args(list(argv))
     seeds = range(arguments.first, arguments.first + max(0, arguments.count))
     mix = MIXES[arguments.mix].changed(miss=arguments.miss_fraction, still=arguments.still_fraction)
     tasks = named_tasks(arguments.tasks)

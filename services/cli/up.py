@@ -5,87 +5,27 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from fastapi import FastAPI
-from pydantic import AliasChoices, Field, ValidationError
-from pydantic_settings import SettingsConfigDict
+from pydantic import ValidationError
 
 from dextouch.command_line import write_result
-from dextouch.data_folder import data_folder
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
-from dextouch.free_text import FreeText
-from dextouch.serving import CommandSettings, configure_logging, explained, load_settings
+from dextouch.serving import configure_logging, explained, load_settings
 from services.cli.data_lock import held_data_folder
 from services.cli.extras import missing_package
 from services.cli.servers import Place, bind, serve_all, stop_on_signals
 from services.cli.standard_streams import discard_output
+from services.cli.up_settings import UpSettings
 
 if TYPE_CHECKING:
     from services.acquisition.settings import AcquisitionSettings
 
 LOOPBACK = "127.0.0.1"
-PORT = "0 for any free one"
 NEEDED = ("episode_store", "acquisition", "dashboard")
 # Makes the app of one service from the settings and the addresses of all services.
-Builder = Callable[["UpSettings", Mapping[str, str]], FastAPI]
-
-
-class UpSettings(CommandSettings):
-    """Run every service in one process, with a dashboard and mock or real devices.
-
-    An explicit port must be free; a default port in use is replaced by a free one. All data is
-    stored in one folder. Mock devices play an episode of its store, or a synthetic pattern; with
-    --no-mock the station has the devices of DEXTOUCH_ACQUISITION_DEVICES. Every service reads its
-    other settings from the same environment variables as on its own (DEXTOUCH_ALIGNMENT_…, see
-    `dextouch align serve --help`).
-
-    Example:
-      dextouch up --data runs/station --without twin,world_model
-    """
-
-    model_config = SettingsConfigDict(
-        frozen=True,
-        extra="forbid",
-        env_prefix="DEXTOUCH_UP_",
-        cli_prog_name="dextouch up",
-    )
-
-    data: Path = Field(
-        default_factory=data_folder,
-        description="folder of store and spool (DEXTOUCH_DATA, else data)",
-    )
-    station: FreeText = Field(
-        default="mock station", min_length=1, max_length=64, description="name of the station"
-    )
-    mock: bool = Field(default=True, description="simulate the station's devices")
-    mock_episode_id: str | None = Field(
-        default=None, description="episode of the store that the mock devices play"
-    )
-    align_new: bool = Field(default=True, description="align saved takes automatically")
-    without: tuple[str, ...] = Field(default=(), description="services not to start")
-    dashboard_port: int = Field(default=8080, ge=0, le=65535, description=PORT)
-    episode_store_port: int = Field(default=8081, ge=0, le=65535, description=PORT)
-    alignment_port: int = Field(default=8082, ge=0, le=65535, description=PORT)
-    acquisition_port: int = Field(default=8083, ge=0, le=65535, description=PORT)
-    twin_port: int = Field(default=8084, ge=0, le=65535, description=PORT)
-    world_model_port: int = Field(default=8085, ge=0, le=65535, description=PORT)
-    studies_port: int = Field(default=8086, ge=0, le=65535, description=PORT)
-    log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="warning", description="minimum level of log events"
-    )
-    json_path: Path | None = Field(
-        default=None,
-        validation_alias=AliasChoices("json"),
-        description="write the addresses as JSON to this file once all services respond; - for "
-        "standard output",
-    )
-
-    @property
-    def store_url(self) -> str:
-        """The store in the data folder."""
-        return str(self.data / "store")
+Builder = Callable[[UpSettings, Mapping[str, str]], FastAPI]
 
 
 def ports_of_up() -> dict[str, int]:
@@ -232,7 +172,8 @@ def _station(settings: UpSettings, **given: object) -> "AcquisitionSettings":
 
 def _twin(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
     from dextouch.worlds import create_world_app
-    from services.twin.serving import TwinServiceSettings, twin_worlds
+    from services.twin.serving import twin_worlds
+    from services.twin.settings import TwinServiceSettings
 
     settings = TwinServiceSettings()
     return create_world_app(twin_worlds(settings.scene), settings, name="twin")
@@ -254,7 +195,8 @@ def _world_model(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
 
 
 def _studies(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
-    from services.evaluation.studies.app import StudyServiceSettings, create_app
+    from services.evaluation.studies.app import create_app
+    from services.evaluation.studies.settings import StudyServiceSettings
 
     return create_app(StudyServiceSettings(studies=settings.data / "studies"))
 

@@ -19,6 +19,7 @@ from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import CHUNK_STEPS
 from dextouch.worlds import World
 from services.evaluation import scene_geometry
+from services.evaluation.prediction_names import DEFAULT_BASELINES
 from services.evaluation.prediction_scenes import (
     Future,
     Scene,
@@ -37,23 +38,6 @@ from services.evaluation.weighted_metrics import DESCRIPTIONS, Pairs, weighted_m
 
 MODEL: Final = "model"
 ALL_TASKS: Final = "all"
-# What every figure stands beside, in the order of tables.
-BASELINES: Final = {
-    "copy": "the first step, repeated",
-    "warp": "the first image, warped by the known motion of the camera over the table",
-    "zero": "no touch at all",
-    "codec": "the truth, encoded and decoded by the model: the limit",
-    "other_take": "the model, given the actions of another take of the task at the same step",
-    "hold": "the model, given actions in which nothing moves",
-    "hands_still": "the model, given actions in which only the head moves",
-    "no_instruction": "the model, given no instruction",
-    "other_instruction": "the model, given the instruction of another task",
-    "true_images": "the true images, measured in the same way: the error of the measurement",
-}
-
-
-# Instructions matter to worlds that read them, and cost two predictions more.
-DEFAULT_BASELINES: Final = tuple(name for name in BASELINES if "instruction" not in name)
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from jaxtyping import Float64, Int64, UInt8
 from dextouch.geometry import invert, pinhole_matrix, transform, transform_from_pose
 from services.twin.appearance import Appearance
 from services.twin.markers import Markers
+from services.twin.names import CAMERAS
 from services.twin.scene import Scene
 from services.twin.simulation import Simulation
 
-CAMERAS: Final = ("camera_head", "camera_wrist_left", "camera_wrist_right")
 FOVY_RAD: Final = {
     "camera_head": math.radians(46.0),
     "camera_wrist_left": math.radians(80.0),

@@ -9,7 +9,8 @@ import numpy as np
 
 from dextouch.errors import InvalidInputError
 from services.twin.mistakes import DEVELOPMENT, TRAINING, Mistake
-from services.twin.motions import MOTION_KINDS, Motion, MotionKind
+from services.twin.motions import Motion
+from services.twin.names import MOTION_KINDS, MotionKind
 from services.twin.take_options import TakeOptions
 
 # Success is decided within about 5 mm, so the levels are dense there.

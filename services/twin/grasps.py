@@ -12,8 +12,9 @@ from jaxtyping import Float64
 
 from dextouch.geometry import apply, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.twin.hands import Domain, TwinHand, twin_hand
+from services.twin.hands import TwinHand, twin_hand
 from services.twin.mjcf import FINGER_STIFFNESS_NM_RAD
+from services.twin.names import Domain
 
 _NUM_FIRST, _NUM_NEXT, _NUM_ROUNDS = 6000, 300, 45
 _SHRINK: Final = 0.90

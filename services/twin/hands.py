@@ -7,7 +7,7 @@ along -z, thumb side +x, right palm towards +y, left palm towards -y).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -17,9 +17,7 @@ from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import FingerTable, HandModel, RobotHand
 from dextouch.tactile.layout import PALM_PITCH_M, PALM_SHAPE, Side
 from services.twin.human_hand import METACARPAL_BASES_M, human_fingers
-
-Domain = Literal["robot", "human"]
-DOMAINS: Final[tuple[Domain, Domain]] = ("robot", "human")
+from services.twin.names import DOMAINS, Domain
 
 # Offset of the sensing skin from the rigid shape, chosen for the most accurate pressure pattern.
 SKIN_OFFSET_M: Final = 0.0015

@@ -5,7 +5,7 @@ any step of a script and are random, so that the outcome must be learned from th
 """
 
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -16,11 +16,10 @@ from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands.actions import HandTrajectory
 from dextouch.tactile.layout import SIDES
 from services.twin.demonstrators import NUM_GRID_STEPS, HandPose, Waypoint, bent, follow, moved
-from services.twin.hands import Domain, TwinHand, twin_hand
+from services.twin.hands import TwinHand, twin_hand
+from services.twin.names import Domain, MotionKind
 from services.twin.simulation import MODEL_RATE_HZ
 
-MotionKind = Literal["retreat", "push", "slip", "wander"]
-MOTION_KINDS: Final[tuple[MotionKind, ...]] = get_args(MotionKind)
 Hands = tuple[HandPose, HandPose]
 
 _END_S: Final = (NUM_GRID_STEPS - 1) / MODEL_RATE_HZ

@@ -9,8 +9,9 @@ import structlog
 from jaxtyping import Int64
 
 from dextouch.tactile.layout import SIDES
-from services.twin.hands import Domain, TwinHand, twin_hand
+from services.twin.hands import TwinHand, twin_hand
 from services.twin.mjcf import scene_xml
+from services.twin.names import Domain
 from services.twin.object_bodies import ObjectBodies
 
 logger = structlog.get_logger(__name__)

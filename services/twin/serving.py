@@ -3,23 +3,9 @@
 from functools import partial
 from typing import Any
 
-from pydantic import Field
-
-from dextouch.serving import load_settings, service_config
-from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, serve_worlds
-from services.twin.settings import TwinSettings
-
-
-class TwinServiceSettings(WorldServiceSettings):
-    """Serve the rollouts of the physics twin, and of a baseline that copies the first step.
-
-    Example:
-      dextouch twin serve --port 8084
-    """
-
-    model_config = service_config("twin", "dextouch twin serve")
-
-    scene: TwinSettings = Field(default=TwinSettings(), description="settings of the scene")
+from dextouch.serving import load_settings
+from dextouch.worlds import CopyFirstWorld, World, serve_worlds
+from services.twin.settings import TwinServiceSettings, TwinSettings
 
 
 def twin_worlds(scene: TwinSettings) -> dict[str, World[Any]]:

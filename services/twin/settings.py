@@ -1,8 +1,10 @@
-"""User settings of the twin; physics and geometry are fixed by the code's version."""
+"""Settings of the twin and its service; physics and geometry are fixed by the code's version."""
 
 from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
+from dextouch.serving import service_config
+from dextouch.worlds import WorldServiceSettings
 
 
 class TwinSettings(FrozenModel):
@@ -27,3 +29,15 @@ class TwinSettings(FrozenModel):
     settle_s: float = Field(
         default=0.2, ge=0.0, le=2.0, description="seconds that objects settle before a take"
     )
+
+
+class TwinServiceSettings(WorldServiceSettings):
+    """Serve the rollouts of the physics twin, and of a baseline that copies the first step.
+
+    Example:
+      dextouch twin serve --port 8084
+    """
+
+    model_config = service_config("twin", "dextouch twin serve")
+
+    scene: TwinSettings = Field(default=TwinSettings(), description="settings of the scene")

@@ -18,7 +18,7 @@ from services.twin.demonstrators import (
     follow,
     head_sway,
 )
-from services.twin.hands import Domain
+from services.twin.names import Domain
 from services.twin.scene import compile_scene
 from services.twin.settings import TwinSettings
 from services.twin.simulation import Command, Simulation

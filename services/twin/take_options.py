@@ -2,22 +2,17 @@
 
 import re
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, check_actions
-from services.twin.cameras import CAMERAS
 from services.twin.demonstrators import NUM_GRID_STEPS
-from services.twin.hands import Domain
 from services.twin.mistakes import Mistake
 from services.twin.motions import Motion
+from services.twin.names import CAMERAS, Domain, StreamChoice
 from services.twin.sizes import USUAL, Sizes
-
-StreamChoice = Literal["all", "training"]
-STREAM_CHOICES: Final[tuple[StreamChoice, ...]] = get_args(StreamChoice)
 
 
 @dataclass(frozen=True)

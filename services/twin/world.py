@@ -18,7 +18,7 @@ from dextouch.hands.actions import (
 from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
 from dextouch.streams import pack, unpack
 from dextouch.worlds import StartedRollout, SteppedRollout
-from services.twin.cameras import CAMERAS
+from services.twin.names import CAMERAS
 from services.twin.recorder import GridLog
 from services.twin.settings import TwinSettings
 from services.twin.simulation import (

@@ -1,34 +1,26 @@
 """Commands of the world model: train both kinds of models, serve one, show its provenance."""
 
 import json
-import os
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dextouch.command_line import CommandParser, ProgressLines, write_result
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.command_line import ProgressLines, write_result
 from dextouch.serving import (
-    CommandSettings,
-    configuration_path,
     load_settings,
-    read_configuration,
-    section_of,
 )
 from dextouch.worlds import World, serve_worlds
 from services.networks.weight_files import digest_of
 from services.world_model.checkpoints import list_checkpoints, read_checkpoint, read_metadata
 from services.world_model.distillation_settings import DistillCommand
+from services.world_model.forms import adapt_settings, train_settings
 from services.world_model.plan import plan_table
-from services.world_model.presets import PRESETS
 from services.world_model.settings import (
-    AdaptCommand,
     AdaptStateCommand,
     ShowCommand,
-    TrainCommand,
     TrainSettings,
     TrainStateCommand,
     WorldModelSettings,
@@ -40,58 +32,23 @@ from services.world_model.training.trainer import TrainingReport, train
 from services.world_model.training.training_run import TrainingProgress
 from services.world_model.world import open_world
 
-STATE: Final = "state"
-
 
 def run_train(arguments: list[str]) -> int:
     """Train the form that --preset names; print the report and optionally write it to a file."""
-    preset = _flag(arguments, "preset", TrainCommand) or STATE
-    if preset not in (STATE, *PRESETS):
-        raise UnknownNameError("preset", preset, [STATE, *PRESETS])
-    if preset == STATE:
-        _refuse_other_settings()
-        return _train_state(load_settings(TrainStateCommand, arguments))
-    settings = load_settings(TrainCommand, arguments)
+    settings = load_settings(train_settings(arguments), arguments)
+    if isinstance(settings, TrainStateCommand):
+        return _train_state(settings)
     if settings.plan:
         print(plan_table(settings.network))
         return 0
     return _train(settings, settings.json_path)
 
 
-def _refuse_other_settings() -> None:
-    """Refuse settings of the paper's form without a preset: nothing would read them.
-
-    Raises:
-        InvalidInputError: the configuration file has some.
-    """
-    path, section = configuration_path(), section_of(TrainCommand)
-    if path is not None and read_configuration(path).get(section, {"preset": STATE}) != {
-        "preset": STATE
-    }:
-        raise InvalidInputError(
-            f"{path}: [{section}] has settings of the paper's form, and no preset of it is named; "
-            f'add preset = "tiny" there, or move them to [{section_of(TrainStateCommand)}]'
-        )
-
-
-def _flag(arguments: list[str], name: str, *classes: type[CommandSettings]) -> str | None:
-    """One setting, before it is known which command the others are of: a flag, or configured."""
-    parser = CommandParser(add_help=False, allow_abbrev=False)
-    parser.add_argument(f"--{name}", dest="value")
-    value: str | None = parser.parse_known_args(arguments)[0].value
-    path = configuration_path()
-    for section in map(section_of, classes):
-        kept = {} if path is None else read_configuration(path).get(section, {})
-        value = value or os.environ.get(f"DEXTOUCH_{section}_{name}".upper()) or kept.get(name)
-    return value
-
-
 def run_adapt(arguments: list[str]) -> int:
     """Adapt a checkpoint to new tasks; print the report and optionally write it to a file."""
-    init = _flag(arguments, "init", AdaptStateCommand, AdaptCommand)
-    if init is None or is_state_checkpoint(Path(init)):
-        return _train_state(load_settings(AdaptStateCommand, arguments))
-    settings = load_settings(AdaptCommand, arguments)
+    settings = load_settings(adapt_settings(arguments), arguments)
+    if isinstance(settings, AdaptStateCommand):
+        return _train_state(settings)
     network = read_checkpoint(settings.init).metadata.network
     return _train(settings.training(network), settings.json_path)
 

@@ -54,7 +54,8 @@ def worlds(_, **settings):
 
 
 def studies(folder, **settings):
-    from services.evaluation.studies.app import StudyServiceSettings, create_app
+    from services.evaluation.studies.app import create_app
+    from services.evaluation.studies.settings import StudyServiceSettings
 
     return create_app(StudyServiceSettings(studies=folder, **settings))
 

@@ -11,7 +11,7 @@ from dextouch.errors import InvalidInputError
 from services.acquisition.settings import AcquisitionSettings
 from services.alignment.settings import AlignmentSettings
 from services.cli import main
-from services.cli.up import UpSettings
+from services.cli.up_settings import UpSettings
 from services.episode_store.settings import EpisodeStoreSettings
 from tests.unit.bridges.takes import write_episode
 

@@ -26,7 +26,7 @@ from dextouch.streams import StreamDescriptor
 from services.acquisition.settings import AcquisitionSettings
 from services.alignment.station_calibration.schemas import Answer, RunRequest
 from services.cli.main import main
-from services.cli.up import UpSettings
+from services.cli.up_settings import UpSettings
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.tasks import load_tasks
 from services.episode_store.app import create_app

@@ -33,8 +33,7 @@ from services.cli.mock_takes import TakePlan, measure_gloves, origin_in_truth_ns
 from services.cli.training_data import Order, in_processes, make_episode
 from services.episode_store.committing import commit_spool
 from services.evaluation.progress import Progress
-from services.twin.cameras import CAMERAS
-from services.twin.hands import Domain
+from services.twin.names import CAMERAS, Domain
 from services.twin.take_options import TakeOptions
 
 # The human stands a bottle, the robot stacks bowls, to cover one-handed and bimanual tasks.

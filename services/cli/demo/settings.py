@@ -38,8 +38,8 @@ class DemoPlan:
         return range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + self.num_seeds)
 
 
-def parse(argv: Sequence[str]) -> DemoPlan:
-    """Parse the command line; `--help` prints the usage and exits."""
+def demo_parser() -> CommandParser:
+    """Parser of `dextouch demo`."""
     parser = CommandParser(
         prog="dextouch demo",
         epilog="example:\n  dextouch demo --output runs/demo --seeds 2",
@@ -60,6 +60,12 @@ def parse(argv: Sequence[str]) -> DemoPlan:
     )
     scenes = "held-out scenes per task for scoring policies (%(default)s)"
     parser.add_argument("--seeds", type=int, metavar="N", default=6, help=scenes)
+    return parser
+
+
+def parse(argv: Sequence[str]) -> DemoPlan:
+    """Parse the command line; `--help` prints the usage and exits."""
+    parser = demo_parser()
     arguments = parser.parse_args(list(argv))
     if arguments.seeds < 1:
         parser.error(f"--seeds: got {arguments.seeds}, expected at least 1")

@@ -7,13 +7,12 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from dextouch.clients import RolloutClient
-from dextouch.command_line import CommandParser, add_json
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.serving import ChildProcess
+from services.cli.parsers import study_parser
 from services.cli.training_data import stage_of
 from services.evaluation.command_line import (
     EXIT_FAILED,
@@ -36,27 +35,6 @@ from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 
 _CHILD = "services.cli.study.world_process"
-_RUN_EPILOG = """\
-example:
-  dextouch study run study.toml
-
-A study file:
-
-  name = "touch"
-  tasks = ["stand_bottle", "stack_bowls"]
-  first_seed = 31000
-  num_starts = 10
-
-  [imagined.model]
-  builtin = "world-model"
-
-  [policies.careful]
-  script = "script 5 mm"
-  [policies.mine]
-  factory = "package.module:make_policy"
-
-All keys of a study file: docs/studies.md
-"""
 
 
 def main(arguments: list[str]) -> int:
@@ -65,54 +43,8 @@ def main(arguments: list[str]) -> int:
     Returns:
         0, or 1 if a rollout failed or has no result yet.
     """
-    options = _parser().parse_args(arguments)
-    run: Any = options.run
-    return int(run(options))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = CommandParser(
-        prog="dextouch study",
-        description="Score policies in real and imagined worlds from matched starts.",
-        epilog="`dextouch study serve` shows the results on the dashboard.",
-    )
-    words = parser.add_subparsers(required=True, metavar="COMMAND")
-    run = words.add_parser(
-        "run",
-        help="run a study, or continue it",
-        description="Run the rollouts of a study that have no result yet, and write its report. "
-        "A study may be interrupted at any time; the same command continues it.",
-        epilog=_RUN_EPILOG,
-    )
-    run.add_argument("study", type=Path, metavar="STUDY", help="study file (TOML)")
-    run.add_argument(
-        "--folder",
-        type=Path,
-        metavar="PATH",
-        help="folder of results, rollouts and reports (default: the study file without .toml)",
-    )
-    run.add_argument(
-        "--store",
-        metavar="URL",
-        help="episode store of the rollouts; with the dashboard's store, it plays them "
-        "(default: rollouts/ in the folder)",
-    )
-    run.add_argument(
-        "--retry-failed", action="store_true", help="run rollouts again that failed before"
-    )
-    run.set_defaults(run=_run)
-    report = words.add_parser(
-        "report",
-        help="write the report of a study's results so far",
-        description="Write report.json, a page for each imagined world, and tables.tex from the "
-        "results of a study, finished or not.",
-        epilog="example:\n  dextouch study report runs/touch",
-    )
-    report.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the study")
-    report.set_defaults(run=_report)
-    for one in (run, report):
-        add_json(one)
-    return parser
+    options = study_parser().parse_args(arguments)
+    return _report(options) if options.word == "report" else _run(options)
 
 
 def _run(options: argparse.Namespace) -> int:

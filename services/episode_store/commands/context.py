@@ -11,7 +11,6 @@ from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.system_files import is_system_file
 
 EXIT_DAMAGED = 1
-_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 _SIZES = ("bytes", "kB", "MB", "GB", "TB")
 
 Outcome = tuple[dict[str, Any], int]
@@ -87,15 +86,6 @@ class Context:
                 "it to a folder first, or use the versions of the bucket"
             )
         return root
-
-
-def seconds_of(text: str) -> float:
-    """Parse a duration such as `30d`, `12h`, `90m` or `10s` to seconds, for argparse."""
-    factor = _UNITS.get(text[-1:])
-    if factor is None or not text[:-1].isdecimal():
-        told = f"got {text!r}, expected a number and one of s m h d, such as 30d"
-        raise argparse.ArgumentTypeError(told)
-    return int(text[:-1]) * factor
 
 
 def readable_size(num_bytes: int) -> str:

@@ -1,44 +1,24 @@
 """Read-only HTTP service of the results of studies."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Depends, FastAPI, Query
 from pydantic import Field
 
-from dextouch.data_folder import data_folder
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import (
     RequireScope,
     ServedFolder,
-    ServiceSettings,
     create_service_app,
     serve,
-    service_config,
 )
+from services.evaluation.studies.settings import StudyServiceSettings
 from services.evaluation.studies.study_figures import StudyFigures, StudyRollout, StudySummary
 from services.evaluation.studies.study_folders import StudyFolders
 
 SCOPE: Final = "study_read"
 MAX_PAGE: Final = 500
-
-
-class StudyServiceSettings(ServiceSettings):
-    """Serve the results of studies over HTTP, for the dashboard.
-
-    Reads only: studies are run by `dextouch study run`, and may run meanwhile.
-
-    Example:
-      dextouch study serve --studies data/studies --port 8086
-    """
-
-    model_config = service_config("studies", "dextouch study serve")
-
-    studies: Path = Field(
-        default_factory=lambda: data_folder() / "studies",
-        description="folder that holds the folder of each study",
-    )
 
 
 class StudyList(FrozenModel):

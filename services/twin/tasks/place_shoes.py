@@ -10,8 +10,9 @@ from dextouch.geometry.rotations import quaternion_from_rotation
 from dextouch.tactile.layout import Side
 from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
 from services.twin.grasps import CylinderGrasp, opened, pressing
-from services.twin.hands import Domain, twin_hand
+from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
+from services.twin.names import Domain
 from services.twin.simulation import Simulation
 from services.twin.tasks.postures import THUMB_UP, yawed
 from services.twin.tasks.task import REST_SPEED

@@ -9,7 +9,8 @@ from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.tactile.layout import Side
 from services.twin.demonstrators import HandPose
-from services.twin.hands import Domain, twin_hand
+from services.twin.hands import twin_hand
+from services.twin.names import Domain
 
 # R_world_wrist with fingers forward (world +y) and the palm down, for the right and left hand.
 PALM_DOWN: Final = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])

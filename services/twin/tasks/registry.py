@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from dextouch.errors import UnknownNameError
+from services.twin.names import TASK_SETS
 from services.twin.tasks.cans import CAN_TASKS
 from services.twin.tasks.insert_peg import InsertPeg
 from services.twin.tasks.lift_box import LiftBox
@@ -34,32 +35,6 @@ _TASKS: Final[dict[str, Task]] = {
         StrikeBell(),
         SqueezeBall(),
     )
-}
-TASK_NAMES: Final = tuple(_TASKS)
-# The paper's four tasks on which policies are trained and evaluated.
-DOWNSTREAM: Final = ("place_shoes", "place_phone", "stack_bowls", "stand_bottle")
-# Tasks of robot and of human episodes for pretraining: no task is in two of these three sets.
-ROBOT_PRETRAINING: Final = ("insert_peg", "open_drawer", "turn_lever", "strike_bell")
-HUMAN_PRETRAINING: Final = (
-    *(task.name for task in CAN_TASKS),
-    "regrasp_can",
-    "lift_box",
-    "squeeze_ball",
-)
-# Tasks of the package's checkpoints; commands record and evaluate these by default.
-EVALUATED: Final = (
-    "stand_bottle",
-    "stack_bowls",
-    "insert_peg",
-    "place_shoes",
-    "place_phone",
-    "open_drawer",
-)
-TASK_SETS: Final[dict[str, tuple[str, ...]]] = {
-    "downstream": DOWNSTREAM,
-    "robot-pretraining": ROBOT_PRETRAINING,
-    "human-pretraining": HUMAN_PRETRAINING,
-    "evaluated": EVALUATED,
 }
 
 

@@ -9,8 +9,9 @@ from dextouch.geometry import invert, transform, transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation
 from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
 from services.twin.grasps import CylinderGrasp, opened, pressing
-from services.twin.hands import Domain, twin_hand
+from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
+from services.twin.names import Domain
 from services.twin.simulation import Simulation
 from services.twin.tasks.postures import THUMB_UP, relaxed, yawed
 from services.twin.tasks.task import REST_SPEED

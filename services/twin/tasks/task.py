@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from services.twin.demonstrators import Waypoint, WaypointNoise
-from services.twin.hands import Domain
+from services.twin.names import Domain
 from services.twin.simulation import Simulation
 
 # An object slower than this (m/s and rad/s) is at rest.

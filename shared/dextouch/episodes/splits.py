@@ -7,10 +7,12 @@ on some of the splits A, B and C and imagine episodes of another.
 
 import hashlib
 from collections.abc import Collection, Iterable
-from typing import Final, Literal, Protocol, TypeVar, get_args, runtime_checkable
+from typing import TYPE_CHECKING, Final, Literal, Protocol, TypeVar, get_args, runtime_checkable
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import EpisodeAttributes
+
+if TYPE_CHECKING:
+    from dextouch.schemas import EpisodeAttributes
 
 Split = Literal["A", "B", "C"]
 SPLITS: Final[tuple[Split, ...]] = get_args(Split)
@@ -28,7 +30,7 @@ class InScene(Protocol):
 InSceneT = TypeVar("InSceneT", bound=InScene)
 
 
-def scene_of(attributes: EpisodeAttributes) -> str:
+def scene_of(attributes: "EpisodeAttributes") -> str:
     """Name of an episode's scene, TASK/SEED.
 
     Without a seed (recordings of people and real robots), a recording is a scene of its own, which
@@ -40,7 +42,7 @@ def scene_of(attributes: EpisodeAttributes) -> str:
     return f"{attributes.task}/{recording or _first_episode(attributes)}"
 
 
-def recording_of(attributes: EpisodeAttributes) -> str | None:
+def recording_of(attributes: "EpisodeAttributes") -> str | None:
     """The recording that an episode was aligned from, by a digest of its content or its id."""
     for entry in attributes.lineage:
         if entry.kind == "recording":
@@ -48,7 +50,7 @@ def recording_of(attributes: EpisodeAttributes) -> str | None:
     return None
 
 
-def split_of(attributes: EpisodeAttributes) -> Split:
+def split_of(attributes: "EpisodeAttributes") -> Split:
     """Split of an episode: a third of all scenes each, by a hash of the scene's name."""
     return _split_of(scene_of(attributes))
 
@@ -58,7 +60,7 @@ def split_of_scene(task: str, scene: int | str) -> Split:
     return _split_of(f"{task}/{scene}")
 
 
-def is_in(attributes: EpisodeAttributes, splits: Collection[Split]) -> bool:
+def is_in(attributes: "EpisodeAttributes", splits: Collection[Split]) -> bool:
     """Whether an episode is in one of these splits; all are if none is given."""
     return not splits or split_of(attributes) in splits
 
@@ -105,7 +107,7 @@ def _split_of(scene: str) -> Split:
     return SPLITS[int.from_bytes(digest[:8], "big") % len(SPLITS)]
 
 
-def _first_episode(attributes: EpisodeAttributes) -> str:
+def _first_episode(attributes: "EpisodeAttributes") -> str:
     """Id of the episode that this one was imagined from, or its own."""
     if attributes.origin == "imagined":
         for entry in attributes.lineage:

@@ -45,27 +45,27 @@ if TYPE_CHECKING:
     from dextouch.schemas.enrolment import StationEnrolments as StationEnrolments
     from dextouch.schemas.enrolment import StationKey as StationKey
     from dextouch.schemas.enrolment import UseToken as UseToken
-    from dextouch.schemas.episodes import ID_PATTERN as ID_PATTERN
     from dextouch.schemas.episodes import MAX_CAUSE as MAX_CAUSE
     from dextouch.schemas.episodes import CatalogHours as CatalogHours
-    from dextouch.schemas.episodes import ClockMethod as ClockMethod
     from dextouch.schemas.episodes import ClockReport as ClockReport
-    from dextouch.schemas.episodes import ClockWarning as ClockWarning
-    from dextouch.schemas.episodes import Domain as Domain
     from dextouch.schemas.episodes import EpisodeAttributes as EpisodeAttributes
     from dextouch.schemas.episodes import EpisodeDetail as EpisodeDetail
     from dextouch.schemas.episodes import EpisodeList as EpisodeList
     from dextouch.schemas.episodes import EpisodeSummary as EpisodeSummary
     from dextouch.schemas.episodes import HoursRow as HoursRow
     from dextouch.schemas.episodes import LineageEntry as LineageEntry
-    from dextouch.schemas.episodes import Matrix as Matrix
-    from dextouch.schemas.episodes import Origin as Origin
     from dextouch.schemas.episodes import StoredAnchor as StoredAnchor
-    from dextouch.schemas.episodes import StoreId as StoreId
     from dextouch.schemas.episodes import Verification as Verification
     from dextouch.schemas.episodes import is_rollout as is_rollout
     from dextouch.schemas.episodes import json_ready as json_ready
     from dextouch.schemas.episodes import matrix_rows as matrix_rows
+    from dextouch.schemas.fields import ID_PATTERN as ID_PATTERN
+    from dextouch.schemas.fields import ClockMethod as ClockMethod
+    from dextouch.schemas.fields import ClockWarning as ClockWarning
+    from dextouch.schemas.fields import Domain as Domain
+    from dextouch.schemas.fields import Matrix as Matrix
+    from dextouch.schemas.fields import Origin as Origin
+    from dextouch.schemas.fields import StoreId as StoreId
     from dextouch.schemas.jpeg_images import IMAGE_PREFIX as IMAGE_PREFIX
     from dextouch.schemas.jpeg_images import decode_images as decode_images
     from dextouch.schemas.observations import EVERYTHING as EVERYTHING

@@ -7,7 +7,7 @@ from pydantic import AwareDatetime, Field
 
 from dextouch.free_text import FreeLines, FreeText
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas.episodes import Domain, Origin, StoreId
+from dextouch.schemas.fields import Domain, Origin, StoreId
 
 ItemKind = Literal["episode", "recording"]
 Verdict = Literal["accepted", "rejected"]

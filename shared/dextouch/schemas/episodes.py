@@ -1,7 +1,7 @@
 """Schemas of episodes: attributes, lineage, clock reports, and the catalog's responses."""
 
 from operator import not_
-from typing import Annotated, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -16,33 +16,23 @@ from pydantic import (
 from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import rigid_error
 from dextouch.hands.actions import AnchorPoses
+from dextouch.schemas.fields import (
+    Box,
+    ClockMethod,
+    ClockWarning,
+    Domain,
+    Matrix,
+    NonNegativeFinite,
+    Origin,
+    StoreId,
+    TraceId,
+)
 from dextouch.streams import StreamDescriptor
 
 FORMAT_VERSION: Final = 1
-ID_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,127}$"
-
-# Source of a stream's time stamps: the device's stamps, its sequence numbers, counting of samples,
-# or plain arrival times.
-ClockMethod = Literal["device", "sequence", "counting", "arrival"]
-# Reasons to doubt the times of a stream: its clock is far off its nominal rate, even the promptest
-# samples arrive more than a sample period later than fitted, or a stop of the clock cannot be
-# distinguished from an increase of the path delay.
 # Characters of the reason why a take is incomplete.
 MAX_CAUSE = 500
-ClockWarning = Literal["skew", "residual", "stop"]
-StoreId = Annotated[str, Field(pattern=ID_PATTERN)]
-# Of a W3C trace (docs/operations.md#traces).
-TraceId = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
-Domain = Literal["human", "robot"]
-Origin = Literal["recorded", "twin", "imagined"]
 RIGID_TOLERANCE: Final = 1e-6
-# Validation of lists in uploads stops at the first mistake: to collect 500,000 takes seconds.
-Matrix = Annotated[
-    tuple[Annotated[tuple[FiniteFloat, ...], Field(fail_fast=True)], ...], Field(fail_fast=True)
-]
-NonNegativeFinite = Annotated[FiniteFloat, Field(ge=0)]
-# Centre x y z and half sizes x y z of a bounding box.
-Box = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 def matrix_rows(matrix: np.ndarray) -> Matrix:

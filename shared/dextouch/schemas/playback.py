@@ -6,7 +6,8 @@ from pydantic import AwareDatetime
 
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.catalog import ItemKind
-from dextouch.schemas.episodes import Domain, LineageEntry, Origin
+from dextouch.schemas.episodes import LineageEntry
+from dextouch.schemas.fields import Domain, Origin
 
 
 class PlayedStream(FrozenModel):

@@ -7,15 +7,8 @@ from pydantic import AwareDatetime, Field, FiniteFloat, model_validator
 
 from dextouch.free_text import check_texts
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas.episodes import (
-    FORMAT_VERSION,
-    MAX_CAUSE,
-    Domain,
-    LineageEntry,
-    Matrix,
-    StoreId,
-    TraceId,
-)
+from dextouch.schemas.episodes import FORMAT_VERSION, MAX_CAUSE, LineageEntry
+from dextouch.schemas.fields import Domain, Matrix, StoreId, TraceId
 from dextouch.streams import StreamDescriptor
 
 # Reason of the store's ConflictError when another recording has the id.

@@ -7,7 +7,7 @@ from pydantic import AwareDatetime, Field, FiniteFloat
 
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas.episodes import Domain, StoreId
+from dextouch.schemas.fields import Domain, StoreId
 
 RecorderState = Literal["idle", "armed", "recording", "checking", "saved", "discarded"]
 RecorderAction = Literal["arm", "record", "stop", "save", "discard", "rerecord"]

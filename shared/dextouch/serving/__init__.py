@@ -24,26 +24,26 @@ if TYPE_CHECKING:
     from dextouch.serving.guard import KIB as KIB
     from dextouch.serving.guard import MSGPACK as MSGPACK
     from dextouch.serving.guard import OCTETS as OCTETS
+    from dextouch.serving.guard import RequireScope as RequireScope
     from dextouch.serving.guard import media_type as media_type
     from dextouch.serving.guard import takes as takes
     from dextouch.serving.json_bodies import JsonBody as JsonBody
     from dextouch.serving.keys import AccessControl as AccessControl
     from dextouch.serving.keys import Grant as Grant
-    from dextouch.serving.keys import RequireScope as RequireScope
     from dextouch.serving.keys import not_signed_in as not_signed_in
     from dextouch.serving.keys import secret_digest as secret_digest
     from dextouch.serving.listening import bound_socket as bound_socket
     from dextouch.serving.logs import configure_logging as configure_logging
     from dextouch.serving.masking import masked as masked
     from dextouch.serving.refusals import WrongKeys as WrongKeys
+    from dextouch.serving.running import MAX_WEBSOCKET_BYTES as MAX_WEBSOCKET_BYTES
+    from dextouch.serving.running import check_address as check_address
+    from dextouch.serving.running import run as run
+    from dextouch.serving.running import serve as serve
+    from dextouch.serving.running import server_options as server_options
     from dextouch.serving.served_folder import ServedFolder as ServedFolder
-    from dextouch.serving.settings import MAX_WEBSOCKET_BYTES as MAX_WEBSOCKET_BYTES
     from dextouch.serving.settings import ServiceSettings as ServiceSettings
-    from dextouch.serving.settings import check_address as check_address
     from dextouch.serving.settings import load_settings as load_settings
-    from dextouch.serving.settings import run as run
-    from dextouch.serving.settings import serve as serve
-    from dextouch.serving.settings import server_options as server_options
     from dextouch.serving.settings import service_config as service_config
     from dextouch.serving.spans import configure_spans as configure_spans
     from dextouch.serving.state import StateStore as StateStore

@@ -14,9 +14,8 @@ from fastapi.dependencies.models import Dependant
 from fastapi.routing import APIRoute
 
 from dextouch.schemas import PROBLEM_MEDIA_TYPE, Problem
-from dextouch.serving.guard import JSON, SAFE_METHODS, body_rule
+from dextouch.serving.guard import JSON, SAFE_METHODS, RequireScope, body_rule
 from dextouch.serving.json_bodies import JsonBody
-from dextouch.serving.keys import RequireScope
 
 CallT = TypeVar("CallT")
 KEY_SCHEME = "api_key"

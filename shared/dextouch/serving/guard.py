@@ -180,6 +180,18 @@ def media_type(content_type: str | None) -> tuple[str, dict[str, str]]:
     return (header.get_content_type() if content_type else "none"), parameters
 
 
+@dataclass(frozen=True)
+class RequireScope:
+    """Route dependency that requires a scope: `dependencies=[Depends(RequireScope("rollout"))]`."""
+
+    scope: str
+
+    async def __call__(self, request: Request) -> str:
+        """The name of the caller's key; raises AccessDeniedError."""
+        access: AccessControl = request.app.state.access
+        return access.check(request.headers.get("authorization"), self.scope)
+
+
 class BodyRules:
     """The rules of all routes of a service."""
 

@@ -3,10 +3,8 @@
 import hashlib
 import hmac
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from pydantic import Field, SecretStr, field_validator
-from starlette.requests import Request
 
 from dextouch.errors import AccessDeniedError
 from dextouch.frozen_model import FrozenModel
@@ -109,18 +107,6 @@ class AccessControl:
     def check(self, authorization: str | None, scope: str) -> str:
         """Check a key and its scope as `granted`, and return the key's name."""
         return self.granted(authorization, scope).name
-
-
-@dataclass(frozen=True)
-class RequireScope:
-    """Route dependency that requires a scope: `dependencies=[Depends(RequireScope("rollout"))]`."""
-
-    scope: str
-
-    async def __call__(self, request: Request) -> str:
-        """The name of the caller's key; raises AccessDeniedError."""
-        access: AccessControl = request.app.state.access
-        return access.check(request.headers.get("authorization"), self.scope)
 
 
 def secret_digest(text: str) -> bytes:

@@ -6,10 +6,8 @@ from functools import partial
 from typing import Any
 
 from fastapi import FastAPI
-from pydantic import Field, model_validator
 
 from dextouch.serving import (
-    ServiceSettings,
     check_address,
     configure_logging,
     configure_spans,
@@ -19,43 +17,14 @@ from dextouch.serving import (
     run_workers,
     server_options,
 )
-from dextouch.worlds.limits import RolloutLimits
 from dextouch.worlds.metrics import WorldMetrics
 from dextouch.worlds.openpi import openpi_router
 from dextouch.worlds.records import RecordStore
 from dextouch.worlds.rollouts import Reopen, RolloutService
 from dextouch.worlds.routes import ChunkShortcut, rollout_router, watch_router
+from dextouch.worlds.settings import WorldServiceSettings
 from dextouch.worlds.watching import RolloutWatch
 from dextouch.worlds.world import World
-
-
-class WorldServiceSettings(ServiceSettings):
-    """Settings of a service of worlds; subclass to add those of a world."""
-
-    state_url: str = Field(
-        default="memory://",
-        description="store of rollouts: memory:// or redis://HOST:PORT/DB",
-    )
-    limits: RolloutLimits = RolloutLimits()
-    workers: int = Field(
-        default=1, ge=1, le=64, description="processes on one port; more than one needs redis://"
-    )
-    drain_s: float = Field(
-        default=0.0,
-        ge=0,
-        le=600,
-        description="seconds after SIGTERM without new rollouts and not ready, before the port is "
-        "closed (of one process)",
-    )
-
-    @model_validator(mode="after")
-    def _workers_share_their_state(self) -> "WorldServiceSettings":
-        if self.workers > 1 and self.state_url == "memory://":
-            raise ValueError(
-                f"workers: got {self.workers} with state_url memory://, which each of them would "
-                "have for itself; set state_url to redis://HOST:PORT/DB"
-            )
-        return self
 
 
 def create_world_app(

@@ -38,7 +38,6 @@ from dextouch.serving import StateStore
 from dextouch.streams import pack
 from dextouch.tracing import current_trace_id
 from dextouch.worlds.batcher import StepJob, WorldWorker, batch_histogram
-from dextouch.worlds.limits import RolloutLimits
 from dextouch.worlds.records import (
     Answer,
     RecordStore,
@@ -49,6 +48,7 @@ from dextouch.worlds.records import (
     parts_of,
     selector_bytes,
 )
+from dextouch.worlds.settings import RolloutLimits
 from dextouch.worlds.warm_up import first_chunk_s
 from dextouch.worlds.world import (
     StartedRollout,

@@ -16,7 +16,7 @@ from dextouch.worlds import WorldServiceSettings
 from services.cli import configuration
 from services.cli.main import main
 from services.dashboard.settings import DashboardSettings
-from services.twin.serving import TwinServiceSettings
+from services.twin.settings import TwinServiceSettings
 from services.world_model.settings import TrainCommand
 
 KEY = "a-key-of-some-length"

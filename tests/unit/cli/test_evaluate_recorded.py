@@ -5,13 +5,14 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from services.cli import evaluate_recorded, main
+from services.cli.parsers import recorded_parser
 from services.evaluation.recorded_takes import REPLAY
 
 HOLD = "services.evaluation.policies.hold:HoldPolicy"
 
 
 def policies(*words):
-    parsed = evaluate_recorded._parser().parse_args(["--episodes", "takes", *words])
+    parsed = recorded_parser().parse_args(["--episodes", "takes", *words])
     return evaluate_recorded._policies(parsed)
 
 

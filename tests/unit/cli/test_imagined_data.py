@@ -15,9 +15,8 @@ from services.cli.imagined_data import (
     chosen_episodes,
     judged_steps,
     main,
-    positive,
-    seed_range,
 )
+from services.cli.parsers import positive, seed_range
 from services.cli.servers import served
 from services.evaluation.endings import read_ending_episode
 from services.generation.demonstrations import imagine_episode

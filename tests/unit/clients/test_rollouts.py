@@ -20,7 +20,7 @@ from dextouch.errors import (
 )
 from dextouch.schemas import ReturnSelector
 from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
-from dextouch.worlds.limits import RolloutLimits
+from dextouch.worlds.settings import RolloutLimits
 from tests.unit.worlds.fakes import CAMERAS, K_HEAD, SumWorld, actions, anchor, observation
 from tests.unit.worlds.running import served
 

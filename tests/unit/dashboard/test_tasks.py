@@ -4,7 +4,8 @@ import pytest
 
 from dextouch.errors import InvalidInputError
 from services.dashboard.tasks import load_tasks
-from services.twin.tasks.registry import TASK_NAMES, get_task
+from services.twin.names import TASK_NAMES
+from services.twin.tasks.registry import get_task
 
 
 def test_the_default_tasks_are_those_of_the_twin():

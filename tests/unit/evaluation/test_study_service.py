@@ -8,8 +8,9 @@ import httpx
 import pytest
 
 from services.evaluation.studies import study_folders
-from services.evaluation.studies.app import StudyServiceSettings, create_app
+from services.evaluation.studies.app import create_app
 from services.evaluation.studies.results import StudyResults
+from services.evaluation.studies.settings import StudyServiceSettings
 from tests.unit.evaluation.study_rows import (
     DEFINITION,
     DOUBTED,

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from dextouch.geometry import apply, invert, project
-from services.twin.cameras import CAMERAS, HEAD_HOME, CameraRig
+from services.twin.cameras import HEAD_HOME, CameraRig
+from services.twin.names import CAMERAS
 from services.twin.scene import compile_scene
 from services.twin.simulation import Command, Simulation
 from services.twin.tasks.postures import relaxed

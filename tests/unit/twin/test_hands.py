@@ -7,7 +7,8 @@ from dextouch.geometry import apply
 from dextouch.hands import NODE_INDEX
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile.layout import FINGERS
-from services.twin.hands import DOMAINS, HumanHand, twin_hand
+from services.twin.hands import HumanHand, twin_hand
+from services.twin.names import DOMAINS
 from services.twin.scene import compile_scene
 from services.twin.tactile import TactileReader
 

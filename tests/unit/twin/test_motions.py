@@ -10,7 +10,8 @@ from dextouch.geometry import apply
 from services.cli.main import main
 from services.twin.episodes import record
 from services.twin.hands import twin_hand
-from services.twin.motions import MOTION_KINDS, Motion, MotionScene, with_motion
+from services.twin.motions import Motion, MotionScene, with_motion
+from services.twin.names import MOTION_KINDS
 from services.twin.take_options import TakeOptions
 
 # Faster than this a wrist would leave its command far behind (m a grid step).

@@ -2,8 +2,8 @@
 
 from dextouch.schemas import ReturnSelector, RolloutStart, decode_answer
 from dextouch.serving.state import MemoryState
-from dextouch.worlds.limits import RolloutLimits
 from dextouch.worlds.rollouts import RolloutService
+from dextouch.worlds.settings import RolloutLimits
 from tests.unit.worlds.fakes import (
     SumWorld,
 )

@@ -1,0 +1,419 @@
+"""Parsers of commands that join services; importing them imports none of the work."""
+
+import argparse
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from dextouch.command_line import CommandParser, add_json
+from dextouch.data_folder import default_store
+from dextouch.episodes import SPLITS
+from services.evaluation.prediction_names import BASELINES, DEFAULT_BASELINES, METRIC_NAMES
+from services.twin.names import (
+    DEFAULT_MIX,
+    EVALUATED,
+    MIX_NAMES,
+    STREAM_CHOICES,
+    TAKE_PATHS,
+    TASK_SETS,
+)
+from services.world_model.shipped_checkpoints import default_checkpoint
+
+# Formats with one file per episode or recording, and those with all episodes together.
+SINGLE_FORMATS, JOINT_FORMATS = ("mcap", "rrd"), ("umi", "lerobot")
+_TRAINING_DATA = """\
+Record twin episodes for training and testing networks.
+
+The data set covers the factors that decide success: errors of a few millimetres, misses, takes that
+stop or never start, retreats, pushes, slipping grasps, wandering hands, and actions of another
+scene. `--mix` selects their shares. With `--policy` every episode is a rollout of that policy in
+the twin instead. Interrupted runs resume: existing episodes are kept.
+
+Human takes are recorded like those of a person: the twin's hands are played to mock devices, whose
+packets go through the drivers, the recorder and alignment to actions of the robot. With
+`--path station`, robot takes are recorded so, too, and nothing but the outcome comes from the twin:
+the poses of objects are measured by markers on them, which the head camera sees.
+"""
+_IMAGINED = """\
+Predict the robot episodes of a store with the world model, to train the success probe on them.
+
+Each imagined episode has the outcome of the same actions in the twin. The success probe is trained
+on real and imagined episodes, so that its probabilities are valid for imagined endings, and
+evaluated on those of other seeds. A state model renders only the images that the probe uses.
+"""
+_GENERATE = """\
+Generate demonstrations: a world model predicts images and touch for recorded robot actions.
+
+Every imagined episode keeps the first observation and the actions of its source, a robot episode
+that the world model was not trained on; later images and touch are predicted. Its `success` is that
+of the source. Training commands skip imagined episodes, except `dextouch train policy --imagined`.
+Existing results are kept, so an interrupted run can be repeated.
+"""
+_GENERATE_EXAMPLE = """\
+example:
+  dextouch train world-model --episodes runs/episodes --splits B,C --output runs/robot.safetensors
+  dextouch generate --episodes runs/episodes --split A --checkpoint runs/robot.safetensors \\
+    --store runs/generated --strips runs/generated.html
+"""
+_PREDICTION = """\
+Measure how well a world model predicts the images and touch of held-out robot episodes.
+
+Every figure stands beside those of simple baselines: a repeated first step, the first image warped
+by the camera's known motion, no touch, the model's codecs alone, and the model with other actions.
+Windows of one chunk begin at true steps, as in the paper; rollouts continue from predictions.
+"""
+_PREDICTION_EXAMPLES = """\
+examples:
+  dextouch evaluate prediction --episodes runs/heldout
+  dextouch evaluate prediction --episodes runs/heldout --checkpoint runs/paper.safetensors \\
+    --horizon windows --metrics psnr,contact_f1 --json runs/prediction.json
+"""
+_RECORDED = """\
+Score policies in a world model from the first observations of recorded takes.
+
+For labs whose real world is a robot: takes are robot episodes with an outcome, of a station or of
+the twin. Their own actions are replayed in the world model first; how well its verdicts match the
+outcomes says how far the policies' scores can be trusted. Takes that the model was trained on are
+refused.
+"""
+_RECORDED_EXAMPLES = """\
+examples:
+  dextouch evaluate recorded --episodes runs/takes --checkpoint runs/state.safetensors \\
+    --probe runs/probe.safetensors --split A
+  dextouch evaluate recorded --episodes runs/takes --policy mine=my_policy:MyPolicy \\
+    --cloned cloned=runs/cloned.safetensors --json runs/scores.json
+"""
+_STUDY_EXAMPLE = """\
+example:
+  dextouch study run study.toml
+
+A study file:
+
+  name = "touch"
+  tasks = ["stand_bottle", "stack_bowls"]
+  first_seed = 31000
+  num_starts = 10
+
+  [imagined.model]
+  builtin = "world-model"
+
+  [policies.careful]
+  script = "script 5 mm"
+  [policies.mine]
+  factory = "package.module:make_policy"
+
+All keys of a study file: docs/studies.md
+"""
+_EXPORT_HELP = """\
+formats:
+  lerobot  a LeRobotDataset v3.0 folder: episodes on a frame grid, video, parquet
+  umi      one zip with a Zarr v2 replay buffer: episodes on the model grid
+           (cannot be imported)
+  mcap     one file per episode or recording, every sample; opens in Foxglove
+  rrd      one file per episode or recording, every sample; opens in Rerun (cannot be imported)
+
+examples:
+  dextouch export --format mcap stand-bottle-0003 --to take.mcap
+  dextouch export --format mcap --kind recording --operator p17 --to takes/
+  dextouch export --format lerobot --task stand_bottle --to data/lerobot
+  dextouch export --format umi --domain robot --to robot.zarr.zip
+  dextouch export --format rrd stand-bottle-0003 --to take.rrd
+"""
+_IMPORT_HELP = """\
+examples:
+  dextouch import --format mcap take.mcap
+  dextouch import --format mcap takes/
+  dextouch import --format lerobot data/lerobot --id-prefix theirs-
+
+What each format keeps and loses: docs/bridges.md
+"""
+
+
+def comma_separated(text: str) -> tuple[str, ...]:
+    """Parse names, for argparse."""
+    return tuple(name for name in text.split(",") if name)
+
+
+def seed_range(text: str) -> range:
+    """Parse seeds given as FIRST:LAST+1, for argparse."""
+    first, _, stop = text.partition(":")
+    if not (first.isdecimal() and stop.isdecimal() and int(first) < int(stop)):
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected FIRST:LAST+1 such as 0:100")
+    return range(int(first), int(stop))
+
+
+def positive(text: str) -> int:
+    """Parse a number of processes, for argparse."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a number of at least 1")
+    return int(text)
+
+
+def _named_path(text: str) -> tuple[str, Path]:
+    name, separator, path = text.partition("=")
+    if not (separator and name and path):
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected NAME=CHECKPOINT")
+    return name, Path(path)
+
+
+def _keywords_by_name(text: str) -> Mapping[str, Any]:
+    try:
+        found = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a JSON object") from error
+    if not isinstance(found, dict) or not all(isinstance(one, dict) for one in found.values()):
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected an object of objects")
+    return found
+
+
+def _whole_fps(text: str) -> int:
+    """Frames per second of a LeRobot dataset, whose format counts whole ones."""
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        rate_hz = math.nan
+    if not math.isfinite(rate_hz) or rate_hz != round(rate_hz):
+        near = f"; {round(rate_hz)} is the nearest" if math.isfinite(rate_hz) else ""
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected a whole number, since LeRobot counts whole frames{near}"
+        )
+    return round(rate_hz)
+
+
+def _keywords(text: str) -> dict[str, Any]:
+    try:
+        return TypeAdapter(dict[str, Any]).validate_json(text)
+    except ValidationError as error:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a JSON object") from error
+
+
+def training_data_parser() -> argparse.ArgumentParser:
+    """Parser of `dextouch train data`."""
+    parser = CommandParser(
+        prog="dextouch train data",
+        description=_TRAINING_DATA,
+        epilog="example:\n  dextouch train data --store runs/episodes --count 20 --images 4",
+    )
+    add = parser.add_argument
+    add("--store", required=True, help="folder of the episode store")
+    add("--first", type=int, default=0, help="first seed (%(default)s)")
+    add("--count", type=int, default=130, help="seeds per task (%(default)s)")
+    tasks = f"tasks, or sets of tasks: {', '.join(TASK_SETS)} (default: {','.join(EVALUATED)})"
+    add("--tasks", type=comma_separated, default=EVALUATED, metavar="A,B", help=tasks)
+    add("--domains", type=comma_separated, default=("robot",), help="robot,human (robot)")
+    path = (
+        "write takes as they are, by devices and alignment with the twin's labels, or as a station "
+        "records them, with poses from markers (robot: direct, human: devices)"
+    )
+    add("--path", choices=TAKE_PATHS, help=path)
+    mixes = parser.add_mutually_exclusive_group()
+    kinds = "kinds of takes (%(default)s)"
+    mixes.add_argument("--mix", choices=MIX_NAMES, default=DEFAULT_MIX, help=kinds)
+    for name, effect in (("exact", "without errors"), ("ladder", "with errors of 0 … 40 mm")):
+        short = mixes.add_argument(f"--{name}", dest="mix", action="store_const", const=name)
+        short.help = f"only scripts {effect}"
+    add("--miss-fraction", type=float, help="share of misses (default: the mix's)")
+    add("--still-fraction", type=float, help="share of takes that stop or never start")
+    add("--policy", metavar="[NAME=]MODULE:FACTORY", help="record rollouts of this policy instead")
+    arguments = "arguments of the factory, as a JSON object"
+    add("--policy-arguments", type=_keywords, default={}, help=arguments)
+    images = "images of every N-th step (%(default)s)"
+    add("--images", type=int, default=1, metavar="N", help=images)
+    looks = "share of scenes with other colours, light and head camera (%(default)s)"
+    add("--varied", type=float, default=0.0, metavar="SHARE", help=looks)
+    sizes = "share of takes whose objects are wider, narrower, higher or lower (%(default)s)"
+    add("--resized", type=float, default=0.0, metavar="SHARE", help=sizes)
+    add("--streams", choices=STREAM_CHOICES, default="training", help="(%(default)s)")
+    add("--jobs", type=int, help="processes (default: one per core)")
+    add_json(parser)
+    return parser
+
+
+def _imagination_parser(**about: str) -> CommandParser:
+    """Parser of a command that imagines episodes; `imagine` takes what it parses."""
+    parser = CommandParser(**about)
+    add = parser.add_argument
+    add("--episodes", required=True, metavar="URL", help="store of the episodes to imagine")
+    add("--store", required=True, metavar="URL", help="store for the imagined episodes")
+    model = "world model (default: the package's)"
+    add("--checkpoint", type=Path, default=default_checkpoint(), metavar="PATH", help=model)
+    add("--tasks", type=comma_separated, metavar="TASK,…", help="default: all")
+    add("--seeds", type=seed_range, metavar="FIRST:LAST+1", help="default: all")
+    jobs = "processes (default: one per core)"
+    add("--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help=jobs)
+    add_json(parser)
+    return parser
+
+
+def imagined_parser() -> argparse.ArgumentParser:
+    """Parser of `dextouch train imagined`."""
+    return _imagination_parser(
+        prog="dextouch train imagined",
+        description=_IMAGINED,
+        epilog="example:\n  dextouch train imagined --episodes runs/episodes --store runs/imagined",
+    )
+
+
+def generate_parser() -> argparse.ArgumentParser:
+    """Parser of `dextouch generate`."""
+    parser = _imagination_parser(
+        prog="dextouch generate", description=_GENERATE, epilog=_GENERATE_EXAMPLE
+    )
+    add = parser.add_argument
+    add("--split", choices=SPLITS, help="only scenes of this split (default: all)")
+    add("--count", type=positive, metavar="N", help="largest number of episodes, over all tasks")
+    add("--with-failures", action="store_true", help="also imagine episodes that failed")
+    add("--strips", type=Path, metavar="PATH", help="HTML page of recorded and imagined images")
+    shown = "episodes on that page (%(default)s)"
+    add("--num-strips", type=positive, default=12, metavar="N", help=shown)
+    return parser
+
+
+def prediction_parser() -> argparse.ArgumentParser:
+    """Parser of `dextouch evaluate prediction`."""
+    parser = CommandParser(
+        prog="dextouch evaluate prediction", description=_PREDICTION, epilog=_PREDICTION_EXAMPLES
+    )
+    add = parser.add_argument
+    add("--episodes", required=True, metavar="STORE", help="store of held-out episodes")
+    add("--checkpoint", type=Path, metavar="PATH", help="world model (default: the package's)")
+    add("--tasks", type=comma_separated, default=(), help="comma-separated (default: the model's)")
+    add(
+        "--horizon",
+        choices=("windows", "rollouts"),
+        help="only windows or only rollouts (default: both)",
+    )
+    names = f"comma-separated, of {', '.join(METRIC_NAMES)} (default: all)"
+    add("--metrics", type=comma_separated, default=(), help=names)
+    weights = "folder of pretrained networks for the metrics that need them (docs/evaluation.md)"
+    add("--weights", type=Path, metavar="PATH", help=weights)
+    names = f"comma-separated, of {', '.join(BASELINES)} (default: without instructions)"
+    add("--baselines", type=comma_separated, default=DEFAULT_BASELINES, help=names)
+    steps = "network calls per chunk of a flow-matching model"
+    add("--sampling-steps", type=int, metavar="N", help=steps)
+    add_json(parser)
+    return parser
+
+
+def recorded_parser() -> argparse.ArgumentParser:
+    """Parser of `dextouch evaluate recorded`."""
+    # Settings need a package that reading and writing files does not.
+    from services.evaluation.settings import DEFAULT_PROBE
+
+    parser = CommandParser(
+        prog="dextouch evaluate recorded", description=_RECORDED, epilog=_RECORDED_EXAMPLES
+    )
+    add = parser.add_argument
+    stores = "stores of the takes"
+    add("--episodes", required=True, type=comma_separated, metavar="URL,…", help=stores)
+    add("--tasks", type=comma_separated, default=(), metavar="A,B", help="default: all")
+    add("--split", choices=SPLITS, help="only scenes of this split (default: all)")
+    add("--count", type=positive, metavar="N", help="takes a task (default: all)")
+    model = "world model (default: the package's)"
+    add("--checkpoint", type=Path, default=default_checkpoint(), metavar="PATH", help=model)
+    judge = "checkpoint of `dextouch train judge` (default: the package's)"
+    add("--probe", type=Path, default=DEFAULT_PROBE, metavar="PATH", help=judge)
+    own = "a policy of yours, [NAME=]MODULE:FACTORY; repeat for more"
+    add("--policy", action="append", default=[], metavar="ADDRESS", help=own)
+    keywords = "arguments of the factories, as a JSON object by policy name"
+    add("--policy-arguments", type=_keywords_by_name, default={}, metavar="JSON", help=keywords)
+    cloned = "a policy of `dextouch train policy`, NAME=CHECKPOINT; repeat for more"
+    add("--cloned", action="append", type=_named_path, default=[], metavar="POLICY", help=cloned)
+    add("--hold", action="store_true", help="also score a policy that holds still")
+    add_json(parser)
+    return parser
+
+
+def study_parser() -> argparse.ArgumentParser:
+    """Parser of `dextouch study`."""
+    parser = CommandParser(
+        prog="dextouch study",
+        description="Score policies in real and imagined worlds from matched starts.",
+        epilog="`dextouch study serve` shows the results on the dashboard.",
+    )
+    words = parser.add_subparsers(dest="word", required=True, metavar="COMMAND")
+    run = words.add_parser(
+        "run",
+        help="run a study, or continue it",
+        description="Run the rollouts of a study that have no result yet, and write its report. "
+        "A study may be interrupted at any time; the same command continues it.",
+        epilog=_STUDY_EXAMPLE,
+    )
+    run.add_argument("study", type=Path, metavar="STUDY", help="study file (TOML)")
+    run.add_argument(
+        "--folder",
+        type=Path,
+        metavar="PATH",
+        help="folder of results, rollouts and reports (default: the study file without .toml)",
+    )
+    run.add_argument(
+        "--store",
+        metavar="URL",
+        help="episode store of the rollouts; with the dashboard's store, it plays them "
+        "(default: rollouts/ in the folder)",
+    )
+    run.add_argument(
+        "--retry-failed", action="store_true", help="run rollouts again that failed before"
+    )
+    report = words.add_parser(
+        "report",
+        help="write the report of a study's results so far",
+        description="Write report.json, a page for each imagined world, and tables.tex from the "
+        "results of a study, finished or not.",
+        epilog="example:\n  dextouch study report runs/touch",
+    )
+    report.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the study")
+    for one in (run, report):
+        add_json(one)
+    return parser
+
+
+def _bridge_parser(word: str, does: str, more: str) -> argparse.ArgumentParser:
+    parser = CommandParser(prog=f"dextouch {word}", description=does, epilog=more)
+    store = "the store (%(default)s)"
+    parser.add_argument("--store", metavar="URL", default=default_store(), help=store)
+    add_json(parser)
+    return parser
+
+
+def export_parser() -> argparse.ArgumentParser:
+    """Parser of `dextouch export`."""
+    parser = _bridge_parser("export", "Write episodes or recordings for other tools.", _EXPORT_HELP)
+    add = parser.add_argument
+    forms = sorted([*SINGLE_FORMATS, *JOINT_FORMATS])
+    add("ids", nargs="*", metavar="ID", help="default: all that match the filters")
+    add("--format", required=True, choices=forms, help="output format")
+    to = "file; mcap and rrd: or a folder"
+    add("--to", required=True, type=Path, metavar="PATH", help=to)
+    kinds = ("episode", "recording")
+    add("--kind", choices=kinds, default="episode", help="kind of the ids (%(default)s)")
+    add("--task", metavar="TASK", help="only episodes of this task")
+    add("--domain", choices=("human", "robot"), help="only episodes of this domain")
+    add("--operator", metavar="P", help="only items of this operator")
+    rejected = "also items that were rejected in review; ids that are given always are"
+    add("--with-rejected", action="store_true", help=rejected)
+    add("--force", action="store_true", help="replace existing files")
+    quality = "mcap: encode rgb8 images as JPEG (default: lossless)"
+    add("--jpeg-quality", type=int, metavar="1…100", help=quality)
+    rate = "lerobot: frames per second (default: model rate)"
+    add("--fps", type=_whole_fps, metavar="N", help=rate)
+    name = "lerobot: name of the data set (%(default)s)"
+    add("--repo-id", default="dextouch/export", metavar="USER/NAME", help=name)
+    return parser
+
+
+def import_parser() -> argparse.ArgumentParser:
+    """Parser of `dextouch import`."""
+    parser = _bridge_parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
+    add = parser.add_argument
+    add("path", type=Path, metavar="PATH", help="file or folder to read")
+    add("--format", required=True, choices=("lerobot", "mcap"), help="input format")
+    add("--id-prefix", default="", metavar="TEXT", help="lerobot: prefix of every id")
+    images = "lerobot: unit of stored images (%(default)s)"
+    add("--images", choices=("h264", "jpeg", "rgb8"), default="h264", help=images)
+    return parser
