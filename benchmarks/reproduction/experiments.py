@@ -104,9 +104,9 @@ class Sizes(FrozenModel):
     reader_steps: int = Field(default=600, ge=2)
     core_steps: int = Field(default=2000, ge=2)
     pretraining_reader_steps: int = Field(default=1000, ge=2)
-    pretraining_core_steps: int = Field(default=4000, ge=2)
-    adapt_reader_steps: int = Field(default=1000, ge=1)
-    adapt_core_steps: int = Field(default=2000, ge=1)
+    pretraining_core_steps: int = Field(default=1500, ge=2)
+    adapt_reader_steps: int = Field(default=500, ge=1)
+    adapt_core_steps: int = Field(default=1000, ge=1)
     core_batch: int = Field(default=32, ge=1)
     drawing_cpu_s: int = Field(default=30, ge=1)
     policy_steps: int = Field(default=3000, ge=1)
@@ -333,11 +333,11 @@ class Experiments:
                 yield self._predicted(model, baselines, data="cans")
 
     def _adapted(self, world: str, seed: int) -> Step:
-        """WM-Robot or WM-Mix, from a model of robot episodes with mistakes and all human ones."""
+        """WM-Robot or WM-Mix, from one model of robot episodes with mistakes and all human ones."""
         sizes = self.sizes
         ancestor = self._pretrained(
-            f"evaluator/pretrained/seed-{seed}/model",
-            seed,
+            "evaluator/pretrained/model",
+            self.seeds[0],
             steps=(sizes.pretraining_reader_steps, sizes.pretraining_core_steps),
             robot="pretraining",
             num_human=self._num_human(max(sizes.multiples)),
