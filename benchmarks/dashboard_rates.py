@@ -21,9 +21,9 @@ import websockets
 from services.acquisition.app import create_app
 from services.acquisition.mocks import pattern
 from services.acquisition.settings import AcquisitionSettings
-from services.cli.servers import bind, serve_all
 from services.dashboard.app import create_app as create_dashboard
 from services.dashboard.settings import DashboardSettings
+from services.pipelines.servers import bind, serve_all
 
 WARM_UP_S = 6.0
 GLOVES = ("tactile_left", "tactile_right")

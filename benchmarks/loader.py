@@ -12,7 +12,7 @@ from benchmarks.report import ResultTable, StageReport
 from benchmarks.rounds import interleaved
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
-from services.cli.training_data import Scope, make_training_data
+from services.pipelines.training_data import Scope, make_training_data
 from services.twin.data_mix import MIXES
 from services.twin.tasks import TASK_NAMES
 

@@ -33,11 +33,11 @@ from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.uploader import Uploader
-from services.cli.servers import served
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.policies.asking import action_chunk, ask
 from services.evaluation.policies.hold import HoldPolicy
+from services.pipelines.servers import served
 
 TAKE_S = 2.0
 NUM_CHUNKS = 3

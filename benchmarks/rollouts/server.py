@@ -24,7 +24,7 @@ from benchmarks.rollouts.worlds import BatchDevice, Device, StillWorld
 from dextouch.schemas import ReturnSelector
 from dextouch.serving import configure_logging, serve_parent
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.cli.servers import Server, bind, served
+from services.pipelines.servers import Server, bind, served
 
 STEPS: Final[tuple[Literal["last", "all"], ...]] = ("last", "all")
 

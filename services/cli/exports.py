@@ -13,7 +13,7 @@ from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader, is_r
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 from dextouch.system_files import is_system_file
-from services.cli.parsers import JOINT_FORMATS, export_parser, import_parser
+from services.pipelines.parsers import JOINT_FORMATS, export_parser, import_parser
 
 Reader = EpisodeReader | RecordingReader
 Report = dict[str, object]

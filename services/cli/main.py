@@ -32,8 +32,8 @@ class Command(NamedTuple):
 COMMANDS = {
     "demo": Command(
         "record, align, predict and evaluate on this machine",
-        "cli.demo.command:main",
-        "cli.demo.settings:demo_parser",
+        "pipelines.demo.command:main",
+        "pipelines.demo.settings:demo_parser",
     ),
     "up": Command("run every service in one process, with a dashboard", "cli.up:main", "up"),
     "doctor": Command("check what this machine can do and what is missing", "cli.doctor:main"),
@@ -51,7 +51,9 @@ COMMANDS = {
         "exchange a one-time token for the station's key of the store",
         "cli.enrolment:station_enrol_main",
     ),
-    "station calibrate": Command("calibrate gloves, cameras and latencies", "cli.calibrate:main"),
+    "station calibrate": Command(
+        "calibrate gloves, cameras and latencies", "pipelines.calibrate:main"
+    ),
     "store": Command(
         "list, show, verify, clicks, repair, delete, deletions, restore, purge, enrol, serve",
         "episode_store.command_line:main",
@@ -69,12 +71,12 @@ COMMANDS = {
     "export": Command(
         "write LeRobot, MCAP, Rerun or UMI files from a store",
         "cli.exports:export_main",
-        "cli.parsers:export_parser",
+        "pipelines.parsers:export_parser",
     ),
     "import": Command(
         "read LeRobot or MCAP files into a store",
         "cli.exports:import_main",
-        "cli.parsers:import_parser",
+        "pipelines.parsers:import_parser",
     ),
     "align": Command(
         "convert recordings to synchronized episodes",
@@ -85,12 +87,12 @@ COMMANDS = {
     "train": Command("train the world model, its judge of success, or a policy"),
     "train data": Command(
         "record training episodes in the twin",
-        "cli.training_data:main",
-        "cli.parsers:training_data_parser",
+        "pipelines.training_data:main",
+        "pipelines.parsers:training_data_parser",
     ),
     "train tokenizer": Command(
         "train a tactile tokenizer for the paper's form of the world model",
-        "cli.train_tokenizer:main",
+        "pipelines.train_tokenizer:main",
         "world_model_train_tokenizer",
     ),
     "train world-model": Command(
@@ -110,8 +112,8 @@ COMMANDS = {
     ),
     "train imagined": Command(
         "predict the episodes of a store with the world model",
-        "cli.imagined_data:main",
-        "cli.parsers:imagined_parser",
+        "pipelines.imagined_data:main",
+        "pipelines.parsers:imagined_parser",
     ),
     "train policy": Command(
         "train a closed-loop policy on demonstrations",
@@ -125,8 +127,8 @@ COMMANDS = {
     ),
     "generate": Command(
         "generate demonstrations from the actions of recorded ones",
-        "cli.generate:main",
-        "cli.parsers:generate_parser",
+        "pipelines.generate:main",
+        "pipelines.parsers:generate_parser",
     ),
     "checkpoint": Command(
         "show the provenance and accuracy of a world model",
@@ -143,18 +145,18 @@ COMMANDS = {
     ),
     "evaluate prediction": Command(
         "measure predicted images and touch on held-out episodes",
-        "cli.evaluate_prediction:main",
-        "cli.parsers:prediction_parser",
+        "pipelines.evaluate_prediction:main",
+        "pipelines.parsers:prediction_parser",
     ),
     "evaluate recorded": Command(
         "score policies from recorded first observations, and how far to trust it",
-        "cli.evaluate_recorded:main",
-        "cli.parsers:recorded_parser",
+        "pipelines.evaluate_recorded:main",
+        "pipelines.parsers:recorded_parser",
     ),
     "study": Command(
         "score policies in several worlds, defined in a file and resumable",
-        "cli.study.command:main",
-        "cli.parsers:study_parser",
+        "pipelines.study.command:main",
+        "pipelines.parsers:study_parser",
     ),
     "study serve": Command(
         "serve the results of studies to the dashboard", "evaluation.studies.app:main", "studies"

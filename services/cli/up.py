@@ -15,9 +15,9 @@ from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.serving import configure_logging, explained, load_settings
 from services.cli.data_lock import held_data_folder
 from services.cli.extras import missing_package
-from services.cli.servers import Place, bind, serve_all, stop_on_signals
 from services.cli.standard_streams import discard_output
 from services.cli.up_settings import UpSettings
+from services.pipelines.servers import Place, bind, serve_all, stop_on_signals
 
 if TYPE_CHECKING:
     from services.acquisition.settings import AcquisitionSettings

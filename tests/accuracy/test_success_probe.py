@@ -8,10 +8,10 @@ import torch
 from scipy.stats import mannwhitneyu
 
 from dextouch.episodes import EpisodeStore
-from services.cli.training_data import Scope, make_training_data
 from services.evaluation.endings import read_ending_episodes
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
+from services.pipelines.training_data import Scope, make_training_data
 from services.twin.data_mix import LADDER_M, MIXES
 
 pytestmark = pytest.mark.slow

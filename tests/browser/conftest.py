@@ -19,7 +19,7 @@ from playwright.sync_api import Error, expect, sync_playwright
 from services.acquisition.app import create_app as create_station
 from services.acquisition.mocks import pattern
 from services.acquisition.settings import AcquisitionSettings
-from services.cli.servers import bind, serve_all
+from services.pipelines.servers import bind, serve_all
 from tests.programs import needed_program
 
 PATIENCE_S = 30

@@ -8,7 +8,7 @@ from pathlib import Path
 from services.acquisition.app import create_app
 from services.acquisition.mocks import pattern
 from services.acquisition.settings import AcquisitionSettings
-from services.cli.servers import bind, serve_all
+from services.pipelines.servers import bind, serve_all
 
 
 def main(spool, name, *streams):

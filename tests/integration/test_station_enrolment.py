@@ -18,7 +18,7 @@ from services.acquisition.enrolment import with_enrolment
 from services.acquisition.mocks import pattern
 from services.acquisition.settings import AcquisitionSettings
 from services.cli.main import main
-from services.cli.servers import served
+from services.pipelines.servers import served
 
 PATIENCE_S = 120
 ADMIN_KEY = "key-of-an-administrator"

@@ -8,9 +8,9 @@ from dextouch.episodes import EpisodeStore
 from dextouch.streams import SampleBatch, StreamDescriptor, encode_batch
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
-from services.cli.servers import served
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings
+from services.pipelines.servers import served
 from tests.unit.alignment.recordings import write_recording
 
 # Of the specification (https://www.w3.org/TR/trace-context/).

@@ -22,7 +22,7 @@ from dextouch.serving import ServiceSettings, create_service_app
 from services.alignment.retargeting import hand_retargeter
 from services.cli import up
 from services.cli.data_lock import held_data_folder
-from services.cli.servers import bind
+from services.pipelines.servers import bind
 
 # Of a machine that is busy with other things; the solver may be compiled first.
 START_LIMIT_S = 900

@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from services.cli.servers import bind
+from services.pipelines.servers import bind
 from tests.unit.alignment.recordings import write_recording
 
 # Compiling the solver for the first time takes half a minute, on a busy machine many of them.

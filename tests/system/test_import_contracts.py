@@ -39,6 +39,11 @@ OFFENCES = [
     ),
     ("redis only in dextouch.serving", "services/dashboard/feeds.py", "import redis"),
     ("OpenCV only in calibration", "services/alignment/retargeting/wrist_frame.py", "import cv2"),
+    (
+        "Commands over pipelines, which join services",
+        "services/pipelines/twin_geometry.py",
+        "import services.cli.extras",
+    ),
     ("mujoco only in the twin", "services/evaluation/closed_loop.py", "import mujoco"),
 ]
 

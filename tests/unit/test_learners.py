@@ -8,10 +8,10 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.schemas import Review
-from services.cli.imagined_data import chosen_episodes
 from services.evaluation.endings import read_ending_episodes
 from services.evaluation.policies.cloning_episodes import read_cloning_episodes
 from services.evaluation.recorded_takes import read_takes
+from services.pipelines.imagined_data import chosen_episodes
 from services.twin.episodes import record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage

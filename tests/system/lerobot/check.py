@@ -18,7 +18,7 @@ from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import Observation
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli import main
-from services.cli.servers import served
+from services.pipelines.servers import served
 from services.twin.serving import twin_worlds
 from services.twin.settings import TwinSettings
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli import main
-from services.cli.servers import served
+from services.pipelines.servers import served
 from services.twin.serving import twin_worlds
 from services.twin.settings import TwinSettings
 

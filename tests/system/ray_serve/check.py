@@ -19,7 +19,7 @@ import ray
 from ray import serve
 
 from dextouch.worlds import WorldServiceSettings, create_serving_app
-from services.cli.ray_serve import application
+from services.pipelines.ray_serve import application
 from tests.contracts.redis_server import running_redis
 from tests.system.scaled import ROOT, Load, free_port, wait_until
 from tests.unit.worlds.fakes import SumWorld

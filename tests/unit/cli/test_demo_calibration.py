@@ -11,8 +11,8 @@ from services.acquisition.mock_station import LATENCY_SIGMA_MS
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.alignment.options import AlignmentOptions
-from services.cli import mock_takes
-from services.cli.demo import recording
+from services.pipelines import mock_takes
+from services.pipelines.demo import recording
 from tests.unit.bridges.takes import write_episode
 
 SEED = 3

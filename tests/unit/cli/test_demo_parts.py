@@ -13,13 +13,13 @@ from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas import LineageEntry
-from services.cli.demo.command import Stages, show, worst_errors
-from services.cli.demo.recording import align, forget_take
-from services.cli.demo.scoring import LADDER, MODEL, ladder, mistake_comment, mistake_rows
-from services.cli.demo.settings import FIRST_HELD_OUT_SEED, parse
-from services.cli.servers import bind, served
-from services.cli.study.command import refuse_trained
 from services.evaluation.scores import REAL, RolloutScore
+from services.pipelines.demo.command import Stages, show, worst_errors
+from services.pipelines.demo.recording import align, forget_take
+from services.pipelines.demo.scoring import LADDER, MODEL, ladder, mistake_comment, mistake_rows
+from services.pipelines.demo.settings import FIRST_HELD_OUT_SEED, parse
+from services.pipelines.servers import bind, served
+from services.pipelines.study.command import refuse_trained
 from services.twin.mistakes import DEVELOPMENT
 from services.twin.scripted_actions import mistake_of
 from services.world_model.state_checkpoints import write_state_checkpoint

@@ -3,7 +3,7 @@
 import pytest
 
 from dextouch.serving import load_settings
-from services.cli.demo import scoring
+from services.pipelines.demo import scoring
 from services.world_model.settings import TrainStateCommand
 
 

@@ -4,9 +4,10 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
-from services.cli import evaluate_recorded, main
-from services.cli.parsers import recorded_parser
+from services.cli import main
 from services.evaluation.recorded_takes import REPLAY
+from services.pipelines import evaluate_recorded
+from services.pipelines.parsers import recorded_parser
 
 HOLD = "services.evaluation.policies.hold:HoldPolicy"
 

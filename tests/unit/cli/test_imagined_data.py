@@ -10,16 +10,16 @@ from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import NotFoundError
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.cli.imagined_data import (
+from services.evaluation.endings import read_ending_episode
+from services.generation.demonstrations import imagine_episode
+from services.pipelines.imagined_data import (
     WORLD,
     chosen_episodes,
     judged_steps,
     main,
 )
-from services.cli.parsers import positive, seed_range
-from services.cli.servers import served
-from services.evaluation.endings import read_ending_episode
-from services.generation.demonstrations import imagine_episode
+from services.pipelines.parsers import positive, seed_range
+from services.pipelines.servers import served
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage

@@ -10,7 +10,7 @@ from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 
 from dextouch.errors import ConflictError, UnavailableError
 from dextouch.serving import MAX_WEBSOCKET_BYTES
-from services.cli.servers import bind, serve_all
+from services.pipelines.servers import bind, serve_all
 
 
 def app_named(name, lives, *, fails=False):

@@ -26,8 +26,8 @@ from services.acquisition.devices import load_calibration
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration
 from services.alignment.station_calibration import record
 from services.cli import main as command_line
-from services.cli.calibrate.command import main
-from services.cli.calibrate.show import show
+from services.pipelines.calibrate.command import main
+from services.pipelines.calibrate.show import show
 from tests.unit.cli.rendered_boards import (
     BOARD,
     SIZE,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import NotFoundError
-from services.cli import train_tokenizer
+from services.pipelines import train_tokenizer
 from services.world_model import command_line
 from services.world_model.tokenizer_files import read_tokenizer
 from services.world_model.training.tactile_hands import TactileHands

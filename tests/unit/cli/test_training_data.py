@@ -8,8 +8,8 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ClockFitError, InvalidInputError, UnknownNameError
-from services.cli import training_data
-from services.cli.training_data import PolicyChoice, Scope, make_training_data
+from services.pipelines import training_data
+from services.pipelines.training_data import PolicyChoice, Scope, make_training_data
 from services.twin.data_mix import MIXES, STRENGTHS, Mix, options_of
 from services.twin.mistakes import TRAINING
 

@@ -10,9 +10,9 @@ from dextouch.episodes import EpisodeStore
 from dextouch.images import scaled_square
 from dextouch.schemas import EVERYTHING, Doubt
 from dextouch.worlds import CopyFirstWorld, SteppedRollout, WorldServiceSettings, create_world_app
-from services.cli.servers import served
 from services.evaluation.endings import read_ending_episode
 from services.generation.demonstrations import imagine_episode
+from services.pipelines.servers import served
 from services.twin.episodes import record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage

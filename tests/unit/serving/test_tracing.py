@@ -21,10 +21,10 @@ from dextouch.tracing import (
     parse_traceparent,
     trace_headers,
 )
-from services.cli.servers import served
 from services.dashboard.app import create_app as create_dashboard
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.upstream import Upstream
+from services.pipelines.servers import served
 
 # Of the specification (https://www.w3.org/TR/trace-context/, examples of traceparent).
 TRACE_ID = "4bf92f3577b34da6a3ce929d0e0e4736"

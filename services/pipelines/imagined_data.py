@@ -21,11 +21,11 @@ from dextouch.episodes import (
 from dextouch.schemas import EpisodeAttributes
 from dextouch.serving import configure_logging
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.cli.parsers import imagined_parser
-from services.cli.servers import served
-from services.cli.training_data import in_processes
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.generation.demonstrations import SHORT_CHUNK_STEPS, imagine_episode, whole_steps
+from services.pipelines.parsers import imagined_parser
+from services.pipelines.servers import served
+from services.pipelines.training_data import in_processes
 from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
 

@@ -1,6 +1,6 @@
 """Networks of the demo, shipped or freshly trained, and the scoring of policies by them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,17 +8,19 @@ from typing import Any
 from dextouch.clients import Policy, RolloutClient
 from dextouch.errors import DexTouchError
 from dextouch.worlds import BatchWorld
-from services.cli.demo.settings import TASKS, DemoPlan
-from services.cli.main import run_command
-from services.cli.study.command import demonstrator
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
+from services.evaluation.command_line import run_train_policy, run_train_probe
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.scores import REAL, RolloutScore
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
 from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_probe import SuccessProbe
+from services.pipelines import imagined_data, training_data
+from services.pipelines.demo.settings import TASKS, DemoPlan
+from services.pipelines.study.command import demonstrator
 from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name
 from services.twin.tasks import get_task
+from services.world_model.command_line import run_train
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.world import open_world
 
@@ -70,17 +72,21 @@ def train_models(folder: Path) -> Models:
     world_model = folder / "state.safetensors"
     policy, probe = folder / "behaviour_cloning.safetensors", folder / "success_probe.safetensors"
     scenes = f"--tasks={','.join(TASKS)}"
-    for words in (
-        ("data", "--store", episodes, *DEMONSTRATIONS),
-        ("data", "--store", exact, *EXACT_DATA),
-        ("data", "--store", endings, *ENDINGS),
-        ("data", "--store", unseen, *UNSEEN_ENDINGS),
-        ("world-model", *_stores(episodes, endings, to=world_model), scenes, *SMALL_STATE_MODEL),
-        ("policy", *_stores(exact, episodes, to=policy)),
-        ("imagined", *_stores(endings), "--store", imagined, "--checkpoint", str(world_model)),
-        ("judge", "--held-out", unseen, *_stores(endings, imagined, to=probe)),
-    ):
-        run_command(["train", *words])
+    steps: list[tuple[Callable[[list[str]], int], list[str]]] = [
+        (training_data.main, ["--store", episodes, *DEMONSTRATIONS]),
+        (training_data.main, ["--store", exact, *EXACT_DATA]),
+        (training_data.main, ["--store", endings, *ENDINGS]),
+        (training_data.main, ["--store", unseen, *UNSEEN_ENDINGS]),
+        (run_train, [*_stores(episodes, endings, to=world_model), scenes, *SMALL_STATE_MODEL]),
+        (run_train_policy, _stores(exact, episodes, to=policy)),
+        (
+            imagined_data.main,
+            [*_stores(endings), "--store", imagined, "--checkpoint", str(world_model)],
+        ),
+        (run_train_probe, ["--held-out", unseen, *_stores(endings, imagined, to=probe)]),
+    ]
+    for step, words in steps:
+        step(words)
     return _load(world_model, policy, probe)
 
 

@@ -23,11 +23,6 @@ from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, create_world_app
 from services.alignment.app import create_app as create_alignment
 from services.alignment.settings import AlignmentSettings
-from services.cli.demo import recording, scoring
-from services.cli.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan, parse
-from services.cli.servers import served
-from services.cli.study.command import refuse_trained
-from services.cli.twin_geometry import TwinGeometry
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.command_line import print_scores
@@ -46,6 +41,11 @@ from services.evaluation.reporting import (
     write_report,
 )
 from services.evaluation.reporting.sections import comparison_bars, error_rows, figure
+from services.pipelines.demo import recording, scoring
+from services.pipelines.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan, parse
+from services.pipelines.servers import served
+from services.pipelines.study.command import refuse_trained
+from services.pipelines.twin_geometry import TwinGeometry
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 

@@ -10,9 +10,9 @@ from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, needs
 from dextouch.errors import ConflictError
 from dextouch.streams import HEAD_CAMERA
-from services.cli.imagined_data import chosen_episodes, imagine
-from services.cli.parsers import generate_parser
 from services.evaluation.reporting import PredictionPicture, ReportPictures, write_report
+from services.pipelines.imagined_data import chosen_episodes, imagine
+from services.pipelines.parsers import generate_parser
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.training.dataset import fingerprint

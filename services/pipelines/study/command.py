@@ -12,8 +12,6 @@ from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.serving import ChildProcess
-from services.cli.parsers import study_parser
-from services.cli.training_data import stage_of
 from services.evaluation.command_line import (
     EXIT_FAILED,
     instructions_for,
@@ -30,11 +28,13 @@ from services.evaluation.studies.reports import REPORT_FILE, write_reports
 from services.evaluation.studies.results import StudyHeader, StudyResults, cells_of
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_probe import SuccessProbe
+from services.pipelines.parsers import study_parser
+from services.pipelines.training_data import stage_of
 from services.twin.scripted_actions import scripted_actions
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 
-_CHILD = "services.cli.study.world_process"
+_CHILD = "services.pipelines.study.world_process"
 
 
 def main(arguments: list[str]) -> int:

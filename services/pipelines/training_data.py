@@ -23,10 +23,10 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, DeviceError, InvalidInputError, UnknownNameError
 from dextouch.schemas import RolloutStart, SceneObjects
 from dextouch.serving import configure_logging
-from services.cli.parsers import training_data_parser
 from services.evaluation.policies.asking import action_chunk, ask
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.progress import Progress
+from services.pipelines.parsers import training_data_parser
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.data_mix import MIXES, Mix, options_of
 from services.twin.demonstrators import NUM_GRID_STEPS
@@ -214,7 +214,7 @@ def _write_directly(order: Order) -> TruthEpisode:
 
 def _write_by_devices(order: Order) -> TruthEpisode:
     # Loads the compiled solver of retargeting.
-    from services.cli.device_takes import device_options, write_through_devices
+    from services.pipelines.device_takes import device_options, write_through_devices
 
     episode = _recorded(order, device_options(order.options))
     write_through_devices(
@@ -224,7 +224,7 @@ def _write_by_devices(order: Order) -> TruthEpisode:
 
 
 def _write_as_a_station(order: Order) -> TruthEpisode:
-    from services.cli.device_takes import device_options, write_as_recorded
+    from services.pipelines.device_takes import device_options, write_as_recorded
 
     stage, objects = marked_stage(order.task, order.domain)
     options = replace(device_options(order.options), image_every=1)

@@ -1,6 +1,6 @@
 """Ray Serve applications of the world model and the twin, for replicas on many machines.
 
-serve run services.cli.ray_serve:world_model num_replicas=4
+serve run services.pipelines.ray_serve:world_model num_replicas=4
 
 Their settings are the variables of `dextouch serve` and `dextouch twin serve`. Replicas are chosen
 by the header `x-session-id`, in which `RolloutClient` sends the rollout's id.

@@ -1,5 +1,5 @@
 """Command `dextouch station calibrate`: cameras, mounts, gloves, wrists, robot bases, latencies."""
 
-from services.cli.calibrate.command import main
+from services.pipelines.calibrate.command import main
 
 __all__ = ["main"]

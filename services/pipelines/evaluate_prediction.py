@@ -6,9 +6,6 @@ from typing import Any
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, needs, select_episodes
 from dextouch.errors import UnknownNameError
-from services.cli.generate import refuse_trained_episodes
-from services.cli.parsers import prediction_parser
-from services.cli.twin_geometry import TwinGeometry
 from services.evaluation.prediction import (
     ALL_TASKS,
     GEOMETRY,
@@ -21,6 +18,9 @@ from services.evaluation.prediction import (
 )
 from services.evaluation.prediction_names import BASELINES
 from services.evaluation.prediction_scenes import Scene, read_rollout, read_windows
+from services.pipelines.generate import refuse_trained_episodes
+from services.pipelines.parsers import prediction_parser
+from services.pipelines.twin_geometry import TwinGeometry
 
 _HORIZONS: dict[str, Callable[[EpisodeReader], list[Scene]]] = {
     "windows": read_windows,

@@ -16,7 +16,7 @@ from dextouch.worlds import (
     WorldServiceSettings,
     create_world_app,
 )
-from services.cli.servers import served
+from services.pipelines.servers import served
 
 
 def open_named(kind: str, value: str) -> World[Any]:

@@ -12,16 +12,16 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.serving import configure_logging
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.cli.generate import refuse_trained_episodes
-from services.cli.imagined_data import WORLD
-from services.cli.parsers import recorded_parser
-from services.cli.servers import served
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.recorded_takes import REPLAY, read_takes, score_lines, score_recorded
 from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_probe import SuccessProbe
+from services.pipelines.generate import refuse_trained_episodes
+from services.pipelines.imagined_data import WORLD
+from services.pipelines.parsers import recorded_parser
+from services.pipelines.servers import served
 from services.world_model.world import open_world
 
 EXIT_FAILED = 1

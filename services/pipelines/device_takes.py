@@ -36,8 +36,8 @@ from services.alignment.options import AlignmentOptions
 from services.alignment.retargeting import warm_up
 from services.alignment.synchronization.episode_builder import build_episode
 from services.alignment.synchronization.recorded_streams import EpisodeStream
-from services.cli.mock_takes import TakePlan, measure_gloves, origin_in_truth_ns, play_take
 from services.episode_store.committing import commit_spool
+from services.pipelines.mock_takes import TakePlan, measure_gloves, origin_in_truth_ns, play_take
 from services.twin.episodes import TruthEpisode
 from services.twin.recorder import NUM_LAST_SHOWN_STEPS, TruthStream
 from services.twin.simulation import MODEL_RATE_HZ
