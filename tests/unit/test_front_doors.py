@@ -32,21 +32,27 @@ def dotted(path):
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-PACKAGES = {
-    dotted(path): ast.parse(path.read_text(encoding="utf-8"))
-    for path in sorted(LIBRARY.glob("*/**/__init__.py"))
-}
+def door_of(init):
+    """The module that lists what a package exports: the stub of one whose names are lazy."""
+    stub = init.with_suffix(".pyi")
+    return ast.parse((stub if stub.is_file() else init).read_text(encoding="utf-8"))
+
+
+PACKAGES = {dotted(path): door_of(path) for path in sorted(LIBRARY.glob("*/**/__init__.py"))}
 MODULES = {dotted(path) for path in LIBRARY.rglob("*.py")} - PACKAGES.keys()
 
 
 def imports(package):
     """The names that a package takes from itself and its modules, in pairs with their home."""
-    return [
-        (alias, node.module)
-        for node in ast.walk(PACKAGES[package])
-        if isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith(f"{package}.")
-        for alias in node.names
-    ]
+    found = []
+    for node in ast.walk(PACKAGES[package]):
+        if isinstance(node, ast.ImportFrom):
+            # A stub's imports are relative.
+            parts = [package if node.level else "", node.module or ""]
+            home = ".".join(part for part in parts if part)
+            if f"{home}.".startswith(f"{package}."):
+                found += [(alias, home) for alias in node.names]
+    return found
 
 
 def listed(package):

@@ -1,0 +1,16 @@
+from . import rotations as rotations
+from .interpolation import bracket as bracket
+from .interpolation import interpolate_linear as interpolate_linear
+from .interpolation import interpolate_poses as interpolate_poses
+from .interpolation import nearest_index as nearest_index
+from .lens import box_pixels as box_pixels
+from .lens import lens_pixels as lens_pixels
+from .lens import points_on_level as points_on_level
+from .transforms import apply as apply
+from .transforms import invert as invert
+from .transforms import pinhole_matrix as pinhole_matrix
+from .transforms import pose_from_transform as pose_from_transform
+from .transforms import project as project
+from .transforms import rigid_error as rigid_error
+from .transforms import transform as transform
+from .transforms import transform_from_pose as transform_from_pose
