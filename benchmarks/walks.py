@@ -239,13 +239,13 @@ def window_into_training(store_url: str) -> Walk:
     """From an episode of a store to the network's input, as the streaming loader reads it."""
     from services.world_model.network.configuration import NetworkConfig
     from services.world_model.network.inputs import build_inputs
-    from services.world_model.training.dataset import Place
+    from services.world_model.training.dataset import WindowPosition
     from services.world_model.training.streaming import index_episodes
 
     (episode, *_) = index_episodes(store_url)
     tracer = Tracer("window into training")
     with tracer.installed(), tracer.on():
-        window = episode.cut(Place(0, 0, 5))
+        window = episode.cut(WindowPosition(0, 0, 5))
         size_px = window.images.shape[1]
         build_inputs([window.request], NetworkConfig(image_px=size_px))
     return tracer.walk

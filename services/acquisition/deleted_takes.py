@@ -23,7 +23,7 @@ from dextouch.schemas import (
     MAX_CHECKED_TAKES,
     CheckTakes,
     ConfirmRemoval,
-    FoundDeletion,
+    PendingDeletion,
     RecordingAttributes,
     SpooledTake,
 )
@@ -141,10 +141,10 @@ class DeletedTakes:
         station: str,
         spooled: Sequence[SpooledTake],
         removed: list[str],
-    ) -> tuple[list[FoundDeletion], str]:
+    ) -> tuple[list[PendingDeletion], str]:
         """Remove the deleted takes of a station; those that are held, and the first revision."""
         operators = tuple(self._operators.known())
-        held: list[FoundDeletion] = []
+        held: list[PendingDeletion] = []
         first_revision: str | None = None
         for start in range(0, max(1, len(spooled)), MAX_CHECKED_TAKES):
             part = tuple(spooled[start : start + MAX_CHECKED_TAKES])

@@ -34,7 +34,7 @@ from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import (
     MockDevice,
     MockPair,
-    MockPlace,
+    MockSlot,
     PacketSource,
     ReplayStream,
     device_rng,
@@ -50,7 +50,7 @@ LEAD_NS = 20_000_000
 LIVE_LEAD_NS = 200_000_000
 
 
-def mock_glove_of(kind_name: str, place: MockPlace) -> MockPair:
+def mock_glove_of(kind_name: str, place: MockSlot) -> MockPair:
     """A simulated glove of a kind of this package or another one.
 
     Raises:
@@ -69,7 +69,7 @@ def mock_glove_of(kind_name: str, place: MockPlace) -> MockPair:
     except IMPORT_FAILURES as error:
         raise InvalidInputError(
             f"{where}: got {type(error).__name__}: {error}, expected a function 'module:function' "
-            "of a MockPlace; fix the package that provides the kind"
+            "of a MockSlot; fix the package that provides the kind"
         ) from error
     pair: object = make(place)
     if not isinstance(pair, MockPair):
@@ -106,8 +106,8 @@ def build_mocks(
     if len(named) != len(streams):
         raise InvalidInputError("mock station: two streams of the same name")
 
-    def place(name: str, stream: str) -> MockPlace:
-        return MockPlace(
+    def place(name: str, stream: str) -> MockSlot:
+        return MockSlot(
             name, named[stream], faults.of(name), seed, clock, links.trackers, unit_seed
         )
 
@@ -134,7 +134,7 @@ def build_mocks(
     return pairs
 
 
-def _camera(place: MockPlace, links: MockLinks) -> MockPair:
+def _camera(place: MockSlot, links: MockLinks) -> MockPair:
     if links.cameras == "station":
         return video_camera(place, encoding=links.images)
     height_px, width_px = place.stream.descriptor.shape[:2]
@@ -144,7 +144,7 @@ def _camera(place: MockPlace, links: MockLinks) -> MockPair:
     return _on_socket(place, CameraSource(place.stream, encoding=links.images), decoder)
 
 
-def _on_socket(place: MockPlace, source: PacketSource, decoder: Decoder) -> MockPair:
+def _on_socket(place: MockSlot, source: PacketSource, decoder: Decoder) -> MockPair:
     port = SocketPort(place.name)
     driver = Driver(place.name, transport=port.transport, decoder=decoder, clock=place.clock)
     return MockPair(MockDevice(place, source, port), driver)

@@ -25,7 +25,7 @@ from dextouch.streams import MAX_STREAMS, pack
 from services.acquisition.health import (
     NUM_ROWS,
     PERIOD_NS,
-    DiskJudge,
+    DiskCheck,
     history_facts,
     json_history,
     judge_uploads,
@@ -99,7 +99,7 @@ class HistoryQuery(FrozenModel):
 
 def station_router(station: Station, uploader: Uploader) -> APIRouter:
     """Health and live views."""
-    disk = DiskJudge(station.recorder.spool_root, station.supervisors, station.clock.now_ns())
+    disk = DiskCheck(station.recorder.spool_root, station.supervisors, station.clock.now_ns())
     station.health.watch(disk)
     station.health.watch(lambda evaluation: judge_uploads(evaluation, uploader.refused))
     router = APIRouter(

@@ -31,7 +31,7 @@ from services.alignment.schemas import (
 )
 from services.alignment.settings import AlignmentSettings
 from services.alignment.station_calibration.routes import calibration_router
-from services.alignment.station_calibration.runs import CalibrationRuns, StationPlace
+from services.alignment.station_calibration.runs import CalibrationRuns, StationLocation
 
 SCOPE = "align"
 PAGE = 100
@@ -43,7 +43,7 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
     jobs = JobRunner(store, settings)
     key = settings.station_key
     runs = CalibrationRuns(
-        StationPlace(
+        StationLocation(
             url=settings.station_url,
             key=None if key is None else key.get_secret_value(),
             folder=settings.calibration_folder,

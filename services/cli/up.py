@@ -17,7 +17,7 @@ from services.cli.data_lock import held_data_folder
 from services.cli.extras import missing_package
 from services.cli.standard_streams import discard_output
 from services.cli.up_settings import UpSettings
-from services.pipelines.servers import Place, bind, serve_all, stop_on_signals
+from services.pipelines.servers import BoundAddress, bind, serve_all, stop_on_signals
 
 if TYPE_CHECKING:
     from services.acquisition.settings import AcquisitionSettings
@@ -72,7 +72,7 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
     return 0
 
 
-def _bind(name: str, settings: UpSettings) -> Place:
+def _bind(name: str, settings: UpSettings) -> BoundAddress:
     field = f"{name}_port"
     port: int = getattr(settings, field)
     try:

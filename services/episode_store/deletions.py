@@ -23,8 +23,8 @@ from dextouch.schemas import (
     Deletions,
     DeletionsRevision,
     DeletionStatus,
-    FoundDeletion,
     OutstandingTakes,
+    PendingDeletion,
     RecordingAttributes,
     SpooledTake,
 )
@@ -91,7 +91,7 @@ def deletions_router(records: DeletionRecords) -> APIRouter:
         return CheckedTakes(
             revision=revision,
             takes=tuple(
-                FoundDeletion(recording_id=take.recording_id, deletion=key)
+                PendingDeletion(recording_id=take.recording_id, deletion=key)
                 for take, key in found
                 if key is not None
             ),

@@ -44,18 +44,18 @@ MAX_TOKENS: Final = 256
 ASK_AGAIN: Final = "ask an administrator for a new one"
 
 
-class KeptEnrolment(StationEnrolment):
+class StoredEnrolment(StationEnrolment):
     """An enrolment that led to a key, of which the file holds the SHA-256 in hexadecimal."""
 
     state: Literal["enrolled", "revoked"]
     key_sha256: str
 
 
-class KeptEnrolments(FrozenModel):
+class StoredEnrolments(FrozenModel):
     """Contents of the file, oldest first."""
 
     format_version: Literal[1] = 1
-    enrolments: tuple[KeptEnrolment, ...] = ()
+    enrolments: tuple[StoredEnrolment, ...] = ()
 
 
 @dataclass
@@ -159,7 +159,7 @@ class Enrolments:
                 "enrolled_from": client,
                 "key_sha256": secret_digest(key).hex(),
             }
-            kept = KeptEnrolment.model_validate(token.enrolment.model_dump() | changed)
+            kept = StoredEnrolment.model_validate(token.enrolment.model_dump() | changed)
             self._save((*self._kept, kept))
             self._accept((*self._kept, kept))
             token.is_used = True
@@ -223,14 +223,14 @@ class Enrolments:
         self._tokens = left
         return num_dropped
 
-    def _save(self, enrolments: tuple[KeptEnrolment, ...]) -> None:
+    def _save(self, enrolments: tuple[StoredEnrolment, ...]) -> None:
         with disk_errors(f"write {self._path}"):
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            text = KeptEnrolments(enrolments=enrolments).model_dump_json(indent=1)
+            text = StoredEnrolments(enrolments=enrolments).model_dump_json(indent=1)
             replace_file(self._path, text.encode(), mode=0o600)
         self._is_saved = True
 
-    def _accept(self, enrolments: tuple[KeptEnrolment, ...]) -> None:
+    def _accept(self, enrolments: tuple[StoredEnrolment, ...]) -> None:
         self._kept = enrolments
         self._access.set_enrolled(
             [
@@ -244,13 +244,13 @@ class Enrolments:
         )
 
 
-def _read(path: Path) -> tuple[KeptEnrolment, ...]:
+def _read(path: Path) -> tuple[StoredEnrolment, ...]:
     with disk_errors(f"read {path}"):
         if not path.exists():
             return ()
         text = path.read_bytes()
     try:
-        return KeptEnrolments.model_validate_json(text).enrolments
+        return StoredEnrolments.model_validate_json(text).enrolments
     except ValidationError as error:
         raise StorageError(
             f"{path}: no valid list of enrolled stations ({first_problems(error)}); restore it "

@@ -44,7 +44,7 @@ def _server(app: FastAPI, grace_s: int) -> Server:
 
 
 @dataclass(frozen=True)
-class Place:
+class BoundAddress:
     """A bound socket, whose URL is known before the service exists."""
 
     name: str
@@ -57,7 +57,7 @@ class Place:
         return f"http://{host}:{port}"
 
 
-def bind(name: str, *, host: str, port: int) -> Place:
+def bind(name: str, *, host: str, port: int) -> BoundAddress:
     """Bind a port; 0 selects a free one.
 
     Raises:
@@ -75,11 +75,11 @@ def bind(name: str, *, host: str, port: int) -> Place:
         raise ConflictError(
             f"{name}: cannot listen on {host}:{port} ({error.strerror}); {advice}"
         ) from error
-    return Place(name, listener)
+    return BoundAddress(name, listener)
 
 
 async def serve_all(
-    placed: Sequence[tuple[Place, FastAPI]],
+    placed: Sequence[tuple[BoundAddress, FastAPI]],
     *,
     stop: asyncio.Event,
     on_ready: Callable[[], None],

@@ -10,7 +10,7 @@ from services.world_model.dynamics.hand_motion import hand_motion
 from services.world_model.dynamics.model import first_steps, mean_poses
 from services.world_model.dynamics.nested import stacked
 from services.world_model.dynamics.objects import BOX_AXES, poses_from_objects
-from services.world_model.network.contact_geometry import SeenObjects
+from services.world_model.network.contact_geometry import ObjectsAtStart
 from services.world_model.network.inputs import PredictionRequest
 from services.world_model.state_checkpoints import StateCheckpoint
 
@@ -30,7 +30,7 @@ class SceneReader:
     @torch.no_grad()
     def objects(
         self, requests: Sequence[PredictionRequest], tasks: Sequence[str]
-    ) -> list[SeenObjects]:
+    ) -> list[ObjectsAtStart]:
         """Objects at the first step of every request.
 
         Raises:
@@ -55,7 +55,7 @@ class SceneReader:
             for task, each in zip(tasks, zip(poses, size, strict=True), strict=True)
         ]
 
-    def _seen(self, task: str, poses: np.ndarray, size: np.ndarray) -> SeenObjects:
+    def _seen(self, task: str, poses: np.ndarray, size: np.ndarray) -> ObjectsAtStart:
         boxes_m = np.array(self._metadata.object_boxes_m[task])
         count = len(boxes_m)
-        return SeenObjects(poses[:count], boxes_m * size[:count, BOX_AXES])
+        return ObjectsAtStart(poses[:count], boxes_m * size[:count, BOX_AXES])

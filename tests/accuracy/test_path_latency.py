@@ -11,7 +11,7 @@ from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mock_glove
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.replay import MockPlace, ReplayStream
+from services.acquisition.mocks.replay import MockSlot, ReplayStream
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
 
@@ -90,7 +90,7 @@ class Glove:
             skew_ppm=float(rng.uniform(-80, 80)),
         )
         pair = mock_glove(
-            MockPlace("glove_left", truth(), self.faults, seed, self.host),
+            MockSlot("glove_left", truth(), self.faults, seed, self.host),
             calibration=GloveCalibration.seeded("left", seed),
         )
         self.device = pair.device

@@ -10,7 +10,7 @@ from dextouch.errors import DeviceError
 from dextouch.schemas import HealthEvent, TakePrompt
 from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices.station_camera.driver import StationCamera
-from services.acquisition.health import STATION, DiskJudge
+from services.acquisition.health import STATION, DiskCheck
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
@@ -285,7 +285,7 @@ def fill_disk(mock: MockStation, pair: MockPair) -> None:
     del pair
     health = mock.station.health
     bytes_a_s = 60 * 720 + 100 * 56
-    disk = DiskJudge(
+    disk = DiskCheck(
         mock.station.recorder.spool_root,
         mock.station.supervisors,
         mock.station.clock.now_ns(),

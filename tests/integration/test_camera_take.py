@@ -19,7 +19,7 @@ from services.acquisition.devices.station_camera.mock import video_camera
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
-from services.acquisition.mocks.replay import MockPlace, ReplayStream
+from services.acquisition.mocks.replay import MockSlot, ReplayStream
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.station import Station
 from services.acquisition.take import Take
@@ -88,7 +88,7 @@ def record(stream, encoding, spool_root, **faults):
     clock = VirtualClock()
     disturbed = DeviceFaults(path_delay_ms=DELAY_MS, **faults)
     pair = video_camera(
-        MockPlace("camera_head", stream, disturbed, 3, clock),
+        MockSlot("camera_head", stream, disturbed, 3, clock),
         encoding=encoding,
         latency_ms=12.0,
         latency_sigma_ms=0.5,
@@ -195,7 +195,7 @@ def test_a_take_of_a_running_camera_begins_with_a_group(tmp_path):
     """What a recorder does with `begin_take` and its takes."""
     clock = VirtualClock()
     stream = replay(45)
-    place = MockPlace("camera_head", stream, DeviceFaults(), 3, clock)
+    place = MockSlot("camera_head", stream, DeviceFaults(), 3, clock)
     pair = video_camera(place, encoding="h264")
     driver, port = pair.driver, pair.device.port
     port.plug()

@@ -8,7 +8,7 @@ import pytest
 
 from dextouch.schemas import TakePrompt
 from services.acquisition.clock import PeriodicCall, VirtualClock
-from services.acquisition.health import DiskJudge, host
+from services.acquisition.health import DiskCheck, host
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
@@ -39,7 +39,7 @@ class SleepyHost(VirtualClock):
 
 def host_judge(station):
     """The check of the station's computer."""
-    return next(j for j in station.health._itself.judges if isinstance(j, host.HostJudge))
+    return next(j for j in station.health._itself.judges if isinstance(j, host.HostCheck))
 
 
 def busy(station):
@@ -65,7 +65,7 @@ def saturated(station):
 
 def nearly_full(station):
     """The disk has room for 20 minutes."""
-    disk = DiskJudge(
+    disk = DiskCheck(
         station.recorder.spool_root,
         station.supervisors,
         station.clock.now_ns(),

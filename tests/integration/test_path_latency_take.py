@@ -13,7 +13,7 @@ from services.acquisition import path_latency
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mock_glove
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.replay import MockPlace, ReplayStream
+from services.acquisition.mocks.replay import MockSlot, ReplayStream
 from services.acquisition.station import Station
 
 SECONDS = 40
@@ -37,7 +37,7 @@ def station(tmp_path, monkeypatch):
     stream = ReplayStream(descriptor, t_ns, np.zeros((count, 320), dtype=np.float32))
     clock, glove = StationClock(), GloveCalibration.seeded("left", 1)
     faults = DeviceFaults(path_delay_ms=PATH_DELAY_MS, jitter_ms=0.5, skew_ppm=60)
-    pair = mock_glove(MockPlace("glove_left", stream, faults, 1, clock), calibration=glove)
+    pair = mock_glove(MockSlot("glove_left", stream, faults, 1, clock), calibration=glove)
     pair.device.port.plug()
     station = Station(
         name="test",

@@ -31,7 +31,7 @@ from services.dashboard.settings import DashboardSettings
 from services.dashboard.tasks import load_tasks
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings
-from services.evaluation.rating.app import GivenMark
+from services.evaluation.rating.app import SubmittedMark
 from services.evaluation.rating.rubrics import Criterion
 
 # Clears a screen, forges a line, turns the reading order, hides.
@@ -75,7 +75,7 @@ FIELDS = [
     *((ReviewItems, ITEM, field) for field in ("reason", "reviewer")),
     *((StartRequest, START, field) for field in ("world", "task", "instruction")),
     *((NewRecording, TAKE, field) for field in ("task", "instruction", "station", "operator")),
-    (GivenMark, MARK, "comment"),
+    (SubmittedMark, MARK, "comment"),
     (RunRequest, {"kind": "camera", "subject": "head"}, "board"),
     (Answer, {}, "text"),
     (Criterion, {"name": "touched", "points": 1}, "description"),

@@ -92,7 +92,7 @@ class DeviceKind(Generic[SettingsT]):
         build: makes the driver, not opened yet, from the settings and the station's clock. It
             raises InvalidInputError where the settings do not say where the device is.
         mock: where a function is that simulates the device, as "module:function"; None if nothing
-            does. It takes a `MockPlace` and gives a `MockPair` (`services.acquisition.mocks`). It
+            does. It takes a `MockSlot` and gives a `MockPair` (`services.acquisition.mocks`). It
             is imported in mock stations only: drivers never import mocks.
     """
 

@@ -10,7 +10,7 @@ from services.acquisition.health.history import NUM_ROWS
 from services.acquisition.health.history_body import history_facts, json_history, packed_history
 from services.acquisition.health.metrics import STATION_FIGURES, HealthCollector
 from services.acquisition.health.monitor import PERIOD_NS, STATION, TICK_NS, HealthMonitor
-from services.acquisition.health.station import DiskJudge, judge_uploads
+from services.acquisition.health.station import DiskCheck, judge_uploads
 
 __all__ = [
     "CODES",
@@ -19,7 +19,7 @@ __all__ = [
     "STATION",
     "STATION_FIGURES",
     "TICK_NS",
-    "DiskJudge",
+    "DiskCheck",
     "HealthCollector",
     "HealthMonitor",
     "count_taxels",

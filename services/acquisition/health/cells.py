@@ -2,7 +2,7 @@
 
 A cell that does not change is not necessarily faulty, because a hand at rest looks the same. It is
 reported if its neighbours change while it does not, or if no load explains its reading.
-`TaxelJudge` checks our own glove by its tare. `CellJudge` checks gloves of other manufacturers,
+`TaxelCheck` checks our own glove by its tare. `CellCheck` checks gloves of other manufacturers,
 which have none: a position that never had a reading is not a cell, and if the layout is unknown, a
 cell that never changed may be an unused position.
 """
@@ -62,7 +62,7 @@ PINNED_STATES: Final[tuple[TaxelState, ...]] = ("dead", "stuck", "saturated")
 _SCAN_COLUMNS = 20
 
 
-class _CellCheck(ABC):
+class _PressureCheck(ABC):
     """State of each cell from all samples so far, and the readings of the last 0.5 s."""
 
     def __init__(self, full_scale: float, noun: str) -> None:
@@ -91,7 +91,7 @@ class _CellCheck(ABC):
 
     @abstractmethod
     def _judge(self, evaluation: Evaluation, low: np.ndarray, high: np.ndarray) -> None:
-        """Judge by the least and greatest reading of the last 0.5 s; NaN where one was."""
+        """HealthCheck by the least and greatest reading of the last 0.5 s; NaN where one was."""
 
     def _add(self, values: np.ndarray, t_ns: np.ndarray) -> None:
         if not len(self._recent_ns):
@@ -150,7 +150,7 @@ class _CellCheck(ABC):
         num_cells: int,
         parts: Mapping[str, str] | None = None,
     ) -> None:
-        """Judge the share of the cells that each code was found in; a part of that name is out."""
+        """Report the share of the cells that each code was found in; a part of that name is out."""
         for code, cells in found.items():
             count, word = int(cells.sum()), code.removeprefix("taxels_")
             evaluation.figures[f"{word}_taxels_ratio"] = count / num_cells
@@ -160,7 +160,7 @@ class _CellCheck(ABC):
                 evaluation.judge(code, count / num_cells, f"{count} {self._noun} {word}")
 
 
-class TaxelJudge(_CellCheck):
+class TaxelCheck(_PressureCheck):
     """Checks the 320 taxels of our own glove from its raw counts.
 
     A taxel drifts if for 10 s it read 2 kPa or more above its tare, or below it, while three
@@ -256,7 +256,7 @@ class TaxelJudge(_CellCheck):
         return None
 
 
-def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellJudge | None":
+def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellCheck | None":
     """The check of the cells that a decoder reads; None where it tells of none.
 
     Args:
@@ -281,7 +281,7 @@ def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellJudg
         )
     cells = mapped_cells(descriptor, calibration)
     used = None if cells is None else np.isin(np.arange(num_cells), cells[cells != NO_CELL])
-    return CellJudge(layout, used, cells)
+    return CellCheck(layout, used, cells)
 
 
 def refused_taxels(
@@ -294,7 +294,7 @@ def refused_taxels(
     return states[raw_indices(side=descriptor.side)] > 0
 
 
-class CellJudge(_CellCheck):
+class CellCheck(_PressureCheck):
     """Checks the cells of another manufacturer's glove.
 
     On a known grid a cell is silent when it does not change while its neighbours move: dead at

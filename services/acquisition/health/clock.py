@@ -34,7 +34,7 @@ BORNE_OUT_NS = 5_000_000_000
 BINS = 10
 
 
-class ClockJudge:
+class ClockCheck:
     """Checks one device's clock on the first of its streams (all share their timestamps)."""
 
     def __init__(self, descriptor: StreamDescriptor) -> None:
@@ -174,7 +174,7 @@ class ClockJudge:
             evaluation.judge("clock_step", in_an_hour, text)
 
 
-class CountingJudge:
+class CountingCheck:
     """Judges a stream without time and number: its clock is the count of its samples.
 
     The nominal period may be off by percents, so that skew is told and `rate` judges it; losses

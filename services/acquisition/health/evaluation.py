@@ -159,7 +159,7 @@ class Evaluation:
 
 
 # A check of one aspect of a stream or of the station, run at every evaluation.
-Judge = Callable[[Evaluation], None]
+HealthCheck = Callable[[Evaluation], None]
 
 
 def raised_finding(

@@ -18,7 +18,7 @@ SUSPENDED_SHOWN_NS = 20_000_000_000
 CLOCK_SET_SHOWN_NS = 60_000_000_000
 
 
-class HostJudge:
+class HostCheck:
     """How late a periodic thread of the station wakes, which an overloaded computer delays.
 
     The 90th percentile of 10 s: a single stop of the process, such as a laptop's sleep, is none.
@@ -87,7 +87,7 @@ def _cpu_times(stat: Path = Path("/proc/stat")) -> tuple[int, int] | None:
     return sum(ticks) - sum(ticks[3:5]), sum(ticks)
 
 
-class HostClockJudge:
+class HostClockCheck:
     """Whether the computer slept, or its wall clock was set, since the last evaluations.
 
     Args:

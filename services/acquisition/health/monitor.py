@@ -18,28 +18,28 @@ from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.drivers.base import Driver
 from services.acquisition.glove_record import glove_record, is_ours
 from services.acquisition.health.causes import SIMULATED_ADVICE, find_causes
-from services.acquisition.health.cells import TaxelJudge, cell_judge, refused_taxels
-from services.acquisition.health.clock import ClockJudge, CountingJudge
+from services.acquisition.health.cells import TaxelCheck, cell_judge, refused_taxels
+from services.acquisition.health.clock import ClockCheck, CountingCheck
 from services.acquisition.health.codes import CODES, SEVERITY
 from services.acquisition.health.evaluation import (
     Block,
     Board,
     Evaluation,
     EventLog,
-    Judge,
+    HealthCheck,
     raised_finding,
     worst,
 )
 from services.acquisition.health.history import STATION_FIGURES, HealthHistory, StreamMeter
-from services.acquisition.health.host import HostClockJudge, HostJudge
+from services.acquisition.health.host import HostCheck, HostClockCheck
 from services.acquisition.health.queues import SampleQueue
-from services.acquisition.health.station import CalibrationJudge, PathJudge, tared_unix_s
+from services.acquisition.health.station import CalibrationCheck, PathCheck, tared_unix_s
 from services.acquisition.health.streams import (
-    CameraJudge,
-    FiniteJudge,
-    LinkJudge,
-    PoseJudge,
-    TrackingJudge,
+    CameraCheck,
+    FiniteCheck,
+    LinkCheck,
+    PoseCheck,
+    TrackingCheck,
 )
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
@@ -60,7 +60,7 @@ STATION = "station"
 class _Watched:
     """The station or one of its streams, with its checks and their latest results."""
 
-    def __init__(self, name: str, judges: list[Judge]) -> None:
+    def __init__(self, name: str, judges: list[HealthCheck]) -> None:
         self.name = name
         self.judges = judges
         self.board = Board()
@@ -85,7 +85,7 @@ class _WatchedStream(_Watched):
     """
 
     def __init__(
-        self, supervisor: DeviceSupervisor, descriptor: StreamDescriptor, judges: list[Judge]
+        self, supervisor: DeviceSupervisor, descriptor: StreamDescriptor, judges: list[HealthCheck]
     ) -> None:
         super().__init__(descriptor.name, judges)
         self._supervisor = supervisor
@@ -201,8 +201,8 @@ class HealthMonitor:
         descriptors = [descriptor for s in supervisors for descriptor in s.driver.descriptors]
         self.nominal_rates_hz = {d.name: d.nominal_rate_hz for d in descriptors}
         self.history = HealthHistory(list(self._streams))
-        host = HostJudge()
-        itself = (CalibrationJudge(descriptors, calibration), host, HostClockJudge(clock))
+        host = HostCheck()
+        itself = (CalibrationCheck(descriptors, calibration), host, HostClockCheck(clock))
         self._itself = _Watched(STATION, [*itself, self._judge_itself])
         self._all = [*streams, self._itself]
         self._started_ns = clock.now_ns()
@@ -215,7 +215,7 @@ class HealthMonitor:
             self.tick, period_ns=TICK_NS, clock=clock, name="health", on_wake=host.note
         )
 
-    def watch(self, judge: Judge) -> None:
+    def watch(self, judge: HealthCheck) -> None:
         """Add a check of the station itself, such as that of its disk."""
         self._itself.judges.append(judge)
 
@@ -336,23 +336,23 @@ def _watch(
 ) -> list[_WatchedStream]:
     """The streams of one device, each with the checks for its kind."""
     watched = []
-    clock: ClockJudge | None = None
+    clock: ClockCheck | None = None
     driver = supervisor.driver
     for descriptor in driver.descriptors:
-        judges: list[Judge] = [LinkJudge(supervisor, descriptor)]
+        judges: list[HealthCheck] = [LinkCheck(supervisor, descriptor)]
         if descriptor.capabilities.device_time and clock is None:
-            clock = ClockJudge(descriptor)
+            clock = ClockCheck(descriptor)
             judges.append(clock)
         elif descriptor.capabilities.device_time and clock is not None:
             # All streams of a device share their timestamps: the first one's result is theirs.
             judges.append(clock.repeat)
         elif not descriptor.capabilities.sequence:
-            judges.append(CountingJudge(descriptor))
+            judges.append(CountingCheck(descriptor))
         judges += _value_judges(driver, descriptor, calibration)
         if "occluded" in driver.events():
-            judges.append(TrackingJudge(supervisor.events))
+            judges.append(TrackingCheck(supervisor.events))
         if paths is not None and paths.num_failures(descriptor.name) is not None:
-            judges.append(PathJudge(descriptor.name, paths, calibration))
+            judges.append(PathCheck(descriptor.name, paths, calibration))
         stream = _WatchedStream(supervisor, descriptor, judges)
         stream.tared_unix_s = tared_unix_s(descriptor, calibration)
         watched.append(stream)
@@ -361,22 +361,22 @@ def _watch(
 
 def _value_judges(
     driver: Driver, descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]
-) -> list[Judge]:
+) -> list[HealthCheck]:
     """Checks of sample values, by the kind of the stream."""
     if descriptor.kind == "tactile":
         record = glove_record(descriptor, calibration) if is_ours(descriptor) else None
         cells = (
-            TaxelJudge(record, refused_taxels(descriptor, calibration))
+            TaxelCheck(record, refused_taxels(descriptor, calibration))
             if record
             else cell_judge(driver.decoder, calibration)
         )
-        nan = FiniteJudge("nan", "taxels are no numbers")
+        nan = FiniteCheck("nan", "taxels are no numbers")
         return [nan] if cells is None else [nan, cells]
     if descriptor.kind == "keypoints":
-        return [FiniteJudge("tracking", "nodes are not seen")]
+        return [FiniteCheck("tracking", "nodes are not seen")]
     if descriptor.kind == "pose":
-        return [PoseJudge(descriptor)]
-    return [CameraJudge(driver)] if descriptor.kind == "image" else []
+        return [PoseCheck(descriptor)]
+    return [CameraCheck(driver)] if descriptor.kind == "image" else []
 
 
 def _device_health(supervisor: DeviceSupervisor, *, simulated: bool) -> DeviceHealth:

@@ -19,7 +19,7 @@ MIN_RATE_SPAN_NS = 900_000_000
 CALIBRATED_AT = "calibrated_at_unix_s"
 
 
-class DiskJudge:
+class DiskCheck:
     """How long the spool's disk would last if everything that arrives now were recorded.
 
     Args:
@@ -58,7 +58,7 @@ class DiskJudge:
             evaluation.judge("disk", -left_s, text)
 
 
-class CalibrationJudge:
+class CalibrationCheck:
     """Whether the calibration that travels with recordings is there, and how old it is.
 
     The age is judged where the record says when it was made (`calibrated_at_unix_s`, 1 × 1, or
@@ -100,7 +100,7 @@ def tared_unix_s(descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]
     return number(calibration, f"{descriptor.name}_{CALIBRATED_AT}") if is_glove else None
 
 
-class PathJudge:
+class PathCheck:
     """Compares a stream's measured path delay with the station's calibration.
 
     Args:

@@ -38,7 +38,7 @@ EVENTS = (
 )
 
 
-class LinkJudge:
+class LinkCheck:
     """Checks the last 10 s of one stream on its path from the device to the spool."""
 
     def __init__(self, supervisor: DeviceSupervisor, descriptor: StreamDescriptor) -> None:
@@ -146,7 +146,7 @@ class LinkJudge:
             evaluation.judge("latency", late_s * rate_hz, text)
 
 
-class TrackingJudge:
+class TrackingCheck:
     """Checks the packets that a tracker's decoder dropped: occluded, jumped, stale.
 
     Args:
@@ -172,7 +172,7 @@ REST_NS = 1_000_000_000
 MIN_REST_SAMPLES = 40
 
 
-class PoseJudge:
+class PoseCheck:
     """Judges the poses of one body: jumps that came through, and its trembling at rest."""
 
     def __init__(self, descriptor: StreamDescriptor) -> None:
@@ -223,7 +223,7 @@ class PoseJudge:
         return float(np.sqrt((errors_m**2).sum(axis=1).mean()))
 
 
-class FiniteJudge:
+class FiniteCheck:
     """Checks the share of a stream's values that is missing (NaN): nodes not seen, broken cells.
 
     What never held a number is no part of the device (a glove model's empty cells).
@@ -247,7 +247,7 @@ class FiniteJudge:
         evaluation.judge(self._code, ratio, f"{ratio:.1%} of the {self._word}")
 
 
-class CameraJudge:
+class CameraCheck:
     """Judges one camera: anything is a warning, and an error after a second."""
 
     def __init__(self, driver: Driver) -> None:

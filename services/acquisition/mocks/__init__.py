@@ -11,7 +11,7 @@ from services.acquisition.mocks.ports import HidPort, MockPort, PtyPort, SocketP
 from services.acquisition.mocks.replay import (
     MockDevice,
     MockPair,
-    MockPlace,
+    MockSlot,
     PacketSource,
     ReplayStream,
     at_rate,
@@ -24,8 +24,8 @@ __all__ = [
     "HidPort",
     "MockDevice",
     "MockPair",
-    "MockPlace",
     "MockPort",
+    "MockSlot",
     "PacketEdits",
     "PacketFields",
     "PacketSource",

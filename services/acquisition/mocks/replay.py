@@ -88,8 +88,8 @@ class PacketSource(ABC):
 
 
 @dataclass(frozen=True)
-class MockPlace:
-    """Place of one device in a mock station.
+class MockSlot:
+    """One device of a mock station.
 
     Attributes:
         name: of the device, such as `glove_left`.
@@ -134,7 +134,7 @@ class MockDevice:
         port: where it says it.
     """
 
-    def __init__(self, place: MockPlace, source: PacketSource, port: MockPort) -> None:
+    def __init__(self, place: MockSlot, source: PacketSource, port: MockPort) -> None:
         faults = place.faults
         self.name = place.name
         self.source = source
@@ -321,7 +321,7 @@ class MockPair:
 
 
 def serial_mock(
-    place: MockPlace,
+    place: MockSlot,
     *,
     source: PacketSource,
     decoder: Decoder,

@@ -15,7 +15,7 @@ from services.acquisition.drivers.sdk_link import (
     FrameConvention,
 )
 from services.acquisition.mocks.ports import SocketPort
-from services.acquisition.mocks.replay import MockDevice, MockPair, MockPlace, PacketSource
+from services.acquisition.mocks.replay import MockDevice, MockPair, MockSlot, PacketSource
 
 # A left-handed sender in centimetres, and OpenVR's own frame: y up, looking along −z.
 LEFT_HANDED = FrameConvention(handedness="left", axes=("+x", "+y", "-z"))
@@ -80,7 +80,7 @@ class BridgePort(SocketPort):
         return host_end
 
 
-def bridged_pair(place: MockPlace, source: BridgeSource, decoder: BridgeDecoder) -> MockPair:
+def bridged_pair(place: MockSlot, source: BridgeSource, decoder: BridgeDecoder) -> MockPair:
     """A simulated device behind a bridge, and the driver that asks the bridge for it."""
     port, clock = BridgePort(place.name, source.hello), place.clock
     device = MockDevice(place, source, port)

@@ -15,7 +15,7 @@ from services.alignment.station_calibration.record import (
     MATRICES_FILE,
     read_matrices,
 )
-from services.alignment.station_calibration.runs import StationPlace
+from services.alignment.station_calibration.runs import StationLocation
 from services.alignment.station_calibration.schemas import (
     CalibrationItem,
     CalibrationOverview,
@@ -95,7 +95,7 @@ RESIDUALS: Final = {
 }
 
 
-def overview(place: StationPlace) -> CalibrationOverview:
+def overview(place: StationLocation) -> CalibrationOverview:
     """The calibration folder, and what the station's streams need besides."""
     note = ""
     streams: tuple[str, ...] = ()
@@ -134,7 +134,7 @@ def _group(name: str) -> str:
 
 
 def _item(
-    name: str, finding: Finding | None, details: Mapping[str, object], place: StationPlace
+    name: str, finding: Finding | None, details: Mapping[str, object], place: StationLocation
 ) -> CalibrationItem:
     state: ItemState = "optional" if name.startswith("hand_profile_") else "missing"
     if finding is not None:
@@ -159,7 +159,7 @@ def _item(
     )
 
 
-def _words(name: str, place: StationPlace) -> tuple[str, str, RunRequest | None]:
+def _words(name: str, place: StationLocation) -> tuple[str, str, RunRequest | None]:
     """Title, next step and guided run of a calibration."""
     for pattern, title, step, kind in KINDS:
         if matched := re.fullmatch(pattern, name):

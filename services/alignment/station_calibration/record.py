@@ -170,7 +170,7 @@ class PhotoPose(BaseModel):
 
 
 @dataclass(frozen=True)
-class TakenStream:
+class TakeStream:
     """All samples of one stream of a take, with the take's calibration."""
 
     take: str
@@ -189,7 +189,7 @@ class TakenStream:
         return timing.t_host_ns, self.batch.values[timing.kept]
 
 
-def read_stream(take: str, name: str, store: str | None) -> TakenStream:
+def read_stream(take: str, name: str, store: str | None) -> TakeStream:
     """Read one stream of a spool folder, or of a recording in a store.
 
     Args:
@@ -214,7 +214,7 @@ def read_stream(take: str, name: str, store: str | None) -> TakenStream:
         raise NotFoundError(
             f"take {take!r}: has no {name!r}, only {', '.join(sorted(reader.streams))}"
         )
-    return TakenStream(take, reader.streams[name], reader.read(name), reader.attributes.calibration)
+    return TakeStream(take, reader.streams[name], reader.read(name), reader.attributes.calibration)
 
 
 def read_rows(path: Path, kind: type[Row], item: str, expected: str) -> list[Row]:

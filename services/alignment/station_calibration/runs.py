@@ -49,7 +49,7 @@ class _CancelledError(Exception):
 
 
 @dataclass(frozen=True)
-class StationPlace:
+class StationLocation:
     """Where the station answers, where its takes are, and the folder of its calibration."""
 
     url: str | None
@@ -71,7 +71,7 @@ class StationPlace:
             )
         return HttpLink(self.url, api_key=self.key)
 
-    def visited(self) -> tuple["StationPlace", tuple[str, ...]]:
+    def visited(self) -> tuple["StationLocation", tuple[str, ...]]:
         """The place with the folder of its devices, and the names of the station's streams.
 
         Simulated devices have the folder `practice`, so that nobody records with their calibration.
@@ -93,7 +93,7 @@ class GuidedRun:
         place: the station.
     """
 
-    def __init__(self, request: RunRequest, place: StationPlace) -> None:
+    def __init__(self, request: RunRequest, place: StationLocation) -> None:
         self._place, self._request = place, request
         now = datetime.now(UTC)
         self._lock = threading.Lock()
@@ -251,7 +251,7 @@ def _points(pixels: np.ndarray) -> tuple[tuple[float, float], ...]:
 class CalibrationRuns:
     """The runs of one station: at most one at a time; the last one stays to be looked at."""
 
-    def __init__(self, place: StationPlace) -> None:
+    def __init__(self, place: StationLocation) -> None:
         self.place = place
         self._run: GuidedRun | None = None
         self._lock = threading.Lock()

@@ -35,7 +35,7 @@ PAGE_HEADERS: Final = {
 Token = Annotated[str, Path(pattern=r"^[0-9a-f]{20}$")]
 
 
-class ShownCriterion(FrozenModel):
+class CriterionView(FrozenModel):
     """A criterion as the page shows it."""
 
     name: str
@@ -43,14 +43,14 @@ class ShownCriterion(FrozenModel):
     latched: bool
 
 
-class ShownRollout(FrozenModel):
+class RolloutView(FrozenModel):
     """The next rollout of a rater; nothing names its policy or world."""
 
     rollout: str
     presentation: int
     task: str
     instruction: str
-    criteria: tuple[ShownCriterion, ...]
+    criteria: tuple[CriterionView, ...]
     penalty: float
     num_steps: int
     rate_hz: float
@@ -58,14 +58,14 @@ class ShownRollout(FrozenModel):
     num_open: int
 
 
-class GivenMark(Judgement):
+class SubmittedMark(Judgement):
     """Body of a mark."""
 
     rollout: str = Field(pattern=r"^[0-9a-f]{20}$")
     comment: FreeLines = Field(default="", max_length=2000)
 
 
-class GivenNumber(FrozenModel):
+class SubmittedMarkNumber(FrozenModel):
     """Number of a stored mark."""
 
     number: int
@@ -133,23 +133,23 @@ def rating_router(
     router = APIRouter(prefix="/v1/rating", tags=["rating"], dependencies=[Depends(needs_rater)])
 
     @router.get(
-        "/next", response_model=None, responses={200: {"model": ShownRollout}, 204: {}, 409: {}}
+        "/next", response_model=None, responses={200: {"model": RolloutView}, 204: {}, 409: {}}
     )
     def next_rollout(
         request: Request, rater: RaterName, key: Annotated[str, Depends(needs_rater)]
-    ) -> ShownRollout | Response:
+    ) -> RolloutView | Response:
         """The rollout that a rater should rate next; 204 when nothing is left."""
         assigned = queue.next(_rater(request, rater, key))
         if assigned is None:
             return Response(status_code=204)
         rollout, rubric = assigned.rollout, rubric_of(assigned.rollout.task, rubrics)
-        return ShownRollout(
+        return RolloutView(
             rollout=rollout.token,
             presentation=assigned.presentation,
             task=rollout.task,
             instruction=rollout.instruction,
             criteria=tuple(
-                ShownCriterion(name=one.name, description=one.description, latched=one.latched)
+                CriterionView(name=one.name, description=one.description, latched=one.latched)
                 for one in rubric.criteria
             ),
             penalty=rubric.penalty,
@@ -171,8 +171,8 @@ def rating_router(
 
     @router.post("/marks", status_code=201)
     def give(
-        request: Request, given: GivenMark, key: Annotated[str, Depends(needs_rater)]
-    ) -> GivenNumber:
+        request: Request, given: SubmittedMark, key: Annotated[str, Depends(needs_rater)]
+    ) -> SubmittedMarkNumber:
         """Add a mark; a second one for the same presentation corrects the first."""
         rollout = queue.rollout(given.rollout)
         fields = given.model_dump(exclude={"rollout", "rater"})
@@ -183,7 +183,7 @@ def rating_router(
             rubric_of(rollout.task, rubrics).score(mark.holds)
         number = marks.add(mark)
         on_mark()
-        return GivenNumber(number=number)
+        return SubmittedMarkNumber(number=number)
 
     return router
 

@@ -16,7 +16,7 @@ from services.evaluation.rollout_runner import RolloutRunner
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure
 from services.evaluation.studies.definition import StudyDefinition
 from services.evaluation.studies.kept_rollouts import keep_rollout
-from services.evaluation.studies.results import Cell, StudyResults, cells_of, study_report
+from services.evaluation.studies.results import PlannedRollout, StudyResults, cells_of, study_report
 from services.evaluation.study_worlds import StudyWorlds
 from services.evaluation.success_probe import SuccessProbe
 
@@ -117,13 +117,13 @@ class _Workers:
         self._lock = threading.Lock()
         self._stopping = threading.Event()
 
-    def run(self, cells: list[Cell]) -> None:
+    def run(self, cells: list[PlannedRollout]) -> None:
         """Run rollouts and keep their outcomes.
 
         Raises:
             UnavailableError: a world stopped answering.
         """
-        by_world: dict[str, list[Cell]] = {}
+        by_world: dict[str, list[PlannedRollout]] = {}
         for cell in cells:
             by_world.setdefault(cell.world, []).append(cell)
         num_failed = 0
@@ -150,7 +150,7 @@ class _Workers:
                 # After an error or Ctrl-C, threads end with their current rollout.
                 self._stopping.set()
 
-    def _outcome(self, cell: Cell) -> Outcome | None:
+    def _outcome(self, cell: PlannedRollout) -> Outcome | None:
         """Outcome of one rollout; None if the study is stopping."""
         if self._stopping.is_set():
             return None

@@ -14,7 +14,7 @@ from dextouch.schemas import (
 )
 from services.evaluation.matched_starts import MatchedStart
 from services.evaluation.rollout_runner import PlayedRollout
-from services.evaluation.studies.results import Cell, StudyHeader, rollout_episode_id
+from services.evaluation.studies.results import PlannedRollout, StudyHeader, rollout_episode_id
 
 _ORIGINS: Final[dict[str, Origin]] = {"twin": "twin", "robot": "recorded"}
 
@@ -22,7 +22,7 @@ _ORIGINS: Final[dict[str, Origin]] = {"twin": "twin", "robot": "recorded"}
 def keep_rollout(
     store: EpisodeStore,
     header: StudyHeader,
-    cell: Cell,
+    cell: PlannedRollout,
     start: MatchedStart,
     played: PlayedRollout,
     world: WorldDescription,

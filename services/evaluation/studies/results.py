@@ -30,7 +30,7 @@ _LOCK_TRIES: Final = 10
 _LOCK_PAUSE_S: Final = 0.05
 
 
-class Cell(NamedTuple):
+class PlannedRollout(NamedTuple):
     """One rollout of a study."""
 
     world: str
@@ -64,7 +64,9 @@ class StudyResults:
         outcomes: of all finished rollouts by cell.
     """
 
-    def __init__(self, path: Path, header: StudyHeader, outcomes: dict[Cell, Outcome]) -> None:
+    def __init__(
+        self, path: Path, header: StudyHeader, outcomes: dict[PlannedRollout, Outcome]
+    ) -> None:
         self.path = path
         self.header = header
         self.outcomes = outcomes
@@ -112,7 +114,7 @@ class StudyResults:
             first, *rows = path.read_bytes().split(b"\n")[:-1]
         except (OSError, ValueError) as error:
             raise StorageError(f"results {path}: no results of a study ({error})") from error
-        outcomes: dict[Cell, Outcome] = {}
+        outcomes: dict[PlannedRollout, Outcome] = {}
         number, line = 1, first
         try:
             header = _HEADER.validate_json(first)
@@ -174,19 +176,21 @@ def _locked(path: Path) -> Iterator[None]:
         yield
 
 
-def cell_of(outcome: Outcome) -> Cell:
+def cell_of(outcome: Outcome) -> PlannedRollout:
     """The cell that an outcome belongs to."""
-    return Cell(outcome.world, outcome.task, outcome.seed, outcome.policy, outcome.repeat)
+    return PlannedRollout(outcome.world, outcome.task, outcome.seed, outcome.policy, outcome.repeat)
 
 
-def cells_of(definition: StudyDefinition) -> Iterator[Cell]:
+def cells_of(definition: StudyDefinition) -> Iterator[PlannedRollout]:
     """All rollouts of a study, in the order of its report."""
     for world in (REAL, *definition.imagined):
         repeats = 1 if world == REAL else definition.repeats
         for task in definition.tasks:
             for seed in definition.seeds:
                 for policy in definition.policies:
-                    yield from (Cell(world, task, seed, policy, n) for n in range(repeats))
+                    yield from (
+                        PlannedRollout(world, task, seed, policy, n) for n in range(repeats)
+                    )
 
 
 def study_report(definition: StudyDefinition, results: StudyResults) -> ClosedLoopReport:
@@ -203,14 +207,14 @@ def study_report(definition: StudyDefinition, results: StudyResults) -> ClosedLo
     )
 
 
-def _not_run(cell: Cell) -> RolloutFailure:
+def _not_run(cell: PlannedRollout) -> RolloutFailure:
     message = "no result yet; `dextouch study run` continues the study"
     return RolloutFailure(
         cell.world, cell.policy, cell.task, cell.seed, "NotRunYet", message, repeat=cell.repeat
     )
 
 
-def rollout_episode_id(header: StudyHeader, cell: Cell) -> str:
+def rollout_episode_id(header: StudyHeader, cell: PlannedRollout) -> str:
     """Id of the episode of one rollout, derived from the study's digests and the cell."""
     digest = hashlib.sha256(repr((sorted(header.digests.items()), tuple(cell))).encode())
     label = f"{cell.world}-{cell.policy}-{cell.task}-{cell.seed}"

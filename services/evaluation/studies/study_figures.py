@@ -12,7 +12,7 @@ from services.evaluation.comments import UNDEFINED, VAGUE_R, undefined_by
 from services.evaluation.scores import REAL, ClosedLoopReport, RolloutFailure, RolloutScore
 from services.evaluation.studies.definition import StudyDefinition
 from services.evaluation.studies.results import (
-    Cell,
+    PlannedRollout,
     StudyResults,
     cells_of,
     rollout_episode_id,
@@ -156,7 +156,7 @@ def _unlike(rollout: StudyRollout) -> tuple[bool, bool, float]:
 
 
 def _rollout(
-    cell: Cell,
+    cell: PlannedRollout,
     outcome: RolloutScore | RolloutFailure,
     real: dict[tuple[str, int, str], bool],
     results: StudyResults,

@@ -28,7 +28,7 @@ from services.alignment.retargeting.wrist_frame import (
 )
 from services.alignment.station_calibration.record import (
     MATRICES_FILE,
-    TakenStream,
+    TakeStream,
     read_matrices,
     read_stream,
     write_entry,
@@ -88,7 +88,7 @@ def measure_person(options: argparse.Namespace) -> dict[str, object]:
     return facts
 
 
-def _keypoints(options: argparse.Namespace) -> TakenStream:
+def _keypoints(options: argparse.Namespace) -> TakeStream:
     taken = read_stream(options.take, f"keypoints_{options.side}", options.store)
     if not len(taken.batch):
         raise InvalidInputError(f"take {options.take!r}: keypoints_{options.side} has no sample")
@@ -144,7 +144,7 @@ def measure_latency(options: argparse.Namespace) -> dict[str, object]:
     return facts
 
 
-def _from_motion(a: TakenStream, b: TakenStream) -> TimeOffset:
+def _from_motion(a: TakeStream, b: TakeStream) -> TimeOffset:
     (t_a_ns, a_rad_s), (t_b_ns, b_rad_s) = _angular_velocity(a), _angular_velocity(b)
     try:
         return estimate_time_offset(t_a_ns, a_rad_s, t_b_ns, b_rad_s)
@@ -154,7 +154,7 @@ def _from_motion(a: TakenStream, b: TakenStream) -> TimeOffset:
         return estimate_time_offset(t_a_ns, speeds[0], t_b_ns, speeds[1])
 
 
-def _from_taps(glove: TakenStream, tracker: TakenStream) -> TimeOffset:
+def _from_taps(glove: TakeStream, tracker: TakeStream) -> TimeOffset:
     stream = glove.descriptor
     t_ns, readings = glove.timed()
     if stream.side is None:
@@ -172,7 +172,7 @@ def _from_taps(glove: TakenStream, tracker: TakenStream) -> TimeOffset:
 
 
 def _angular_velocity(
-    stream: TakenStream,
+    stream: TakeStream,
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
     """Angular velocity in the world (rad/s), which is the same for all parts of a rigid body."""
     t_ns, poses = _poses(stream)
@@ -182,7 +182,7 @@ def _angular_velocity(
     return t_ns[:-1] + steps_ns // 2, turns_rad / (steps_ns[:, None] * 1e-9)
 
 
-def _poses(stream: TakenStream) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"]]:
+def _poses(stream: TakeStream) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"]]:
     """Times and poses of valid tracking."""
     t_ns, values = stream.timed()
     poses = values.astype(np.float64)

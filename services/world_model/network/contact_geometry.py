@@ -25,7 +25,7 @@ _PER_M = 10.0
 
 
 @dataclass(frozen=True)
-class SeenObjects:
+class ObjectsAtStart:
     """Objects at the first step of a window.
 
     `poses` are x y z (m), qw qx qy qz in the world; `boxes_m` the middle and the half sizes of each
@@ -45,7 +45,7 @@ class SeenObjects:
 
 
 def contact_geometry(
-    actions: Float64[np.ndarray, "time 67"], anchor: AnchorPoses, objects: SeenObjects | None
+    actions: Float64[np.ndarray, "time 67"], anchor: AnchorPoses, objects: ObjectsAtStart | None
 ) -> Float32[np.ndarray, "time 2 size"]:
     """Features [time, hand, `GEOMETRY_SIZE`] of every step; zero in slots without an object."""
     points_m = torch.from_numpy(hand_motion(actions, anchor).points_m)[:, None]

@@ -27,7 +27,7 @@ from dextouch.hands.actions import (
 from dextouch.schemas import ActionKind
 from dextouch.tactile.layout import NUM_TAXELS
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
-from services.world_model.network.contact_geometry import SeenObjects, contact_geometry
+from services.world_model.network.contact_geometry import ObjectsAtStart, contact_geometry
 from services.world_model.network.instruction import instruction_ids
 from services.world_model.network.mirroring import (
     MIRROR_CAMERA,
@@ -63,7 +63,7 @@ class PredictionRequest:
     instruction: str
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"]
-    objects: SeenObjects | None = None
+    objects: ObjectsAtStart | None = None
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ class Context:
     clean: CleanTokens | None = None
 
 
-class Begun(NamedTuple):
+class PreparedContext(NamedTuple):
     """Both streams before the first layer, with their conditions."""
 
     video: Stream
@@ -235,15 +235,15 @@ class JointWorldModel(nn.Module):
     def _joint_layers(self) -> list[JointLayer]:
         return [layer for layer in self.layers if isinstance(layer, JointLayer)]
 
-    def _begin(self, context: Context, noisy: JointLatents, t: Tensor) -> Begun:
+    def _begin(self, context: Context, noisy: JointLatents, t: Tensor) -> PreparedContext:
         noisy = self.with_clean_first(noisy, context.first)
         of_video: Any = self.video_condition.at(context.video, _time_of_each(t, noisy.video))
         video = self.video.start(noisy.video, context.first.video, of_video, context.raster)
         if self.tactile is None or self.tactile_condition is None or context.tactile is None:
-            return Begun(video, None, of_video, None)
+            return PreparedContext(video, None, of_video, None)
         of_tactile = self.tactile_condition.at(context.tactile, _time_of_each(t, noisy.tactile))
         tactile = self.tactile.start(noisy.tactile, context.first.tactile, of_tactile)
-        return Begun(video, tactile, of_video, of_tactile)
+        return PreparedContext(video, tactile, of_video, of_tactile)
 
     def with_clean_first(self, noisy: JointLatents, first: FirstLatents) -> JointLatents:
         """Latents whose first ones are clean: zero for residuals, `first` for plain ones."""

@@ -124,7 +124,7 @@ def _joined_fields(parts: Sequence[Any]) -> list[Any]:
 
 
 @dataclass(frozen=True)
-class _SeenObjects:
+class _ObjectPixels:
     """Object pixels, the start of each image, and the matching start image positions."""
 
     hits: BoxHits
@@ -159,7 +159,7 @@ def drawing_inputs_from(
     positions = motion.image_positions(shape_px)
     warped, marks, outside = _warped(start, owner, positions, config)
     at_start = positions_at_start(hits, before.Ts_camera_box[owner], boxes_m[..., 3:], K)
-    seen = _SeenObjects(hits, owner, at_start)
+    seen = _ObjectPixels(hits, owner, at_start)
     objects = _objects(seen, start)
     fine = [warped, objects[:, :3], hands.colour, hands.coverage, objects[:, 3:], marks, outside]
     change = np.tile(_camera_change(positions), (1, 1, *shape_px)).astype(np.float32)
@@ -217,7 +217,7 @@ def _warped(
     return planes[:, :3], planes[:, 3:], outside[:, None].astype(np.float32)
 
 
-def _objects(seen: _SeenObjects, start: _Start) -> Float32[np.ndarray, "n 4 h w"]:
+def _objects(seen: _ObjectPixels, start: _Start) -> Float32[np.ndarray, "n 4 h w"]:
     """Objects in the start image's colours, and their mask."""
     hits = seen.hits
     texture = colours_at_positions(start.rgb, seen.owner[hits.image], seen.at_start)
@@ -226,7 +226,7 @@ def _objects(seen: _SeenObjects, start: _Start) -> Float32[np.ndarray, "n 4 h w"
 
 
 def _coarse(
-    seen: _SeenObjects,
+    seen: _ObjectPixels,
     start: _Start,
     states: SceneStates,
     boxes_m: np.ndarray,

@@ -18,12 +18,12 @@ from torch import Tensor
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, Domain
-from services.world_model.network.contact_geometry import SeenObjects
+from services.world_model.network.contact_geometry import ObjectsAtStart
 from services.world_model.network.inputs import PredictionRequest
 
 
 @dataclass(frozen=True)
-class Place:
+class WindowPosition:
     """Position of a window: steps start … start + num_steps − 1 of an episode.
 
     `from_command` anchors commanded actions at the first step's *commanded* pose.
@@ -83,7 +83,7 @@ class TrainingEpisode(Protocol):
         """Number of steps."""
         ...
 
-    def cut(self, place: Place) -> "Window":
+    def cut(self, place: WindowPosition) -> "Window":
         """Cut the window at a place in this episode."""
         ...
 
@@ -114,11 +114,11 @@ class EpisodeArrays:
     def __len__(self) -> int:
         return len(self.tactile_kpa)
 
-    def objects_at(self, step: int) -> SeenObjects | None:
+    def objects_at(self, step: int) -> ObjectsAtStart | None:
         """Objects at a step, if their poses and boxes are known."""
         if self.object_poses is None or self.boxes_m is None:
             return None
-        return SeenObjects(self.object_poses[step].astype(np.float64), self.boxes_m)
+        return ObjectsAtStart(self.object_poses[step].astype(np.float64), self.boxes_m)
 
     @property
     def action_kinds(self) -> tuple[ActionKind, ...]:
@@ -129,7 +129,7 @@ class EpisodeArrays:
         """`fingerprint` of its arrays."""
         return fingerprint(self)
 
-    def cut(self, place: Place) -> "Window":
+    def cut(self, place: WindowPosition) -> "Window":
         """Cut the window at a place in this episode."""
         return cut_window(
             self,
@@ -279,11 +279,11 @@ class WindowSampler:
         """A batch of random windows."""
         return self.cut(self.places(batch, num_steps))
 
-    def places(self, batch: int, num_steps: int) -> list[Place]:
+    def places(self, batch: int, num_steps: int) -> list[WindowPosition]:
         """Places of the windows of the next batch."""
         return [self._place(num_steps) for _ in range(batch)]
 
-    def cut(self, places: Sequence[Place]) -> WindowBatch:
+    def cut(self, places: Sequence[WindowPosition]) -> WindowBatch:
         """The windows at these places."""
         return stack_windows([self._episodes[p.episode_index].cut(p) for p in places])
 
@@ -294,12 +294,14 @@ class WindowSampler:
         chosen = self._human if is_human else self._robot
         return chosen[int(self._rng.integers(len(chosen)))]
 
-    def _place(self, num_steps: int) -> Place:
+    def _place(self, num_steps: int) -> WindowPosition:
         index = self._episode_index()
         episode = self._episodes[index]
         start = int(self._rng.integers(len(episode) - num_steps + 1))
         is_commanded = self._rng.random() < self._commanded_fraction
         is_chained = bool(self._rng.random() < self._chained_fraction)
         if not is_commanded or "commanded" not in episode.action_kinds:
-            return Place(index, start, num_steps)
-        return Place(index, start, num_steps, action_kind="commanded", from_command=is_chained)
+            return WindowPosition(index, start, num_steps)
+        return WindowPosition(
+            index, start, num_steps, action_kind="commanded", from_command=is_chained
+        )

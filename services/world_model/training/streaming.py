@@ -17,14 +17,14 @@ from torch.utils.data import DataLoader, Dataset
 from dextouch.episodes import EpisodeGrid, EpisodeReader, EpisodeStore, Split, select_episodes
 from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, Domain
-from services.world_model.network.contact_geometry import SeenObjects
+from services.world_model.network.contact_geometry import ObjectsAtStart
 from services.world_model.network.inputs import PredictionRequest
 from services.world_model.training.dataset import (
     EpisodeArrays,
-    Place,
     TrainingEpisode,
     Window,
     WindowBatch,
+    WindowPosition,
     stack_windows,
 )
 from services.world_model.training.episodes import (
@@ -69,7 +69,7 @@ class StoredEpisode:
         """Load the whole episode."""
         return read_episode(_reader(self.url, self.episode_id), image_px=self.image_px)
 
-    def cut(self, place: Place) -> Window:
+    def cut(self, place: WindowPosition) -> Window:
         """Read the window at a place in this episode.
 
         Raises:
@@ -87,7 +87,9 @@ class StoredEpisode:
             actions = reanchor(actions, 0)
         images = grid.images(range(place.start, place.start + place.num_steps))
         known = grid.boxed_objects(read.t_ref_ns[:1])
-        objects = None if known is None else SeenObjects(known[0][0].astype(np.float64), known[1])
+        objects = (
+            None if known is None else ObjectsAtStart(known[0][0].astype(np.float64), known[1])
+        )
         request = PredictionRequest(
             first_image=images[0],
             first_tactile_kpa=read.tactile_kpa[0],
@@ -139,13 +141,13 @@ class _Windows(Dataset[Window]):
     def __init__(self, episodes: Sequence[TrainingEpisode]) -> None:
         self._episodes = list(episodes)
 
-    def __getitem__(self, place: Place) -> Window:
+    def __getitem__(self, place: WindowPosition) -> Window:
         return self._episodes[place.episode_index].cut(place)
 
 
 def read_batches(
     episodes: Sequence[TrainingEpisode],
-    places: Iterable[list[Place]],
+    places: Iterable[list[WindowPosition]],
     *,
     num_workers: int = 0,
     start_method: StartMethod | None = None,

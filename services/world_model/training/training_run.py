@@ -30,9 +30,9 @@ from services.world_model.network.tactile_tokenizer import TactileTokenizer
 from services.world_model.pretrained_video import initial_model, share_texts
 from services.world_model.settings import TrainSettings
 from services.world_model.training.dataset import (
-    Place,
     TrainingEpisode,
     WindowBatch,
+    WindowPosition,
     WindowSampler,
 )
 from services.world_model.training.distribution import (
@@ -278,13 +278,13 @@ class TrainingRun:
             return read_batches(self.episodes, self._noted_places(), num_workers=workers)
         return map(self._sampler.cut, self._noted_places())
 
-    def _noted_places(self) -> Iterator[list[Place]]:
+    def _noted_places(self) -> Iterator[list[WindowPosition]]:
         """`places`, recording the generator state after each, since readers fetch ahead."""
         for places in self.places():
             self._drawn.append(json.dumps(self._rng.bit_generator.state))
             yield self.processes.part(places)
 
-    def places(self) -> Iterator[list[Place]]:
+    def places(self) -> Iterator[list[WindowPosition]]:
         """Endless iterator over the places of the windows of each step."""
         while True:
             num_steps = self._window_steps(self._num_steps())

@@ -28,8 +28,8 @@ from .deletions import ConfirmRemoval as ConfirmRemoval
 from .deletions import Deletions as Deletions
 from .deletions import DeletionsRevision as DeletionsRevision
 from .deletions import DeletionStatus as DeletionStatus
-from .deletions import FoundDeletion as FoundDeletion
 from .deletions import OutstandingTakes as OutstandingTakes
+from .deletions import PendingDeletion as PendingDeletion
 from .deletions import SpooledTake as SpooledTake
 from .enrolment import KEY_NAME_PATTERN as KEY_NAME_PATTERN
 from .enrolment import EnrolmentToken as EnrolmentToken

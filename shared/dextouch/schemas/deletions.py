@@ -37,7 +37,7 @@ class CheckTakes(FrozenModel):
     operators: Annotated[tuple[str, ...], Field(max_length=MAX_OPERATORS)] = ()
 
 
-class FoundDeletion(FrozenModel):
+class PendingDeletion(FrozenModel):
     """A take that has to be removed, and the deletion that says so."""
 
     recording_id: str
@@ -48,7 +48,7 @@ class CheckedTakes(FrozenModel):
     """Takes to remove and operators to forget; `revision` is that of the deletions."""
 
     revision: str
-    takes: tuple[FoundDeletion, ...] = ()
+    takes: tuple[PendingDeletion, ...] = ()
     operators: tuple[str, ...] = ()
 
 
@@ -63,7 +63,7 @@ class ConfirmRemoval(FrozenModel):
 
     station: StationName
     revision: str
-    held: Annotated[tuple[FoundDeletion, ...], Field(max_length=MAX_CHECKED_TAKES)] = ()
+    held: Annotated[tuple[PendingDeletion, ...], Field(max_length=MAX_CHECKED_TAKES)] = ()
 
 
 class OutstandingTakes(FrozenModel):

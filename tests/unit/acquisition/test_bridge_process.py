@@ -17,7 +17,7 @@ from services.acquisition.devices import build_drivers
 from services.acquisition.mock_bridge import BridgeServer, pattern_source
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.replay import MockPlace
+from services.acquisition.mocks.replay import MockSlot
 from services.acquisition.mocks.sdk_link import bridged_pair
 from services.acquisition.settings import AcquisitionSettings
 
@@ -78,7 +78,7 @@ def test_a_bridge_without_samples_still_lives(kind, monkeypatch):
     # Longer than the real limit of 200 ms, so that a busy machine is not taken for a dead bridge.
     monkeypatch.setattr("services.acquisition.drivers.sdk_link.SILENCE_NS", 10**9)
     source, clock = pattern_source(kind, DEVICES[kind][0], seed=0), StationClock()
-    place = MockPlace("bridge", pattern_streams()[0], DeviceFaults(), 0, clock)
+    place = MockSlot("bridge", pattern_streams()[0], DeviceFaults(), 0, clock)
     pair = bridged_pair(place, source, driver_of(kind, 1).decoder)
     pair.device.port.plug()
     pair.driver.open()

@@ -15,7 +15,7 @@ from dextouch.errors import (
 )
 from dextouch.schemas import (
     CheckedTakes,
-    FoundDeletion,
+    PendingDeletion,
     RecorderSession,
     RecordingAttributes,
     SavedTakes,
@@ -56,7 +56,7 @@ class Store(EpisodeStoreClient):
     def check_takes(self, spooled):
         self.checked.append(spooled)
         found = tuple(
-            FoundDeletion(recording_id=one.recording_id, deletion="d")
+            PendingDeletion(recording_id=one.recording_id, deletion="d")
             for one in spooled.takes
             if one.operator == "gone"
         )

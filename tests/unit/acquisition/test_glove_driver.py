@@ -20,7 +20,7 @@ from services.acquisition.devices.wuji_glove.mock import mock_wuji_glove
 from services.acquisition.drivers.packets import Packet
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.ports import PtyPort
-from services.acquisition.mocks.replay import MockPlace, ReplayStream
+from services.acquisition.mocks.replay import MockSlot, ReplayStream
 
 
 def pressures(count=20):
@@ -38,7 +38,7 @@ def pressures(count=20):
 
 def make(side="left", **options):
     return mock_glove(
-        MockPlace(f"glove_{side}", pressures(), DeviceFaults(), 1, StationClock()),
+        MockSlot(f"glove_{side}", pressures(), DeviceFaults(), 1, StationClock()),
         calibration=GloveCalibration.seeded(side, 1),
         **options,
     )
@@ -194,7 +194,7 @@ def test_commands_with_bit_errors_are_asked_again(glove, monkeypatch):
 
 @pytest.mark.parametrize("make_glove", [mock_wuji_glove, mock_justfloat_glove])
 def test_vendor_gloves_speak_over_a_terminal(make_glove):
-    pair = make_glove(MockPlace("glove_left", pressures(), DeviceFaults(), 1, StationClock()))
+    pair = make_glove(MockSlot("glove_left", pressures(), DeviceFaults(), 1, StationClock()))
     pair.device.port.plug()
     pair.driver.open()
     for index in range(6):

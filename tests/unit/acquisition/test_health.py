@@ -10,10 +10,10 @@ from services.acquisition.devices.camera.driver import camera_descriptor
 from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
 from services.acquisition.devices.tactile_glove.driver import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.health import CODES, DiskJudge, HealthCollector, HealthMonitor
+from services.acquisition.health import CODES, DiskCheck, HealthCollector, HealthMonitor
 from services.acquisition.health.codes import table
 from services.acquisition.health.evaluation import Board, Finding, Hysteresis
-from services.acquisition.health.station import CalibrationJudge
+from services.acquisition.health.station import CalibrationCheck
 from services.acquisition.mocks.ports import HidPort, PtyPort
 from services.acquisition.station import LiveView
 from services.acquisition.supervisor import DeviceSupervisor
@@ -308,7 +308,7 @@ def test_calibration_that_is_missing_or_old_is_told():
     day_s = 86_400.0
 
     def found(calibration):
-        judge = CalibrationJudge(descriptors, calibration, unix_s=lambda: 10 * day_s)
+        judge = CalibrationCheck(descriptors, calibration, unix_s=lambda: 10 * day_s)
         return [(f.code, f.level) for f in judged(judge, NOTHING, 0).findings]
 
     K_head = ((1.0, 0.0, 0.0),) * 3
@@ -327,7 +327,7 @@ def test_a_station_starts_with_half_a_calibration_of_a_glove(known):
     driver = Driver("g", transport=PtyPort("a").transport, decoder=decoder, clock=VirtualClock(1))
     live = LiveView([driver], calibration)
     assert live._gloves == {}
-    (finding,) = judged(CalibrationJudge(driver.descriptors, calibration), NOTHING, 0).findings
+    (finding,) = judged(CalibrationCheck(driver.descriptors, calibration), NOTHING, 0).findings
     assert finding.code == "calibration_missing"
     assert all(f"tactile_left_{name}" not in finding.message for name in known)
 
@@ -335,7 +335,7 @@ def test_a_station_starts_with_half_a_calibration_of_a_glove(known):
 @pytest.mark.parametrize(("minutes", "level"), [(40, None), (20, "WARN"), (4, "ERROR")])
 def test_the_disk_is_judged_by_the_time_it_lasts(bench, tmp_path, minutes, level):
     rate = 60 * 720 + 100 * 56
-    disk = DiskJudge(
+    disk = DiskCheck(
         tmp_path,
         bench.supervisors,
         bench.clock.now_ns(),

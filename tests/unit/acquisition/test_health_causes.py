@@ -8,7 +8,7 @@ from dextouch.schemas import DeviceHealth, RaisedFinding, SharedLink, StreamHeal
 from services.acquisition.health.causes import SIMULATED_ADVICE, find_causes
 from services.acquisition.health.codes import CAUSES, CODES, cause_table
 from services.acquisition.health.evaluation import Evaluation
-from services.acquisition.health.host import HostJudge
+from services.acquisition.health.host import HostCheck
 from services.acquisition.transports.ports import TransportInfo
 from services.acquisition.transports.shared_links import shared_link
 
@@ -180,7 +180,7 @@ def test_the_docs_hold_the_table_of_causes():
 
 
 def wakes(late_ms):
-    judge = HostJudge(lambda: (15.2, 2))
+    judge = HostCheck(lambda: (15.2, 2))
     for index, late in enumerate(late_ms):
         judge.note(index * 10**8, round(late * 1e6))
     evaluation = Evaluation(len(late_ms) * 10**8)

@@ -7,7 +7,7 @@ from dextouch.errors import InvalidInputError
 from services.acquisition.devices.justfloat_glove.driver import JustFloatGloveDecoder
 from services.acquisition.devices.wuji_glove.driver import WujiGloveDecoder
 from services.acquisition.drivers.base import CellLayout
-from services.acquisition.health.cells import CellJudge, cell_judge
+from services.acquisition.health.cells import CellCheck, cell_judge
 from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes, judged
 
 
@@ -36,14 +36,14 @@ class GridSheet(Sheet):
     absent = np.nan
 
     def __init__(self, used=None):
-        super().__init__(CellJudge(CellLayout(1.0, (24, 32)), used), 768)
+        super().__init__(CellCheck(CellLayout(1.0, (24, 32)), used), 768)
 
 
 class BareSheet(Sheet):
     absent = 0.0
 
     def __init__(self, used=None):
-        super().__init__(CellJudge(CellLayout(4095.0, None), used), 401, full_scale=4095.0)
+        super().__init__(CellCheck(CellLayout(4095.0, None), used), 401, full_scale=4095.0)
 
 
 @pytest.mark.parametrize("kind", [GridSheet, BareSheet])

@@ -7,7 +7,7 @@ import pytest
 
 from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.tactile_glove.driver import glove_descriptor
-from services.acquisition.health.clock import ClockJudge, CountingJudge
+from services.acquisition.health.clock import ClockCheck, CountingCheck
 from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes, judged
 
 
@@ -21,7 +21,7 @@ def stamped(second, *, skew_ppm=0.0, step_ns=0, rng=None, delay_ms=0.0):
 
 @pytest.mark.parametrize(("skew_ppm", "level"), [(50, None), (-400, "WARN"), (3000, "ERROR")])
 def test_skew_is_found_within_two_seconds_and_later(skew_ppm, level, rng):
-    judge = ClockJudge(glove_descriptor("left"))
+    judge = ClockCheck(glove_descriptor("left"))
     for second in range(15):
         arrived = stamped(second, skew_ppm=skew_ppm, rng=rng, delay_ms=0.5)
         verdict = judged(judge, arrived, (second + 1) * SECOND_NS)
@@ -31,7 +31,7 @@ def test_skew_is_found_within_two_seconds_and_later(skew_ppm, level, rng):
 
 
 def test_steps_are_counted_once_and_three_in_an_hour_are_an_error():
-    judge = ClockJudge(glove_descriptor("left"))
+    judge = ClockCheck(glove_descriptor("left"))
     levels = []
     steps_ns = [0] * 4 + [-30_000_000] * 4 + [50_000_000] * 4 + [0] * 4
     for second, step_ns in enumerate(steps_ns):
@@ -57,7 +57,7 @@ def late_ms(load, t_s):
 def test_late_arrivals_of_a_busy_host_are_no_finding_of_the_devices_clock(load, has_sequence, rng):
     descriptor = glove_descriptor("left")
     capabilities = descriptor.capabilities.model_copy(update={"sequence": has_sequence})
-    judge = ClockJudge(descriptor.model_copy(update={"capabilities": capabilities}))
+    judge = ClockCheck(descriptor.model_copy(update={"capabilities": capabilities}))
     raised = set()
     for second in range(15):
         arrived = stamped(second, skew_ppm=50.0, rng=rng, delay_ms=0.5)
@@ -75,7 +75,7 @@ def test_a_clock_that_wraps_is_no_step():
         update={"sequence_bits": 16, "device_time_bits": 32, "tick_ns": 1000}
     )
     descriptor = glove_descriptor("left").model_copy(update={"capabilities": capabilities})
-    judge = ClockJudge(descriptor)
+    judge = ClockCheck(descriptor)
     modulus_ns = 2**32 * 1000
     for second in range(6):
         arrived = stamped(second)
@@ -106,7 +106,7 @@ def bare(numbers, rng, *, delay_ms, skew_ppm=0.0):
     ("delay_ms", "level"), [(0.5, None), (2.0, "WARN"), (5.0, "ERROR")], ids=["0.5", "2", "5"]
 )
 def test_a_stream_without_stamps_is_judged_by_its_count(delay_ms, level, rng):
-    judge = CountingJudge(bare_descriptor())
+    judge = CountingCheck(bare_descriptor())
     for second in range(15):
         numbers = second * 60 + np.arange(60)
         kept = numbers[rng.random(60) > 0.005]
@@ -123,13 +123,13 @@ def test_a_stream_without_stamps_is_judged_by_its_count(delay_ms, level, rng):
 
 
 def test_a_restart_of_a_stream_without_stamps_is_counted_and_no_clock_is_guessed(rng):
-    judge = CountingJudge(bare_descriptor())
+    judge = CountingCheck(bare_descriptor())
     for second in range(20):
         # It pauses for half a second and goes on between two of its former moments.
         numbers = second * 60 + np.arange(60) + (30.5 if second >= 10 else 0.0)
         verdict = judged(judge, bare(numbers, rng, delay_ms=0.3), (second + 1) * SECOND_NS)
     assert verdict.figures["clock_resets"] == 1
-    unsteady = CountingJudge(bare_descriptor())
+    unsteady = CountingCheck(bare_descriptor())
     for second in range(5):
         arrived = block(second + np.sort(rng.random(40)))
         assert judged(unsteady, arrived, (second + 1) * SECOND_NS).figures == {}

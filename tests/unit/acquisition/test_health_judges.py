@@ -10,10 +10,10 @@ from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder,
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.image_quality import ImageQuality
 from services.acquisition.glove_record import GloveRecord
-from services.acquisition.health.cells import TaxelJudge, count_taxels
+from services.acquisition.health.cells import TaxelCheck, count_taxels
 from services.acquisition.health.neighbours import neighbour_share
 from services.acquisition.health.queues import SampleQueue
-from services.acquisition.health.streams import CameraJudge, FiniteJudge, PoseJudge, TrackingJudge
+from services.acquisition.health.streams import CameraCheck, FiniteCheck, PoseCheck, TrackingCheck
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.supervisor import StreamCounters
 from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes, judged
@@ -27,7 +27,7 @@ class Hand:
     def __init__(self, *, drift_counts=0.0, pressed=True, tare=TARE):
         full = np.full(360, 1.0)
         cells = raw_indices(side="left")
-        self.judge = TaxelJudge(GloveRecord(full * tare, full * GAIN, full * 0.0, cells))
+        self.judge = TaxelCheck(GloveRecord(full * tare, full * GAIN, full * 0.0, cells))
         self.drift_counts, self.pressed = drift_counts, pressed
         self.tare = tare
         self.second = 0
@@ -161,7 +161,7 @@ def test_encoded_images_count_their_bytes():
 
 
 def test_jumps_are_seen_by_the_devices_clock():
-    judge = PoseJudge(pose_descriptor("head"))
+    judge = PoseCheck(pose_descriptor("head"))
     t_s = np.arange(100) / 100
     poses = np.zeros((100, 7))
     poses[:, 0] = 0.3 * t_s
@@ -173,7 +173,7 @@ def test_jumps_are_seen_by_the_devices_clock():
 
 @pytest.mark.parametrize(("tremble_m", "level"), [(2e-4, None), (2e-3, "WARN"), (8e-3, "ERROR")])
 def test_trembling_is_judged_at_rest_only(rng, tremble_m, level):
-    judge = PoseJudge(pose_descriptor("head"))
+    judge = PoseCheck(pose_descriptor("head"))
     t_s = np.arange(100) / 100
     poses = np.zeros((100, 7))
     poses[:, :3] = tremble_m / np.sqrt(3) * rng.standard_normal((100, 3))
@@ -182,7 +182,7 @@ def test_trembling_is_judged_at_rest_only(rng, tremble_m, level):
     assert codes(verdict).get("pose_jitter") == level
     assert verdict.figures["stationary_jitter_meters"] == pytest.approx(tremble_m, rel=0.15)
     poses[:, 0] += t_s
-    moving = judged(PoseJudge(pose_descriptor("head")), block(t_s, poses), SECOND_NS)
+    moving = judged(PoseCheck(pose_descriptor("head")), block(t_s, poses), SECOND_NS)
     assert "stationary_jitter_meters" not in moving.figures
 
 
@@ -202,7 +202,7 @@ def driver_of(decoder, kind=Driver):
 )
 def test_what_a_trackers_decoder_leaves_out_is_judged(kind, count, expected):
     decoder = PoseTrackerDecoder("head")
-    judge = TrackingJudge(driver_of(decoder).events)
+    judge = TrackingCheck(driver_of(decoder).events)
     decoder.statistics.packets += 1000
     for _ in range(count):
         decoder.tracking[kind] += 1
@@ -210,7 +210,7 @@ def test_what_a_trackers_decoder_leaves_out_is_judged(kind, count, expected):
 
 
 def test_values_that_are_no_numbers_are_counted_where_numbers_were():
-    judge = FiniteJudge("tracking", "nodes are not seen")
+    judge = FiniteCheck("tracking", "nodes are not seen")
     values = np.zeros((100, 25, 3), dtype=np.float32)
     values[:, 24] = np.nan
     assert judged(judge, block(np.arange(100) / 100, values), SECOND_NS).findings == []
@@ -235,7 +235,7 @@ class CheckedDriver(Driver):
 )
 def test_bad_images_warn_and_are_an_error_after_a_second(change, code):
     driver = driver_of(PoseTrackerDecoder("head"), CheckedDriver)
-    judge = CameraJudge(driver)
+    judge = CameraCheck(driver)
     assert judged(judge, block([]), 0).findings == []
     driver.quality = ImageQuality(**change)
     seen = [codes(judged(judge, block([]), t * SECOND_NS)) for t in (1, 2)]

@@ -14,7 +14,7 @@ from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices.tactile_glove.driver import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health import HealthCollector, HealthMonitor
-from services.acquisition.health.station import PathJudge
+from services.acquisition.health.station import PathCheck
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.path_latency import MAX_BACK_OFF, PathWatch, add_latencies
 from services.acquisition.recorder import Recorder, TakeOptions
@@ -219,7 +219,7 @@ def test_a_calibration_that_the_answers_contradict_is_a_finding(off_ns, is_found
     for _ in range(15):
         glove.live_a_second()
     calibrated = {NAME: ((float(glove.latency_ns + off_ns),),), SIGMA_NAME: ((2e5,),)}
-    judge = PathJudge("tactile_left", glove.watch, calibrated)
+    judge = PathCheck("tactile_left", glove.watch, calibrated)
     verdict = judged(judge, block([]), 0)
     found = [(finding.code, finding.level) for finding in verdict.findings]
     assert found == ([("latency_calibration", "WARN")] if is_found else [])

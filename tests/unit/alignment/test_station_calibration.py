@@ -11,7 +11,7 @@ from dextouch.clients import Reply
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnknownNameError
 from services.alignment.station_calibration.overview import overview
 from services.alignment.station_calibration.record import write_entry
-from services.alignment.station_calibration.runs import CalibrationRuns, StationPlace
+from services.alignment.station_calibration.runs import CalibrationRuns, StationLocation
 from services.alignment.station_calibration.schemas import RunRequest
 
 GLOVE = RunRequest(kind="glove", subject="left")
@@ -41,7 +41,7 @@ class FakeLink:
 
 
 @dataclass(frozen=True)
-class FakePlace(StationPlace):
+class FakePlace(StationLocation):
     simulated: bool = False
     links: list = field(default_factory=list)
 
@@ -112,7 +112,7 @@ def test_what_cannot_be_calibrated_is_refused_at_once(runs, request_, error, why
 
 
 def test_without_a_station_nothing_is_begun_and_the_rest_is_shown(facts):
-    place = StationPlace(url=None, **facts)
+    place = StationLocation(url=None, **facts)
     with pytest.raises(InvalidInputError, match="DEXTOUCH_ALIGNMENT_STATION_URL"):
         CalibrationRuns(place).start(GLOVE)
     seen = overview(place)

@@ -23,7 +23,7 @@ from services.evaluation.studies.definition import StudyDefinition, read_definit
 from services.evaluation.studies.engine import StudyParts, run_study
 from services.evaluation.studies.policies import PolicyFactory
 from services.evaluation.studies.results import (
-    Cell,
+    PlannedRollout,
     StudyHeader,
     StudyResults,
     cells_of,
@@ -66,7 +66,7 @@ def test_a_study_counts_its_rollouts(tmp_path):
     study = definition_of(STUDY, tmp_path, repeats=2)
     # 2 tasks x 3 starts x 2 policies: once in the real world, twice in the other.
     assert study.num_rollouts == 12 * 3 == len(set(cells_of(study)))
-    assert next(cells_of(study)) == Cell("real", "reach", 2000, "hold", 0)
+    assert next(cells_of(study)) == PlannedRollout("real", "reach", 2000, "hold", 0)
     assert study.digest != definition_of(STUDY, tmp_path).digest
     assert study.digest == study.model_copy(update={"name": "another"}).digest
     again = StudyDefinition.model_validate_json(study.model_dump_json())
@@ -310,7 +310,9 @@ def test_milestones_of_a_rollout_are_unknown_not_missed(tmp_path, study, parts):
     store = EpisodeStore(tmp_path / "rollouts")
     results = StudyResults.create_or_resume(tmp_path, header_of(study))
     run_study(study, results, replace(parts, store=store))
-    failed = store.open(rollout_episode_id(results.header, Cell("real", "reach", 2000, "hold", 0)))
+    failed = store.open(
+        rollout_episode_id(results.header, PlannedRollout("real", "reach", 2000, "hold", 0))
+    )
     assert failed.attributes.success is False
     assert read_ending_episode(failed).event_times_s is None
     rubric = Rubric.model_validate(
@@ -357,7 +359,7 @@ def test_kept_rollouts_hold_what_the_worlds_returned(tmp_path, url, study, parts
     results = StudyResults.create_or_resume(tmp_path, header_of(study))
     report = run_study(study, results, replace(parts, store=store))
     assert len(store.list()) == len(report.scores)
-    cell = Cell("dream", "reach", 2000, "script", 0)
+    cell = PlannedRollout("dream", "reach", 2000, "script", 0)
     episode = store.open(rollout_episode_id(results.header, cell))
     about = episode.attributes
     assert (about.origin, about.success, about.task, about.seed) == (

@@ -14,7 +14,7 @@ from services.world_model.dynamics.features import NEAR_M
 from services.world_model.dynamics.hand_motion import hand_motion
 from services.world_model.network.contact_geometry import (
     GEOMETRY_SIZE,
-    SeenObjects,
+    ObjectsAtStart,
     contact_geometry,
 )
 from services.world_model.network.inputs import build_inputs
@@ -53,7 +53,7 @@ def test_distances_are_those_of_the_hand_points_to_a_turned_box(window):
     request = window.request
     pose = np.array([0.1, -0.05, 0.02, 0.5, 0.5, -0.5, 0.5])
     box = np.array([0.01, 0.0, 0.02, 0.05, 0.02, 0.03])
-    seen = SeenObjects(pose[None], box[None])
+    seen = ObjectsAtStart(pose[None], box[None])
     features = contact_geometry(request.actions, request.anchor, seen)
     points_m = hand_motion(request.actions, request.anchor).points_m[:, :, 1:].astype(np.float64)
     local = apply(invert(transform_from_pose(pose)), points_m.reshape(-1, 3)) - box[:3]
@@ -72,7 +72,7 @@ def test_slots_without_an_object_are_empty(window):
     assert np.count_nonzero(none[..., :-1]) == 0
     np.testing.assert_array_equal(none[0, :, -1], [-1, 1])
     with pytest.raises(InvalidInputError, match="at most 3"):
-        SeenObjects(np.zeros((4, 7)), np.zeros((4, 6)))
+        ObjectsAtStart(np.zeros((4, 7)), np.zeros((4, 6)))
 
 
 def test_a_window_has_the_objects_of_its_first_step(toy_episode):

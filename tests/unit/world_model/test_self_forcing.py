@@ -11,7 +11,7 @@ from services.world_model.command_line import run_distill
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents
 from services.world_model.training import self_forcing
-from services.world_model.training.dataset import Place, WindowSampler, stack_windows
+from services.world_model.training.dataset import WindowPosition, WindowSampler, stack_windows
 from services.world_model.training.distribution import Processes
 from services.world_model.training.objective import LossOptions, losses
 from services.world_model.training.self_forcing import own_context, own_noisy
@@ -30,7 +30,10 @@ def generator():
 def batch(toy_episodes):
     """Windows of two chunks."""
     return stack_windows(
-        [toy_episodes[k].cut(Place(k, 2 * k, 33, action_kind="commanded")) for k in range(3)]
+        [
+            toy_episodes[k].cut(WindowPosition(k, 2 * k, 33, action_kind="commanded"))
+            for k in range(3)
+        ]
     )
 
 
@@ -53,7 +56,9 @@ def test_the_second_chunk_begins_like_that_of_a_served_rollout(
         assert np.array_equal(made.first_image, seen.images["camera_head"][-1])
         np.testing.assert_allclose(made.first_tactile_kpa, seen.tactile_kpa[-1], atol=1e-4)
         assert torch.equal(seconds.images[index, 0], torch.from_numpy(made.first_image))
-        later = Place(index, 2 * index + 16, 17, action_kind="commanded", from_command=True)
+        later = WindowPosition(
+            index, 2 * index + 16, 17, action_kind="commanded", from_command=True
+        )
         truth = toy_episodes[index].cut(later)
         np.testing.assert_allclose(made.actions, truth.request.actions, atol=1e-9)
         anchors = made.anchor.as_tuple(), truth.request.anchor.as_tuple()

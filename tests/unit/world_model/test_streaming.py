@@ -12,7 +12,7 @@ from dextouch.errors import InvalidInputError, NotFoundError
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.command_line import run_train
 from services.world_model.training.dataset import (
-    Place,
+    WindowPosition,
     WindowSampler,
     fingerprint,
 )
@@ -27,10 +27,10 @@ from services.world_model.training.training_run import TrainingRun
 from tests.unit.world_model.conftest import write_episode
 
 PLACES = [
-    Place(0, 0, 17),
-    Place(2, 7, 9, action_kind="commanded"),
-    Place(2, 24, 17, action_kind="commanded", from_command=True),
-    Place(5, 36, 5),
+    WindowPosition(0, 0, 17),
+    WindowPosition(2, 7, 9, action_kind="commanded"),
+    WindowPosition(2, 24, 17, action_kind="commanded", from_command=True),
+    WindowPosition(5, 36, 5),
 ]
 
 
@@ -131,13 +131,13 @@ def test_only_the_models_camera_is_decoded(stored, monkeypatch):
         return images_at(self, name, indices, **options)
 
     monkeypatch.setattr(EpisodeReader, "images_at", noted)
-    stored[0].cut(Place(0, 7, 5))
+    stored[0].cut(WindowPosition(0, 7, 5))
     assert decoded == [("camera_head", [7, 8, 9, 10, 11])]
 
 
 def test_steps_that_do_not_exist_are_refused(stored):
     with pytest.raises(InvalidInputError, match="steps 30"):
-        stored[0].cut(Place(0, 30, 17))
+        stored[0].cut(WindowPosition(0, 30, 17))
 
 
 def test_images_of_every_second_step_are_not_taken_for_those_of_all(tmp_path, toy_episode):
@@ -211,7 +211,7 @@ def test_larger_images_are_scaled_in_memory_and_from_disk_alike(url, in_memory):
     assert loaded.images.shape == (len(large), side, side, 3)
     assert loaded.fingerprint() == stored.fingerprint() != large.fingerprint()
     np.testing.assert_allclose(loaded.K_head[:2], large.K_head[:2] / 2)
-    place = Place(0, 3, 5)
+    place = WindowPosition(0, 3, 5)
     from_disk, cut = stored.cut(place), loaded.cut(place)
     np.testing.assert_array_equal(from_disk.images, cut.images)
     np.testing.assert_array_equal(from_disk.request.K_head, cut.request.K_head)

@@ -27,7 +27,7 @@ from services.acquisition.mocks.ports import HidPort
 from services.acquisition.mocks.replay import (
     MockDevice,
     MockPair,
-    MockPlace,
+    MockSlot,
     PacketSource,
     ReplayStream,
     device_rng,
@@ -135,7 +135,7 @@ class BridgeFingerTrackerSource(TrackedFingers, BridgeSource):
         return 100.0 * points_m @ self.frame.ours_from_theirs()
 
 
-def mock_finger_tracker(place: MockPlace) -> MockPair:
+def mock_finger_tracker(place: MockSlot) -> MockPair:
     """A finger tracker of one hand; the stream of its place is [n, 25, 3] in m, wrist frame."""
     rng = device_rng(place.seed, f"noise_{place.name}")
     if place.link == "bridge":

@@ -10,7 +10,7 @@ from services.acquisition.devices.justfloat_glove.driver import TAIL, JustFloatG
 from services.acquisition.mocks.faults import PacketEdits, PacketFields, Pinned
 from services.acquisition.mocks.replay import (
     MockPair,
-    MockPlace,
+    MockSlot,
     PacketSource,
     ReplayStream,
     serial_mock,
@@ -23,7 +23,7 @@ FULL_SCALE = 4095.0
 PINNED: dict[Pinned, float] = {"stuck": 1_000.0, "saturated": FULL_SCALE}
 
 
-def mock_justfloat_glove(place: MockPlace) -> MockPair:
+def mock_justfloat_glove(place: MockSlot) -> MockPair:
     """A glove that sends bare float32s at the rate of the stream."""
     source = JustFloatGloveSource(place.stream, dead_taxels=place.faults.dead_taxels)
     decoder = JustFloatGloveDecoder(

@@ -30,7 +30,7 @@ from services.acquisition.mocks.ports import HidPort
 from services.acquisition.mocks.replay import (
     MockDevice,
     MockPair,
-    MockPlace,
+    MockSlot,
     PacketSource,
     ReplayStream,
     device_rng,
@@ -145,7 +145,7 @@ class BridgePoseSource(TrackedPoses, BridgeSource):
         return np.concatenate([R, (self.poses[:, :3] @ M.T)[:, :, None]], axis=2)
 
 
-def mock_pose_tracker(place: MockPlace) -> MockPair:
+def mock_pose_tracker(place: MockSlot) -> MockPair:
     """A pose tracker; the stream of its place is [n, 7], x y z (m) qw qx qy qz in the world."""
     stream, faults = place.stream, place.faults
     where = stream.descriptor.name

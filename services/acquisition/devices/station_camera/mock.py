@@ -20,7 +20,7 @@ from services.acquisition.mocks.ports import ReportPort
 from services.acquisition.mocks.replay import (
     MockDevice,
     MockPair,
-    MockPlace,
+    MockSlot,
     PacketSource,
     ReplayStream,
 )
@@ -110,7 +110,7 @@ class VideoDevice(MockDevice):
         return super().play(clock, waiter, start_host_ns=start_host_ns, offset_ns=offset_ns)
 
 
-def video_camera(place: MockPlace, **settings: float | str) -> MockPair:
+def video_camera(place: MockSlot, **settings: float | str) -> MockPair:
     """A mock camera that plays a stream of images, and its driver.
 
     Args:

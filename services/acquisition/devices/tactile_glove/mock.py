@@ -34,7 +34,7 @@ from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.mocks.replay import (
     MockDevice,
     MockPair,
-    MockPlace,
+    MockSlot,
     PacketSource,
     ReplayStream,
     device_rng,
@@ -118,7 +118,7 @@ class GloveCalibration:
 
 
 def mock_glove(
-    place: MockPlace,
+    place: MockSlot,
     *,
     calibration: GloveCalibration | None = None,
     worn_side: Side | None = None,

@@ -26,7 +26,7 @@ from services.acquisition.devices.wuji_glove.driver import (
 from services.acquisition.mocks.faults import PacketEdits, PacketFields, Pinned
 from services.acquisition.mocks.replay import (
     MockPair,
-    MockPlace,
+    MockSlot,
     PacketSource,
     ReplayStream,
     at_rate,
@@ -41,7 +41,7 @@ _FINGER_ROWS = slice(0, 4)
 _PALM_ROWS, _PALM_COLUMNS = slice(6, 21), slice(8, 24)
 
 
-def mock_wuji_glove(place: MockPlace) -> MockPair:
+def mock_wuji_glove(place: MockSlot) -> MockPair:
     """A Wuji glove: CRC-16, a number of 16 bits, milliseconds."""
     source = WujiGloveSource(
         at_rate(place.stream, NOMINAL_RATE_HZ),

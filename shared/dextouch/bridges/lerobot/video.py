@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class VideoPlace:
+class VideoLocation:
     """Location of one episode's images: file number of the camera and seconds within it."""
 
     file_number: int
@@ -57,7 +57,7 @@ class CameraVideo:
         self._parameters = b""
         self._file: tuple[OutputContainer, VideoStream] | None = None
 
-    def append(self, access_units: Sequence[bytes], *, where: str) -> VideoPlace:
+    def append(self, access_units: Sequence[bytes], *, where: str) -> VideoLocation:
         """Mux the access units of one episode, one per image, without B-frames.
 
         Raises:
@@ -84,7 +84,7 @@ class CameraVideo:
                 output.mux(packet)
                 self._num_images += 1
         self._num_bytes += size
-        return VideoPlace(self._file_number, first / self._fps, self._num_images / self._fps)
+        return VideoLocation(self._file_number, first / self._fps, self._num_images / self._fps)
 
     def close(self) -> None:
         """Complete the file that is open."""

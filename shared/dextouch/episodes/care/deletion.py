@@ -17,7 +17,13 @@ from pathlib import Path
 from pydantic import BaseModel, ValidationError
 
 from dextouch.episodes.care.deletion_records import DeletionRecords, Outstanding, TakeFacts
-from dextouch.episodes.care.store_facts import PLACES, Facts, Wanted, all_facts, small_files
+from dextouch.episodes.care.store_facts import (
+    PLACES,
+    Facts,
+    IdentifierSearch,
+    all_facts,
+    small_files,
+)
 from dextouch.episodes.files import disk_errors, replace_file, try_lock
 from dextouch.episodes.format import Kind, sha256_hex
 from dextouch.episodes.reviews import REVIEW_FILE
@@ -192,7 +198,7 @@ def _reason(facts: Facts, request: DeletionRequest) -> str | None:
     if facts.operator == request.operator:
         return "operator"
     files = ((path.name, path) for path in small_files(facts.folder))
-    named = not facts.readable and _references(Wanted({request.operator}), files)
+    named = not facts.readable and _references(IdentifierSearch({request.operator}), files)
     return "damaged, names the operator" if named else None
 
 
@@ -269,7 +275,7 @@ def delete_for_good(
         if not any(went):
             break
     words = {v.id for v in known} | {v.sha256 for v in known if v.sha256} | {request.name}
-    wanted = Wanted(words)
+    wanted = IdentifierSearch(words)
     remaining, unreadable, num_files = _search(root, wanted, checkpoints, skip=path)
     deleted = [v for v in known if not (root / v.place / v.folder).exists()]
     receipt = DeletionReceipt(
@@ -306,7 +312,7 @@ def _nothing(root: Path, request: DeletionRequest) -> str:
 
 
 def _search(
-    root: Path, wanted: Wanted, checkpoints: Path | None, *, skip: Path
+    root: Path, wanted: IdentifierSearch, checkpoints: Path | None, *, skip: Path
 ) -> tuple[list[Reference], list[str], int]:
     """What still refers to identifiers, what cannot be read, and the number of files searched.
 
@@ -330,7 +336,7 @@ def _search(
     return found, unreadable, len(files)
 
 
-def _references(wanted: Wanted, files: Iterable[tuple[str, Path]]) -> list[Reference]:
+def _references(wanted: IdentifierSearch, files: Iterable[tuple[str, Path]]) -> list[Reference]:
     found = []
     for where, path in files:
         with disk_errors(f"search {path.name}"), path.open("rb") as file:

@@ -136,7 +136,7 @@ def _text(value: object) -> str | None:
     return value if isinstance(value, str) else None
 
 
-class Wanted:
+class IdentifierSearch:
     """Search for identifiers (a pseudonym, ids, hashes), at least one, as whole words."""
 
     def __init__(self, words: set[str]) -> None:

@@ -44,14 +44,14 @@ class _Table(FrozenModel):
         return values
 
 
-class _Place(_Table):
+class _ModelPart(_Table):
     """A table that names one part of the model: a link (of MJCF: a body) or a site."""
 
     link: Name | None = None
     body: Name | None = None
 
     @model_validator(mode="after")
-    def _names_one_part(self) -> "_Place":
+    def _names_one_part(self) -> "_ModelPart":
         parts = [part for part in ("link", "body", "site") if part in type(self).model_fields]
         named = [part for part in parts if part in self.model_fields_set]
         if len(named) != 1:
@@ -66,7 +66,7 @@ class _Place(_Table):
         return self.link or self.body or ""
 
 
-class TipMapping(_Place):
+class TipMapping(_ModelPart):
     """Fingertip: a link (body) or a site, and an offset in its frame."""
 
     site: Name | None = None
@@ -84,7 +84,7 @@ class FingerMapping(_Table):
     tip: TipMapping
 
 
-class WristMapping(_Place):
+class WristMapping(_ModelPart):
     """The wrist's link, and our wrist axes in its frame."""
 
     fingers_along: Vector

@@ -25,7 +25,7 @@ _FOREIGN: Final = ("include", "attach", "replicate", "composite", "flexcomp")
 _TINY: Final = 1e-9
 
 
-class _Place(NamedTuple):
+class _ElementLocation(NamedTuple):
     """An element with its body, T_body_parent of the enclosing frames, and its default class."""
 
     element: Element
@@ -41,9 +41,9 @@ class MjcfModel:
         self.source = root.source.rpartition(" line ")[0]
         self.parents: dict[str, str | None] = {WORLD: None}
         self._settings = _Settings(root)
-        self._bodies: dict[str, _Place] = {}
-        self._joints: dict[str, list[_Place]] = {WORLD: []}
-        self._sites: dict[str, _Place] = {}
+        self._bodies: dict[str, _ElementLocation] = {}
+        self._joints: dict[str, list[_ElementLocation]] = {WORLD: []}
+        self._sites: dict[str, _ElementLocation] = {}
         self._coupled = {
             name
             for equality in root.each("equality")
@@ -54,14 +54,17 @@ class MjcfModel:
         for child in root.each("include"):
             raise child.refusal(_flatten("include"))
         # An explicit stack instead of recursion, since files may be deeply nested.
-        waiting = [_Place(child, WORLD, np.eye(4), MAIN_CLASS) for child in root.each("worldbody")]
+        waiting = [
+            _ElementLocation(child, WORLD, np.eye(4), MAIN_CLASS)
+            for child in root.each("worldbody")
+        ]
         while waiting:
             self._read_children(waiting.pop(), waiting)
 
-    def _read_children(self, place: _Place, waiting: list[_Place]) -> None:
+    def _read_children(self, place: _ElementLocation, waiting: list[_ElementLocation]) -> None:
         class_name = place.element.attributes.get("childclass", place.class_name)
         for child in place.element.children:
-            inner = _Place(child, place.body, place.T_body_parent, class_name)
+            inner = _ElementLocation(child, place.body, place.T_body_parent, class_name)
             match child.tag:
                 case "body":
                     waiting.append(self._read_body(inner))
@@ -75,7 +78,7 @@ class MjcfModel:
                 case tag if tag in _FOREIGN:
                     raise child.refusal(_flatten(tag))
 
-    def _read_body(self, place: _Place) -> _Place:
+    def _read_body(self, place: _ElementLocation) -> _ElementLocation:
         # An unnamed body cannot be named in the mapping, but fingers may pass through it.
         name = place.element.attributes.get("name") or f"unnamed body at {place.element.source}"
         if name == WORLD:
@@ -86,7 +89,7 @@ class MjcfModel:
         _add(self._bodies, name, place)
         self.parents[name] = place.body
         self._joints[name] = []
-        return _Place(place.element, name, np.eye(4), place.class_name)
+        return _ElementLocation(place.element, name, np.eye(4), place.class_name)
 
     def link(self, name: str) -> Link:
         """A body with its joints."""
@@ -106,7 +109,7 @@ class MjcfModel:
             raise element.refusal("got fromto, expected pos; name a body and an offset_m instead")
         return place.body, place.T_body_parent @ self._settings.frame(element)
 
-    def _joint(self, place: _Place) -> Joint:
+    def _joint(self, place: _ElementLocation) -> Joint:
         element = self._settings.with_defaults(place)
         joint = Joint(element.attributes.get("name", ""), str(element))
         is_free = element.tag == "freejoint"
@@ -135,7 +138,7 @@ class MjcfModel:
         return float(lower), float(upper)
 
 
-def _add(places: dict[str, _Place], name: str, place: _Place) -> None:
+def _add(places: dict[str, _ElementLocation], name: str, place: _ElementLocation) -> None:
     if name in places:
         raise place.element.refusal(
             f"got this name twice, first in {places[name].element.source}; names must differ"
@@ -183,7 +186,7 @@ class _Settings:
                 raise child.refusal(f"got class {nested!r} twice; names must differ")
             self._read_class(child, nested, tags)
 
-    def with_defaults(self, place: _Place) -> Element:
+    def with_defaults(self, place: _ElementLocation) -> Element:
         """A place's element with the defaults of its class."""
         element = place.element
         name = element.attributes.get("class", place.class_name)
