@@ -52,7 +52,7 @@ from services.evaluation.checkpoints import (
 from services.evaluation.optimization import optimized
 from services.evaluation.starts import start_digest
 from services.evaluation.statistics import area_under_roc
-from services.evaluation.success_probe_figures import MIN_OUTCOMES
+from services.evaluation.success_classifier_figures import MIN_OUTCOMES
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.world_model.dynamics.commands import Commands
 from services.world_model.dynamics.configuration import DynamicsConfig

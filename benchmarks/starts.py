@@ -23,7 +23,7 @@ from dextouch.images import decode_jpeg, encode_jpeg
 from dextouch.schemas import Observation, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from services.evaluation.settings import DEFAULT_PROBE
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 from services.twin.scripted_actions import Actions, script_name, scripted_actions
 from services.twin.settings import TwinSettings
 from services.twin.tasks import EVALUATED, named_tasks
@@ -117,7 +117,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     if count < 1:
         raise InvalidInputError(f"--starts: got {count}, expected at least 1")
     tasks = named_tasks(options.tasks.split(","))
-    judged = _Judged(options.world, SuccessProbe.load(options.probe))
+    judged = _Judged(options.world, SuccessClassifier.load(options.probe))
     found: dict[str, dict[str, list[_Read]]] = {}
     with bar("starting", len(tasks) * count) as step:
         for width in (1.0, *WIDTHS):
@@ -153,7 +153,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 class _Judged:
     """The state model with its judge."""
 
-    def __init__(self, checkpoint: Path, probe: SuccessProbe) -> None:
+    def __init__(self, checkpoint: Path, probe: SuccessClassifier) -> None:
         self._world, self._probe = StateWorld(read_state_checkpoint(checkpoint)), probe
 
     def usual(self, twin: TwinWorld, task: str, seed: int) -> dict[str, _Read]:

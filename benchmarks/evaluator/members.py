@@ -11,7 +11,7 @@ from benchmarks.direct_judge import DirectJudge
 from benchmarks.evaluator.plan import Trained
 from dextouch.errors import InvalidInputError
 from dextouch.worlds import BatchWorld
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 from services.world_model.world import open_world
 
 
@@ -25,7 +25,7 @@ class Member:
 
     about: dict[str, str]
     world: BatchWorld[Any]
-    probe: SuccessProbe
+    probe: SuccessClassifier
     direct: DirectJudge | None = None
     untouched: BatchWorld[Any] | None = None
 
@@ -35,14 +35,18 @@ class Member:
         return set(self.world.description.tasks) & set(self.probe.metadata.tasks)
 
     @property
-    def judges(self) -> list[SuccessProbe | DirectJudge]:
+    def judges(self) -> list[SuccessClassifier | DirectJudge]:
         """All judges, each of which has training starts."""
         return [self.probe, *([] if self.direct is None else [self.direct])]
 
 
 def open_members(trained: tuple[Trained, ...]) -> tuple[Member, ...]:
     """The networks of every training seed; a file that several share is opened once."""
-    worlds, probes, directs = cache(open_world), cache(SuccessProbe.load), cache(DirectJudge.load)
+    worlds, probes, directs = (
+        cache(open_world),
+        cache(SuccessClassifier.load),
+        cache(DirectJudge.load),
+    )
     found = []
     for one in trained:
         world: BatchWorld[Any] = worlds(one.world)

@@ -31,7 +31,7 @@ from dextouch.schemas import RolloutDoubt, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
-from services.evaluation.success_probe import DECISION_THRESHOLD
+from services.evaluation.success_classifier import DECISION_THRESHOLD
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.scripted_actions import Actions
 from services.twin.world import TwinWorld

@@ -1,4 +1,4 @@
-"""Stress of the success probe and the policies with unusual touch and poses."""
+"""Stress of the success classifier and the policies with unusual touch and poses."""
 
 from dataclasses import replace
 from functools import cache, partial
@@ -19,7 +19,7 @@ from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.object_features import known_objects, object_features
 from services.evaluation.policies.behaviour_cloning import KIND, BehaviourCloningPolicy
 from services.evaluation.policies.hold import HoldPolicy
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 
 STAGE = StageCells("judging")
 _PRETRAINED = Path(services.evaluation.__file__).parent / "pretrained"
@@ -169,8 +169,8 @@ STAGE.does_not_apply(
 
 
 @cache
-def _probe() -> SuccessProbe:
-    return SuccessProbe.load(_PRETRAINED / "success_probe.safetensors")
+def _probe() -> SuccessClassifier:
+    return SuccessClassifier.load(_PRETRAINED / "success_probe.safetensors")
 
 
 @cache

@@ -285,7 +285,7 @@ class TakeWatch:
         return self._host.problems()
 
     def check(self) -> TakeCheck:
-        """HealthCheck the ended take: complete means no problem of level ERROR."""
+        """Judge the ended take: complete means no problem of level ERROR."""
         own = [problem for fact in self._facts for problem in fact.problems()]
         streams = tuple(
             StreamTake(

@@ -41,7 +41,7 @@ SECTIONS: Final = {
     "rating_report": "evaluation.rating.settings:RatingReportSettings",
     "evaluation_run": "evaluation.settings:RunSettings",
     "evaluation_train_policy": "evaluation.settings:TrainPolicySettings",
-    "evaluation_train_probe": "evaluation.settings:TrainProbeSettings",
+    "evaluation_train_probe": "evaluation.settings:TrainJudgeSettings",
     "world_model_show": "world_model.settings:ShowCommand",
     "world_model_train": "world_model.settings:TrainCommand",
     "world_model_train_state": "world_model.settings:TrainStateCommand",

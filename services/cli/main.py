@@ -122,7 +122,7 @@ COMMANDS = {
     ),
     "train judge": Command(
         "train the judge of success on true and imagined episodes",
-        "evaluation.command_line:run_train_probe",
+        "evaluation.command_line:run_train_judge",
         "evaluation_train_probe",
     ),
     "generate": Command(

@@ -1,1 +1,1 @@
-"""Policies, success probes, closed-loop evaluation in worlds, and evaluation reports."""
+"""Policies, success classifiers, closed-loop evaluation in worlds, and evaluation reports."""

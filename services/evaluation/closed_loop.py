@@ -18,7 +18,7 @@ from services.evaluation.rollout_runner import RolloutRunner
 from services.evaluation.scores import ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
 from services.evaluation.starts import refuse_training_starts
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def evaluate(
     imagined: Mapping[str, WorldAddress],
     policies: Mapping[str, Policy],
     plan: EvaluationPlan,
-    probe: SuccessProbe,
+    probe: SuccessClassifier,
     keep: Callable[[Outcome], None] | None = None,
 ) -> ClosedLoopReport:
     """Roll out every policy from every start in every world.
@@ -90,7 +90,7 @@ def evaluate(
 
 
 def begin_matched(
-    real: WorldAddress, plan: EvaluationPlan, probe: SuccessProbe
+    real: WorldAddress, plan: EvaluationPlan, probe: SuccessClassifier
 ) -> list[MatchedStart | FailedStart]:
     """Start every task and seed once in the real world.
 
@@ -103,7 +103,7 @@ def begin_matched(
         for seed in plan.seeds
     ]
     digests = [start.digest for start in starts if isinstance(start, MatchedStart)]
-    trained_on = {**plan.trained_on, "the success probe": probe.metadata.training_starts}
+    trained_on = {**plan.trained_on, "the success classifier": probe.metadata.training_starts}
     for what, trained in trained_on.items():
         refuse_training_starts(digests, trained_on=trained, what=what)
     return starts

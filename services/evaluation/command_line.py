@@ -29,15 +29,15 @@ from services.evaluation.results import ResultLog
 from services.evaluation.settings import (
     RunSettings,
     ServedWorld,
+    TrainJudgeSettings,
     TrainPolicySettings,
-    TrainProbeSettings,
     command_line,
 )
 from services.evaluation.study_worlds import WorldAddress
-from services.evaluation.success_probe import KIND, SuccessProbe
-from services.evaluation.success_probe_training import (
-    calibrate_success_probe,
-    train_success_probe,
+from services.evaluation.success_classifier import KIND, SuccessClassifier
+from services.evaluation.success_classifier_training import (
+    calibrate_success_classifier,
+    train_success_classifier,
 )
 
 EXIT_FAILED = 1
@@ -66,9 +66,9 @@ def run_train_policy(arguments: list[str]) -> int:
     return _keep(trained.finished, settings.output, settings.json_path)
 
 
-def run_train_probe(arguments: list[str]) -> int:
-    """Train the success probe and save it."""
-    settings = load_settings(TrainProbeSettings, arguments)
+def run_train_judge(arguments: list[str]) -> int:
+    """Train the success classifier and save it."""
+    settings = load_settings(TrainJudgeSettings, arguments)
 
     def read(urls: Sequence[str]) -> list[EndingEpisode]:
         stores = [EpisodeStore(url) for url in urls]
@@ -84,14 +84,14 @@ def run_train_probe(arguments: list[str]) -> int:
                 f"train judge --base: got --held-out {','.join(settings.held_out)}, expected none: "
                 "the figures of the base's weights are kept"
             )
-        calibrated = calibrate_success_probe(
+        calibrated = calibrate_success_classifier(
             load_checkpoint(settings.base, kind=KIND),
             [*read(settings.episodes), *read(settings.development)],
             settings.training,
             command=command_line("probe", arguments),
         )
         return _keep(calibrated, settings.output, settings.json_path)
-    checkpoint = train_success_probe(
+    checkpoint = train_success_classifier(
         read(settings.episodes),
         settings.training,
         command=command_line("probe", arguments),
@@ -119,7 +119,7 @@ def run_evaluation(arguments: list[str]) -> int:
         0, or 1 if a rollout failed.
     """
     settings = load_settings(RunSettings, arguments)
-    probe = SuccessProbe.load(settings.probe)
+    probe = SuccessClassifier.load(settings.probe)
     policies, trained_on = gather_policies(settings)
     plan = EvaluationPlan(
         instructions_for(settings.tasks, probe.metadata.settings["instructions"]),
@@ -184,11 +184,11 @@ def instructions_for(tasks: Sequence[str], known: Mapping[str, str]) -> dict[str
     """Instructions of the given tasks, or of all known tasks if none is given.
 
     Raises:
-        UnknownNameError: a task that the success probe does not know.
+        UnknownNameError: a task that the success classifier does not know.
     """
     for task in tasks:
         if task not in known:
-            raise UnknownNameError("task of the success probe", task, list(known))
+            raise UnknownNameError("task of the success classifier", task, list(known))
     return {task: known[task] for task in tasks or known}
 
 

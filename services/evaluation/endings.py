@@ -1,4 +1,4 @@
-"""Endings of rollouts, true and imagined: input and training data of success probes."""
+"""Endings of rollouts, true and imagined: input and training data of success classifiers."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Network of the success probe: final image, touch and, where known, object poses."""
+"""Network of the success classifier: final image, touch and, where known, object poses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -22,7 +22,7 @@ _OBJECT_HIDDEN, _OBJECT_OUTPUT = 64, 32
 _FARTHEST = 5.0
 
 
-class ProbeShape(FrozenModel):
+class ClassifierShape(FrozenModel):
     """Shape of the probe's network; stored in the checkpoint.
 
     `milestones` are the further outputs of each task, in their order.
@@ -40,7 +40,7 @@ class ProbeShape(FrozenModel):
 
 
 @dataclass(frozen=True)
-class ProbeBatch:
+class ClassifierBatch:
     """Inputs of the network: last images as bytes, touch, features of object poses, task index.
 
     Missing inputs are zero and marked in `has_image` and `has_objects`. `imagined` is used in
@@ -55,9 +55,9 @@ class ProbeBatch:
     has_objects: Bool[torch.Tensor, " n"]
     imagined: Bool[torch.Tensor, " n"]
 
-    def __getitem__(self, index: torch.Tensor) -> "ProbeBatch":
+    def __getitem__(self, index: torch.Tensor) -> "ClassifierBatch":
         """Select endings."""
-        return ProbeBatch(*(getattr(self, part.name)[index] for part in fields(self)))
+        return ClassifierBatch(*(getattr(self, part.name)[index] for part in fields(self)))
 
 
 class TaskNetwork(nn.Module):
@@ -71,7 +71,7 @@ class TaskNetwork(nn.Module):
     object_mean: torch.Tensor
     object_std: torch.Tensor
 
-    def __init__(self, shape: ProbeShape) -> None:
+    def __init__(self, shape: ClassifierShape) -> None:
         super().__init__()
         layers: list[nn.Module] = []
         channels = 3
@@ -94,7 +94,7 @@ class TaskNetwork(nn.Module):
         self.register_buffer("object_std", torch.ones(NUM_OBJECT_FEATURES))
 
     def forward(
-        self, images: Float32[torch.Tensor, "n 3 h w"], batch: ProbeBatch
+        self, images: Float32[torch.Tensor, "n 3 h w"], batch: ClassifierBatch
     ) -> Float32[torch.Tensor, "n outputs"]:
         """Log odds of a batch with images given separately in −0.5 … 0.5."""
         usual = (batch.objects - self.object_mean) / self.object_std
@@ -110,14 +110,14 @@ class TaskNetwork(nn.Module):
         return torch.as_tensor(self.head(torch.cat(parts, dim=1)))
 
 
-class ProbeNetwork(nn.Module):
+class ClassifierNetwork(nn.Module):
     """One network per task.
 
     A network shared by six tasks has to recognize the task in the image before it can resolve
     millimetres: at equal cost it separates stacked from tilted bowls far worse.
     """
 
-    def __init__(self, shape: ProbeShape) -> None:
+    def __init__(self, shape: ClassifierShape) -> None:
         super().__init__()
         self.num_outputs = shape.num_outputs
         self.tasks = nn.ModuleDict({task: TaskNetwork(shape) for task in shape.tasks})
@@ -126,7 +126,7 @@ class ProbeNetwork(nn.Module):
         """The network of one task."""
         return cast("TaskNetwork", self.tasks[task])
 
-    def forward(self, batch: ProbeBatch) -> Float32[torch.Tensor, "n outputs"]:
+    def forward(self, batch: ClassifierBatch) -> Float32[torch.Tensor, "n outputs"]:
         """Log odds [n, outputs] of success and of the milestones of the task."""
         odds = torch.zeros((len(batch.task), self.num_outputs))
         for index, network in enumerate(self.tasks.values()):
@@ -142,7 +142,7 @@ def unit_images(images: UInt8[torch.Tensor, "n 3 h w"]) -> Float32[torch.Tensor,
     return images.float() / 255 - 0.5
 
 
-def probe_batch(endings: Sequence[Ending], shape: ProbeShape) -> ProbeBatch:
+def probe_batch(endings: Sequence[Ending], shape: ClassifierShape) -> ClassifierBatch:
     """Network tensors of endings, for training and prediction alike.
 
     Raises:
@@ -159,7 +159,7 @@ def probe_batch(endings: Sequence[Ending], shape: ProbeShape) -> ProbeBatch:
         unknown if e.object_poses is None else object_features(e.object_poses) for e in endings
     ]
     touch = pad_features(np.stack([e.tactile_kpa for e in endings]))
-    return ProbeBatch(
+    return ClassifierBatch(
         torch.from_numpy(images).permute(0, 3, 1, 2).contiguous(),
         torch.from_numpy(np.concatenate([touch.mean(axis=1), touch[:, -1]], axis=1)),
         torch.from_numpy(np.stack(objects)),
@@ -170,14 +170,16 @@ def probe_batch(endings: Sequence[Ending], shape: ProbeShape) -> ProbeBatch:
     )
 
 
-def _check(ending: Ending, shape: ProbeShape) -> None:
+def _check(ending: Ending, shape: ClassifierShape) -> None:
     size = (NUM_SEEN_STEPS, shape.image_size_px, shape.image_size_px, 3)
     if ending.task not in shape.tasks:
-        raise UnknownNameError("task of the success probe", ending.task, list(shape.tasks))
+        raise UnknownNameError("task of the success classifier", ending.task, list(shape.tasks))
     if ending.images is None and ending.object_poses is None:
         raise InvalidInputError(
-            f"success probe: an ending of {ending.task!r} has neither images nor object poses; "
-            "request the images of the last chunk"
+            f"success classifier: an ending of {ending.task!r} has neither images nor object "
+            "poses; request the images of the last chunk"
         )
     if ending.images is not None and ending.images.shape != size:
-        raise InvalidInputError(f"success probe: got images {ending.images.shape}, expected {size}")
+        raise InvalidInputError(
+            f"success classifier: got images {ending.images.shape}, expected {size}"
+        )

@@ -33,7 +33,7 @@ from services.evaluation.scores import Outcome, RolloutFailure, RolloutScore
 from services.evaluation.starts import refuse_training_starts, start_digest
 from services.evaluation.statistics import area_under_roc, wilson_interval
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 from services.networks.training_settings import USUAL_IMAGE_PX
 
 IMAGINED: Final = "imagined"
@@ -183,7 +183,7 @@ def score_recorded(
     policies: Mapping[str, Policy],
     world: WorldAddress,
     description: WorldDescription,
-    probe: SuccessProbe,
+    probe: SuccessClassifier,
     *,
     trained_on: Mapping[str, Iterable[str]] | None = None,
 ) -> RecordedScores:
@@ -199,7 +199,7 @@ def score_recorded(
             than the judge's, or a take that is shorter than a chunk.
     """
     digests = [digest for take in takes for digest in _digests(take.start)]
-    judged = {"the success probe": probe.metadata.training_starts}
+    judged = {"the success classifier": probe.metadata.training_starts}
     for what, trained in {**judged, **(trained_on or {})}.items():
         refuse_training_starts(digests, trained_on=trained, what=what)
     multiple = description.chunk_multiple

@@ -27,7 +27,7 @@ from services.evaluation.matched_starts import (
 from services.evaluation.policies.asking import action_chunk, ask
 from services.evaluation.scores import REAL, Outcome, RolloutScore
 from services.evaluation.study_worlds import StudyWorlds
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 
 # Repeats of an imagined rollout differ by this in the seed of their noise.
 _REPEAT_STRIDE = 2**40
@@ -71,7 +71,7 @@ class RolloutRunner:
     """
 
     worlds: StudyWorlds
-    probe: SuccessProbe
+    probe: SuccessClassifier
     num_steps: int
     shows_all: bool = False
 

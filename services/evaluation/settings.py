@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 from dextouch.command_line import JSON_HELP
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import CommandSettings, service_config
-from services.evaluation.training_settings import CloningSettings, ProbeSettings
+from services.evaluation.training_settings import ClassifierSettings, CloningSettings
 from services.networks.training_settings import USUAL_IMAGE_PX, ImagePx, Splits, Stores, Tasks
 
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -55,8 +55,8 @@ class TrainPolicySettings(CommandSettings):
         return self.output.with_stem(f"{self.output.stem}_early")
 
 
-class TrainProbeSettings(CommandSettings):
-    r"""Train the success probe on true and imagined robot episodes of some stores.
+class TrainJudgeSettings(CommandSettings):
+    r"""Train the success classifier on true and imagined robot episodes of some stores.
 
     Example:
       dextouch train judge --episodes runs/true,runs/imagined --output runs/probe.safetensors
@@ -71,8 +71,8 @@ class TrainProbeSettings(CommandSettings):
     episodes: Stores
     base: Path | None = Field(
         default=None,
-        description="success probe whose weights are kept: only its probabilities and bands are "
-        "fitted, to all of --episodes and --development",
+        description="success classifier whose weights are kept: only its probabilities and bands "
+        "are fitted, to all of --episodes and --development",
     )
     development: tuple[str, ...] = Field(
         default=(), description="stores to calibrate on (default: a share of the scenes)"
@@ -87,7 +87,9 @@ class TrainProbeSettings(CommandSettings):
     splits: Splits = ()
     image_px: ImagePx = USUAL_IMAGE_PX
     jobs: int = Field(default=2, ge=1, le=64, description="tasks trained in parallel")
-    training: ProbeSettings = Field(default=ProbeSettings(), description="training settings")
+    training: ClassifierSettings = Field(
+        default=ClassifierSettings(), description="training settings"
+    )
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 

@@ -62,7 +62,7 @@ class StudyWorlds:
             UnknownNameError: a task that a world does not have.
             InvalidInputError: a real world that does not report success or does not start from
                 task and seed, an imagined one that does not start from its observations, images
-                of another size than the success probe's, or a length that is not a multiple of
+                of another size than the success classifier's, or a length that is not a multiple of
                 a world's chunk.
         """
         real = self.descriptions[REAL]
@@ -86,7 +86,7 @@ class StudyWorlds:
             if size != (image_size_px, image_size_px):
                 raise InvalidInputError(
                     f"world {name!r}: got images of {size[0]}x{size[1]} px, expected "
-                    f"{image_size_px}x{image_size_px} px as the success probe was trained on"
+                    f"{image_size_px}x{image_size_px} px as the success classifier was trained on"
                 )
             if name != REAL:
                 _check_imagined(name, world, real)

@@ -30,8 +30,8 @@ class CloningSettings(FrozenModel):
     held_out_share: float = Field(default=0.12, gt=0, lt=1, description="share of held-out seeds")
 
 
-class ProbeSettings(FrozenModel):
-    """Training settings of a success probe."""
+class ClassifierSettings(FrozenModel):
+    """Training settings of a success classifier."""
 
     seed: Seed = 0
     # For each task.

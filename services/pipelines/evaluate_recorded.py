@@ -17,7 +17,7 @@ from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.recorded_takes import REPLAY, read_takes, score_lines, score_recorded
 from services.evaluation.study_worlds import WorldAddress
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines.generate import refuse_trained_episodes
 from services.pipelines.imagined_data import WORLD
 from services.pipelines.parsers import recorded_parser
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str]) -> int:
         own = sorted(wanted & set(store.list()))
         refuse_trained_episodes(store, own, options.checkpoint, command="evaluate recorded")
     policies = _policies(options)
-    probe = SuccessProbe.load(options.probe)
+    probe = SuccessClassifier.load(options.probe)
     torch.set_num_threads(1)
     configure_logging(service="evaluate_recorded", log_format="auto", level="warning")
     app = create_world_app(

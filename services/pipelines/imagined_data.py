@@ -73,7 +73,7 @@ def imagine_all(
         episodes: store to read.
         output: store to write.
         checkpoint: checkpoint of a world model of either kind.
-        only_judged: whether a state model draws only the images that the success probe uses.
+        only_judged: whether a state model draws only the images that the success classifier uses.
     """
     source, target = EpisodeStore(episodes), EpisodeStore(output)
     torch.set_num_threads(1)
@@ -91,7 +91,7 @@ def imagine_all(
 
 
 def judged_steps(episode: EpisodeReader) -> set[int]:
-    """Steps of an episode whose images the success probe uses."""
+    """Steps of an episode whose images the success classifier uses."""
     scene = scene_of(episode.attributes)
     last = whole_steps(episode.num_steps, SHORT_CHUNK_STEPS) - 1
     ends = (early_step(scene, last), middle_step(scene, last), last - 1, last)

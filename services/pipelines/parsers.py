@@ -40,11 +40,11 @@ packets go through the drivers, the recorder and alignment to actions of the rob
 the poses of objects are measured by markers on them, which the head camera sees.
 """
 _IMAGINED = """\
-Predict the robot episodes of a store with the world model, to train the success probe on them.
+Predict the robot episodes of a store with the world model, to train the success classifier on them.
 
-Each imagined episode has the outcome of the same actions in the twin. The success probe is trained
-on real and imagined episodes, so that its probabilities are valid for imagined endings, and
-evaluated on those of other seeds. A state model renders only the images that the probe uses.
+Each imagined episode has the outcome of the same actions in the twin. The success classifier is
+trained on real and imagined episodes, so that its probabilities are valid for imagined endings, and
+evaluated on those of other seeds. A state model renders only the images that it uses.
 """
 _GENERATE = """\
 Generate demonstrations: a world model predicts images and touch for recorded robot actions.

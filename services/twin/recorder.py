@@ -24,7 +24,7 @@ TACTILE_RATE_HZ: Final = 60
 POSE_RATE_HZ: Final = 100
 KEYPOINT_RATE_HZ: Final = 120
 IMAGE_RATE_HZ: Final = 30
-# Number of final grid steps that always have images, since the success probe needs them.
+# Number of final grid steps that always have images, since the success classifier needs them.
 NUM_LAST_SHOWN_STEPS: Final = 3
 _NS_PER_S: Final = 1_000_000_000
 

@@ -26,7 +26,7 @@ LEARNERS = {
     "joint world model": load_episodes,
     "joint world model, streaming": index_episodes,
     "state world model": lambda url: load_state_data(TrainStateCommand(episodes=(url,))).episodes,
-    "success probe": lambda url: read_ending_episodes(EpisodeStore(url)),
+    "success classifier": lambda url: read_ending_episodes(EpisodeStore(url)),
     "cloned policy": lambda url: read_cloning_episodes(EpisodeStore(url)),
     "recorded takes": lambda url: read_takes([EpisodeStore(url)]),
     "imagination": lambda url: chosen_episodes(EpisodeStore(url), None, None),
@@ -60,7 +60,7 @@ def url(tmp_path_factory):
 def test_rejected_imagined_and_unknown_episodes_are_left_out_by_all(url, name):
     found = {episode.episode_id for episode in LEARNERS[name](url)}
     expected = {"good", "better"}
-    if name == "success probe":
+    if name == "success classifier":
         # It alone learns from what was imagined, too.
         expected |= {"dream-good", "dream-better"}
     if name in ("joint world model", "joint world model, streaming", "imagination"):

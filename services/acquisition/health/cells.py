@@ -91,7 +91,7 @@ class _PressureCheck(ABC):
 
     @abstractmethod
     def _judge(self, evaluation: Evaluation, low: np.ndarray, high: np.ndarray) -> None:
-        """HealthCheck by the least and greatest reading of the last 0.5 s; NaN where one was."""
+        """Judge by the least and greatest reading of the last 0.5 s; NaN where one was."""
 
     def _add(self, values: np.ndarray, t_ns: np.ndarray) -> None:
         if not len(self._recent_ns):

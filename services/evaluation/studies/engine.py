@@ -18,7 +18,7 @@ from services.evaluation.studies.definition import StudyDefinition
 from services.evaluation.studies.kept_rollouts import keep_rollout
 from services.evaluation.studies.results import PlannedRollout, StudyResults, cells_of, study_report
 from services.evaluation.study_worlds import StudyWorlds
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 
 Start = MatchedStart | FailedStart
 
@@ -39,7 +39,7 @@ class StudyParts:
 
     connect: Callable[[ExitStack], StudyWorlds]
     load_policies: Callable[[], Mapping[str, Policy]]
-    probe: SuccessProbe
+    probe: SuccessClassifier
     instructions: Mapping[str, str]
     trained_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     store: EpisodeStore | None = None

@@ -45,7 +45,7 @@ class StudyHeader:
     """First line of the file: what the results belong to.
 
     `definition` is that of the study as JSON; `digests` are those of the definition, of every world
-    and of the success probe. Results are only continued with equal digests.
+    and of the success classifier. Results are only continued with equal digests.
     """
 
     name: str

@@ -23,8 +23,8 @@ from services.evaluation.studies.results import (
 DISAGREEMENT: Final = 0.5
 MEANINGS: Final = {
     "rate": "Share of the starts from which the policy succeeded, with its 95 % Wilson interval. "
-    "In an imagined world success is what the success probe decides from images, touch and object "
-    "poses and from the world's own estimate; rollouts that it cannot tell count in no rate.",
+    "In an imagined world success is what the success classifier decides from images, touch and "
+    "object poses and from the world's own estimate; rollouts that it cannot tell count in no rate.",
     "pearson": "Pearson's r: 1 if the world's success rates of the policies are a straight line "
     "over the real ones, 0 if they say nothing about them, negative if they reverse them. It needs "
     "three policies: two points always lie on a line.",
@@ -35,8 +35,8 @@ MEANINGS: Final = {
     "bias": "Mean of the world's success rates minus the real ones; above 0 it is too optimistic.",
     "interval": "Intervals contain the true policies' figure with 95 % probability; with few "
     "policies or starts they are wide.",
-    "unreliable": "The success probe cannot tell: its probability is too close to 0.5, it and the "
-    "world's own estimate contradict each other, or the world doubted its prediction at a step. "
+    "unreliable": "The success classifier cannot tell: its probability is too close to 0.5, it and "
+    "the world's own estimate contradict each other, or the world doubted its prediction at a step. "
     f"With fewer than {LEAST_DECIDED:.0%} of its rollouts decided a policy is not compared.",
 }
 
@@ -63,8 +63,8 @@ class StudyRate(FrozenModel):
     Attributes:
         interval: 95 % Wilson interval.
         num_missing: rollouts without a result yet.
-        num_unreliable: rollouts on which the success probe abstains, and `reasons` why; they count
-            in no rate.
+        num_unreliable: rollouts on which the success classifier abstains, and `reasons` why; they
+            count in no rate.
         is_comparable: whether enough of the rollouts are decided to compare the policy.
         num_disagreements: starts whose outcome differs from the real one.
     """

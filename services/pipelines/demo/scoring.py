@@ -9,12 +9,12 @@ from dextouch.clients import Policy, RolloutClient
 from dextouch.errors import DexTouchError
 from dextouch.worlds import BatchWorld
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
-from services.evaluation.command_line import run_train_policy, run_train_probe
+from services.evaluation.command_line import run_train_judge, run_train_policy
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.scores import REAL, RolloutScore
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
 from services.evaluation.study_worlds import WorldAddress
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines import imagined_data, training_data
 from services.pipelines.demo.settings import TASKS, DemoPlan
 from services.pipelines.study.command import demonstrator
@@ -50,7 +50,7 @@ class Models:
     world_model: BatchWorld[Any]
     checkpoint: Path
     policy: BehaviourCloningPolicy
-    probe: SuccessProbe
+    probe: SuccessClassifier
 
 
 def committed_models() -> Models:
@@ -59,7 +59,7 @@ def committed_models() -> Models:
 
 
 def train_models(folder: Path) -> Models:
-    """Record training episodes and train a small state model, a policy and a success probe.
+    """Record training episodes and train a small state model, a policy and a success classifier.
 
     The probe is trained on true endings and on those imagined by the state model.
 
@@ -83,7 +83,7 @@ def train_models(folder: Path) -> Models:
             imagined_data.main,
             [*_stores(endings), "--store", imagined, "--checkpoint", str(world_model)],
         ),
-        (run_train_probe, ["--held-out", unseen, *_stores(endings, imagined, to=probe)]),
+        (run_train_judge, ["--held-out", unseen, *_stores(endings, imagined, to=probe)]),
     ]
     for step, words in steps:
         step(words)
@@ -101,7 +101,7 @@ def _load(world_model: Path, policy: Path, probe: Path) -> Models:
         open_world(world_model),
         world_model,
         BehaviourCloningPolicy.load(policy),
-        SuccessProbe.load(probe),
+        SuccessClassifier.load(probe),
     )
 
 

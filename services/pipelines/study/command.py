@@ -27,7 +27,7 @@ from services.evaluation.studies.policies import PolicyFactory, file_digest
 from services.evaluation.studies.reports import REPORT_FILE, write_reports
 from services.evaluation.studies.results import StudyHeader, StudyResults, cells_of
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines.parsers import study_parser
 from services.pipelines.training_data import stage_of
 from services.twin.scripted_actions import scripted_actions
@@ -52,7 +52,7 @@ def _run(options: argparse.Namespace) -> int:
     folder = options.folder or options.study.with_suffix("")
     refuse_training_seeds(definition)
     probe_path = definition.probe or DEFAULT_PROBE
-    probe = SuccessProbe.load(probe_path)
+    probe = SuccessClassifier.load(probe_path)
     instructions = instructions_for(definition.tasks, probe.metadata.settings["instructions"])
     policies = PolicyFactory(definition, partial(demonstrator, definition.tasks, definition.seeds))
     policies.load()

@@ -1,7 +1,7 @@
 """Episodes as networks learn from them: which are fit, their arrays on the model grid, one hash.
 
-World models, tokenizers, success probes, cloned policies and the figures of predictions all select
-episodes here and read them through `EpisodeGrid`, so that they agree on what an episode is.
+World models, tokenizers, success classifiers, cloned policies and the figures of predictions all
+select episodes here and read them through `EpisodeGrid`, so that they agree on what an episode is.
 """
 
 import hashlib

@@ -4,7 +4,10 @@ import pytest
 import torch
 
 from services.evaluation.policies.cloning_training import CloningSettings, train_cloned_policy
-from services.evaluation.success_probe_training import ProbeSettings, train_success_probe
+from services.evaluation.success_classifier_training import (
+    ClassifierSettings,
+    train_success_classifier,
+)
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.shown_endings import ending_episode
 
@@ -34,10 +37,10 @@ def policy_checkpoint(demonstrations):
 
 
 def _probe(demonstrations, num_steps):
-    settings = ProbeSettings(
+    settings = ClassifierSettings(
         num_training_steps=num_steps, batch_size=32, shift_px=1, learning_rate=3e-3
     )
-    return train_success_probe(
+    return train_success_classifier(
         [ending_episode(d) for d in demonstrations], settings, command="a test"
     )
 

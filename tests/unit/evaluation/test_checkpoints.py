@@ -20,8 +20,8 @@ from services.evaluation.checkpoints import (
     save_checkpoint,
 )
 from services.evaluation.policies.behaviour_cloning import KIND, BehaviourCloningPolicy
-from services.evaluation.success_probe import KIND as PROBE_KIND
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import KIND as PROBE_KIND
+from services.evaluation.success_classifier import SuccessClassifier
 
 
 def changed(checkpoint: Checkpoint, **tensors: torch.Tensor | None) -> Checkpoint:
@@ -32,7 +32,7 @@ def changed(checkpoint: Checkpoint, **tensors: torch.Tensor | None) -> Checkpoin
 def test_round_trip(policy_checkpoint, probe_checkpoint, tmp_path):
     for kind, checkpoint, build in (
         (KIND, policy_checkpoint, BehaviourCloningPolicy),
-        (PROBE_KIND, probe_checkpoint, SuccessProbe),
+        (PROBE_KIND, probe_checkpoint, SuccessClassifier),
     ):
         path = tmp_path / "deep" / f"{kind}.safetensors"
         save_checkpoint(path, checkpoint)

@@ -16,7 +16,7 @@ from services.evaluation.matched_starts import matched_start
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.study_worlds import WorldAddress
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
 
@@ -66,7 +66,7 @@ def client():
 
 @pytest.fixture(scope="module")
 def probe(trained_probe):
-    return SuccessProbe(trained_probe)
+    return SuccessClassifier(trained_probe)
 
 
 @pytest.fixture(scope="module")
@@ -249,7 +249,7 @@ def test_training_starts_are_refused(client, probe, policies, demonstrations):
         "probe": probe,
     }
     instructions = {"reach": toy.INSTRUCTIONS["reach"]}
-    with pytest.raises(ConflictError, match="trained on by the success probe"):
+    with pytest.raises(ConflictError, match="trained on by the success classifier"):
         evaluate(plan=EvaluationPlan(instructions, [2000, seen]), **asked)
     digest = matched_start(asked["real"], "reach", 2000, "").digest
     plan = EvaluationPlan(instructions, [2000], trained_on={"the world model": {digest}})

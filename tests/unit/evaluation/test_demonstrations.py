@@ -9,7 +9,7 @@ from dextouch.clients.policy import PolicyStart
 from dextouch.episodes import EpisodeStore, select_episodes
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from services.cli.main import run_command
-from services.evaluation.command_line import run_train_probe
+from services.evaluation.command_line import run_train_judge
 from services.evaluation.endings import read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.cloning_episodes import (
@@ -18,7 +18,7 @@ from services.evaluation.policies.cloning_episodes import (
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import action_picture, episode_picture
 from services.evaluation.starts import refuse_training_starts, start_digest
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.toy_store import write
 
@@ -98,13 +98,13 @@ def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     training += ["--training.development-share", "0.2"]
     assert run_command(["train", "judge", *flags, *training]) == 0
     assert "held_out_accuracy" in capsys.readouterr().out
-    probe = SuccessProbe.load(output)
+    probe = SuccessClassifier.load(output)
     assert probe.metadata.settings["instructions"] == toy.INSTRUCTIONS
     assert json.loads(figures.read_text())["metrics"] == probe.metadata.metrics
 
 
 @pytest.mark.parametrize(
-    ("network", "trained"), [("judge", SuccessProbe), ("policy", BehaviourCloningPolicy)]
+    ("network", "trained"), [("judge", SuccessClassifier), ("policy", BehaviourCloningPolicy)]
 )
 def test_what_a_station_recorded_can_be_trained_on(network, trained, tmp_path):
     store = EpisodeStore(tmp_path / "recorded")
@@ -123,7 +123,7 @@ def test_a_judge_that_nothing_would_measure_is_refused_before_it_is_trained(tmp_
         write(store, item)
     flags = ["--episodes", str(store.root), "--output", str(tmp_path / "judge.safetensors")]
     with pytest.raises(InvalidInputError, match=r"are held out.* --training\.held-out-share"):
-        run_train_probe([*flags, "--training.held-out-share", "0.02"])
+        run_train_judge([*flags, "--training.held-out-share", "0.02"])
 
 
 def test_policies_can_be_trained_from_the_command_line(url, tmp_path, capsys):

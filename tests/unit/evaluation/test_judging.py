@@ -11,14 +11,14 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import Doubt, Observation, RolloutDoubt
 from services.evaluation.calibration import Calibration, Combination
 from services.evaluation.endings import Ending, EndingEpisode, milestones_of
-from services.evaluation.judge_network import ProbeShape, probe_batch
-from services.evaluation.success_probe import SuccessProbe
-from services.evaluation.success_probe_data import labelled_endings
-from services.evaluation.success_probe_figures import fit_combinations
-from services.evaluation.success_probe_training import (
-    ProbeSettings,
+from services.evaluation.judge_network import ClassifierShape, probe_batch
+from services.evaluation.success_classifier import SuccessClassifier
+from services.evaluation.success_classifier_data import labelled_endings
+from services.evaluation.success_classifier_figures import fit_combinations
+from services.evaluation.success_classifier_training import (
+    ClassifierSettings,
     some_parts,
-    train_success_probe,
+    train_success_classifier,
 )
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.shown_endings import ending_episode
@@ -76,9 +76,9 @@ def _episodes(seeds: range) -> list[EndingEpisode]:
 
 @pytest.fixture(scope="module")
 def judge():
-    settings = ProbeSettings(num_training_steps=150, batch_size=32, learning_rate=3e-3)
-    return SuccessProbe(
-        train_success_probe(
+    settings = ClassifierSettings(num_training_steps=150, batch_size=32, learning_rate=3e-3)
+    return SuccessClassifier(
+        train_success_classifier(
             _episodes(range(45)),
             settings,
             command="a test",
@@ -165,7 +165,7 @@ def test_it_cannot_tell_within_its_band(judge):
         metadata = judge.metadata.model_copy(
             update={"settings": {**settings, "calibration": calibration}}
         )
-        probe = object.__new__(SuccessProbe)
+        probe = object.__new__(SuccessClassifier)
         probe.__dict__ |= judge.__dict__ | {
             "metadata": metadata,
             "_calibrations": {
@@ -180,7 +180,7 @@ def test_it_cannot_tell_within_its_band(judge):
 
 def _with_combination(judge, *, name="reach", **fields):
     """A probe of which only these fields of the combination are known, and no calibration."""
-    probe = object.__new__(SuccessProbe)
+    probe = object.__new__(SuccessClassifier)
     combination = {name: Combination(**fields)} if fields else {}
     probe.__dict__ |= judge.__dict__ | {"_calibrations": {}, "_combinations": combination}
     return probe
@@ -250,8 +250,8 @@ def test_estimates_of_development_endings_are_fitted_and_kept_in_the_checkpoint(
             final = replace(item.final, success_probability=told)
             yield replace(item, endings={**item.endings, item.last_step: final})
 
-    settings = ProbeSettings(num_training_steps=2)
-    checkpoint = train_success_probe(
+    settings = ClassifierSettings(num_training_steps=2)
+    checkpoint = train_success_classifier(
         _episodes(range(30)),
         settings,
         command="x",
@@ -264,22 +264,22 @@ def test_estimates_of_development_endings_are_fitted_and_kept_in_the_checkpoint(
     ending = next(
         e for e in estimated(range(700, 706), sure=1.0) if e.imagined and e.task == "reach"
     )
-    found = SuccessProbe(checkpoint).verdict(ending.final)
+    found = SuccessClassifier(checkpoint).verdict(ending.final)
     assert found.world_probability in {0.1, 0.9}
     doubted = [
         replace(e, endings={**e.endings, e.last_step: replace(e.final, doubted="slipped")})
         for e in estimated(range(600, 660), sure=1.0)
     ]
-    probe = SuccessProbe(checkpoint)
+    probe = SuccessClassifier(checkpoint)
     assert fit_combinations(probe, doubted, risk=0.1, margin=0.0) == {}
     assert fit_combinations(probe, _episodes(range(600, 660)), risk=0.1, margin=0.0) == {}
 
 
 def test_processes_do_not_change_the_weights():
     one, two = (
-        train_success_probe(
+        train_success_classifier(
             _episodes(range(30)),
-            ProbeSettings(num_training_steps=3),
+            ClassifierSettings(num_training_steps=3),
             command="x",
             development=_episodes(range(600, 612)),
             held_out=_episodes(range(700, 712)),
@@ -304,9 +304,9 @@ def test_a_world_that_is_wrong_about_unusual_sizes_decides_nothing_about_them():
         return replace(item, endings={**item.endings, item.last_step: final})
 
     development = [estimated(item) for item in _episodes(range(600, 720))]
-    checkpoint = train_success_probe(
+    checkpoint = train_success_classifier(
         _episodes(range(30)),
-        ProbeSettings(num_training_steps=2),
+        ClassifierSettings(num_training_steps=2),
         command="x",
         development=development,
         held_out=_episodes(range(800, 812)),
@@ -357,7 +357,9 @@ def test_milestones_are_known_where_somebody_noted_them():
 
 def test_true_and_imagined_endings_weigh_as_asked():
     episodes = _episodes(range(30))
-    shape = ProbeShape(tasks=toy.TASKS, image_size_px=toy.SIZE, milestones=milestones_of(episodes))
+    shape = ClassifierShape(
+        tasks=toy.TASKS, image_size_px=toy.SIZE, milestones=milestones_of(episodes)
+    )
     labelled = labelled_endings(episodes, shape, imagined_share=0.25)
     imagined = np.repeat([e.imagined for e in episodes], 4)
     share = labelled.weight[imagined].sum() / labelled.weight.sum()
@@ -369,9 +371,9 @@ def test_true_and_imagined_endings_weigh_as_asked():
 
 def test_true_endings_are_learned_without_poses_and_imagined_ones_with_them():
     episodes = _episodes(range(30))
-    shape = ProbeShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
+    shape = ClassifierShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
     batch = labelled_endings(episodes, shape).batch
-    settings = ProbeSettings(
+    settings = ClassifierSettings(
         true_without_poses=1, true_without_images=0,
         imagined_without_poses=0, imagined_without_images=1,
     )  # fmt: skip

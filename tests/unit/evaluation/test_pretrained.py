@@ -12,7 +12,7 @@ from dextouch.worlds.world import ReturnSelector, RolloutStart
 from services.evaluation.checkpoints import MAX_CHECKPOINT_BYTES
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE, EARLY_POLICY
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 from tests.unit.evaluation import true_endings
@@ -35,7 +35,7 @@ LEAST = {"stack_bowls": (0.97, 0.90), "stand_bottle": (0.97, 0.90)}
     [
         (DEFAULT_POLICY, BehaviourCloningPolicy, SIX),
         (EARLY_POLICY, BehaviourCloningPolicy, SIX),
-        (DEFAULT_PROBE, SuccessProbe, SIX),
+        (DEFAULT_PROBE, SuccessClassifier, SIX),
     ],
 )
 def test_a_committed_checkpoint(path, build, tasks):
@@ -112,7 +112,7 @@ def test_an_unknown_task_is_refused(twin):
 
 @pytest.mark.parametrize("task", SIX)
 def test_the_probe_says_what_it_was_measured_on(task):
-    metrics = SuccessProbe.load(DEFAULT_PROBE).metadata.metrics
+    metrics = SuccessClassifier.load(DEFAULT_PROBE).metadata.metrics
     assert metrics[f"held_out_auc_{task}"] >= 0.97
     assert metrics[f"held_out_balanced_accuracy_{task}"] >= 0.90
     for outcome in ("successes", "failures"):
@@ -123,7 +123,7 @@ def test_the_probe_says_what_it_was_measured_on(task):
 @pytest.mark.parametrize("task", ["stack_bowls", "stand_bottle"])
 def test_the_probe_tells_true_endings_near_the_border(task, capsys):
     endings, success = true_endings.read(task)
-    told = SuccessProbe.load(DEFAULT_PROBE).probabilities(endings)
+    told = SuccessClassifier.load(DEFAULT_PROBE).probabilities(endings)
     wins, losses = told[success], told[~success]
     auc = mannwhitneyu(wins, losses).statistic / (len(wins) * len(losses))
     balanced = ((wins >= 0.5).mean() + (losses < 0.5).mean()) / 2

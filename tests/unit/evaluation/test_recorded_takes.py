@@ -22,7 +22,7 @@ from services.evaluation.recorded_takes import (
 from services.evaluation.scores import RolloutScore
 from services.evaluation.starts import start_digest
 from services.evaluation.study_worlds import WorldAddress
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 from tests.unit.evaluation import toy, toy_store
 from tests.unit.worlds.running import served
 
@@ -72,7 +72,7 @@ def client(items):
 
 @pytest.fixture(scope="module")
 def probe(trained_probe):
-    return SuccessProbe(trained_probe)
+    return SuccessClassifier(trained_probe)
 
 
 def scored(store, client, probe, world, **options):

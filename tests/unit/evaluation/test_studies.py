@@ -31,7 +31,7 @@ from services.evaluation.studies.results import (
     study_report,
 )
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
 
@@ -136,7 +136,7 @@ def parts(url, probe_checkpoint):
     return StudyParts(
         connect,
         lambda: {"hold": Fragile(), "script": script()},
-        SuccessProbe(probe_checkpoint),
+        SuccessClassifier(probe_checkpoint),
         toy.INSTRUCTIONS,
     )
 

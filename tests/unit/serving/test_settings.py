@@ -21,7 +21,7 @@ from services.cli.up_settings import UpSettings
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - that keys are demanded there is what is tested
 
 
-class ProbeSettings(ServiceSettings):
+class ClassifierSettings(ServiceSettings):
     """Settings of a service that exists only here."""
 
     model_config = service_config("probe")
@@ -32,42 +32,42 @@ class ProbeSettings(ServiceSettings):
 def test_flags_stand_above_the_environment(monkeypatch):
     monkeypatch.setenv("DEXTOUCH_PROBE_PORT", "8101")
     monkeypatch.setenv("DEXTOUCH_PROBE_RATE_HZ", "30")
-    settings = load_settings(ProbeSettings, ["--rate-hz", "60"])
+    settings = load_settings(ClassifierSettings, ["--rate-hz", "60"])
     assert (settings.port, settings.rate_hz) == (8101, 60.0)
 
 
 def test_an_empty_variable_counts_as_not_set(monkeypatch):
     monkeypatch.setenv("DEXTOUCH_PROBE_RATE_HZ", "")
     monkeypatch.setenv("DEXTOUCH_UP_STATION", "")
-    assert load_settings(ProbeSettings, []).rate_hz == 15.0
+    assert load_settings(ClassifierSettings, []).rate_hz == 15.0
     assert load_settings(UpSettings, []).station == "mock station"
 
 
 def test_a_variable_that_is_no_json_is_named(monkeypatch):
     monkeypatch.setenv("DEXTOUCH_PROBE_ALLOWED_HOSTS", "lab.example")
     with pytest.raises(InvalidInputError, match="variable DEXTOUCH_PROBE_ALLOWED_HOSTS is no JSON"):
-        load_settings(ProbeSettings, [])
+        load_settings(ClassifierSettings, [])
 
 
 def test_unknown_flags_are_refused(capsys):
     with pytest.raises(SystemExit) as caught:
-        load_settings(ProbeSettings, ["--colour", "red"])
+        load_settings(ClassifierSettings, ["--colour", "red"])
     assert caught.value.code == 2
     assert "--colour" in capsys.readouterr().err
 
 
 def test_wrong_values_are_named():
     with pytest.raises(InvalidInputError, match=r"port: .*65535"):
-        load_settings(ProbeSettings, ["--port", "99999"])
+        load_settings(ClassifierSettings, ["--port", "99999"])
 
 
 def test_open_addresses_need_keys(monkeypatch):
     with pytest.raises(InvalidInputError, match="not loopback"):
-        load_settings(ProbeSettings, ["--host", EVERYWHERE])
+        load_settings(ClassifierSettings, ["--host", EVERYWHERE])
     monkeypatch.setenv(
         "DEXTOUCH_PROBE_API_KEYS", '[{"name": "a", "key": "a-key-of-some-length", "scopes": ["x"]}]'
     )
-    settings = load_settings(ProbeSettings, ["--host", EVERYWHERE])
+    settings = load_settings(ClassifierSettings, ["--host", EVERYWHERE])
     assert settings.api_keys[0].scopes == ("x",)
     assert "a-key-of-some-length" not in repr(settings)
 
@@ -77,7 +77,7 @@ def test_open_addresses_need_keys(monkeypatch):
 )
 def test_host_names_that_could_never_match_are_refused(name):
     with pytest.raises(InvalidInputError, match=r"allowed_hosts.*without its port"):
-        load_settings(ProbeSettings, ["--allowed-hosts", json.dumps([name])])
+        load_settings(ClassifierSettings, ["--allowed-hosts", json.dumps([name])])
 
 
 @pytest.mark.parametrize(
@@ -93,15 +93,15 @@ def test_host_names_that_could_never_match_are_refused(name):
 )
 def test_origins_that_could_never_match_are_refused(origin):
     with pytest.raises(InvalidInputError, match=r"allowed_origins.*got .*, expected "):
-        load_settings(ProbeSettings, ["--allowed-origins", json.dumps([origin])])
+        load_settings(ClassifierSettings, ["--allowed-origins", json.dumps([origin])])
 
 
 def test_settings_are_frozen_and_closed():
-    settings = ProbeSettings()
+    settings = ClassifierSettings()
     with pytest.raises(ValidationError, match="frozen"):
         settings.port = 1
     with pytest.raises(ValidationError, match="extra"):
-        ProbeSettings(colour="red")
+        ClassifierSettings(colour="red")
 
 
 @pytest.mark.parametrize(
@@ -180,32 +180,32 @@ def test_the_garbage_collector_leaves_out_what_a_service_starts_with(monkeypatch
 )
 def test_a_wrong_value_is_told_with_what_is_expected(flag, value, told):
     with pytest.raises(InvalidInputError) as caught:
-        load_settings(ProbeSettings, [f"{flag}={value}"])
+        load_settings(ClassifierSettings, [f"{flag}={value}"])
     assert told in caught.value.message
     assert "Input should" not in caught.value.message
 
 
 def test_rates_that_are_no_whole_numbers_are_accepted():
-    assert load_settings(ProbeSettings, ["--rate-hz", "29.97"]).rate_hz == 29.97
+    assert load_settings(ClassifierSettings, ["--rate-hz", "29.97"]).rate_hz == 29.97
 
 
 def test_wrong_values_of_the_environment_and_the_file_are_told_alike(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "dextouch.toml").write_text('[probe]\nport = 1.5\ncolour = "red"\n')
     with pytest.raises(InvalidInputError) as caught:
-        load_settings(ProbeSettings, [])
+        load_settings(ClassifierSettings, [])
     assert "port: got 1.5, expected a whole number" in caught.value.message
     assert "colour: there is no such setting" in caught.value.message
     assert "dextouch.toml:2 [probe] port" in caught.value.message
     monkeypatch.setenv("DEXTOUCH_PROBE_PORT", "many")
     with pytest.raises(InvalidInputError, match="port: got 'many', expected a whole number"):
-        load_settings(ProbeSettings, [])
+        load_settings(ClassifierSettings, [])
 
 
 def test_a_wrong_value_that_may_be_secret_is_not_repeated(monkeypatch):
     keys = '[{"name": "a", "key": "short-one", "scopes": 7}, {"name": "b", "key": 1234567890123}]'
     monkeypatch.setenv("DEXTOUCH_PROBE_API_KEYS", keys)
     with pytest.raises(InvalidInputError) as caught:
-        load_settings(ProbeSettings, [])
+        load_settings(ClassifierSettings, [])
     assert "short-one" not in caught.value.message
     assert "1234567890123" not in caught.value.message

@@ -1,4 +1,4 @@
-"""Training examples of the success probe: endings as tensors, with labels and weights."""
+"""Training examples of the success classifier: endings as tensors, with labels and weights."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
 from services.evaluation.endings import Ending, EndingEpisode
-from services.evaluation.judge_network import ProbeBatch, ProbeShape, probe_batch
+from services.evaluation.judge_network import ClassifierBatch, ClassifierShape, probe_batch
 
 # Share of early endings in the weight of a task's failures. They are easy: with more weight they
 # would dominate the near misses, which matter.
@@ -29,7 +29,7 @@ class Labelled:
     known.
     """
 
-    batch: ProbeBatch
+    batch: ClassifierBatch
     outcome: torch.Tensor
     known: torch.Tensor
     weight: torch.Tensor
@@ -54,7 +54,7 @@ class _Example:
 
 
 def labelled_endings(
-    episodes: Sequence[EndingEpisode], shape: ProbeShape, *, imagined_share: float = 0.5
+    episodes: Sequence[EndingEpisode], shape: ClassifierShape, *, imagined_share: float = 0.5
 ) -> Labelled:
     """Endings with outcomes, weighted so that both outcomes count the same in every task.
 
@@ -86,7 +86,7 @@ def labelled_endings(
     return Labelled(batch, outcome, known, scaled)
 
 
-def _examples(item: EndingEpisode, shape: ProbeShape) -> list[_Example]:
+def _examples(item: EndingEpisode, shape: ClassifierShape) -> list[_Example]:
     last = item.last_step
     steps: list[tuple[int, str, bool | None]] = [
         (last, "final", item.success),
@@ -135,14 +135,14 @@ def _group_weights(examples: Sequence[_Example], what: str) -> Float64[np.ndarra
     ):
         if share and not chosen.any():
             raise InvalidInputError(
-                f"success probe: no {word} episode of {what} among {len(examples)} endings; "
+                f"success classifier: no {word} episode of {what} among {len(examples)} endings; "
                 "record with more noise levels"
             )
         weight[chosen] = share / max(chosen.sum(), 1)
     return weight
 
 
-def object_scale(batch: ProbeBatch) -> tuple[torch.Tensor, torch.Tensor]:
+def object_scale(batch: ClassifierBatch) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean and standard deviation of the object pose features, each [features].
 
     They are 0 and 1 for fewer than two known poses.

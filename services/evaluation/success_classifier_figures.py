@@ -1,4 +1,4 @@
-"""Calibration of a trained success probe, and its metrics on held-out endings."""
+"""Calibration of a trained success classifier, and its metrics on held-out endings."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,10 +18,10 @@ from services.evaluation.calibration import (
 )
 from services.evaluation.endings import Ending, EndingEpisode
 from services.evaluation.statistics import area_under_roc, balanced_accuracy
-from services.evaluation.success_probe import (
+from services.evaluation.success_classifier import (
     IMAGINED,
     TRUE,
-    SuccessProbe,
+    SuccessClassifier,
     calibration_name,
     combination_name,
 )
@@ -34,7 +34,7 @@ Figures = dict[str, float | int]
 
 
 def fit_calibrations(
-    probe: SuccessProbe, episodes: Sequence[EndingEpisode], *, risk: float
+    probe: SuccessClassifier, episodes: Sequence[EndingEpisode], *, risk: float
 ) -> dict[str, Calibration]:
     """Calibration of every task and kind of ending with enough of both outcomes."""
     found: dict[str, Calibration] = {}
@@ -49,7 +49,7 @@ def fit_calibrations(
 
 
 def fit_combinations(
-    probe: SuccessProbe, episodes: Sequence[EndingEpisode], *, risk: float, margin: float
+    probe: SuccessClassifier, episodes: Sequence[EndingEpisode], *, risk: float, margin: float
 ) -> dict[str, Combination]:
     """Combination of a calibrated probe with the world's own estimates, of every task.
 
@@ -80,7 +80,7 @@ def fit_combinations(
 
 
 def milestones_that_can_be_told(
-    probe: SuccessProbe, episodes: Sequence[EndingEpisode]
+    probe: SuccessClassifier, episodes: Sequence[EndingEpisode]
 ) -> dict[str, tuple[str, ...]]:
     """Milestones of every task that the probe classifies well on held-out endings."""
     areas = milestone_areas(probe, episodes)
@@ -91,7 +91,7 @@ def milestones_that_can_be_told(
 
 
 def milestone_areas(
-    probe: SuccessProbe, episodes: Sequence[EndingEpisode]
+    probe: SuccessClassifier, episodes: Sequence[EndingEpisode]
 ) -> dict[tuple[str, str], float]:
     """Area under the ROC curve of every task and milestone with both outcomes."""
     areas: dict[tuple[str, str], float] = {}
@@ -107,7 +107,7 @@ def milestone_areas(
     return areas
 
 
-def held_out_figures(probe: SuccessProbe, episodes: Sequence[EndingEpisode]) -> Figures:
+def held_out_figures(probe: SuccessClassifier, episodes: Sequence[EndingEpisode]) -> Figures:
     """Share of correct decisions over all tasks, and metrics of true and imagined endings by task.
 
     True endings are given without object poses, which a real robot does not have; `poses` are true
@@ -136,7 +136,7 @@ def held_out_figures(probe: SuccessProbe, episodes: Sequence[EndingEpisode]) -> 
 
 
 def _figures(
-    probe: SuccessProbe, endings: Sequence[Ending], success: np.ndarray, name: str
+    probe: SuccessClassifier, endings: Sequence[Ending], success: np.ndarray, name: str
 ) -> Figures:
     verdicts = probe.verdicts(endings)
     probabilities = np.array([v.probability for v in verdicts])

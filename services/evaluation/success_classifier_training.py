@@ -1,4 +1,4 @@
-"""Training of the success probe on true and imagined endings of known outcome.
+"""Training of the success classifier on true and imagined endings of known outcome.
 
 Three disjoint sets of episodes: training, development (to calibrate the probabilities) and held out
 (for the metrics in the checkpoint).
@@ -19,27 +19,27 @@ from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, netw
 from services.evaluation.demonstrations import instructions_of
 from services.evaluation.endings import EndingEpisode, milestones_of
 from services.evaluation.judge_network import (
-    ProbeBatch,
-    ProbeNetwork,
-    ProbeShape,
+    ClassifierBatch,
+    ClassifierNetwork,
+    ClassifierShape,
     TaskNetwork,
     unit_images,
 )
 from services.evaluation.optimization import optimized
 from services.evaluation.starts import refuse_training_starts
-from services.evaluation.success_probe import DECISION_THRESHOLD, KIND, SuccessProbe
-from services.evaluation.success_probe_data import Labelled, labelled_endings, object_scale
-from services.evaluation.success_probe_figures import (
+from services.evaluation.success_classifier import DECISION_THRESHOLD, KIND, SuccessClassifier
+from services.evaluation.success_classifier_data import Labelled, labelled_endings, object_scale
+from services.evaluation.success_classifier_figures import (
     fit_calibrations,
     fit_combinations,
     held_out_figures,
     milestones_that_can_be_told,
 )
-from services.evaluation.training_settings import ProbeSettings
+from services.evaluation.training_settings import ClassifierSettings
 
 
 @dataclass(frozen=True)
-class ProbeSets:
+class ClassifierSets:
     """Disjoint sets of episodes; no two sets share a start."""
 
     training: Sequence[EndingEpisode]
@@ -50,11 +50,11 @@ class ProbeSets:
     def split(
         cls,
         episodes: Sequence[EndingEpisode],
-        settings: ProbeSettings,
+        settings: ClassifierSettings,
         *,
         development: Sequence[EndingEpisode] = (),
         held_out: Sequence[EndingEpisode] = (),
-    ) -> "ProbeSets":
+    ) -> "ClassifierSets":
         """The given sets; missing ones are taken from a share of the scenes of `episodes`."""
         training, tested, calibrated = list(episodes), list(held_out), list(development)
         if not tested:
@@ -82,7 +82,9 @@ class ProbeSets:
             (self.held_out, self.training_starts),
         ):
             refuse_training_starts(
-                (e.start_digest for e in others), trained_on=trained_on, what="the success probe"
+                (e.start_digest for e in others),
+                trained_on=trained_on,
+                what="the success classifier",
             )
 
     def check_measurable(self) -> None:
@@ -95,15 +97,15 @@ class ProbeSets:
             outcomes = [e.success for e in self.held_out if e.task == task and not e.imagined]
             if len(set(outcomes)) < 2:
                 raise InvalidInputError(
-                    f"success probe: {len(outcomes)} true takes of {task!r} are held out, "
+                    f"success classifier: {len(outcomes)} true takes of {task!r} are held out, "
                     f"{sum(outcomes)} of them successful; expected both outcomes: choose a larger "
                     "--training.held-out-share, or give --held-out STORE"
                 )
 
 
-def train_success_probe(
+def train_success_classifier(
     episodes: Sequence[EndingEpisode],
-    settings: ProbeSettings,
+    settings: ClassifierSettings,
     *,
     command: str,
     development: Sequence[EndingEpisode] = (),
@@ -128,14 +130,14 @@ def train_success_probe(
         InvalidInputError: a task has only one outcome.
     """
     torch.manual_seed(settings.seed)
-    sets = ProbeSets.split(episodes, settings, development=development, held_out=held_out)
+    sets = ClassifierSets.split(episodes, settings, development=development, held_out=held_out)
     sets.check()
-    shape = ProbeShape(
+    shape = ClassifierShape(
         tasks=tuple(sorted({e.task for e in sets.training})),
         image_size_px=_image_size_px(sets.training),
         milestones=milestones_of(sets.training),
     )
-    network = ProbeNetwork(shape)
+    network = ClassifierNetwork(shape)
     learned = labelled_endings(sets.training, shape, imagined_share=settings.imagined_share)
     sets.check_measurable()
     orders = [
@@ -152,8 +154,12 @@ def train_success_probe(
     return _measured(_calibrated(plain, sets, settings), sets)
 
 
-def calibrate_success_probe(
-    base: Checkpoint, episodes: Sequence[EndingEpisode], settings: ProbeSettings, *, command: str
+def calibrate_success_classifier(
+    base: Checkpoint,
+    episodes: Sequence[EndingEpisode],
+    settings: ClassifierSettings,
+    *,
+    command: str,
 ) -> Checkpoint:
     """Fit the probabilities and the bands of a trained probe anew, for another world model.
 
@@ -172,7 +178,7 @@ def calibrate_success_probe(
         "settings": {**metadata.settings, "calibrated_by": command},
     }
     checkpoint = replace(base, metadata=metadata.model_copy(update=known))
-    return _calibrated(checkpoint, ProbeSets((), episodes, ()), settings)
+    return _calibrated(checkpoint, ClassifierSets((), episodes, ()), settings)
 
 
 def _image_size_px(episodes: Sequence[EndingEpisode]) -> int:
@@ -181,7 +187,11 @@ def _image_size_px(episodes: Sequence[EndingEpisode]) -> int:
 
 
 def _metadata(
-    sets: ProbeSets, settings: ProbeSettings, shape: ProbeShape, command: str, cpu_s: float
+    sets: ClassifierSets,
+    settings: ClassifierSettings,
+    shape: ClassifierShape,
+    command: str,
+    cpu_s: float,
 ) -> CheckpointMetadata:
     everything = [*sets.training, *sets.development, *sets.held_out]
     return CheckpointMetadata(
@@ -208,9 +218,11 @@ def _metadata(
     )
 
 
-def _calibrated(checkpoint: Checkpoint, sets: ProbeSets, settings: ProbeSettings) -> Checkpoint:
+def _calibrated(
+    checkpoint: Checkpoint, sets: ClassifierSets, settings: ClassifierSettings
+) -> Checkpoint:
     """The checkpoint with all that is fitted to the development episodes."""
-    probe = SuccessProbe(checkpoint)
+    probe = SuccessClassifier(checkpoint)
     calibrations = fit_calibrations(probe, sets.development, risk=settings.risk)
     calibrated = _with_settings(
         checkpoint,
@@ -218,7 +230,7 @@ def _calibrated(checkpoint: Checkpoint, sets: ProbeSets, settings: ProbeSettings
         told_milestones=milestones_that_can_be_told(probe, sets.development),
     )
     combinations = fit_combinations(
-        SuccessProbe(calibrated),
+        SuccessClassifier(calibrated),
         sets.development,
         risk=settings.imagined_risk,
         margin=settings.contradiction_margin,
@@ -234,9 +246,9 @@ def _with_settings(checkpoint: Checkpoint, **added: object) -> Checkpoint:
     return replace(checkpoint, metadata=metadata.model_copy(update={"settings": settings}))
 
 
-def _measured(checkpoint: Checkpoint, sets: ProbeSets) -> Checkpoint:
+def _measured(checkpoint: Checkpoint, sets: ClassifierSets) -> Checkpoint:
     """The checkpoint with its metrics on the held-out episodes."""
-    figures = held_out_figures(SuccessProbe(checkpoint), sets.held_out)
+    figures = held_out_figures(SuccessClassifier(checkpoint), sets.held_out)
     metadata = checkpoint.metadata
     return replace(
         checkpoint,
@@ -244,7 +256,7 @@ def _measured(checkpoint: Checkpoint, sets: ProbeSets) -> Checkpoint:
     )
 
 
-_Order = tuple[TaskNetwork, Labelled, ProbeSettings, str]
+_Order = tuple[TaskNetwork, Labelled, ClassifierSettings, str]
 _Optimized = tuple[dict[str, Tensor], float]
 
 
@@ -259,7 +271,7 @@ def _all_optimized(orders: Sequence[_Order], jobs: int) -> list[_Optimized]:
 
 
 def _optimized(
-    network: TaskNetwork, learned: Labelled, settings: ProbeSettings, name: str
+    network: TaskNetwork, learned: Labelled, settings: ClassifierSettings, name: str
 ) -> _Optimized:
     """Minimize the balanced cross entropy of one task; returns weights and CPU seconds."""
     # Dropout draws from the global generator.
@@ -286,7 +298,7 @@ def _optimized(
 
 
 def _loss(
-    odds: torch.Tensor, outcome: torch.Tensor, known: torch.Tensor, settings: ProbeSettings
+    odds: torch.Tensor, outcome: torch.Tensor, known: torch.Tensor, settings: ClassifierSettings
 ) -> torch.Tensor:
     """Cross entropy of success and, with less weight, milestones, where they are known."""
     each = functional.binary_cross_entropy_with_logits(odds, outcome, reduction="none") * known
@@ -296,8 +308,11 @@ def _loss(
 
 
 def some_parts(
-    batch: ProbeBatch, object_std: torch.Tensor, settings: ProbeSettings, generator: torch.Generator
-) -> ProbeBatch:
+    batch: ClassifierBatch,
+    object_std: torch.Tensor,
+    settings: ClassifierSettings,
+    generator: torch.Generator,
+) -> ClassifierBatch:
     """Add noise to the poses, and drop poses or images at random.
 
     Args:
@@ -326,7 +341,7 @@ def some_parts(
 
 
 def _disturb(
-    images: torch.Tensor, settings: ProbeSettings, generator: torch.Generator
+    images: torch.Tensor, settings: ClassifierSettings, generator: torch.Generator
 ) -> torch.Tensor:
     """Noise, brightness and a small shift, and a blur of half the examples, as in predictions."""
     num = len(images)

@@ -1,4 +1,4 @@
-"""The success probe: accuracy on held-out toys, balance, and honest refusals."""
+"""The success classifier: accuracy on held-out toys, balance, and honest refusals."""
 
 from dataclasses import replace
 
@@ -9,13 +9,13 @@ from scipy.stats import mannwhitneyu
 
 from dextouch.episodes import split_by_scene
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
-from services.evaluation.judge_network import ProbeShape
-from services.evaluation.success_probe import SuccessProbe
-from services.evaluation.success_probe_data import labelled_endings
-from services.evaluation.success_probe_training import (
-    ProbeSettings,
-    calibrate_success_probe,
-    train_success_probe,
+from services.evaluation.judge_network import ClassifierShape
+from services.evaluation.success_classifier import SuccessClassifier
+from services.evaluation.success_classifier_data import labelled_endings
+from services.evaluation.success_classifier_training import (
+    ClassifierSettings,
+    calibrate_success_classifier,
+    train_success_classifier,
 )
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.shown_endings import ending_episode, final_ending
@@ -33,7 +33,7 @@ def test_held_out_accuracy_is_kept_in_the_checkpoint(trained_probe):
 
 
 def test_it_tells_new_successes_from_failures(trained_probe):
-    probe = SuccessProbe(trained_probe)
+    probe = SuccessClassifier(trained_probe)
     fresh = [toy.demonstration(t, s, noise_m=n) for t in toy.TASKS for s in range(500, 510)
              for n in (0.0, 0.06)]  # fmt: skip
     told = probe.probabilities([final_ending(d, d.num_steps - 1) for d in fresh]) > 0.5
@@ -43,14 +43,14 @@ def test_it_tells_new_successes_from_failures(trained_probe):
 
 
 def test_one_and_many_agree(probe_checkpoint):
-    probe = SuccessProbe(probe_checkpoint)
+    probe = SuccessClassifier(probe_checkpoint)
     endings = [final_ending(toy.demonstration("reach", s), 80) for s in range(4)]
     together = probe.probabilities(endings)
     assert together == pytest.approx([probe.probability(e) for e in endings], abs=1e-6)
 
 
 def test_both_outcomes_weigh_the_same(demonstrations):
-    shape = ProbeShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
+    shape = ClassifierShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
     labelled = labelled_endings(_episodes(demonstrations), shape)
     for task in range(2):
         of_task = labelled.batch.task == task
@@ -62,11 +62,13 @@ def test_both_outcomes_weigh_the_same(demonstrations):
 
 def test_one_sided_data_is_refused():
     with pytest.raises(InvalidInputError, match=r"no failed episode of true 'reach'"):
-        train_success_probe(_episodes(toy.demonstrations(range(20))), ProbeSettings(), command="x")
+        train_success_classifier(
+            _episodes(toy.demonstrations(range(20))), ClassifierSettings(), command="x"
+        )
 
 
 def test_foreign_input_is_refused(probe_checkpoint):
-    probe = SuccessProbe(probe_checkpoint)
+    probe = SuccessClassifier(probe_checkpoint)
     ending = final_ending(toy.demonstration("reach", 0), 80)
     with pytest.raises(UnknownNameError, match="juggle"):
         probe.probability(toy.replace(ending, task="juggle"))
@@ -87,13 +89,13 @@ def test_a_start_never_stands_on_both_sides(demonstrations):
 
 
 def test_it_is_measured_on_the_held_out_episodes_it_is_given(demonstrations):
-    settings = ProbeSettings(num_training_steps=1)
+    settings = ClassifierSettings(num_training_steps=1)
     others = toy.demonstrations(range(900, 920), noise_m=0.03)
-    checkpoint = train_success_probe(
+    checkpoint = train_success_classifier(
         _episodes(demonstrations), settings, command="x", held_out=_episodes(others)
     )
     assert len(checkpoint.metadata.training_episodes) == len(demonstrations)
-    metrics, probe = checkpoint.metadata.metrics, SuccessProbe(checkpoint)
+    metrics, probe = checkpoint.metadata.metrics, SuccessClassifier(checkpoint)
     for task in toy.TASKS:
         mine = [d for d in others if d.task == task]
         told = probe.probabilities([final_ending(d, 80) for d in mine])
@@ -102,8 +104,8 @@ def test_it_is_measured_on_the_held_out_episodes_it_is_given(demonstrations):
         auc = mannwhitneyu(wins, losses).statistic / (len(wins) * len(losses))
         assert metrics[f"held_out_auc_{task}"] == pytest.approx(auc)
         assert metrics[f"num_held_out_failures_{task}"] == len(losses) > 0
-    with pytest.raises(ConflictError, match="trained on by the success probe"):
-        train_success_probe(
+    with pytest.raises(ConflictError, match="trained on by the success classifier"):
+        train_success_classifier(
             _episodes(demonstrations),
             settings,
             command="x",
@@ -112,7 +114,7 @@ def test_it_is_measured_on_the_held_out_episodes_it_is_given(demonstrations):
 
 
 def test_early_endings_do_not_crowd_out_near_misses(demonstrations):
-    shape = ProbeShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
+    shape = ClassifierShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
     labelled = labelled_endings(_episodes(demonstrations), shape)
     # Two endings of each episode are late; an early one follows them.
     early = torch.tensor([False, False, True] * len(demonstrations))
@@ -132,11 +134,11 @@ def test_a_probe_with_spoiled_probabilities_is_calibrated_to_what_happened(
         settings["calibration"][f"{task}/true"] = {"temperature": 1.0, "bias": 8.0, "band": 0.0}
     metadata = probe_checkpoint.metadata.model_copy(update={"settings": settings})
     base = replace(probe_checkpoint, metadata=metadata)
-    calibrated = calibrate_success_probe(base, episodes, ProbeSettings(), command="test")
+    calibrated = calibrate_success_classifier(base, episodes, ClassifierSettings(), command="test")
     for name, tensor in base.tensors.items():
         assert (calibrated.tensors[name] == tensor).all()
     assert calibrated.metadata.settings["calibrated_by"] == "test"
     last = [one.endings[max(one.endings)] for one in episodes]
     rate = sum(one.success for one in episodes) / len(episodes)
-    assert SuccessProbe(base).probabilities(last).mean() > rate + 0.2
-    assert SuccessProbe(calibrated).probabilities(last).mean() == pytest.approx(rate, abs=0.08)
+    assert SuccessClassifier(base).probabilities(last).mean() > rate + 0.2
+    assert SuccessClassifier(calibrated).probabilities(last).mean() == pytest.approx(rate, abs=0.08)

@@ -1,4 +1,4 @@
-"""The shipped success probe on true endings near the border of success, recorded here and now."""
+"""The shipped success classifier on true endings near the border of success, recorded here."""
 
 import sys
 from dataclasses import replace
@@ -10,7 +10,7 @@ from scipy.stats import mannwhitneyu
 from dextouch.episodes import EpisodeStore
 from services.evaluation.endings import read_ending_episodes
 from services.evaluation.settings import DEFAULT_PROBE
-from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines.training_data import Scope, make_training_data
 from services.twin.data_mix import LADDER_M, MIXES
 
@@ -25,7 +25,7 @@ LESS_SURE = {"stack_bowls": 0.70, "open_drawer": 0.80, "place_shoes": 0.85}
 def test_it_tells_successes_from_near_misses(tmp_path):
     torch.set_num_threads(1)
     seeds = range(FIRST_SEED, FIRST_SEED + 4 * len(LADDER_M))
-    probe = SuccessProbe.load(DEFAULT_PROBE)
+    probe = SuccessClassifier.load(DEFAULT_PROBE)
     scope = Scope(probe.metadata.tasks)
     make_training_data(str(tmp_path), seeds, MIXES["ladder"], num_jobs=1, scope=scope)
     episodes = read_ending_episodes(EpisodeStore(tmp_path))

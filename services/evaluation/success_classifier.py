@@ -1,4 +1,4 @@
-"""Success probe: classifies the end of a rollout as success or failure.
+"""Success classifier: classifies the end of a rollout as success or failure.
 
 Its inputs are images, touch and, for imagined endings, the predicted object poses; never actions.
 """
@@ -16,7 +16,12 @@ from dextouch.errors import InvalidInputError
 from services.evaluation.calibration import UNFITTED, Calibration, Combination, sigmoid
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_network
 from services.evaluation.endings import Ending
-from services.evaluation.judge_network import ProbeBatch, ProbeNetwork, ProbeShape, probe_batch
+from services.evaluation.judge_network import (
+    ClassifierBatch,
+    ClassifierNetwork,
+    ClassifierShape,
+    probe_batch,
+)
 
 # Version 4 of the network, one per task; older checkpoints are rejected by this name.
 KIND = "success-probe-4"
@@ -44,7 +49,7 @@ class Verdict:
     world_probability: float | None = None
 
 
-class SuccessProbe:
+class SuccessClassifier:
     """A trained probe.
 
     Args:
@@ -57,7 +62,7 @@ class SuccessProbe:
     def __init__(self, checkpoint: Checkpoint) -> None:
         self.metadata = checkpoint.metadata
         settings = checkpoint.metadata.settings
-        self.shape = ProbeShape.model_validate(settings["shape"])
+        self.shape = ClassifierShape.model_validate(settings["shape"])
         self.threshold = float(settings.get("threshold", DECISION_THRESHOLD))
         self._calibrations = {
             name: Calibration.model_validate(values)
@@ -68,11 +73,11 @@ class SuccessProbe:
             for name, values in settings.get("combination", {}).items()
         }
         self._told: Mapping[str, Sequence[str]] = settings.get("told_milestones", {})
-        self._network = ProbeNetwork(self.shape)
+        self._network = ClassifierNetwork(self.shape)
         load_network(self._network, checkpoint)
 
     @classmethod
-    def load(cls, path: Path) -> "SuccessProbe":
+    def load(cls, path: Path) -> "SuccessClassifier":
         """Load a probe from its file."""
         return cls(load_checkpoint(path, kind=KIND))
 
@@ -94,13 +99,13 @@ class SuccessProbe:
             InvalidInputError: no endings, images of another size, or missing images.
         """
         if not endings:
-            raise InvalidInputError("success probe: got no endings, expected at least one")
+            raise InvalidInputError("success classifier: got no endings, expected at least one")
         parts = [endings[at : at + _BATCH] for at in range(0, len(endings), _BATCH)]
         with torch.no_grad():
             odds = [self._seen(probe_batch(part, self.shape)) for part in parts]
         return torch.cat(odds).double().numpy()
 
-    def _seen(self, batch: ProbeBatch) -> Float32[torch.Tensor, "n outputs"]:
+    def _seen(self, batch: ClassifierBatch) -> Float32[torch.Tensor, "n outputs"]:
         """Log odds; with images and poses, the mean of those with and without the images.
 
         Where poses are known, images rendered from them add as much error as information.
