@@ -38,8 +38,8 @@ def imagine_episode(
     is cut off. Actions are the commanded ones, or those that were reached if the robot keeps no
     commands. Its `success` is that of the *source*: the real outcome of the actions, and the label
     for training a success classifier on imagined endings. Its lineage names the source and the
-    world's     digest. Object poses, if the world provides them, are the stream `object_poses`, from step 1 on;
-    the world's doubt about the whole rollout, and its own estimate of success, are quality figures
+    world's digest. Object poses, if the world provides them, are the stream `object_poses`, from
+    step 1 on; the world's doubt about the whole rollout, and its own estimate of success, are quality figures
     (`RolloutDoubt.to_quality`).
 
     Args:

@@ -24,7 +24,8 @@ DISAGREEMENT: Final = 0.5
 MEANINGS: Final = {
     "rate": "Share of the starts from which the policy succeeded, with its 95 % Wilson interval. "
     "In an imagined world success is what the success classifier decides from images, touch and "
-    "object poses and from the world's own estimate; rollouts that it cannot tell count in no rate.",
+    "object poses and from the world's own estimate; rollouts that it cannot tell count in no "
+    "rate.",
     "pearson": "Pearson's r: 1 if the world's success rates of the policies are a straight line "
     "over the real ones, 0 if they say nothing about them, negative if they reverse them. It needs "
     "three policies: two points always lie on a line.",
@@ -36,7 +37,8 @@ MEANINGS: Final = {
     "interval": "Intervals contain the true policies' figure with 95 % probability; with few "
     "policies or starts they are wide.",
     "unreliable": "The success classifier cannot tell: its probability is too close to 0.5, it and "
-    "the world's own estimate contradict each other, or the world doubted its prediction at a step. "
+    "the world's own estimate contradict each other, or the world doubted its prediction at a "
+    "step. "
     f"With fewer than {LEAST_DECIDED:.0%} of its rollouts decided a policy is not compared.",
 }
 
