@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dextouch.geometry import box_pixels, lens_pixels, points_on_level, project
+from dextouch.geometry import box_pixels, lens_pixels, points_on_level, project, undistorted
 
 K = np.array([[560.0, 0.0, 322.0], [0.0, 555.0, 238.0], [0.0, 0.0, 1.0]])
 STRAIGHT = np.zeros(5)
@@ -100,3 +100,27 @@ def test_corners_of_a_box():
     )
     corners = [[x, y, z] for z in (0.03, 0.09) for y in (-0.2, 0.2) for x in (-0.1, 0.1)]
     np.testing.assert_allclose(pixels, seen_by_opencv(np.array(corners), LENSES[1], T), atol=1e-9)
+
+
+@pytest.mark.parametrize("distortion", LENSES[1:])
+def test_images_are_undistorted_as_by_opencv(distortion):
+    noise = np.random.default_rng(7).integers(0, 256, (2, 12, 16, 3), dtype=np.uint8)
+    images = np.stack([cv2.resize(one, SIZE_PX, interpolation=cv2.INTER_CUBIC) for one in noise])
+    # OpenCV's first pixel has its centre at 0, ours at 0.5.
+    camera = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    x, y = cv2.initUndistortRectifyMap(camera, distortion, None, camera, SIZE_PX, cv2.CV_32FC1)
+    expected = [
+        cv2.remap(one, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for one in images
+    ]
+    got = undistorted(images, K, distortion)
+    # OpenCV interpolates at 32 places of a pixel.
+    off = np.abs(got.astype(int) - np.stack(expected))
+    assert off.max() <= 4
+    assert off.mean() < 0.4
+    assert np.abs(got.astype(int) - images).mean() > 3 * off.mean()
+
+
+def test_images_without_distortion_are_left_alone():
+    images = np.zeros((1, 480, 640, 3), dtype=np.uint8)
+    assert undistorted(images, K, STRAIGHT) is images
+    assert undistorted(images[:0], K, LENSES[1]).shape == (0, 480, 640, 3)

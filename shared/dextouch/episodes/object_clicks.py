@@ -70,8 +70,7 @@ def first_camera(
     about: EpisodeAttributes,
 ) -> tuple[tuple[np.ndarray, np.ndarray], Float64[np.ndarray, "4 4"]]:
     """K (px) and distortion of an episode's head camera, and T_world_camera at its first step."""
-    distortion = about.calibration.get("distortion_head", ((0.0,) * 5,))
-    camera = about.K_head_matrix(), np.array(distortion[0], dtype=np.float64)
+    camera = about.K_head_matrix(), about.head_distortion()
     return camera, about.anchor.to_poses().T_world_camera_head
 
 

@@ -21,6 +21,7 @@ from dextouch.episodes.reader import OWN_IMAGE_SHARE, EpisodeReader
 from dextouch.episodes.splits import Split, is_in, recording_of, scene_of, split_of
 from dextouch.episodes.store import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.geometry import undistorted
 from dextouch.hands.actions import AnchorPoses
 from dextouch.images import scaled_square, square_of_at_most
 from dextouch.schemas import ActionKind, Domain, EpisodeAttributes, Observation, Origin
@@ -300,7 +301,10 @@ class EpisodeGrid:
         return height_px, width_px
 
     def images(self, steps: Sequence[int] | np.ndarray) -> UInt8[np.ndarray, "n h w 3"]:
-        """The head camera image nearest to each of some non-decreasing steps, whatever its own."""
+        """The head camera image nearest to each of some non-decreasing steps, whatever its own.
+
+        They are undistorted: as a pinhole camera with `K_head` would have taken them.
+        """
         return self._nearest(steps)[1]
 
     def own_images(self, steps: Sequence[int] | np.ndarray) -> UInt8[np.ndarray, "n h w 3"] | None:
@@ -314,7 +318,9 @@ class EpisodeGrid:
     ) -> tuple[Int64[np.ndarray, " n"], UInt8[np.ndarray, "n h w 3"]]:
         times_ns = self.t_ref_ns[np.asarray(steps)]
         indices, images = self.reader.nearest_pictures(HEAD_CAMERA, times_ns)
-        scaled, _ = square_of_at_most(images, self.about.K_head_matrix(), self.image_px)
+        K = self.about.K_head_matrix()
+        flat = undistorted(images, K, self.about.head_distortion())
+        scaled, _ = square_of_at_most(flat, K, self.image_px)
         return self.reader.stamps_ns(HEAD_CAMERA)[indices] - times_ns, scaled
 
     def observation(self, step: int = 0) -> Observation:

@@ -6,6 +6,7 @@ from .interpolation import nearest_index as nearest_index
 from .lens import box_pixels as box_pixels
 from .lens import lens_pixels as lens_pixels
 from .lens import points_on_level as points_on_level
+from .lens import undistorted as undistorted
 from .transforms import apply as apply
 from .transforms import invert as invert
 from .transforms import pinhole_matrix as pinhole_matrix

@@ -147,6 +147,10 @@ class EpisodeAttributes(FrozenModel):
     def _is_camera_matrix(cls, rows: Matrix) -> Matrix:
         return _check_matrix(rows, (3, 3))
 
+    def head_distortion(self) -> Float64[np.ndarray, "5"]:
+        """Distortion of the head camera's lens, k1 k2 p1 p2 k3; zeros where none is known."""
+        return np.array(self.calibration.get("distortion_head", ((0.0,) * 5,))[0], dtype=np.float64)
+
     def K_head_matrix(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802 (K is the camera matrix)
         """The head camera's matrix in pixels."""
         return np.array(self.K_head)

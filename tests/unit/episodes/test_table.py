@@ -3,6 +3,7 @@
 from dataclasses import replace
 from datetime import UTC, datetime
 
+import cv2
 import numpy as np
 import pytest
 
@@ -276,6 +277,42 @@ def test_images_and_their_camera_are_scaled_together(readers):
     np.testing.assert_allclose(small.K_head[:2], whole.K_head[:2] / 2)
     means = whole.images([0])[0].reshape(32, 2, 32, 2, 3).mean(axis=(1, 3))
     assert np.abs(small.images([0])[0] - means).max() <= 0.5
+
+
+def test_images_of_a_lens_are_read_without_its_distortion(truths, store):
+    """The twin's pinhole images, as a lens would have taken them, come back as they were."""
+    truth = truths["script"]
+    stream, K = truth.streams["camera_head"], truth.attributes.K_head_matrix()
+    height, width = stream.values.shape[1:3]
+    lens = np.array([-0.6, 0.2, 0.001, -0.001, 0.0])
+    # Smooth, so that interpolating them twice costs less than the distortion.
+    pinhole = np.stack([cv2.GaussianBlur(one, (0, 0), 2.0) for one in stream.values])
+    rows, columns = np.mgrid[0:height, 0:width] + 0.5
+    seen = np.stack([columns.ravel(), rows.ravel()], axis=-1)
+    flat = cv2.undistortPoints(seen[:, None], K, lens, P=K).reshape(height, width, 2) - 0.5
+    taken = np.stack(
+        [
+            cv2.remap(
+                one, *np.moveaxis(flat.astype(np.float32), -1, 0), cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
+            for one in pinhole
+        ]
+    )  # fmt: skip
+    calibration = truth.attributes.calibration | {"distortion_head": (tuple(lens.tolist()),)}
+    recorded = replace(
+        truth,
+        attributes=truth.attributes.model_copy(update={"calibration": calibration}),
+        streams=truth.streams | {"camera_head": replace(stream, values=taken)},
+    )
+    write_truth(store, recorded)
+    grid = EpisodeGrid(store.open(truth.attributes.episode_id))
+    steps = [0, 40]
+    inside = np.s_[:, 6:-6, 6:-6]
+    truly = pinhole[[0, 10]][inside].astype(float)
+    error = np.abs(grid.images(steps)[inside] - truly).mean()
+    assert error < 0.4 * np.abs(taken[[0, 10]][inside] - truly).mean()
+    np.testing.assert_allclose(grid.K_head, K)
 
 
 def test_the_first_observation_is_that_of_its_step(truths, readers):
