@@ -54,18 +54,23 @@ from services.evaluation.starts import start_digest
 from services.evaluation.statistics import area_under_roc
 from services.evaluation.success_classifier_figures import MIN_OUTCOMES
 from services.networks.training_settings import USUAL_IMAGE_PX
-from services.world_model.dynamics.commands import Commands
-from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import NUM_PADS, OWN_SIZE, own_features
-from services.world_model.dynamics.features import SLOT_SIZE, compressed, slot_features
-from services.world_model.dynamics.hand_motion import hand_motion
+from services.world_model.dynamics.features import (
+    BOX_AXES,
+    SLOT_SIZE,
+    Commands,
+    DynamicsConfig,
+    compressed,
+    hand_motion,
+    rotations,
+    slot_features,
+)
+from services.world_model.dynamics.members import combined, mapped
 from services.world_model.dynamics.model import first_steps
-from services.world_model.dynamics.nested import combined, mapped
-from services.world_model.dynamics.objects import BOX_AXES, rotations
 from services.world_model.dynamics.start_reader import TASK_WIDTH, FirstStep, Reading, StartReader
 from services.world_model.settings import ReaderSettings
 from services.world_model.starts import observed_start
-from services.world_model.training.reader_training import read_step, train_reader
+from services.world_model.training.core_training import read_step, train_reader
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 
 KIND: Final = "direct-judge-2"

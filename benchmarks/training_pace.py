@@ -7,9 +7,8 @@ from itertools import islice
 import torch
 
 from services.world_model.settings import TrainSettings
-from services.world_model.training.dataset import WindowBatch
-from services.world_model.training.streaming import index_episodes, read_batches
-from services.world_model.training.training_run import TrainingRun
+from services.world_model.training.dataset import WindowBatch, index_episodes, read_batches
+from services.world_model.training.trainer import TrainingRun
 
 
 class TrainingPace:

@@ -14,7 +14,7 @@ from benchmarks.stress import worlds
 from benchmarks.stress.cells import Check, StageCells
 from benchmarks.stress.worlds import TASK, Subject
 from dextouch.errors import EndedError, InvalidInputError
-from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.network import RendererNetwork

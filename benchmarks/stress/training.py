@@ -18,7 +18,7 @@ from services.world_model.settings import OptimizerSettings, TrainSettings, Wind
 from services.world_model.training.dataset import EpisodeArrays, WindowBatch, WindowSampler
 from services.world_model.training.objective import LossOptions, losses
 from services.world_model.training.splits import check_disjoint
-from services.world_model.training.training_run import TrainingRun
+from services.world_model.training.trainer import TrainingRun
 
 STAGE = StageCells("training")
 _PX = 32

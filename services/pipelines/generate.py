@@ -15,8 +15,7 @@ from services.pipelines.imagined_data import chosen_episodes, imagine
 from services.pipelines.parsers import generate_parser
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
-from services.world_model.training.dataset import fingerprint
-from services.world_model.training.episodes import read_episode
+from services.world_model.training.dataset import fingerprint, read_episode
 
 _NUM_MOMENTS = 8
 

@@ -28,8 +28,7 @@ from services.world_model.settings import (
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.tokenizer_files import is_tokenizer, read_tokenizer
 from services.world_model.training.distribution import Processes, joined_processes
-from services.world_model.training.trainer import TrainingReport, train
-from services.world_model.training.training_run import TrainingProgress
+from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
 from services.world_model.world import open_world
 
 

@@ -20,11 +20,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from dextouch.tactile.layout import NUM_TAXELS
 from services.networks.memory import memory_of
+from services.world_model.network.attention import CAMERA_DIM, HAND_DIM
 from services.world_model.network.configuration import NetworkConfig, num_latents
-from services.world_model.network.contact_geometry import GEOMETRY_SIZE
-from services.world_model.network.inputs import ModelInputs
+from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs
 from services.world_model.network.instruction import MAX_WORDS
-from services.world_model.network.mirroring import CAMERA_DIM, HAND_DIM
 from services.world_model.network.model import FirstLatents, JointLatents, JointWorldModel
 from services.world_model.wan.configuration import WanConfig
 from services.world_model.wan.text import key_of

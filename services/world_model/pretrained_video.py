@@ -7,11 +7,19 @@ from torch import nn
 from dextouch.errors import InvalidInputError
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel
-from services.world_model.network.wan_codec import WanVideoCodec
-from services.world_model.network.wan_video import WanBlock, WanVideoCondition, WanVideoExpert
+from services.world_model.network.video import (
+    WanBlock,
+    WanVideoCodec,
+    WanVideoCondition,
+    WanVideoExpert,
+)
 from services.world_model.wan.configuration import WanFiles
-from services.world_model.wan.loading import find_weights, load_weights
-from services.world_model.wan.renaming import TRANSFORMER_RULES, autoencoder_rules
+from services.world_model.wan.loading import (
+    TRANSFORMER_RULES,
+    autoencoder_rules,
+    find_weights,
+    load_weights,
+)
 
 _STEM = "diffusion_pytorch_model"
 _ORIGINAL_AUTOENCODER = "Wan2.2_VAE"

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
@@ -11,6 +12,11 @@ from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.images import scaled_square
 from dextouch.schemas import Observation, RolloutStart
 from dextouch.streams import HEAD_CAMERA
+from services.world_model.dynamics.features import BOX_AXES, hand_motion, poses_from_objects
+from services.world_model.dynamics.members import stacked
+from services.world_model.dynamics.model import first_steps, mean_poses
+from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
+from services.world_model.state_checkpoints import StateCheckpoint
 
 # Larger values are mistakes of units or frames.
 MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
@@ -112,3 +118,49 @@ def check_geometry(anchor: AnchorPoses, K_head: Float64[np.ndarray, "3 3"]) -> N
             f"start: K_head has focal lengths {focal_px.tolist()} and centre "
             f"{K_head[:2, 2].tolist()} px, expected 1 … {MAX_CAMERA_PX:.0f} px"
         )
+
+
+class SceneReader:
+    """Finds the objects of requests, for a model that is conditioned on contact geometry.
+
+    Args:
+        checkpoint: a state model, whose start readers are averaged.
+    """
+
+    def __init__(self, checkpoint: StateCheckpoint) -> None:
+        self._readers = checkpoint.dynamics.readers()
+        self._metadata = checkpoint.metadata
+        self.tasks = checkpoint.metadata.dynamics.tasks
+
+    @torch.no_grad()
+    def objects(
+        self, requests: Sequence[PredictionRequest], tasks: Sequence[str]
+    ) -> list[ObjectsAtStart]:
+        """Objects at the first step of every request.
+
+        Raises:
+            UnknownNameError: a task that the state model was not trained on.
+        """
+        unknown = sorted(set(tasks) - set(self.tasks))
+        if unknown:
+            raise UnknownNameError("task of the start readers", unknown[0], list(self.tasks))
+        hands = [hand_motion(request.actions[:1], request.anchor) for request in requests]
+        first = first_steps(
+            [request.first_image for request in requests],
+            [request.K_head for request in requests],
+            [request.first_tactile_kpa for request in requests],
+            hands,
+            [self.tasks.index(task) for task in tasks],
+        )
+        readings = [reader(first) for reader in self._readers]
+        poses = poses_from_objects(mean_poses(stacked([one.objects for one in readings])))
+        size = stacked([one.size for one in readings]).mean(0).double().numpy()
+        return [
+            self._seen(task, *each)
+            for task, each in zip(tasks, zip(poses, size, strict=True), strict=True)
+        ]
+
+    def _seen(self, task: str, poses: np.ndarray, size: np.ndarray) -> ObjectsAtStart:
+        boxes_m = np.array(self._metadata.object_boxes_m[task])
+        count = len(boxes_m)
+        return ObjectsAtStart(poses[:count], boxes_m * size[:count, BOX_AXES])

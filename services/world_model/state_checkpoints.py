@@ -17,7 +17,7 @@ from services.networks.weight_files import (
     read_weights,
     write_weights,
 )
-from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.network import RendererNetwork

@@ -15,8 +15,7 @@ from services.networks.weight_files import (
     write_weights,
 )
 from services.world_model.network.configuration import NetworkConfig, TokenizerName
-from services.world_model.network.tactile_tokenizer import TactileTokenizer
-from services.world_model.network.tokenizer_choice import build_tokenizer
+from services.world_model.network.tactile_tokenizers import TactileTokenizer, build_tokenizer
 
 METADATA_KEY = "dextouch_tactile_tokenizer"
 

@@ -34,11 +34,10 @@ from services.world_model.checkpoints import Checkpoint, read_checkpoint
 from services.world_model.network.configuration import Precision, Sampler
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Prediction, Sampling, stack_noise
-from services.world_model.network.visual_codec import to_uint8, to_unit
+from services.world_model.network.video import to_uint8, to_unit
 from services.world_model.placement import Placement
-from services.world_model.scene_reader import SceneReader
 from services.world_model.shipped_checkpoints import default_checkpoint
-from services.world_model.starts import observed_start
+from services.world_model.starts import SceneReader, observed_start
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.state_world import StateWorld
 

@@ -13,8 +13,7 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.shipped_checkpoints import paper_form_checkpoint
-from services.world_model.training.dataset import EpisodeArrays, cut_window
-from services.world_model.training.episodes import load_episodes
+from services.world_model.training.dataset import EpisodeArrays, cut_window, load_episodes
 from services.world_model.training.evaluation import evaluate_prediction, predict_all
 
 # Far from the seeds of training and of the checkpoint's own held-out set.

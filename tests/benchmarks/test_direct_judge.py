@@ -31,7 +31,7 @@ from services.twin.motions import Motion
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
-from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.training.scene_table import scene_table
 from tests.unit.world_model.test_state_training import NUM_STEPS, PX, episode
 from tests.unit.world_model.toy_grid import ToyGrid, changed

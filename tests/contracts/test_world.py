@@ -25,7 +25,7 @@ from services.world_model.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel

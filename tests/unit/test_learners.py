@@ -17,10 +17,9 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
 from services.world_model.settings import TrainStateCommand
-from services.world_model.training.episodes import load_episodes
+from services.world_model.training.dataset import index_episodes, load_episodes
 from services.world_model.training.state_data import load_state_data
-from services.world_model.training.streaming import index_episodes
-from services.world_model.training.tactile_hands import load_hands
+from services.world_model.training.tokenizer_trainer import load_hands
 
 LEARNERS = {
     "joint world model": load_episodes,

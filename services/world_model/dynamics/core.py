@@ -19,16 +19,21 @@ from torch.nn import functional
 
 from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile.layout import NUM_TAXELS
-from services.world_model.dynamics.commands import Commands
-from services.world_model.dynamics.configuration import (
+from services.world_model.dynamics.features import (
+    BOX_AXES,
+    LOOKS,
+    MAX_DISTANCE_M,
+    NUM_POINTS,
+    SLOT_SIZE,
     STEPS_PER_LATENT,
+    Commands,
     DynamicsConfig,
+    ObjectPoses,
+    compressed,
+    rotations,
+    slot_features,
 )
-from services.world_model.dynamics.features import LOOKS, SLOT_SIZE, compressed, slot_features
-from services.world_model.dynamics.hand_motion import NUM_POINTS
-from services.world_model.dynamics.member_layers import MemberGRU, MemberLinear, MemberNorm
-from services.world_model.dynamics.nested import combined
-from services.world_model.dynamics.objects import BOX_AXES, MAX_DISTANCE_M, ObjectPoses, rotations
+from services.world_model.dynamics.members import MemberGRU, MemberLinear, MemberNorm, combined
 
 NUM_PADS = 12
 # The contact of a hand's taxels is modelled as a mixture of this many patterns.

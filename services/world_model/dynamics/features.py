@@ -1,15 +1,85 @@
-"""Contact geometry: hand points relative to the surface of every object at its present pose.
+"""What the dynamics read and predict: configuration, commands, hands, objects and touch."""
 
-Success is decided within millimetres, which a wrist pose relative to its own start does not
-resolve. Distances are compressed by asinh(d / 1 cm), so that a millimetre near an object and a
-decimetre far from it both change a feature by about a tenth. The scale is the same for all tasks.
-"""
+from dataclasses import dataclass
+from typing import Final
 
+import numpy as np
 import torch
-from jaxtyping import Float32
-from torch import Tensor
+from jaxtyping import Float32, Float64, Shaped
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+from torch.nn import functional
 
-from services.world_model.dynamics.hand_motion import NUM_POINTS
+from dextouch.frozen_model import FrozenModel
+from dextouch.geometry import pose_from_transform, transform, transform_from_pose
+from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, AnchorPoses, poses_from_actions
+from dextouch.hands.robot_hand import chain_points_of_both_m
+from dextouch.schemas import MAX_OBJECTS, Domain
+from dextouch.tactile.layout import NUM_TAXELS
+from services.networks.principal_axes import principal_axes, root_pressure
+from services.world_model.dynamics.members import mapped
+
+# Of each hand: the wrist, five fingertips, five PIP joints, and the middle of the palm.
+NUM_POINTS: Final = 12
+
+
+@dataclass(frozen=True)
+class HandMotion:
+    """Both hands over n steps in the world frame, left before right.
+
+    `points_m` are the wrist, thumb … little fingertip, their PIP joints, and a point halfway
+    between the wrist and the knuckles; `axes` the first two columns of
+    R_world_wrist; `Ts_world_camera` the head camera's poses.
+    """
+
+    points_m: Float32[np.ndarray, "n 2 12 3"]
+    axes: Float32[np.ndarray, "n 2 6"]
+    joints_rad: Float32[np.ndarray, "n 2 20"]
+    Ts_world_camera: Float64[np.ndarray, "n 4 4"]
+
+    def __len__(self) -> int:
+        return len(self.points_m)
+
+    def __getitem__(self, steps: slice | np.ndarray) -> "HandMotion":
+        """Select steps."""
+        return HandMotion(
+            self.points_m[steps],
+            self.axes[steps],
+            self.joints_rad[steps],
+            self.Ts_world_camera[steps],
+        )
+
+
+def hand_motion(
+    actions: Float64[np.ndarray, "n 67"], anchor: AnchorPoses, *, validated: bool = False
+) -> HandMotion:
+    """Motion of both hands under the given actions.
+
+    Args:
+        actions: relative to `anchor`.
+        anchor: T_world poses that the actions are relative to.
+        validated: the actions were returned by `check_actions` and are not checked again.
+
+    Raises:
+        DegenerateRotationError: the actions contain a degenerate rotation.
+    """
+    poses = poses_from_actions(actions, anchor, validated=validated)
+    Ts = np.stack([poses.Ts_world_wrist_left, poses.Ts_world_wrist_right], axis=1)
+    joints = np.stack([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1)
+    chains = chain_points_of_both_m(joints)
+    knuckles, pips, tips = chains[..., 0, :], chains[..., 1, :], chains[..., 3, :]
+    palm = 0.5 * knuckles[:, :, 1:].mean(axis=2, keepdims=True)
+    R = Ts[..., :3, :3]
+    points = np.concatenate([np.zeros_like(palm), tips, pips, palm], axis=2)
+    points = points @ np.swapaxes(R, -1, -2) + Ts[:, :, None, :3, 3]
+    axes = np.concatenate([R[..., 0], R[..., 1]], axis=-1)
+    return HandMotion(
+        points.astype(np.float32),
+        axes.astype(np.float32),
+        joints.astype(np.float32),
+        poses.Ts_world_camera_head,
+    )
+
 
 NEAR_M = 0.01
 # Features are computed at these of the four steps of a latent: hands may shake within one.
@@ -52,3 +122,235 @@ def slot_features(
     distance = distance + beyond.amax(-1, keepdim=True).clamp_max(0.0)
     each = compressed(torch.cat([distance, from_middle, offset], dim=-1))
     return each.permute(0, 2, 4, 1, 3, 5).flatten(3)
+
+
+# Largest number of objects of a task; unused slots are masked.
+# What models of older releases know.
+_ROBOT_ALONE: Final[tuple[Domain, ...]] = ("robot",)
+# The core runs once every four steps of the model grid, the rate of video latents.
+STEPS_PER_LATENT: Final = 4
+
+
+class DynamicsConfig(FrozenModel):
+    """Architecture of a dynamics model.
+
+    `tasks` and `num_objects` form its vocabulary: a task's index selects its embedding, and its
+    objects fill the first slots in the order of the episode's `object_names`. With the domain
+    `human`, cores are given whose hands act, and predict the touch of either by heads of its own.
+    """
+
+    tasks: tuple[str, ...] = Field(min_length=1)
+    num_objects: tuple[int, ...]
+    image_px: int = Field(default=64, ge=16, le=256)
+    reader_channels: int = Field(default=32, ge=8, le=256)
+    reader_keypoints: int = Field(default=40, ge=4, le=256)
+    width: int = Field(default=192, ge=8, le=1024)
+    touch_channels: int = Field(default=96, ge=4, le=320)
+    domains: tuple[Domain, ...] = Field(
+        default=_ROBOT_ALONE, exclude_if=lambda domains: domains == _ROBOT_ALONE
+    )
+
+    @property
+    def has_humans(self) -> bool:
+        """Whether cores tell people from robots."""
+        return "human" in self.domains
+
+    @model_validator(mode="after")
+    def _objects_fit(self) -> "DynamicsConfig":
+        if len(self.num_objects) != len(self.tasks) or len(set(self.tasks)) != len(self.tasks):
+            raise ValueError(
+                f"got {len(self.tasks)} tasks and {len(self.num_objects)} numbers of objects, "
+                "expected one number for every task and no task twice"
+            )
+        if any(not 1 <= count <= MAX_OBJECTS for count in self.num_objects):
+            raise ValueError(
+                f"num_objects: got {self.num_objects}, expected 1 … {MAX_OBJECTS} for every task"
+            )
+        return self
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Motion of both hands at the sampled steps of each latent.
+
+    `points_m` are those of `HandMotion` at the `LOOKS` of each latent, `axes` and `joints_rad` at
+    its end.
+    """
+
+    points_m: Float32[Tensor, "batch latents looks 2 points 3"]
+    axes: Float32[Tensor, "batch latents 2 6"]
+    joints_rad: Float32[Tensor, "batch latents 2 20"]
+
+    def __len__(self) -> int:
+        # A tensor while a trace is made.
+        return int(self.points_m.shape[1])
+
+    def __getitem__(self, latents: slice) -> "Commands":
+        """Select latent steps."""
+        return Commands(
+            self.points_m[:, latents], self.axes[:, latents], self.joints_rad[:, latents]
+        )
+
+    def repeated(self, times: int) -> "Commands":
+        """The same commands for each of several members, whose entries follow each other."""
+        return mapped(self, lambda values: values.repeat(times, *[1] * (values.ndim - 1)))
+
+    @classmethod
+    def of(cls, motions: list[HandMotion]) -> "Commands":
+        """Commands of a batch: for each entry, the hand motion over the next 4k steps."""
+        looks = np.arange(0, len(motions[0]), STEPS_PER_LATENT)[:, None] + np.array(LOOKS) - 1
+        ends = looks[:, -1]
+        return cls(
+            torch.from_numpy(np.stack([motion.points_m[looks] for motion in motions])),
+            torch.from_numpy(np.stack([motion.axes[ends] for motion in motions])),
+            torch.from_numpy(np.stack([motion.joints_rad[ends] for motion in motions])),
+        )
+
+    @classmethod
+    def standing(cls, motions: list[HandMotion]) -> "Commands":
+        """The single latent step, with resting hands, that starts a rollout (one step each)."""
+        return cls.of([motion[np.zeros(STEPS_PER_LATENT, dtype=np.int64)] for motion in motions])
+
+
+# Objects farther than this from the world's origin count as absent.
+MAX_DISTANCE_M = 1.0
+# Factors of the usual size that an object may have.
+SIZE_RANGE = (0.5, 2.0)
+# Which factor, width or height, each number of a box has: middle, half sizes; x, y, z.
+BOX_AXES = [0, 0, 1, 0, 0, 1]
+# Shorter axes have no direction.
+_SHORTEST = 1e-3
+
+
+@dataclass(frozen=True)
+class ObjectPoses:
+    """Objects in the world frame.
+
+    `axes` are the directions of the object's z and x axis. An axis that cannot be observed (the yaw
+    of a round bowl) is predicted shorter than one, so that its length expresses certainty.
+    `present` is 1 for an object, 0 for unused slots and objects out of reach, and a probability in
+    between.
+    """
+
+    position_m: Float32[Tensor, "*batch objects 3"]
+    axes: Float32[Tensor, "*batch objects 2 3"]
+    present: Float32[Tensor, "*batch objects"]
+
+    def __getitem__(self, index: Tensor | int | slice | tuple[slice, int]) -> "ObjectPoses":
+        """Index the batch."""
+        return ObjectPoses(self.position_m[index], self.axes[index], self.present[index])
+
+    def slots(self, count: int) -> "ObjectPoses":
+        """The first slots."""
+        return ObjectPoses(
+            self.position_m[..., :count, :],
+            self.axes[..., :count, :, :],
+            self.present[..., :count],
+        )
+
+
+def objects_from_poses(poses: Shaped[np.ndarray, "*batch objects 7"]) -> ObjectPoses:
+    """Fill slots with known poses (x y z in metres, qw qx qy qz); further slots stay empty."""
+    T = transform_from_pose(np.asarray(poses, dtype=np.float64))
+    batch, count = T.shape[:-3], T.shape[-3]
+    position = np.zeros((*batch, MAX_OBJECTS, 3), dtype=np.float32)
+    axes = np.zeros((*batch, MAX_OBJECTS, 2, 3), dtype=np.float32)
+    present = np.zeros((*batch, MAX_OBJECTS), dtype=np.float32)
+    near = np.linalg.norm(T[..., :3, 3], axis=-1) <= MAX_DISTANCE_M
+    position[..., :count, :] = np.where(near[..., None], T[..., :3, 3], 0.0)
+    axes[..., :count, 0, :], axes[..., :count, 1, :] = T[..., :3, 2], T[..., :3, 0]
+    present[..., :count] = near
+    return ObjectPoses(
+        torch.from_numpy(position), torch.from_numpy(axes), torch.from_numpy(present)
+    )
+
+
+def poses_from_objects(objects: ObjectPoses) -> Float64[np.ndarray, "*batch objects 7"]:
+    """Rigid poses nearest to predicted positions and axes.
+
+    z keeps its direction; x is made perpendicular to it. Where x is unknown (near zero or along
+    z), any perpendicular direction is taken, as for an object that is symmetric about z.
+    """
+    axes = objects.axes.double().numpy()
+    z = _unit(axes[..., 0, :], np.array([0.0, 0.0, 1.0]))
+    x = axes[..., 1, :] - z * (axes[..., 1, :] * z).sum(-1, keepdims=True)
+    helper = np.where(np.abs(z[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    fallback = helper - z * (helper * z).sum(-1, keepdims=True)
+    fallback /= np.linalg.norm(fallback, axis=-1, keepdims=True)
+    x = _unit(x, fallback)
+    R = np.stack([x, np.cross(z, x), z], axis=-1)
+    return pose_from_transform(transform(R, objects.position_m.double().numpy()))
+
+
+def rotations(axes: Float32[Tensor, "*batch 2 3"]) -> Float32[Tensor, "*batch 3 3"]:
+    """R_world_object nearest to predicted axes: z keeps its direction, x is made perpendicular.
+
+    As `poses_from_objects`, for networks. Axes of no length give some rotation.
+    """
+    z = _direction(axes[..., 0, :], torch.tensor([0.0, 0.0, 1.0]))
+    x = axes[..., 1, :]
+    x = x - z * (x * z).sum(-1, keepdim=True)
+    helper = torch.where(
+        z[..., :1].abs() < 0.9, torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0])
+    )
+    x = _direction(x, functional.normalize(helper - z * (helper * z).sum(-1, keepdim=True), dim=-1))
+    return torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
+
+
+def _direction(vectors: Tensor, otherwise: Tensor) -> Tensor:
+    length = vectors.norm(dim=-1, keepdim=True)
+    return torch.where(length > _SHORTEST, vectors / length.clamp_min(_SHORTEST), otherwise)
+
+
+def _unit(vectors: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > _SHORTEST, vectors / np.maximum(length, _SHORTEST), otherwise)
+
+
+# Pads with a lower peak pressure count as free when contact is learned.
+FREE_KPA = 2.0
+
+
+class TouchCodec(nn.Module):
+    """Frozen encoder and decoder of one hand's taxels, the same for left and right.
+
+    Latents are in units of the strongest axis' amplitude, so that their squared error is
+    proportional to that of the root of pressure. Decoded pressure is bounded by `peak_kpa`, the
+    highest pressure in training.
+    """
+
+    basis: Tensor
+    scale: Tensor
+    peak_kpa: Tensor
+
+    def __init__(self, num_channels: int) -> None:
+        super().__init__()
+        self.register_buffer("basis", torch.eye(NUM_TAXELS, num_channels))
+        self.register_buffer("scale", torch.ones(()))
+        self.register_buffer("peak_kpa", torch.full((), 1e3))
+
+    @torch.no_grad()
+    def fit(self, tactile_kpa: Float32[Tensor, "n 320"], *, peak_kpa: float | None = None) -> None:
+        """Fit axes, scale and peak to training touch of single hands.
+
+        Args:
+            tactile_kpa: sample of the training data.
+            peak_kpa: highest pressure of all training data; None uses that of the sample.
+        """
+        roots = root_pressure(tactile_kpa).double()
+        # Not centred: the mean touch is not a touch that occurs.
+        basis, rms = principal_axes(roots.T @ roots / len(roots), self.basis.shape[1])
+        self.basis.copy_(basis)
+        self.scale.copy_(rms[0].clamp_min(1e-3))
+        peak = float(tactile_kpa.max()) if peak_kpa is None else peak_kpa
+        self.peak_kpa.fill_(max(peak, FREE_KPA))
+
+    def encode(self, tactile_kpa: Float32[Tensor, "*b 320"]) -> Float32[Tensor, "*b channels"]:
+        """Latents; pressures are clipped to 0 … peak."""
+        bounded = torch.minimum(tactile_kpa, self.peak_kpa)
+        return (root_pressure(bounded) @ self.basis) / self.scale
+
+    def decode(self, latents: Float32[Tensor, "*b channels"]) -> Float32[Tensor, "*b 320"]:
+        """Pressures in kPa between zero and the peak."""
+        roots = ((latents * self.scale) @ self.basis.T).clamp_min(0.0)
+        return torch.minimum(roots.square(), self.peak_kpa)

@@ -9,12 +9,15 @@ from torch import Tensor
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile.layout import NUM_TAXELS
-from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import NUM_PADS, CoreState, SceneStart
-from services.world_model.dynamics.hand_motion import NUM_POINTS
+from services.world_model.dynamics.features import (
+    NUM_POINTS,
+    SIZE_RANGE,
+    DynamicsConfig,
+    ObjectPoses,
+)
+from services.world_model.dynamics.members import named
 from services.world_model.dynamics.model import SceneMemory
-from services.world_model.dynamics.nested import named
-from services.world_model.dynamics.objects import SIZE_RANGE, ObjectPoses
 
 # Bound on metres, kilopascals and latents; this world never writes larger values.
 _LARGEST = 1e6

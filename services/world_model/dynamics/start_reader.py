@@ -14,11 +14,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dextouch.schemas import MAX_OBJECTS
-from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import NUM_PADS
-from services.world_model.dynamics.features import compressed
-from services.world_model.dynamics.hand_motion import NUM_POINTS
-from services.world_model.dynamics.objects import MAX_DISTANCE_M, ObjectPoses, rotations
+from services.world_model.dynamics.features import (
+    MAX_DISTANCE_M,
+    NUM_POINTS,
+    DynamicsConfig,
+    ObjectPoses,
+    compressed,
+    rotations,
+)
 
 TASK_WIDTH = 16
 _POINT_SIZE = 2 * NUM_POINTS * 3

@@ -14,13 +14,10 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
-from services.world_model.network.action_attention import ActionTokens
-from services.world_model.network.axes import split_axis
+from services.world_model.network.attention import CAMERA_DIM, HAND_DIM, ActionTokens, split_axis
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
-from services.world_model.network.contact_geometry import GEOMETRY_SIZE
-from services.world_model.network.inputs import ModelInputs
+from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs
 from services.world_model.network.instruction import InstructionEncoder, SubwordEncoder
-from services.world_model.network.mirroring import CAMERA_DIM, HAND_DIM
 
 TIME_WIDTH = 64
 TIME_RANGE = 1000.0

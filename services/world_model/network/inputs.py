@@ -6,6 +6,7 @@ tensors, so that training and serving treat a window identically.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,29 +15,148 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
-from dextouch.geometry import invert, rigid_error
+from dextouch.geometry import apply, invert, project, rigid_error, transform_from_pose
+from dextouch.hands.actions import CAMERA_HEAD as CAMERA
 from dextouch.hands.actions import (
     IDENTITY_POSE_9D,
     JOINTS_LEFT,
     JOINTS_RIGHT,
     POSE_SLICES,
+    WRIST_LEFT,
+    WRIST_RIGHT,
     AnchorPoses,
     check_actions,
+    pose_from_9d,
     pose_to_9d,
 )
-from dextouch.schemas import ActionKind
+from dextouch.hands.robot_hand import RobotHand
+from dextouch.schemas import MAX_OBJECTS, ActionKind
 from dextouch.tactile.layout import NUM_TAXELS
-from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
-from services.world_model.network.contact_geometry import ObjectsAtStart, contact_geometry
-from services.world_model.network.instruction import instruction_ids
-from services.world_model.network.mirroring import (
+from services.world_model.dynamics.features import LOOKS, SLOT_SIZE, hand_motion, slot_features
+from services.world_model.network.attention import (
     MIRROR_CAMERA,
     MIRROR_WRIST,
     camera_features,
     hand_features,
     mirror_pose_9d,
 )
-from services.world_model.network.pose_raster import pose_raster
+from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
+from services.world_model.network.instruction import instruction_ids
+
+_PER_SLOT = SLOT_SIZE // len(LOOKS) + 6 + 1
+# Of a hand: every slot's features, its box and whether it holds an object; and the side.
+GEOMETRY_SIZE = MAX_OBJECTS * _PER_SLOT + 1
+_PER_M = 10.0
+
+
+@dataclass(frozen=True)
+class ObjectsAtStart:
+    """Objects at the first step of a window.
+
+    `poses` are x y z (m), qw qx qy qz in the world; `boxes_m` the middle and the half sizes of each
+    object's box in its frame.
+    """
+
+    poses: Float64[np.ndarray, "objects 7"]
+    boxes_m: Float64[np.ndarray, "objects 6"]
+
+    def __post_init__(self) -> None:
+        count = len(self.poses)
+        if count > MAX_OBJECTS or len(self.boxes_m) != count:
+            raise InvalidInputError(
+                f"objects: got {count} poses and {len(self.boxes_m)} boxes, expected one each of "
+                f"at most {MAX_OBJECTS} objects"
+            )
+
+
+def contact_geometry(
+    actions: Float64[np.ndarray, "time 67"], anchor: AnchorPoses, objects: ObjectsAtStart | None
+) -> Float32[np.ndarray, "time 2 size"]:
+    """Features [time, hand, `GEOMETRY_SIZE`] of every step; zero in slots without an object."""
+    points_m = torch.from_numpy(hand_motion(actions, anchor).points_m)[:, None]
+    steps = len(points_m)
+    slots = torch.zeros(steps, 2, MAX_OBJECTS, _PER_SLOT)
+    if objects is not None and len(objects.poses):
+        T = torch.from_numpy(transform_from_pose(objects.poses)).float()
+        boxes = torch.from_numpy(objects.boxes_m).float()
+        count = len(boxes)
+        each = slot_features(
+            points_m,
+            T[None, :, :3, 3].expand(steps, -1, -1),
+            T[None, :, :3, :3].expand(steps, -1, -1, -1),
+            boxes[None].expand(steps, -1, -1),
+        )
+        known = torch.cat([boxes * _PER_M, torch.ones(count, 1)], dim=-1)
+        slots[:, :, :count] = torch.cat([each, known.expand(steps, 2, -1, -1)], dim=-1)
+    side = torch.tensor([-1.0, 1.0])[None, :, None].expand(steps, -1, -1)
+    return torch.cat([slots.flatten(2), side], dim=-1).numpy()
+
+
+# Standard deviation of a point's Gaussian blot, in raster cells.
+BLOT_CELLS = 1.0
+_WRIST_AND_SIDES = (("left", WRIST_LEFT, JOINTS_LEFT), ("right", WRIST_RIGHT, JOINTS_RIGHT))
+
+
+@cache
+def _hand(side: str) -> RobotHand:
+    return RobotHand(side)
+
+
+def hand_points_m(joints_rad: np.ndarray, *, side: str) -> Float64[np.ndarray, "*batch 21 3"]:
+    """Wrist and four points per finger in wrist coordinates, for joint angles [..., 20]."""
+    joints = np.asarray(joints_rad, dtype=np.float64)
+    batch = joints.shape[:-1]
+    chains = _hand(side).chain_points_m(joints.reshape(-1, 20)).reshape(*batch, 20, 3)
+    return np.concatenate([np.zeros((*batch, 1, 3)), chains], axis=-2)
+
+
+def blots(
+    pixels: np.ndarray, visible: np.ndarray, *, image_px: int, cells: int
+) -> Float32[np.ndarray, "*batch cells cells"]:
+    """Gaussian blots of points [..., n, 2] on a cells × cells raster of the image, in 0 … 1."""
+    position = pixels.astype(np.float32) * (cells / image_px)
+    centres = np.arange(cells, dtype=np.float32) + 0.5
+    across = np.exp(-0.5 * np.square((centres - position[..., :1]) / BLOT_CELLS))
+    down = np.exp(-0.5 * np.square((centres - position[..., 1:]) / BLOT_CELLS))
+    down = down * visible[..., None].astype(np.float32)
+    # Overlapping blots saturate at one instead of adding up.
+    return (1.0 - np.exp(-np.swapaxes(down, -1, -2) @ across)).astype(np.float32)
+
+
+def pose_raster(
+    actions: np.ndarray, anchors: np.ndarray, K_head: np.ndarray, *, image_px: int, cells: int
+) -> Float32[np.ndarray, "batch time 2 cells cells"]:
+    """Rasters of both hands at the poses of the actions, seen by the moving head camera.
+
+    Args:
+        actions: [B, T, 67] relative to the anchors.
+        anchors: [B, 3, 4, 4] T_world of left wrist, right wrist and head camera at step 0.
+        K_head: [B, 3, 3] in pixels of the image; lens distortion is not applied.
+        image_px: side of the square image.
+        cells: side of the raster.
+
+    Returns:
+        Left hand, then right hand; points behind the camera leave no blot.
+    """
+    actions = np.asarray(actions, dtype=np.float64)
+    Ts_world_camera = anchors[:, None, 2] @ pose_from_9d(actions[..., CAMERA])
+    Ts_camera_world = invert(Ts_world_camera)
+    rasters = []
+    for index, (side, wrist, joints) in enumerate(_WRIST_AND_SIDES):
+        Ts_world_wrist = anchors[:, None, index] @ pose_from_9d(actions[..., wrist])
+        points_wrist = hand_points_m(actions[..., joints], side=side)
+        points_camera = apply(Ts_camera_world @ Ts_world_wrist, points_wrist)
+        pixels, visible = _project_each(K_head, points_camera)
+        # Far outside the image a blot is zero; clipping keeps float32 squares finite.
+        pixels = np.clip(pixels, -10.0 * image_px, 10.0 * image_px)
+        rasters.append(blots(pixels, visible, image_px=image_px, cells=cells))
+    return np.stack(rasters, axis=2)
+
+
+def _project_each(K_head: np.ndarray, points_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    pairs = [project(K, points) for K, points in zip(K_head, points_camera, strict=True)]
+    return np.stack([pixels for pixels, _ in pairs]), np.stack([front for _, front in pairs])
+
 
 MAX_TRANSLATION_M = 2.0
 MAX_JOINT_RAD = 2.0 * np.pi

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor, nn
 
 from services.world_model.network import flow_matching
-from services.world_model.network.clean_tokens import CleanTokens
+from services.world_model.network.attention import JointLayer, Stream, clean_mask
 from services.world_model.network.conditioning import (
     ActionNormalizer,
     Condition,
@@ -24,13 +24,11 @@ from services.world_model.network.configuration import (
     Sampler,
     num_latents,
 )
+from services.world_model.network.flow_matching import CleanTokens
 from services.world_model.network.inputs import ModelInputs
-from services.world_model.network.joint_attention import JointLayer, Stream, clean_mask
 from services.world_model.network.tactile_expert import TactileExpert
-from services.world_model.network.tokenizer_choice import build_tokenizer
-from services.world_model.network.video_side import video_side
-from services.world_model.network.visual_codec import to_unit
-from services.world_model.network.wan_video import WanVideoCondition
+from services.world_model.network.tactile_tokenizers import build_tokenizer
+from services.world_model.network.video import WanVideoCondition, to_unit, video_side
 from services.world_model.wan.configuration import FLOAT32_PARTS
 from services.world_model.wan.text import TextFeatures
 

@@ -4,17 +4,18 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
-from services.world_model.network.axes import split_axis
-from services.world_model.network.conditioning import Condition
-from services.world_model.network.configuration import NetworkConfig
-from services.world_model.network.joint_attention import (
+from services.world_model.network.attention import (
     NUM_MODULATIONS,
     ExpertBlock,
     Stream,
+    angles,
     modulated_norm,
+    split_axis,
+    tactile_positions,
     zero_linear,
 )
-from services.world_model.network.rotary import angles, tactile_positions
+from services.world_model.network.conditioning import Condition
+from services.world_model.network.configuration import NetworkConfig
 
 
 class TactileExpert(nn.Module):

@@ -20,12 +20,11 @@ from services.networks.optimizer import (
     half_cosine,
     update_average,
 )
-from services.world_model.rendering.box_raster import object_transforms
-from services.world_model.rendering.clips import SceneClip, gather
 from services.world_model.rendering.configuration import RendererConfig, RendererTraining
-from services.world_model.rendering.inputs import DrawingInputs, drawing_inputs
+from services.world_model.rendering.inputs import DrawingInputs, SceneClip, drawing_inputs, gather
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.precision import has_fast_bfloat16
+from services.world_model.rendering.rasters import object_transforms
 from services.world_model.rendering.scene_states import SceneStates
 
 LOG_EVERY_STEPS = 50

@@ -1,25 +1,36 @@
 """Random training windows of episodes in memory, as requests and targets.
 
 Episodes are read once and cut with the same re-anchoring as in the store's reader, so that an epoch
-reads nothing from disk. `services.world_model.training.streaming` provides the same windows for
+reads nothing from disk. `services.world_model.training.dataset` provides the same windows for
 episodes that stay on disk.
 """
 
 import hashlib
-from collections.abc import Sequence
+import multiprocessing
+from collections.abc import Collection, Generator, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar, runtime_checkable
+from functools import lru_cache
+from typing import Final, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, UInt8
 from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
 
+from dextouch.episodes import (
+    EpisodeGrid,
+    EpisodeReader,
+    EpisodeStore,
+    Split,
+    needs,
+    select_episodes,
+)
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, Domain
-from services.world_model.network.contact_geometry import ObjectsAtStart
-from services.world_model.network.inputs import PredictionRequest
+from dextouch.streams import HEAD_CAMERA
+from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
 
 
 @dataclass(frozen=True)
@@ -305,3 +316,204 @@ class WindowSampler:
         return WindowPosition(
             index, start, num_steps, action_kind="commanded", from_command=is_chained
         )
+
+
+# What an episode must have for windows to be cut from it.
+CUT: Final = (needs.EVERY_IMAGE,)
+
+
+def load_episodes(
+    url: str,
+    *,
+    splits: Collection[Split] = (),
+    domain: Domain | None = None,
+    image_px: int | None = None,
+) -> list[EpisodeArrays]:
+    """Episodes of a store, read once into memory: those of the given splits and domain.
+
+    The middle square of images that are larger than `image_px` is scaled to it.
+
+    Raises:
+        NotFoundError, ConflictError: as `select_episodes`.
+    """
+    readers = select_episodes([EpisodeStore(url)], domain=domain, splits=splits, needs=CUT)
+    return [read_episode(reader, image_px=image_px) for reader in readers]
+
+
+def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> EpisodeArrays:
+    """Read a whole episode.
+
+    The middle square of images that are larger than `image_px` is scaled to it.
+
+    Raises:
+        InvalidInputError: the image of a step is missing.
+        UnknownNameError: an episode without the head camera.
+    """
+    reader.require_images(HEAD_CAMERA)
+    grid, about = EpisodeGrid(reader, image_px), reader.attributes
+    actions: dict[ActionKind, Float64[np.ndarray, "steps 67"]] = {"measured": grid.measured}
+    if grid.action_kind == "commanded":
+        actions["commanded"] = reader.actions(0, len(grid), kind="commanded")
+    tactile_kpa, tactile_valid = grid.touch()
+    poses, boxes_m = grid.boxed_objects(grid.t_ref_ns) or (None, None)
+    return EpisodeArrays(
+        episode_id=about.episode_id,
+        task=about.task,
+        instruction=about.instruction,
+        scene=grid.scene,
+        images=grid.images(range(len(grid))),
+        tactile_kpa=tactile_kpa,
+        tactile_valid=tactile_valid,
+        actions=actions,
+        anchor=grid.anchor,
+        K_head=grid.K_head,
+        model_rate_hz=about.model_rate_hz,
+        content_sha256=grid.content_sha256,
+        domain=about.domain,
+        object_poses=poses,
+        boxes_m=boxes_m,
+    )
+
+
+# Open readers per process; each holds an episode's timestamps and actions.
+MAX_OPEN_READERS = 512
+StartMethod = Literal["fork", "spawn", "forkserver"]
+
+
+@lru_cache(maxsize=MAX_OPEN_READERS)
+def _reader(url: str, episode_id: str) -> EpisodeReader:
+    return EpisodeStore(url).open(episode_id)
+
+
+@dataclass(frozen=True)
+class StoredEpisode:
+    """One episode that stays on disk; created by `index_episodes`."""
+
+    url: str
+    episode_id: str
+    task: str
+    scene: str
+    num_steps: int
+    action_kinds: tuple[ActionKind, ...]
+    content_sha256: str
+    print_sha256: str
+    domain: Domain
+    model_rate_hz: float
+    image_px: int | None = None
+
+    def __len__(self) -> int:
+        return self.num_steps
+
+    def fingerprint(self) -> str:
+        """`fingerprint` of its arrays when it was indexed."""
+        return self.print_sha256
+
+    def load(self) -> EpisodeArrays:
+        """Load the whole episode."""
+        return read_episode(_reader(self.url, self.episode_id), image_px=self.image_px)
+
+    def cut(self, place: WindowPosition) -> Window:
+        """Read the window at a place in this episode.
+
+        Raises:
+            InvalidInputError: steps outside the episode.
+            UnknownNameError: an action kind that it does not have.
+            CorruptDataError: damaged bytes.
+        """
+        grid = EpisodeGrid(_reader(self.url, self.episode_id), self.image_px)
+        read = grid.reader.window(
+            place.start, place.num_steps, cameras=(), action_kind=place.action_kind
+        )
+        actions, anchor = read.actions, read.anchor
+        if place.from_command and place.action_kind == "commanded":
+            anchor = poses_from_actions(actions[:1], anchor).anchor(0)
+            actions = reanchor(actions, 0)
+        images = grid.images(range(place.start, place.start + place.num_steps))
+        known = grid.boxed_objects(read.t_ref_ns[:1])
+        objects = (
+            None if known is None else ObjectsAtStart(known[0][0].astype(np.float64), known[1])
+        )
+        request = PredictionRequest(
+            first_image=images[0],
+            first_tactile_kpa=read.tactile_kpa[0],
+            actions=actions,
+            action_kind=place.action_kind,
+            instruction=read.instruction,
+            anchor=anchor,
+            K_head=grid.K_head,
+            objects=objects,
+        )
+        return Window(request, images, read.tactile_kpa, read.tactile_valid)
+
+
+def index_episodes(
+    url: str,
+    *,
+    splits: Collection[Split] = (),
+    domain: Domain | None = None,
+    image_px: int | None = None,
+) -> list[StoredEpisode]:
+    """`load_episodes`, for episodes that stay on disk; each is read once to be hashed."""
+    # The episode of an id may have changed since it was last read.
+    _reader.cache_clear()
+    store, indexed = EpisodeStore(url), list[StoredEpisode]()
+    for found in select_episodes([store], domain=domain, splits=splits, needs=CUT):
+        # The cached reader, so that processes forked later inherit it open.
+        arrays = read_episode(_reader(url, found.item_id), image_px=image_px)
+        indexed.append(
+            StoredEpisode(
+                url=url,
+                episode_id=arrays.episode_id,
+                task=arrays.task,
+                scene=arrays.scene,
+                num_steps=len(arrays),
+                action_kinds=arrays.action_kinds,
+                content_sha256=arrays.content_sha256,
+                print_sha256=arrays.fingerprint(),
+                domain=arrays.domain,
+                model_rate_hz=arrays.model_rate_hz,
+                image_px=image_px,
+            )
+        )
+    return indexed
+
+
+class _Windows(Dataset[Window]):
+    """Windows of episodes by their places; works in DataLoader workers, forked or spawned."""
+
+    def __init__(self, episodes: Sequence[TrainingEpisode]) -> None:
+        self._episodes = list(episodes)
+
+    def __getitem__(self, place: WindowPosition) -> Window:
+        return self._episodes[place.episode_index].cut(place)
+
+
+def read_batches(
+    episodes: Sequence[TrainingEpisode],
+    places: Iterable[list[WindowPosition]],
+    *,
+    num_workers: int = 0,
+    start_method: StartMethod | None = None,
+) -> Generator[WindowBatch, None, None]:
+    """Batches at these places, in order, independent of the number of processes.
+
+    Args:
+        episodes: episodes that the places refer to.
+        places: places of each batch; may be endless and is read ahead.
+        num_workers: reader processes, which end with the iterator; 0 reads in this process.
+        start_method: start method of the processes; None for the platform's default.
+    """
+    loader = DataLoader(
+        _Windows(episodes),
+        batch_sampler=places,
+        collate_fn=stack_windows,
+        num_workers=num_workers,
+        multiprocessing_context=_context(start_method) if num_workers else None,
+        # Its own generator: otherwise the loader seeds its workers from the global one.
+        generator=torch.Generator().manual_seed(0),
+    )
+    yield from loader
+
+
+def _context(start_method: StartMethod | None) -> multiprocessing.context.BaseContext:
+    return multiprocessing.get_context(start_method)

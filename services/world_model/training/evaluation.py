@@ -15,7 +15,7 @@ from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import ActionKind
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
-from services.world_model.network.visual_codec import to_uint8, to_unit
+from services.world_model.network.video import to_uint8, to_unit
 from services.world_model.training.dataset import (
     EpisodeArrays,
     Window,

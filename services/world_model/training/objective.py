@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import NUM_TIP_TAXELS
-from services.world_model.network.axes import split_axis
+from services.world_model.network.attention import split_axis
 from services.world_model.network.configuration import Precision
 from services.world_model.network.flow_matching import (
     add_noise,

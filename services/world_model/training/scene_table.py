@@ -10,20 +10,27 @@ from torch import Tensor
 
 from dextouch.episodes import EpisodeGrid, ObjectTrack
 from dextouch.errors import InvalidInputError
+from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
 from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile.layout import split_pads
-from services.world_model.dynamics.commands import Commands
-from services.world_model.dynamics.configuration import (
-    STEPS_PER_LATENT,
-    DynamicsConfig,
-)
 from services.world_model.dynamics.core import NUM_PADS
-from services.world_model.dynamics.features import LOOKS
-from services.world_model.dynamics.hand_motion import HandMotion, hand_motion
+from services.world_model.dynamics.features import (
+    FREE_KPA,
+    LOOKS,
+    MAX_DISTANCE_M,
+    SIZE_RANGE,
+    STEPS_PER_LATENT,
+    Commands,
+    DynamicsConfig,
+    HandMotion,
+    ObjectPoses,
+    hand_motion,
+    objects_from_poses,
+)
 from services.world_model.dynamics.model import pad_means_kpa
-from services.world_model.dynamics.objects import SIZE_RANGE, ObjectPoses, objects_from_poses
 from services.world_model.dynamics.start_reader import FirstStep
-from services.world_model.dynamics.touch_codec import FREE_KPA
+from services.world_model.rendering.inputs import SceneClip
+from services.world_model.rendering.scene_states import SceneStates
 
 # Objects that never move farther than this are fixed; measured ones by more than their errors.
 _MOVED_M = 2e-3
@@ -452,3 +459,38 @@ def _checked_tracks(episodes: Sequence[EpisodeGrid], config: DynamicsConfig) -> 
             )
         tracks.append(track)
     return tracks
+
+
+def scene_clips(episodes: Sequence[EpisodeGrid]) -> list[SceneClip]:
+    """Clips of the images of which all objects are known, where an episode has two or more."""
+    clips = []
+    for episode in episodes:
+        if (track := episode.objects) is None or not len(episode.boxes_m):
+            continue
+        steps = episode.image_steps[track.known[episode.image_steps].all(axis=1)]
+        if len(steps) > 1:
+            clips.append(_clip(episode, steps, track.poses[steps].astype(np.float64)))
+    return clips
+
+
+def _clip(
+    episode: EpisodeGrid,
+    steps: Int64[np.ndarray, " n"],
+    poses: Float64[np.ndarray, "n objects 7"],
+) -> SceneClip:
+    actions = episode.measured[steps]
+    hands = poses_from_actions(actions, episode.anchor)
+    wrists = (hands.Ts_world_wrist_left, hands.Ts_world_wrist_right)
+    return SceneClip(
+        steps=steps,
+        images=episode.images(steps),
+        states=SceneStates(
+            Ts_world_camera=hands.Ts_world_camera_head,
+            Ts_world_wrist=np.stack(wrists, axis=1),
+            joints_rad=np.stack([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1),
+            object_poses=poses,
+            object_present=np.linalg.norm(poses[..., :3], axis=-1) <= MAX_DISTANCE_M,
+        ),
+        K_head=episode.K_head,
+        boxes_m=episode.boxes_m,
+    )

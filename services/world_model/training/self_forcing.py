@@ -21,7 +21,7 @@ from services.world_model.network.model import (
     JointWorldModel,
     Sampling,
 )
-from services.world_model.network.visual_codec import to_uint8
+from services.world_model.network.video import to_uint8
 from services.world_model.training.dataset import WindowBatch
 from services.world_model.training.distribution import Processes
 

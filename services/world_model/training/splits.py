@@ -9,11 +9,15 @@ from dextouch.schemas import Domain
 from services.world_model.checkpoints import Checkpoint
 from services.world_model.settings import TrainSettings
 from services.world_model.tokenizer_files import read_tokenizer
-from services.world_model.training.dataset import E, EpisodeArrays, TrainingEpisode
+from services.world_model.training.dataset import (
+    E,
+    EpisodeArrays,
+    TrainingEpisode,
+    index_episodes,
+    load_episodes,
+)
 from services.world_model.training.domains import subset_by_hash
-from services.world_model.training.episodes import load_episodes
-from services.world_model.training.frozen_tokenizer import split_unseen
-from services.world_model.training.streaming import index_episodes
+from services.world_model.training.tokenizer_trainer import split_unseen
 
 
 def load_split(

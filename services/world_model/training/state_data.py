@@ -17,7 +17,7 @@ from dextouch.episodes import (
 )
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import Domain, ObjectClicks, load_object_clicks
-from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.settings import StateTrainSettings
 from services.world_model.state_checkpoints import scene_digest
 from services.world_model.training.domains import check_tasks, subset_by_hash

@@ -10,9 +10,9 @@ from torch import Tensor
 from dextouch.errors import InvalidInputError
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import CHUNK_STEPS
-from services.world_model.dynamics.configuration import STEPS_PER_LATENT
+from services.world_model.dynamics.features import STEPS_PER_LATENT
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.training.reader_training import reader_errors
+from services.world_model.training.core_training import reader_errors
 from services.world_model.training.scene_table import SceneTable
 
 # Start steps of rollouts, as far as they have images.

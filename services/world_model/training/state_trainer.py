@@ -26,11 +26,10 @@ from dextouch.episodes import (
 from dextouch.errors import InvalidInputError
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.networks.weight_files import read_tensors, write_tensors
-from services.world_model.dynamics.configuration import STEPS_PER_LATENT, DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore
+from services.world_model.dynamics.features import STEPS_PER_LATENT, DynamicsConfig, TouchCodec
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.start_reader import Reading, StartReader
-from services.world_model.dynamics.touch_codec import TouchCodec
 from services.world_model.recorded_commands import flags_of, last_name
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.precision import uses_bfloat16
@@ -44,15 +43,16 @@ from services.world_model.state_checkpoints import (
 from services.world_model.training.averaging import OnStep
 from services.world_model.training.core_training import (
     CoreData,
+    read_step,
     start_steps,
     touch_latents,
     train_core,
+    train_reader,
 )
 from services.world_model.training.domains import training_sets
-from services.world_model.training.reader_training import read_step, train_reader
-from services.world_model.training.scene_clips import scene_clips
 from services.world_model.training.scene_table import (
     SceneTable,
+    scene_clips,
     scene_table,
     usual_boxes_m,
 )

@@ -2,9 +2,11 @@
 
 import copy
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,14 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
+from dextouch.episodes import (
+    EpisodeGrid,
+    EpisodeStore,
+    Split,
+    data_hash,
+    scene_fraction,
+    select_episodes,
+)
 from dextouch.errors import InvalidInputError
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
@@ -23,17 +33,68 @@ from services.networks.optimizer import (
     update_average,
 )
 from services.networks.principal_axes import root_pressure
-from services.world_model.network.learned_tokenizer import LearnedTokenizer
-from services.world_model.network.tactile_tokenizer import TactileTokenizer
-from services.world_model.network.tokenizer_choice import build_tokenizer
+from services.world_model.network.tactile_tokenizers import (
+    LearnedTokenizer,
+    TactileTokenizer,
+    build_tokenizer,
+)
+from services.world_model.settings import TrainSettings
 from services.world_model.tokenizer_files import (
     Reconstruction,
+    StoredTokenizer,
     TokenizerMetadata,
     read_tokenizer,
     write_tokenizer,
 )
 from services.world_model.tokenizer_settings import TrainTokenizerSettings
-from services.world_model.training.tactile_hands import TactileHands, load_hands
+from services.world_model.training.dataset import E, TrainingEpisode
+
+# By scene: the touch of each episode, and its content.
+_Side = dict[str, list[tuple[np.ndarray, str]]]
+
+
+@dataclass(frozen=True)
+class TactileHands:
+    """Measured touch of the hands of some scenes, at the model rate.
+
+    `data_hash` is that of their episodes.
+    """
+
+    tactile_kpa: Float32[np.ndarray, "hands 320"]
+    scenes: tuple[str, ...]
+    data_hash: str
+
+
+def load_hands(
+    urls: Sequence[str], *, splits: Collection[Split] = (), heldout_share: float
+) -> tuple[TactileHands, TactileHands]:
+    """Training and held-out hands of all people and robots; a scene is on one side only.
+
+    Hands of steps without a measurement and imagined episodes are left out.
+
+    Raises:
+        InvalidInputError: either side has no scene.
+        NotFoundError, ConflictError: as `select_episodes`.
+    """
+    sides: tuple[_Side, _Side] = ({}, {})
+    for reader in select_episodes([EpisodeStore(url) for url in urls], splits=splits):
+        grid = EpisodeGrid(reader)
+        touch_kpa, is_measured = grid.touch()
+        side = sides[scene_fraction(grid.scene) < heldout_share]
+        side.setdefault(grid.scene, []).append((touch_kpa[is_measured], grid.content_sha256))
+    if not all(sides):
+        raise InvalidInputError(
+            f"tokenizer: got {len(sides[0])} scenes to train on and {len(sides[1])} held out, "
+            "expected at least one each; add episodes or change --heldout-share"
+        )
+    training, heldout = (_hands(side) for side in sides)
+    return training, heldout
+
+
+def _hands(side: _Side) -> TactileHands:
+    touch_kpa, contents = zip(*chain(*side.values()), strict=True)
+    return TactileHands(np.concatenate(touch_kpa), tuple(sorted(side)), data_hash(contents))
+
 
 MIN_LEARNING_RATE_SHARE = 0.01
 _EVALUATION_BATCH = 1000
@@ -205,3 +266,69 @@ def _ms_per_1000_hands(tokenizer: TactileTokenizer, hands: TactileHands) -> floa
         _through(tokenizer, batch)
         times_ms.append(1000 * (time.process_time() - begin_s))
     return float(np.median(times_ms))
+
+
+def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokenizer | None]:
+    """The settings with the network of `--tokenizer`, and that tokenizer if one is given.
+
+    Raises:
+        InvalidInputError: a learned tokenizer without a file or an initial checkpoint that holds
+            it, both of these, or a tokenizer for a network without touch.
+        ConflictError: the network settings name another tokenizer than the file.
+    """
+    if settings.tokenizer is None:
+        if settings.network.tokenizer != "principal_axes" and settings.init is None:
+            raise InvalidInputError(
+                f"training: the tokenizer {settings.network.tokenizer} is learned; train it first "
+                "(dextouch train tokenizer) and give its file as --tokenizer"
+            )
+        return settings, None
+    if not settings.network.use_touch:
+        raise InvalidInputError(
+            "training: got a --tokenizer for a network without touch; leave it out"
+        )
+    if settings.init is not None:
+        raise InvalidInputError(
+            "training: got --init and --tokenizer, expected one of them; the initial checkpoint "
+            "holds the tokenizer that its latents come from"
+        )
+    stored = read_tokenizer(settings.tokenizer)
+    network = stored.metadata.network(settings.network)
+    return settings.model_copy(update={"network": network}), stored
+
+
+def split_unseen(
+    episodes: Sequence[E], stored: StoredTokenizer, *, heldout_percent: int
+) -> tuple[list[E], list[E]]:
+    """Training and held-out episodes, the latter of scenes that the tokenizer has not seen.
+
+    Raises:
+        InvalidInputError: either side would be empty.
+    """
+    sizes = Counter(episode.scene for episode in episodes)
+    heldout: set[str] = set()
+    for scene in sorted(sizes.keys() - set(stored.metadata.train_scenes), key=scene_fraction):
+        if 100 * sum(sizes[one] for one in heldout) >= heldout_percent * len(episodes):
+            break
+        heldout.add(scene)
+    if not 0 < len(heldout) < len(sizes):
+        raise InvalidInputError(
+            f"split: got {len(heldout)} of {len(sizes)} scenes to hold out that the tokenizer has "
+            "not seen, expected some; give a --heldout store"
+        )
+    return (
+        [episode for episode in episodes if episode.scene not in heldout],
+        [episode for episode in episodes if episode.scene in heldout],
+    )
+
+
+def check_unseen(heldout: Sequence[TrainingEpisode], stored: StoredTokenizer) -> None:
+    """Raise if the tokenizer was trained on the scene of a held-out episode."""
+    seen = set(stored.metadata.train_scenes)
+    both = [episode.episode_id for episode in heldout if episode.scene in seen]
+    if both:
+        raise InvalidInputError(
+            f"training: the tokenizer was trained on the scenes of {len(both)} held-out episodes "
+            f"{both[:3]}; give a --heldout store that it has not seen",
+            episodes=both,
+        )

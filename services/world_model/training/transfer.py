@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
-from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore, direction_free_inputs
+from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.state_checkpoints import StateCheckpoint, read_state_checkpoint
 

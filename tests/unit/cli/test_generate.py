@@ -13,7 +13,7 @@ from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.world_model.state_checkpoints import write_state_checkpoint
-from services.world_model.training.episodes import load_episodes
+from services.world_model.training.dataset import load_episodes
 from tests.contracts.test_world import untrained_state_checkpoint
 
 SEEDS = (4, 5, 8)

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from services.world_model.settings import TrainSettings
 from services.world_model.training.distribution import joined_processes
-from services.world_model.training.trainer import train
-from services.world_model.training.training_run import TrainingProgress
+from services.world_model.training.trainer import TrainingProgress, train
 
 
 def main(settings: Path, log: Path, killed_rank: int) -> None:

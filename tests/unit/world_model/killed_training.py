@@ -6,8 +6,7 @@ import sys
 from pathlib import Path
 
 from services.world_model.settings import TrainSettings
-from services.world_model.training.trainer import train
-from services.world_model.training.training_run import TrainingProgress
+from services.world_model.training.trainer import TrainingProgress, train
 
 
 def die(progress: TrainingProgress) -> None:

@@ -6,8 +6,8 @@ import torch
 
 from services.networks.principal_axes import principal_axes, root_scale
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.network.principal_axes_tokenizer import PrincipalAxesTokenizer
-from services.world_model.network.visual_codec import VisualCodec, to_uint8, to_unit
+from services.world_model.network.tactile_tokenizers import PrincipalAxesTokenizer
+from services.world_model.network.video import VisualCodec, to_uint8, to_unit
 
 
 def _images(num_windows=6, num_steps=9, px=32):

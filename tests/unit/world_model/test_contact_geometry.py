@@ -10,16 +10,15 @@ from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert, transform_from_pose
 from dextouch.streams import HEAD_CAMERA
 from services.world_model.checkpoints import read_checkpoint, write_checkpoint
-from services.world_model.dynamics.features import NEAR_M
-from services.world_model.dynamics.hand_motion import hand_motion
-from services.world_model.network.contact_geometry import (
+from services.world_model.dynamics.features import NEAR_M, hand_motion
+from services.world_model.network.inputs import (
     GEOMETRY_SIZE,
     ObjectsAtStart,
+    build_inputs,
     contact_geometry,
 )
-from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
-from services.world_model.scene_reader import SceneReader
+from services.world_model.starts import SceneReader
 from services.world_model.training.dataset import WindowSampler, cut_window
 from services.world_model.training.distribution import Processes
 from services.world_model.training.self_forcing import own_context

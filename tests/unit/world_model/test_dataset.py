@@ -11,8 +11,9 @@ from services.world_model.training.dataset import (
     WindowSampler,
     cut_window,
     fingerprint,
+    load_episodes,
+    read_episode,
 )
-from services.world_model.training.episodes import load_episodes, read_episode
 
 
 @pytest.mark.parametrize("kind", ["measured", "commanded"])

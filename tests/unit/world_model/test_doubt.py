@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dextouch.schemas import ReturnSelector
-from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.state_checkpoints import StateBounds
 from services.world_model.state_world import StateWorld

@@ -12,16 +12,27 @@ from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.schemas import MAX_OBJECTS
-from services.world_model.dynamics.commands import Commands
-from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import (
     RecurrentCore,
     SceneStart,
     _ending_features,
     direction_free_inputs,
 )
-from services.world_model.dynamics.features import LOOKS, compressed, slot_features
-from services.world_model.dynamics.hand_motion import NUM_POINTS, hand_motion
+from services.world_model.dynamics.features import (
+    LOOKS,
+    NUM_POINTS,
+    Commands,
+    DynamicsConfig,
+    ObjectPoses,
+    TouchCodec,
+    compressed,
+    hand_motion,
+    objects_from_poses,
+    poses_from_objects,
+    rotations,
+    slot_features,
+)
+from services.world_model.dynamics.members import mapped, stacked
 from services.world_model.dynamics.memory import (
     memory_arrays,
     memory_from_arrays,
@@ -29,19 +40,11 @@ from services.world_model.dynamics.memory import (
     stack_memories,
 )
 from services.world_model.dynamics.model import (
+    REST_LATENTS,
     DynamicsModel,
     mean_start,
 )
-from services.world_model.dynamics.nested import mapped, stacked
-from services.world_model.dynamics.objects import (
-    ObjectPoses,
-    objects_from_poses,
-    poses_from_objects,
-    rotations,
-)
 from services.world_model.dynamics.start_reader import FirstStep, ray_at_height
-from services.world_model.dynamics.stillness import REST_LATENTS
-from services.world_model.dynamics.touch_codec import TouchCodec
 
 CONFIG = DynamicsConfig(tasks=("one", "two"), num_objects=(1, 2), image_px=32, width=16)
 

@@ -17,16 +17,15 @@ from dextouch.errors import (
 from dextouch.geometry import transform
 from dextouch.hands.actions import AnchorPoses
 from dextouch.hands.robot_hand import RobotHand
-from services.world_model.network.conditioning import ActionNormalizer, SceneEncoder
-from services.world_model.network.inputs import build_inputs
-from services.world_model.network.instruction import NO_WORD, hash_words
-from services.world_model.network.mirroring import (
+from services.world_model.network.attention import (
     MIRROR_WRIST,
     camera_features,
     hand_features,
     left_joint_signs,
 )
-from services.world_model.network.pose_raster import blots, pose_raster
+from services.world_model.network.conditioning import ActionNormalizer, SceneEncoder
+from services.world_model.network.inputs import blots, build_inputs, pose_raster
+from services.world_model.network.instruction import NO_WORD, hash_words
 from services.world_model.training.dataset import cut_window
 
 # The rotation columns of both wrists and the head camera in a 67-D action.

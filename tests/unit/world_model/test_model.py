@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from services.world_model.network.attention import clean_mask
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import build_inputs
-from services.world_model.network.joint_attention import clean_mask
 from services.world_model.network.model import JointLatents, JointWorldModel, stack_noise
 from services.world_model.training.dataset import cut_window
 

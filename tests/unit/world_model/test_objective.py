@@ -8,7 +8,7 @@ from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents
 from services.world_model.training.dataset import WindowSampler
 from services.world_model.training.objective import LossOptions, contact_or_changing, losses
-from services.world_model.training.training_run import TrainingRun
+from services.world_model.training.trainer import TrainingRun
 
 
 @pytest.fixture

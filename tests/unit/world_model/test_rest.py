@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dextouch.schemas import ReturnSelector
-from services.world_model.dynamics.stillness import REST_LATENTS, stillness
+from services.world_model.dynamics.model import REST_LATENTS, stillness
 from services.world_model.state_world import StateWorld
 from tests.contracts.test_world import from_observation, untrained_state_checkpoint
 

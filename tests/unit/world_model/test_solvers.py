@@ -9,9 +9,8 @@ from diffusers import UniPCMultistepScheduler
 from scipy.integrate import solve_ivp
 
 from dextouch.errors import InvalidInputError
-from services.world_model.network.flow_matching import sample
+from services.world_model.network.flow_matching import SOLVERS, sample
 from services.world_model.network.model import Sampling
-from services.world_model.network.solvers import SOLVERS
 from services.world_model.world import ModelWorld, open_world
 from tests.unit.world_model.test_world import make_start
 

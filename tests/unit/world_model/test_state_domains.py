@@ -15,9 +15,8 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
 from services.world_model import command_line
-from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore
-from services.world_model.dynamics.touch_codec import TouchCodec
+from services.world_model.dynamics.features import DynamicsConfig, TouchCodec
 from services.world_model.settings import (
     AdaptCommand,
     AdaptStateCommand,

@@ -15,15 +15,13 @@ from services.world_model.training.dataset import (
     WindowPosition,
     WindowSampler,
     fingerprint,
-)
-from services.world_model.training.episodes import load_episodes, read_episode
-from services.world_model.training.splits import load_split
-from services.world_model.training.streaming import (
     index_episodes,
+    load_episodes,
     read_batches,
+    read_episode,
 )
-from services.world_model.training.trainer import train
-from services.world_model.training.training_run import TrainingRun
+from services.world_model.training.splits import load_split
+from services.world_model.training.trainer import TrainingRun, train
 from tests.unit.world_model.conftest import write_episode
 
 PLACES = [

@@ -8,12 +8,13 @@ from dextouch.errors import ConflictError, InvalidInputError
 from services.networks.optimizer import Budget
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.network.tokenizer_choice import build_tokenizer
+from services.world_model.network.tactile_tokenizers import build_tokenizer
 from services.world_model.tokenizer_files import read_tokenizer
 from services.world_model.tokenizer_settings import TrainTokenizerSettings
 from services.world_model.training.splits import load_split
-from services.world_model.training.tactile_hands import TactileHands, load_hands
 from services.world_model.training.tokenizer_trainer import (
+    TactileHands,
+    load_hands,
     reconstruction,
     reconstruction_loss,
     train_tokenizer,

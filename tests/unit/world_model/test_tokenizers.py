@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.network.grid_tokenizer import canvas_cells
-from services.world_model.network.tokenizer_choice import build_tokenizer
+from services.world_model.network.tactile_tokenizers import build_tokenizer, canvas_cells
 
 LEARNED = ["split_hands", "grid"]
 

@@ -5,12 +5,9 @@ import torch
 
 from dextouch.schemas import MAX_OBJECTS
 from services.world_model.dynamics import traces
-from services.world_model.dynamics.commands import Commands
-from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import NUM_PADS, CoreState, SceneStart
-from services.world_model.dynamics.features import LOOKS
+from services.world_model.dynamics.features import LOOKS, Commands, DynamicsConfig, ObjectPoses
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.traces import Traced
 from services.world_model.state_world import StateWorld
 from tests.contracts.test_world import untrained_state_checkpoint

@@ -15,8 +15,7 @@ from services.world_model.training.dataset import cut_window, fingerprint, stack
 from services.world_model.training.evaluation import evaluate_prediction, predict_all
 from services.world_model.training.objective import losses
 from services.world_model.training.splits import check_disjoint
-from services.world_model.training.trainer import train, train_on
-from services.world_model.training.training_run import TrainingRun
+from services.world_model.training.trainer import TrainingRun, train, train_on
 
 
 @pytest.fixture

@@ -12,8 +12,7 @@ import torch
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.training import state_files
-from services.world_model.training.trainer import train, train_on
-from services.world_model.training.training_run import TrainingRun
+from services.world_model.training.trainer import TrainingRun, train, train_on
 from services.world_model.training.training_state import read_state, state_path
 
 CHILD = Path(__file__).with_name("killed_training.py")

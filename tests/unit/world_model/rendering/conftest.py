@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from dextouch.geometry import transform
-from services.world_model.rendering.clips import SceneClip
 from services.world_model.rendering.configuration import RendererConfig
-from services.world_model.rendering.inputs import Scenes
+from services.world_model.rendering.inputs import SceneClip, Scenes
 from services.world_model.rendering.scene_states import SceneState, SceneStates
 from tests.unit.world_model.rendering.scene_by_hand import BOXES_M, DOWN, K, shifted
 

@@ -6,20 +6,18 @@ from scipy.ndimage import maximum_filter
 
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
-from services.world_model.rendering.box_raster import (
+from services.world_model.rendering.inputs import grown
+from services.world_model.rendering.rasters import (
     BoxHits,
+    HandPoints,
+    base_points_world,
     cast_boxes,
     colours_at_positions,
     object_transforms,
     positions_at_start,
-)
-from services.world_model.rendering.hand_raster import (
-    HandPoints,
-    base_points_world,
     project_hands,
     splat_hands,
 )
-from services.world_model.rendering.inputs import grown
 from services.world_model.rendering.scene_states import SceneStates
 from tests.unit.world_model.rendering.scene_by_hand import K
 

@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.evaluator.measuring import sharpness
 from dextouch.errors import InvalidInputError
-from services.world_model.rendering.clips import gather
+from services.world_model.rendering.inputs import gather
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.training import (
     RendererRun,

@@ -14,7 +14,7 @@ from services.world_model.network.model import JointWorldModel
 from services.world_model.pretrained_video import load_pretrained
 from services.world_model.training.dataset import cut_window
 from services.world_model.wan.configuration import WanConfig
-from services.world_model.wan.renaming import (
+from services.world_model.wan.loading import (
     TRANSFORMER_RULES,
     autoencoder_rules,
     renamed,

@@ -15,11 +15,13 @@ from dextouch.errors import (
 )
 from services.networks import memory
 from services.world_model.wan.configuration import WanConfig
-from services.world_model.wan.loading import find_weights, load_weights
-from services.world_model.wan.networks import empty_autoencoder, empty_transformer
-from services.world_model.wan.renaming import (
+from services.world_model.wan.loading import (
     TRANSFORMER_RULES,
     autoencoder_rules,
+    empty_autoencoder,
+    empty_transformer,
+    find_weights,
+    load_weights,
     renamed,
 )
 

@@ -6,11 +6,22 @@ from dataclasses import replace
 import pytest
 import torch
 
-from services.world_model.network.joint_attention import JointLayer, Stream, Text
-from services.world_model.network.rotary import angles, rotate, tactile_positions, video_positions
+from services.world_model.network.attention import (
+    JointLayer,
+    Stream,
+    Text,
+    angles,
+    rotate,
+    tactile_positions,
+    video_positions,
+)
 from services.world_model.network.tactile_expert import TactileExpert
-from services.world_model.network.wan_codec import WanVideoCodec
-from services.world_model.network.wan_video import WanBlock, WanVideoCondition, WanVideoExpert
+from services.world_model.network.video import (
+    WanBlock,
+    WanVideoCodec,
+    WanVideoCondition,
+    WanVideoExpert,
+)
 from services.world_model.wan.configuration import LATENT_MEAN, LATENT_STD
 
 

@@ -5,10 +5,11 @@ from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffu
 
 from dextouch.errors import InvalidInputError
 from services.world_model.wan.configuration import WanConfig
-from services.world_model.wan.networks import empty_autoencoder, empty_transformer
-from services.world_model.wan.renaming import (
+from services.world_model.wan.loading import (
     TRANSFORMER_RULES,
     autoencoder_rules,
+    empty_autoencoder,
+    empty_transformer,
     renamed,
 )
 

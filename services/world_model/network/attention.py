@@ -1,22 +1,169 @@
-"""Joint transformer layer of both experts.
-
-Mixture-of-Transformers: each stream has its own projections, norms, modulation and feed-forward
-network; only the attention is shared, over the tokens of both.
-"""
+"""Attention of the joint model: rotary positions, actions, tokens of video and touch together."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor, nn
 from torch.nn import functional
 
-from services.world_model.network.action_attention import ActionAttention
-from services.world_model.network.axes import split_axis
-from services.world_model.network.rotary import rotate
+from dextouch.hands.actions import unpack_action
+from dextouch.hands.robot_hand import RobotHand
+from services.world_model.network.configuration import FRAMES_PER_LATENT
+
+HAND_DIM = 29
+CAMERA_DIM = 9
+MIRROR_WRIST = np.array([1.0, -1.0, 1.0])
+MIRROR_CAMERA = np.array([-1.0, 1.0, 1.0])
+
+
+@cache
+def left_joint_signs() -> Float64[np.ndarray, "20"]:
+    """Signs that map left joint angles to those of the mirrored right joints.
+
+    A mirror maps an axis a to -S a; the sign says whether that is the right hand's axis.
+    """
+    left, right = RobotHand("left"), RobotHand("right")
+    signs = [
+        np.sign(np.dot(-MIRROR_WRIST * np.array(row_left.axis), np.array(row_right.axis)))
+        for finger_left, finger_right in zip(left.fingers, right.fingers, strict=True)
+        for row_left, row_right in zip(finger_left.joints, finger_right.joints, strict=True)
+    ]
+    return np.array(signs, dtype=np.float64)
+
+
+def mirror_pose_9d(
+    pose: np.ndarray, *, mirror_to: np.ndarray, mirror_from: np.ndarray
+) -> Float64[np.ndarray, "*batch 9"]:
+    """S_to T S_from of 9-D poses: translation and two rotation columns keep their places."""
+    signs = np.concatenate(
+        [mirror_to, mirror_to * mirror_from[0], mirror_to * mirror_from[1]], dtype=np.float64
+    )
+    return np.asarray(pose, dtype=np.float64) * signs
+
+
+def hand_features(actions: np.ndarray) -> Float64[np.ndarray, "*batch 2 29"]:
+    """Left (mirrored) and right hand of actions [..., 67]: 9-D wrist pose and 20 angles (rad)."""
+    parts = unpack_action(actions)
+    wrist_left = mirror_pose_9d(parts.wrist_left, mirror_to=MIRROR_WRIST, mirror_from=MIRROR_WRIST)
+    left = np.concatenate([wrist_left, parts.joints_left_rad * left_joint_signs()], axis=-1)
+    right = np.concatenate([parts.wrist_right, parts.joints_right_rad], axis=-1)
+    return np.stack([left, right], axis=-2).astype(np.float64)
+
+
+def camera_features(actions: np.ndarray) -> Float64[np.ndarray, "*batch 2 9"]:
+    """Head camera pose of actions [..., 67] as each hand sees it: mirrored for the left."""
+    camera = np.asarray(unpack_action(actions).camera_head, dtype=np.float64)
+    mirrored = mirror_pose_9d(camera, mirror_to=MIRROR_CAMERA, mirror_from=MIRROR_CAMERA)
+    return np.stack([mirrored, camera], axis=-2)
+
+
+def split_axis(tensor: Tensor, axis: int, sizes: tuple[int, ...]) -> Tensor:
+    """Split one axis into several; one size may be -1. Typed, unlike `Tensor.unflatten`."""
+    axis = axis % tensor.ndim
+    return tensor.reshape(*tensor.shape[:axis], *sizes, *tensor.shape[axis + 1 :])
+
+
+_THETA = 1e4
+
+
+def video_positions(num_latents: int, side: int) -> Float32[Tensor, "tokens 3"]:
+    """Latent, row and column of the tokens of square latent frames, row by row."""
+    axes = (torch.arange(num_latents), torch.arange(side), torch.arange(side))
+    return torch.cartesian_prod(*axes).float()
+
+
+def tactile_positions(num_steps: int, tokens_per_step: int) -> Float32[Tensor, "tokens 3"]:
+    """Positions of tactile tokens, step by step."""
+    positions = torch.zeros(num_steps, tokens_per_step, 3)
+    positions[..., 0] = torch.arange(num_steps)[:, None] / FRAMES_PER_LATENT
+    return positions.flatten(0, 1)
+
+
+def angles(positions: Float32[Tensor, "tokens 3"], head_width: int) -> Float32[Tensor, "tokens n"]:
+    """Angle of each pair of a head's values; rows and columns take two sixths of the width each.
+
+    Computed in float64, since angles grow with time.
+    """
+    spatial = 2 * (head_width // 6)
+    parts = []
+    for axis, width in enumerate((head_width - 2 * spatial, spatial, spatial)):
+        exponents = torch.arange(0, width, 2, dtype=torch.float64) / width
+        parts.append(positions[:, axis, None].double() * _THETA**-exponents)
+    return torch.cat(parts, dim=1).float()
+
+
+def rotate(
+    heads: Float[Tensor, "batch heads tokens width"], turn: Float32[Tensor, "tokens n"]
+) -> Float[Tensor, "batch heads tokens width"]:
+    """Turn each pair of values by its angle, in float32."""
+    first, second = split_axis(heads.float(), -1, (-1, 2)).unbind(-1)
+    cos, sin = turn.cos(), turn.sin()
+    turned = torch.stack([first * cos - second * sin, first * sin + second * cos], dim=-1)
+    return turned.flatten(-2).to(heads.dtype)
+
+
+PART_DIMS = [HAND_DIM, HAND_DIM, CAMERA_DIM]
+
+
+class ActionTokens(nn.Module):
+    """Tokens of the actions of one latent frame or step."""
+
+    def __init__(self, *, num_steps: int, width: int) -> None:
+        super().__init__()
+        self.parts = nn.ModuleList(
+            nn.Sequential(nn.Linear(dim, width), nn.SiLU(), nn.Linear(width, width))
+            for dim in PART_DIMS
+        )
+        self.steps = nn.Parameter(0.02 * torch.randn(num_steps, 1, width))
+
+    def forward(
+        self, actions: Float32[Tensor, "*batch steps 67"]
+    ) -> Float32[Tensor, "*batch tokens width"]:
+        """Three tokens for each step."""
+        parts = zip(self.parts, torch.split(actions, PART_DIMS, dim=-1), strict=True)
+        tokens = torch.stack([embed(part) for embed, part in parts], dim=-2)
+        return (tokens + self.steps).flatten(-3, -2)
+
+
+class ActionAttention(nn.Module):
+    """Attention of each group of tokens to the action tokens of that group.
+
+    Without biases, so that action tokens of zero (index 0) change nothing.
+    """
+
+    def __init__(self, *, width: int, num_heads: int, head_width: int) -> None:
+        super().__init__()
+        inner = num_heads * head_width
+        self.num_heads = num_heads
+        self.norm = nn.LayerNorm(width)
+        self.to_query = nn.Linear(width, inner, bias=False)
+        self.to_key_value = nn.Linear(width, 2 * inner, bias=False)
+        self.query_norm = nn.RMSNorm(head_width, eps=1e-6)
+        self.key_norm = nn.RMSNorm(head_width, eps=1e-6)
+        self.to_out = nn.Linear(inner, width, bias=False)
+
+    def forward(
+        self,
+        tokens: Float32[Tensor, "batch tokens width"],
+        actions: Float32[Tensor, "batch groups keys width"],
+    ) -> Float32[Tensor, "batch tokens width"]:
+        """What the tokens take from their actions; groups are consecutive and of one size."""
+        groups = split_axis(self.norm(tokens), 1, (actions.shape[1], -1)).flatten(0, 1)
+        query = split_axis(self.to_query(groups), -1, (self.num_heads, -1)).transpose(1, 2)
+        both = split_axis(
+            self.to_key_value(actions.flatten(0, 1)), -1, (2, self.num_heads, -1)
+        ).permute(2, 0, 3, 1, 4)
+        attended = functional.scaled_dot_product_attention(
+            self.query_norm(query), self.key_norm(both[0]), both[1]
+        )
+        return self.to_out(attended.transpose(1, 2).flatten(2)).reshape(tokens.shape)
+
 
 NUM_MODULATIONS = 6
 

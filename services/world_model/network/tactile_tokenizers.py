@@ -1,0 +1,360 @@
+"""Tactile tokenizers: pressure of hands to latent tokens and back."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dextouch.errors import InvalidInputError
+from dextouch.tactile.layout import (
+    NUM_FINGERTIPS,
+    NUM_TAXELS,
+    NUM_TIP_TAXELS,
+    PALM_SHAPE,
+    TIP_SHAPE,
+    join_pads,
+)
+from services.networks.principal_axes import principal_axes, root_pressure, root_scale
+from services.world_model.network.attention import split_axis
+from services.world_model.network.configuration import NetworkConfig
+
+# For checkpoints without a stored training peak: twice the peak of eight demonstrations of the
+# twin's first two tasks.
+UNKNOWN_PEAK_KPA = 200.0
+
+
+class TactileTokenizer(nn.Module, ABC):
+    """Encoder and decoder of the taxels of one hand; zero pressure is the zero latent.
+
+    `peak_kpa` is the highest pressure in training.
+
+    Args:
+        num_tokens: tokens per hand.
+        channels: latent values of each token.
+    """
+
+    peak_kpa: Tensor
+
+    def __init__(self, *, num_tokens: int, channels: int) -> None:
+        super().__init__()
+        self.num_tokens, self.channels = num_tokens, channels
+        self.register_buffer("peak_kpa", torch.full((), UNKNOWN_PEAK_KPA))
+
+    @abstractmethod
+    def fit(self, tactile_kpa: Float32[Tensor, "n 2 320"]) -> None:
+        """Fit what follows from training touch in closed form, including `peak_kpa`."""
+
+    @abstractmethod
+    def encode(
+        self, tactile_kpa: Float32[Tensor, "*batch 320"]
+    ) -> Float32[Tensor, "*batch tokens channels"]:
+        """Latents; pressures below zero count as zero."""
+
+    @abstractmethod
+    def decode(
+        self, latents: Float32[Tensor, "*batch tokens channels"]
+    ) -> Float32[Tensor, "*batch 320"]:
+        """Pressures in kPa, never below zero."""
+
+    def bounded(
+        self,
+        tactile_kpa: Float32[Tensor, "batch steps 2 320"],
+        first_kpa: Float32[Tensor, "batch 2 320"],
+    ) -> Float32[Tensor, "batch steps 2 320"]:
+        """Clip decoded pressures to the larger of the training peak and the first touch's peak."""
+        highest_kpa = torch.maximum(first_kpa.flatten(1).amax(dim=1), self.peak_kpa)
+        return torch.minimum(tactile_kpa, highest_kpa[:, None, None, None])
+
+
+NUM_PADS = 6
+
+
+class LearnedTokenizer(TactileTokenizer):
+    """Autoencoder of root pressures in units of their root mean square."""
+
+    root_scale: Tensor
+
+    def __init__(self, config: NetworkConfig) -> None:
+        num_tokens = NUM_PADS if config.tactile_tokens == "pad" else 1
+        super().__init__(num_tokens=num_tokens, channels=config.tactile_channels // num_tokens)
+        self.register_buffer("root_scale", torch.ones(()))
+
+    @abstractmethod
+    def encode_roots(self, roots: Float32[Tensor, "n 320"]) -> Float32[Tensor, "n latents"]:
+        """Latents of scaled root pressures."""
+
+    @abstractmethod
+    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n 320"]:
+        """Scaled root pressures of latents; values may be below zero."""
+
+    def fit(self, tactile_kpa: Float32[Tensor, "n 2 320"]) -> None:
+        """Fit the scale and `peak_kpa`; the weights are learned by gradient."""
+        self.root_scale.copy_(root_pressure(tactile_kpa).square().mean().sqrt().clamp_min(1e-3))
+        self.peak_kpa.copy_(tactile_kpa.max())
+
+    def encode(
+        self, tactile_kpa: Float32[Tensor, "*batch 320"]
+    ) -> Float32[Tensor, "*batch tokens channels"]:
+        """Latents; pressures below zero count as zero."""
+        roots = root_pressure(tactile_kpa).reshape(-1, NUM_TAXELS) / self.root_scale
+        latents = self.encode_roots(roots)
+        return latents.reshape(*tactile_kpa.shape[:-1], self.num_tokens, self.channels)
+
+    def decode(
+        self, latents: Float32[Tensor, "*batch tokens channels"]
+    ) -> Float32[Tensor, "*batch 320"]:
+        """Pressures in kPa, never below zero."""
+        return self.roots(latents).clamp_min(0.0).square()
+
+    def roots(
+        self, latents: Float32[Tensor, "*batch tokens channels"]
+    ) -> Float32[Tensor, "*batch 320"]:
+        """Root pressures (√kPa), which the loss compares; values may be below zero."""
+        flat = latents.reshape(-1, self.num_tokens * self.channels)
+        return split_axis(self.decode_roots(flat), 0, latents.shape[:-2]) * self.root_scale
+
+
+@dataclass(frozen=True)
+class MapShape:
+    """Shape of the maps that one autoencoder handles, and its size.
+
+    Args:
+        rows: rows of a map.
+        columns: columns of a map.
+        num_maps: maps per hand that share the weights and differ by an identity embedding.
+        channels: latent values of each map.
+        width: channels of the convolutions.
+        hidden: width of the layer between features and latents.
+        num_halvings: how often the encoder halves the resolution.
+    """
+
+    rows: int
+    columns: int
+    num_maps: int
+    channels: int
+    width: int
+    hidden: int
+    num_halvings: int
+
+    @property
+    def lowest(self) -> tuple[int, int]:
+        """Rows and columns at the lowest resolution, rounded up."""
+        cells = 2**self.num_halvings
+        return -(-self.rows // cells), -(-self.columns // cells)
+
+    @property
+    def num_features(self) -> int:
+        """Values of a map at the lowest resolution."""
+        rows, columns = self.lowest
+        return self.width * rows * columns
+
+
+class MapEncoder(nn.Module):
+    """Encodes every map of a hand by the same weights."""
+
+    def __init__(self, shape: MapShape) -> None:
+        super().__init__()
+        self.first = _convolution(1, shape.width)
+        self.position = nn.Parameter(torch.zeros(shape.width, shape.rows, shape.columns))
+        strides = [2] * shape.num_halvings or [1]
+        self.deeper = nn.Sequential(
+            *(
+                layer
+                for stride in strides
+                for layer in (_convolution(shape.width, shape.width, stride=stride), nn.GELU())
+            ),
+            nn.Flatten(),
+            nn.Linear(shape.num_features, shape.hidden, bias=False),
+        )
+        self.identity = nn.Parameter(0.1 * torch.randn(shape.num_maps, shape.hidden))
+        self.to_latents = nn.Linear(shape.hidden, shape.channels, bias=False)
+
+    def forward(
+        self, maps: Float32[Tensor, "n maps rows columns"]
+    ) -> Float32[Tensor, "n maps channels"]:
+        """Latents of each map."""
+        features = functional.gelu(self.first(maps.flatten(0, 1)[:, None])) * (1.0 + self.position)
+        hidden = split_axis(self.deeper(features), 0, maps.shape[:2])
+        return self.to_latents(functional.gelu(hidden * (1.0 + self.identity)))
+
+
+class MapDecoder(nn.Module):
+    """Decodes the latents of every map of a hand by the same weights."""
+
+    def __init__(self, shape: MapShape) -> None:
+        super().__init__()
+        self._shape = shape
+        self.from_latents = nn.Linear(shape.channels, shape.hidden, bias=False)
+        self.identity = nn.Parameter(0.1 * torch.randn(shape.num_maps, shape.hidden))
+        self.to_features = nn.Linear(shape.hidden, shape.num_features, bias=False)
+        self.deeper = nn.Sequential(
+            nn.GELU(),
+            *(
+                layer
+                for _ in range(shape.num_halvings - 1)
+                for layer in (
+                    nn.Upsample(scale_factor=2),
+                    _convolution(shape.width, shape.width),
+                    nn.GELU(),
+                )
+            ),
+        )
+        # The last doubling of the resolution writes four cells per feature.
+        factor = 2 if shape.num_halvings else 1
+        rows, columns = (n * 2**shape.num_halvings // factor for n in shape.lowest)
+        self.position = nn.Parameter(torch.zeros(shape.width, rows, columns))
+        self.last = nn.Sequential(_convolution(shape.width, factor**2), nn.PixelShuffle(factor))
+
+    def forward(
+        self, latents: Float32[Tensor, "n maps channels"]
+    ) -> Float32[Tensor, "n maps rows columns"]:
+        """Maps of the latents; values may be below zero."""
+        shape = self._shape
+        hidden = functional.gelu(self.from_latents(latents) * (1.0 + self.identity))
+        flat = self.to_features(hidden).flatten(0, 1)
+        features = self.deeper(split_axis(flat, 1, (shape.width, *shape.lowest)))
+        maps = self.last(features * (1.0 + self.position))[:, 0, : shape.rows, : shape.columns]
+        return split_axis(maps, 0, latents.shape[:2])
+
+
+def _convolution(in_width: int, out_width: int, *, stride: int = 1) -> nn.Conv2d:
+    """Three by three cells without a bias."""
+    return nn.Conv2d(in_width, out_width, 3, stride=stride, padding=1, bias=False)
+
+
+CANVAS_SHAPE = (20, 20)
+_PALM_COLUMN = 2
+
+
+def canvas_cells() -> np.ndarray:
+    """Cell of the canvas, counted row by row, of each of the 320 taxels."""
+    cells = np.arange(CANVAS_SHAPE[0] * CANVAS_SHAPE[1]).reshape(CANVAS_SHAPE)
+    rows, columns = TIP_SHAPE
+    tips = [cells[:rows, columns * finger :][:, :columns] for finger in range(NUM_FINGERTIPS)]
+    palm = cells[rows : rows + PALM_SHAPE[0], _PALM_COLUMN : _PALM_COLUMN + PALM_SHAPE[1]]
+    return join_pads(np.stack(tips), palm)
+
+
+class GridTokenizer(LearnedTokenizer):
+    """One autoencoder for the canvas, with as many weights and latents as Split-Hands."""
+
+    _cells: Tensor
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        # The most accurate of three sizes with as many weights as Split-Hands.
+        shape = MapShape(
+            *CANVAS_SHAPE, num_maps=1, channels=config.tactile_channels, width=24, hidden=90,
+            num_halvings=2,
+        )  # fmt: skip
+        self.encoder, self.decoder = MapEncoder(shape), MapDecoder(shape)
+        self.register_buffer("_cells", torch.from_numpy(canvas_cells()), persistent=False)
+
+    def encode_roots(self, roots: Float32[Tensor, "n 320"]) -> Float32[Tensor, "n latents"]:
+        """Latents of the canvas."""
+        canvas = roots.new_zeros(len(roots), CANVAS_SHAPE[0] * CANVAS_SHAPE[1])
+        canvas[:, self._cells] = roots
+        return self.encoder(canvas.reshape(-1, 1, *CANVAS_SHAPE)).flatten(1)
+
+    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n 320"]:
+        """Root pressures at the taxels' cells."""
+        return self.decoder(latents[:, None]).flatten(1)[:, self._cells]
+
+
+class SplitHandsTokenizer(LearnedTokenizer):
+    """One autoencoder for fingertips, one for palms."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        channels = config.tactile_channels // NUM_PADS
+        tip = MapShape(
+            *TIP_SHAPE, num_maps=NUM_FINGERTIPS, channels=channels, width=16, hidden=64,
+            num_halvings=0,
+        )  # fmt: skip
+        palm = MapShape(
+            *PALM_SHAPE, num_maps=1, channels=channels, width=24, hidden=128, num_halvings=2
+        )
+        self.tip_encoder, self.tip_decoder = MapEncoder(tip), MapDecoder(tip)
+        self.palm_encoder, self.palm_decoder = MapEncoder(palm), MapDecoder(palm)
+
+    def encode_roots(self, roots: Float32[Tensor, "n 320"]) -> Float32[Tensor, "n latents"]:
+        """Latents of the five fingertips, then of the palm."""
+        tips = split_axis(roots[:, :NUM_TIP_TAXELS], 1, (NUM_FINGERTIPS, *TIP_SHAPE))
+        palm = split_axis(roots[:, NUM_TIP_TAXELS:], 1, (1, *PALM_SHAPE))
+        return torch.cat([self.tip_encoder(tips), self.palm_encoder(palm)], dim=1).flatten(1)
+
+    def decode_roots(self, latents: Float32[Tensor, "n latents"]) -> Float32[Tensor, "n 320"]:
+        """Root pressures of the five fingertips, then of the palm."""
+        pads = split_axis(latents, 1, (NUM_PADS, -1))
+        tips = self.tip_decoder(pads[:, :NUM_FINGERTIPS]).flatten(1)
+        return torch.cat([tips, self.palm_decoder(pads[:, NUM_FINGERTIPS:]).flatten(1)], dim=1)
+
+
+# Amplitude of palms relative to that of tips; the best value in an ablation on touch.
+PALM_SCALE = 0.7
+
+
+class PrincipalAxesTokenizer(TactileTokenizer):
+    """Tips as they are and palms along their principal axes, as one token."""
+
+    tip_scale: Tensor
+    palm_basis: Tensor
+    palm_scale: Tensor
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(num_tokens=1, channels=NUM_TIP_TAXELS + config.palm_channels)
+        num_palm = NUM_TAXELS - NUM_TIP_TAXELS
+        self.register_buffer("tip_scale", torch.ones(()))
+        self.register_buffer("palm_basis", torch.eye(num_palm, config.palm_channels))
+        self.register_buffer("palm_scale", torch.ones(config.palm_channels))
+
+    def fit(self, tactile_kpa: Float32[Tensor, "n 2 320"]) -> None:
+        """Fit scales and palm axes to training touch (both hands alike)."""
+        roots = root_pressure(tactile_kpa).double()
+        palms = roots[..., NUM_TIP_TAXELS:].reshape(-1, NUM_TAXELS - NUM_TIP_TAXELS)
+        # Not centred: the mean touch is not a touch that occurs.
+        basis, rms = principal_axes(palms.T @ palms / len(palms), self.palm_basis.shape[1])
+        tips_rms = roots[..., :NUM_TIP_TAXELS].square().mean().sqrt()
+        self.palm_basis.copy_(basis)
+        self.palm_scale.copy_(root_scale(rms) * PALM_SCALE)
+        self.tip_scale.copy_(tips_rms.clamp_min(1e-3).float())
+        self.peak_kpa.copy_(tactile_kpa.max())
+
+    def encode(
+        self, tactile_kpa: Float32[Tensor, "*batch 320"]
+    ) -> Float32[Tensor, "*batch 1 channels"]:
+        """Latents; pressures below zero count as zero."""
+        roots = root_pressure(tactile_kpa)
+        tips = roots[..., :NUM_TIP_TAXELS] / self.tip_scale
+        palm = (roots[..., NUM_TIP_TAXELS:] @ self.palm_basis) / self.palm_scale
+        return torch.cat([tips, palm], dim=-1)[..., None, :]
+
+    def decode(
+        self, latents: Float32[Tensor, "*batch 1 channels"]
+    ) -> Float32[Tensor, "*batch 320"]:
+        """Pressures in kPa, never below zero."""
+        tips = latents[..., 0, :NUM_TIP_TAXELS] * self.tip_scale
+        palm = (latents[..., 0, NUM_TIP_TAXELS:] * self.palm_scale) @ self.palm_basis.T
+        return torch.cat([tips, palm], dim=-1).clamp_min(0.0).square()
+
+
+def build_tokenizer(config: NetworkConfig) -> TactileTokenizer:
+    """The tokenizer that the configuration names, with initial weights.
+
+    Raises:
+        InvalidInputError: tokens per pad with another tokenizer than Split-Hands.
+    """
+    if config.tactile_tokens == "pad" and config.tokenizer != "split_hands":
+        raise InvalidInputError(
+            f"network: got tactile_tokens pad with tokenizer {config.tokenizer}, expected hand; "
+            "only split_hands has a token for each pad"
+        )
+    if config.tokenizer == "split_hands":
+        return SplitHandsTokenizer(config)
+    if config.tokenizer == "grid":
+        return GridTokenizer(config)
+    return PrincipalAxesTokenizer(config)

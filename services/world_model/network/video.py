@@ -1,0 +1,522 @@
+"""The video side of the joint model: codec, expert and Wan's network."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from jaxtyping import Float, Float32, UInt8
+from torch import Tensor, nn
+from torch.nn import functional
+
+from services.networks.principal_axes import principal_axes, root_scale
+from services.world_model.network.attention import (
+    NUM_MODULATIONS,
+    Block,
+    ExpertBlock,
+    KeysValues,
+    Stream,
+    Text,
+    angles,
+    modulated_norm,
+    rotate,
+    split_axis,
+    video_positions,
+    zero_linear,
+)
+from services.world_model.network.conditioning import (
+    ACTION_WIDTH,
+    TIME_RANGE,
+    ActionFeatures,
+    Condition,
+    VideoCondition,
+    after_first,
+    two_layers,
+)
+from services.world_model.network.configuration import (
+    FRAMES_PER_LATENT,
+    RASTER_CELLS_PER_TOKEN,
+    NetworkConfig,
+)
+from services.world_model.network.inputs import ModelInputs
+from services.world_model.wan.configuration import (
+    LATENT_CHANNELS,
+    LATENT_MEAN,
+    LATENT_STD,
+    WanConfig,
+)
+from services.world_model.wan.loading import empty_autoencoder, empty_transformer
+from services.world_model.wan.text import TextFeatures
+
+if TYPE_CHECKING:
+    from diffusers import WanTransformer3DModel
+
+
+class VideoExpert(nn.Module):
+    """Visual stream: `tokens_per_latent` tokens per latent frame; the first frame is clean."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        width = config.video_width
+        self.tokens_across = config.tokens_across
+        self.use_pose_raster = config.use_pose_raster
+        self.add_condition = config.add_condition_to_tokens
+        self.is_anchored = config.video_target == "residual"
+        raster_width = 2 * FRAMES_PER_LATENT * RASTER_CELLS_PER_TOKEN**2
+        # Residuals come with the latent that they are relative to.
+        self.embed = nn.Linear((1 + self.is_anchored) * config.video_channels, width)
+        self.embed_raster = nn.Linear(raster_width, width, bias=False)
+        self.places = nn.Parameter(0.02 * torch.randn(config.tokens_per_latent, width))
+        self.frames = nn.Parameter(0.02 * torch.randn(config.max_latents, 1, width))
+        self.modulate = nn.Sequential(nn.SiLU(), zero_linear(width, NUM_MODULATIONS * width))
+        self.modulate_out = nn.Sequential(nn.SiLU(), zero_linear(width, 2 * width))
+        self.predict = zero_linear(width, config.video_channels)
+
+    @staticmethod
+    def block(config: NetworkConfig) -> ExpertBlock:
+        """This expert's block of one joint layer."""
+        return ExpertBlock(
+            width=config.video_width,
+            num_heads=config.num_heads,
+            head_width=config.head_width,
+            ffn_ratio=config.ffn_ratio,
+            attends_to_actions=config.action_conditioning == "cross_attention",
+        )
+
+    def start(
+        self,
+        noisy: Float32[Tensor, "batch latents tokens channels"],
+        first: Float32[Tensor, "batch tokens channels"],
+        condition: Condition,
+        raster: Float32[Tensor, "batch time 2 cells cells"],
+    ) -> Stream:
+        """Tokens before the first layer.
+
+        `noisy` are residuals, the first one zero, or plain latents, the first one clean.
+        """
+        num_latents, dtype = noisy.shape[1], self.places.dtype
+        condition = condition.to(dtype)
+        if self.is_anchored:
+            noisy = torch.cat([noisy, first[:, None].expand_as(noisy)], dim=-1)
+        tokens = self.embed(noisy.to(dtype)) + self.places + self.frames[:num_latents]
+        if self.add_condition:
+            tokens = tokens + condition.vector[:, :, None]
+        if self.use_pose_raster:
+            tokens = tokens + self.embed_raster(self.raster_tokens(raster).to(dtype))
+        modulation = split_axis(self.modulate(condition.vector), -1, (NUM_MODULATIONS, -1))
+        per_token = modulation.repeat_interleave(noisy.shape[2], dim=1)
+        return Stream(tokens.flatten(1, 2), per_token, actions=condition.actions)
+
+    def finish(
+        self, stream: Stream, condition: Condition
+    ) -> Float32[Tensor, "batch latents tokens channels"]:
+        """Predict the clean latents, or the velocity, as the configuration says."""
+        condition = condition.to(self.places.dtype)
+        tokens = split_axis(stream.tokens, 1, (condition.vector.shape[1], -1))
+        shift, scale = (
+            self.modulate_out(condition.vector)[:, :, None]
+            .expand(-1, -1, tokens.shape[2], -1)
+            .chunk(2, dim=-1)
+        )
+        return self.predict(modulated_norm(tokens, shift, scale)).float()
+
+    def raster_tokens(
+        self, raster: Float32[Tensor, "batch time 2 cells cells"]
+    ) -> Float32[Tensor, "batch latents tokens values"]:
+        """The raster cut into image tokens: four steps, four by four cells and two hands each."""
+        first = raster[:, :1].expand(-1, FRAMES_PER_LATENT, -1, -1, -1)
+        padded = torch.cat([first, raster[:, 1:]], dim=1)
+        groups = split_axis(padded, 1, (-1, FRAMES_PER_LATENT))
+        cells = (self.tokens_across, RASTER_CELLS_PER_TOKEN)
+        grid = split_axis(split_axis(groups, 5, cells), 4, cells)
+        # [B, L, 4, 2, rows, 4, cols, 4] -> [B, L, rows, cols, 4, 2, 4, 4]
+        return grid.permute(0, 1, 4, 6, 2, 3, 5, 7).flatten(4).flatten(2, 3)
+
+
+class VisualCodec(nn.Module):
+    """Linear tokenizer; a token covers two by two patches of one latent frame."""
+
+    mean: Tensor
+    basis: Tensor
+    scale: Tensor
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.patch_px = config.patch_px
+        self.tokens_across = config.tokens_across
+        self.channels = config.codec_channels
+        values = FRAMES_PER_LATENT * config.patch_px**2 * 3
+        self.register_buffer("mean", torch.zeros(values))
+        self.register_buffer("basis", torch.eye(values, config.codec_channels))
+        self.register_buffer("scale", torch.ones(config.codec_channels))
+
+    def fit(self, windows: UInt8[Tensor, "n time px px 3"], *, batch: int = 16) -> None:
+        """Fit mean and principal axes to windows of images."""
+        size = len(self.mean)
+        total = torch.zeros(size, dtype=torch.float64)
+        moment = torch.zeros(size, size, dtype=torch.float64)
+        count = 0
+        for part in torch.split(windows, batch):
+            patches = self._patches(to_unit(part)).reshape(-1, size)
+            total += patches.sum(dim=0, dtype=torch.float64)
+            moment += (patches.T @ patches).double()
+            count += len(patches)
+        mean = total / count
+        basis, rms = principal_axes(moment / count - torch.outer(mean, mean), self.channels)
+        self.mean.copy_(mean.float())
+        self.basis.copy_(basis)
+        self.scale.copy_(root_scale(rms))
+
+    def encode(
+        self, images: Float32[Tensor, "batch time px px 3"]
+    ) -> Float32[Tensor, "batch latents tokens channels"]:
+        """Latents of images in 0 … 1; time is 1 + 4k."""
+        coded = ((self._patches(images) - self.mean) @ self.basis) / self.scale
+        # [B, L, rows, cols, 2, 2, C]: two by two patches become one token.
+        across = self.tokens_across
+        grid = split_axis(split_axis(coded, 3, (across, 2)), 2, (across, 2)).transpose(3, 4)
+        return grid.flatten(4).flatten(2, 3)
+
+    def decode(
+        self, latents: Float32[Tensor, "batch latents tokens channels"]
+    ) -> Float32[Tensor, "batch time px px 3"]:
+        """Images in 0 … 1; the first latent gives one image, the others four each."""
+        across = self.tokens_across
+        grid = split_axis(split_axis(latents, 2, (across, across)), 4, (2, 2, self.channels))
+        coded = grid.transpose(3, 4).flatten(2, 3).flatten(3, 4)
+        patches = (coded * self.scale) @ self.basis.T + self.mean
+        groups = split_axis(patches, 4, (FRAMES_PER_LATENT, self.patch_px, self.patch_px, 3))
+        # [B, L, rows, cols, 4, p, p, 3] -> [B, L, 4, rows, p, cols, p, 3]
+        images = groups.permute(0, 1, 4, 2, 5, 3, 6, 7).flatten(5, 6).flatten(3, 4)
+        first = images[:, 0].mean(dim=1, keepdim=True)
+        return torch.cat([first, images[:, 1:].flatten(1, 2)], dim=1).clamp(0.0, 1.0)
+
+    def decode_future(
+        self, latents: Float32[Tensor, "batch latents tokens channels"], *, all_images: bool
+    ) -> Float32[Tensor, "batch shown px px 3"]:
+        """Images after the first, or those of the last latent only.
+
+        The last latent is decoded separately, so that its images are bit-identical whether or not
+        the others are decoded.
+        """
+        images = self.decode(latents[:, [0, -1]])[:, 1:]
+        if all_images and latents.shape[1] > 2:
+            images = torch.cat([self.decode(latents[:, :-1])[:, 1:], images], dim=1)
+        return images
+
+    def _patches(
+        self, images: Float32[Tensor, "batch time px px 3"]
+    ) -> Float32[Tensor, "batch latents rows cols values"]:
+        first = images[:, :1].expand(-1, FRAMES_PER_LATENT, -1, -1, -1)
+        padded = torch.cat([first, images[:, 1:]], dim=1)
+        groups = split_axis(padded, 1, (-1, FRAMES_PER_LATENT))
+        grid = split_axis(split_axis(groups, 4, (-1, self.patch_px)), 3, (-1, self.patch_px))
+        # [B, L, 4, rows, p, cols, p, 3] -> [B, L, rows, cols, 4, p, p, 3]
+        return grid.permute(0, 1, 3, 5, 2, 4, 6, 7).flatten(4)
+
+
+def to_unit(images: UInt8[Tensor, "..."]) -> Float32[Tensor, "..."]:
+    """Scale uint8 images to 0 … 1."""
+    return images.float() / 255.0
+
+
+def to_uint8(images: Float32[Tensor, "..."]) -> UInt8[Tensor, "..."]:
+    """Convert images in 0 … 1 to uint8."""
+    return (images * 255.0).round().clamp(0, 255).to(torch.uint8)
+
+
+class WanVideoCodec(nn.Module):
+    """Latent tokens, two by two latents each, with mean 0 and deviation 1 by channel."""
+
+    def __init__(self, config: NetworkConfig, wan: WanConfig) -> None:
+        super().__init__()
+        self._tokens_across = config.tokens_across
+        self.autoencoder = empty_autoencoder(wan).requires_grad_(requires_grad=False)
+
+    def fit(self, windows: UInt8[Tensor, "n time px px 3"]) -> None:
+        """Do nothing: the autoencoder is pretrained."""
+
+    @torch.no_grad()
+    def encode(
+        self, images: Float32[Tensor, "batch time px px 3"]
+    ) -> Float32[Tensor, "batch latents tokens channels"]:
+        """Latents of images in 0 … 1; time is 1 + 4k."""
+        pixels = images.permute(0, 4, 1, 2, 3) * 2.0 - 1.0
+        # The mean of the encoder's distribution, not a sample of it.
+        latents = self.autoencoder.encode(pixels).latent_dist.mode()
+        mean, std = _statistics(latents)
+        grid = ((latents - mean) / std).permute(0, 2, 3, 4, 1)
+        across = self._tokens_across
+        tokens = split_axis(split_axis(grid, 3, (across, 2)), 2, (across, 2)).transpose(3, 4)
+        return tokens.flatten(4).flatten(2, 3)
+
+    @torch.no_grad()
+    def decode(
+        self, tokens: Float32[Tensor, "batch latents tokens channels"]
+    ) -> Float32[Tensor, "batch time px px 3"]:
+        """Images in 0 … 1; the first latent gives one image, the others four each."""
+        across = self._tokens_across
+        grid = split_axis(split_axis(tokens, 2, (across, across)), 4, (2, 2, LATENT_CHANNELS))
+        latents = grid.transpose(3, 4).flatten(2, 3).flatten(3, 4).permute(0, 4, 1, 2, 3)
+        mean, std = _statistics(latents)
+        pixels = self.autoencoder.decode(latents * std + mean).sample
+        return (pixels.permute(0, 2, 3, 4, 1) + 1.0) / 2.0
+
+    def decode_future(
+        self, tokens: Float32[Tensor, "batch latents tokens channels"], *, all_images: bool
+    ) -> Float32[Tensor, "batch shown px px 3"]:
+        """Images after the first, or the last four; all are decoded, since they depend in order."""
+        images = self.decode(tokens)
+        return images[:, 1:] if all_images else images[:, -FRAMES_PER_LATENT:]
+
+
+def _statistics(
+    like: Float[Tensor, "batch channels latents rows columns"],
+) -> tuple[Float[Tensor, "channels 1 1 1"], Float[Tensor, "channels 1 1 1"]]:
+    values = (like.new_tensor(constant).view(-1, 1, 1, 1) for constant in (LATENT_MEAN, LATENT_STD))
+    mean, std = values
+    return mean, std
+
+
+@dataclass(frozen=True)
+class WanCondition:
+    """Condition of the video tokens: `time` has the actions, too; `text` is shared by all."""
+
+    time: Float32[Tensor, "batch latents width"]
+    modulation: Float32[Tensor, "batch latents 6 width"]
+    text: Text
+
+
+@dataclass(frozen=True)
+class WanConstants:
+    """What conditions consist of apart from the flow time."""
+
+    actions: Float32[Tensor, "batch latents width"]
+    text: Text
+
+
+class WanVideoCondition(nn.Module):
+    """Times, actions and instructions as the transformer of Wan2.2 takes them."""
+
+    def __init__(self, config: NetworkConfig, wan: WanConfig, embedder: nn.Module) -> None:
+        super().__init__()
+        width = config.video_width
+        self.embedder: Any = embedder
+        self.actions = two_layers(FRAMES_PER_LATENT * ACTION_WIDTH, width, width)
+        self.actions[-1] = zero_linear(width, width)
+        self.commanded = nn.Parameter(torch.zeros(width))
+        self.text_features = TextFeatures(wan)
+
+    def forward(
+        self,
+        inputs: ModelInputs,
+        features: ActionFeatures,
+        t: Float32[Tensor, "batch latents"],
+    ) -> WanCondition:
+        """Conditions; t is zero where the latent is clean."""
+        return self.at(self.constants(inputs, features), t)
+
+    def constants(self, inputs: ModelInputs, features: ActionFeatures) -> WanConstants:
+        """What does not depend on the flow time."""
+        groups = split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT)).flatten(2)
+        actions = after_first(self.actions(groups.to(self.commanded.dtype))).float()
+        kind = inputs.commanded[:, None, None] * self.commanded.float()
+        return self._constants(actions + kind, self.text_features.stack(inputs.instructions))
+
+    def of(
+        self,
+        t: Float32[Tensor, "batch latents"],
+        actions: Float32[Tensor, "batch latents width"],
+        text: Float[Tensor, "batch words features"],
+    ) -> WanCondition:
+        """Conditions from embedded actions and text features."""
+        return self.at(self._constants(actions, text), t)
+
+    def _constants(self, actions: Tensor, text: Tensor) -> WanConstants:
+        weight = self.embedder.time_proj.weight
+        return WanConstants(actions, Text(self.embedder.text_embedder(text.to(weight))))
+
+    def at(self, constants: WanConstants, t: Float32[Tensor, "batch latents"]) -> WanCondition:
+        """Conditions at these times."""
+        waves = self.embedder.timesteps_proj(TIME_RANGE * t.flatten())
+        time = split_axis(self.embedder.time_embedder(waves), 0, tuple(t.shape)) + constants.actions
+        project = self.embedder.time_proj
+        modulation = project(functional.silu(time).to(project.weight.dtype)).float()
+        return WanCondition(time, split_axis(modulation, -1, (NUM_MODULATIONS, -1)), constants.text)
+
+
+class WanBlock(Block):
+    """One layer of Wan2.2, before and after the shared attention."""
+
+    def __init__(self, block: nn.Module) -> None:
+        super().__init__()
+        self.block: Any = block
+
+    def queries_keys_values(
+        self, stream: Stream
+    ) -> tuple[
+        Float[Tensor, "batch heads tokens head_width"],
+        Float[Tensor, "batch heads tokens head_width"],
+        Float[Tensor, "batch heads tokens head_width"],
+    ]:
+        """Queries, keys and values for the shared attention."""
+        attention = self.block.attn1
+        shift, scale, *_ = self._modulation(stream)
+        normed = self._modulated(self.block.norm1, stream.tokens, shift, scale)
+        query, key, value = (
+            split_axis(part, -1, (attention.heads, -1)).transpose(1, 2)
+            for part in (
+                attention.norm_q(attention.to_q(normed)),
+                attention.norm_k(attention.to_k(normed)),
+                attention.to_v(normed),
+            )
+        )
+        if stream.turn is None:
+            return query, key, value
+        return rotate(query, stream.turn), rotate(key, stream.turn), value
+
+    def finish(self, stream: Stream, attended: Float[Tensor, "batch tokens inner"]) -> Stream:
+        """Add the outputs of the shared attention, of the text and of the feed-forward network."""
+        block = self.block
+        _, _, gate, ffn_shift, ffn_scale, ffn_gate = self._modulation(stream)
+        tokens = self._gated(stream.tokens, block.attn1.to_out[0](attended), gate)
+        normed = block.norm2(tokens.float()).to(tokens.dtype)
+        if stream.text is not None:
+            tokens = tokens + self._read(normed, stream.text)
+        normed = self._modulated(block.norm3, tokens, ffn_shift, ffn_scale)
+        tokens = self._gated(tokens, block.ffn(normed), ffn_gate)
+        return replace(stream, tokens=tokens)
+
+    def _read(self, tokens: Tensor, text: Text) -> Tensor:
+        """What tokens take from the text by cross-attention."""
+        attention = self.block.attn2
+        heads = (attention.heads, -1)
+
+        def keys_values(words: Tensor) -> KeysValues:
+            words = words.to(tokens.dtype)
+            key, value = attention.norm_k(attention.to_k(words)), attention.to_v(words)
+            return KeysValues(
+                split_axis(key, -1, heads).transpose(1, 2),
+                split_axis(value, -1, heads).transpose(1, 2),
+            )
+
+        known = text.keys_values(self, keys_values)
+        query = split_axis(attention.norm_q(attention.to_q(tokens)), -1, heads).transpose(1, 2)
+        read = functional.scaled_dot_product_attention(query, known.keys, known.values)
+        out: Tensor = attention.to_out[0](read.transpose(1, 2).flatten(2))
+        return out
+
+    def _modulation(self, stream: Stream) -> tuple[Tensor, ...]:
+        """Shift, scale and gate of each latent frame, twice."""
+        return (stream.modulation + self.block.scale_shift_table).unbind(2)
+
+    @staticmethod
+    def _modulated(norm: nn.Module, tokens: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+        frames = split_axis(norm(tokens.float()), 1, (shift.shape[1], -1))
+        changed = frames * (1.0 + scale[:, :, None]) + shift[:, :, None]
+        return changed.flatten(1, 2).to(tokens.dtype)
+
+    @staticmethod
+    def _gated(tokens: Tensor, added: Tensor, gate: Tensor) -> Tensor:
+        frames = split_axis(added.float(), 1, (gate.shape[1], -1)) * gate[:, :, None]
+        return (tokens.float() + frames.flatten(1, 2)).to(tokens.dtype)
+
+
+class WanVideoExpert(nn.Module):
+    """Ends of the transformer: embeds latents and predicts velocities."""
+
+    def __init__(self, config: NetworkConfig, transformer: "WanTransformer3DModel") -> None:
+        super().__init__()
+        self._side, self._head_width = config.tokens_across, config.head_width
+        self.patch_embedding = transformer.patch_embedding
+        self.norm_out = transformer.norm_out
+        self.proj_out = transformer.proj_out
+        self.scale_shift_table = transformer.scale_shift_table
+
+    def start(
+        self,
+        noisy: Float32[Tensor, "batch latents tokens channels"],
+        first: Float32[Tensor, "batch tokens channels"],
+        condition: WanCondition,
+        _: Float32[Tensor, "batch time 2 cells cells"],
+    ) -> Stream:
+        """Tokens before the first layer; the first latent frame is the clean `first`."""
+        latents = torch.cat([first[:, None], noisy[:, 1:]], dim=1)
+        # The convolution has the size of its stride, so it is one product per token.
+        weight = self.patch_embedding.weight
+        matrix = weight.permute(0, 2, 3, 4, 1).flatten(1)
+        embedded = functional.linear(latents.to(weight.dtype), matrix, self.patch_embedding.bias)
+        positions = video_positions(noisy.shape[1], self._side)
+        return Stream(
+            embedded.flatten(1, 2),
+            condition.modulation,
+            turn=angles(positions, self._head_width).to(noisy.device),
+            text=condition.text,
+        )
+
+    def finish(
+        self, stream: Stream, condition: WanCondition
+    ) -> Float32[Tensor, "batch latents tokens channels"]:
+        """Predict the velocity, noise less data."""
+        tokens = split_axis(stream.tokens, 1, (condition.time.shape[1], -1))
+        ends = self.scale_shift_table + condition.time[:, :, None]
+        shift, scale = ends[:, :, None].unbind(3)
+        normed = self.norm_out(tokens.float()) * (1.0 + scale) + shift
+        predicted: Tensor = self.proj_out(normed.to(tokens.dtype)).float()
+        return predicted
+
+
+class TinyVideoSide:
+    """Small expert, trained from scratch, on the latents of a linear codec."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        self._config = config
+
+    def codec(self) -> VisualCodec:
+        """Principal axes of patches."""
+        return VisualCodec(self._config)
+
+    def condition(self) -> VideoCondition:
+        """Time, actions, instruction and kind of action."""
+        return VideoCondition(self._config)
+
+    def expert(self) -> VideoExpert:
+        """Embedding and prediction."""
+        return VideoExpert(self._config)
+
+    def block(self, _: int) -> Block:
+        """A new block."""
+        return VideoExpert.block(self._config)
+
+
+class WanVideoSide:
+    """Parts of the networks of Wan2.2, on the meta device until their weights are loaded."""
+
+    def __init__(self, config: NetworkConfig, wan: WanConfig) -> None:
+        self._config, self._wan = config, wan
+        self._transformer = empty_transformer(
+            wan,
+            num_layers=config.num_layers,
+            num_heads=config.num_heads,
+            head_width=config.head_width,
+        )
+
+    def codec(self) -> WanVideoCodec:
+        """Video autoencoder."""
+        return WanVideoCodec(self._config, self._wan)
+
+    def condition(self) -> WanVideoCondition:
+        """Time, actions and text features."""
+        return WanVideoCondition(self._config, self._wan, self._transformer.condition_embedder)
+
+    def expert(self) -> WanVideoExpert:
+        """Embedding and prediction."""
+        return WanVideoExpert(self._config, self._transformer)
+
+    def block(self, index: int) -> Block:
+        """A block of the transformer."""
+        return WanBlock(self._transformer.blocks[index])
+
+
+def video_side(config: NetworkConfig) -> TinyVideoSide | WanVideoSide:
+    """The video side that the configuration names."""
+    return TinyVideoSide(config) if config.wan is None else WanVideoSide(config, config.wan)
