@@ -38,9 +38,8 @@ from services.acquisition.devices.robot_state.driver import (
     robot_descriptor,
 )
 from services.acquisition.devices.robot_state.mock import RobotStateSource
-from services.acquisition.drivers.base import Decoder
+from services.acquisition.drivers.base import DESCRIPTOR_REPORT, Decoder
 from services.acquisition.drivers.image_encoding import ImageEncoding
-from services.acquisition.drivers.reports import DESCRIPTOR_REPORT
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
 from services.acquisition.transports.ports import READ_BYTES

@@ -17,13 +17,14 @@ from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile import pad_forces_n
 from dextouch.tactile.layout import SIDES, Side
 from services.alignment.retargeting import HandRetargeter
-from services.alignment.retargeting.touch_anchor import anchored_joints, touch_shares
 from services.alignment.retargeting.wrist_transfer import (
     MatchedPoints,
+    anchored_joints,
     constant_offset_m,
     matched_points,
     shifted_wrist,
     touch_offsets_m,
+    touch_shares,
 )
 from services.alignment.synchronization.resampling import (
     GridPlacement,

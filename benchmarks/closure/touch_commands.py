@@ -24,8 +24,11 @@ from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
-from services.alignment.retargeting.touch_anchor import fingertip_jacobians
-from services.alignment.retargeting.wrist_transfer import NUM_PADS, robot_places_m
+from services.alignment.retargeting.wrist_transfer import (
+    NUM_PADS,
+    fingertip_jacobians,
+    robot_places_m,
+)
 
 # Lever that converts moments to forces, about half the size of a grasp.
 _LEVER_M: Final = 0.05

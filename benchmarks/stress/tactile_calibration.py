@@ -6,9 +6,15 @@ from benchmarks.stress.cells import Check, StageCells
 from dextouch.errors import NonFiniteError
 from dextouch.tactile import pad_forces_n
 from dextouch.tactile.layout import NUM_TAXELS, raw_indices
-from services.alignment.calibration.tactile_baseline import TactileCalibration, unusable_taxels
 from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
-from services.alignment.calibration.tactile_tare import SATURATED, STATES, TaxelTare, measure_tare
+from services.alignment.calibration.tactile_tare import (
+    SATURATED,
+    STATES,
+    TactileCalibration,
+    TaxelTare,
+    measure_tare,
+    unusable_taxels,
+)
 
 STAGE = StageCells("tactile-calibration")
 _TARE, _GAIN, _FULL = 500.0, 100.0, 65_535.0

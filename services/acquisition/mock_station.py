@@ -28,8 +28,7 @@ from services.acquisition.devices.robot_state.mock import RobotStateSource
 from services.acquisition.devices.station_camera.mock import video_camera
 from services.acquisition.drivers.base import Decoder, Driver
 from services.acquisition.mock_links import MockLinks
-from services.acquisition.mocks.faults import FaultScript
-from services.acquisition.mocks.ledger import Ledger
+from services.acquisition.mocks.faults import FaultScript, Ledger
 from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import (
     MockDevice,

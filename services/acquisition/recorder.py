@@ -35,8 +35,7 @@ from services.acquisition.path_latency import add_latencies
 from services.acquisition.session import SessionCount
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.take import Take, check_free_space
-from services.acquisition.take_cause import incomplete_cause
-from services.acquisition.take_check import DeviceEvents, TakeWatch
+from services.acquisition.take_check import DeviceEvents, TakeWatch, incomplete_cause
 
 logger = structlog.get_logger(__name__)
 

@@ -12,7 +12,7 @@ from dextouch.errors import DeviceError
 from dextouch.streams import Sample
 from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.drivers.base import Driver, Readings
-from services.acquisition.transports.shared_links import shared_link
+from services.acquisition.transports.ports import shared_link
 
 logger = structlog.get_logger(__name__)
 

@@ -16,7 +16,7 @@ from rich.text import Text
 from dextouch.episodes import EpisodeReader
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import ClockReport, Domain, Matrix
-from services.alignment.calibration.tactile_baseline import REASONS
+from services.alignment.calibration.tactile_tare import REASONS
 from services.alignment.synchronization.refused_parts import RefusedPart, refused_parts
 
 EXPECTED_STREAMS = (

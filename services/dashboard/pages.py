@@ -18,9 +18,8 @@ from starlette.requests import HTTPConnection
 
 from dextouch.errors import AccessDeniedError, NotFoundError
 from dextouch.serving import FORM, KIB, AccessControl, Grant, not_signed_in, takes
-from services.dashboard.documents import HELP, Documents, find_documents
+from services.dashboard.documents import HELP, Documents, TaskChoice, find_documents, load_tasks
 from services.dashboard.settings import DashboardSettings
-from services.dashboard.tasks import TaskChoice, load_tasks
 
 COOKIE = "dextouch_session"
 SCOPE = "operate"

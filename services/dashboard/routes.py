@@ -22,9 +22,8 @@ from services.dashboard.audit import AuditLog, AuditPage
 from services.dashboard.audit_trail import ALL_ACTIONS
 from services.dashboard.comparison import Comparisons, ComparisonView, StartComparison
 from services.dashboard.enrolments import used_tokens
-from services.dashboard.feeds import Feeds, Topic
+from services.dashboard.feeds import Feeds, Topic, heatmap_layout, skeleton_bones
 from services.dashboard.fleet import Fleet
-from services.dashboard.live_messages import heatmap_layout, skeleton_bones
 from services.dashboard.pages import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView

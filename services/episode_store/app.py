@@ -14,14 +14,12 @@ from dextouch.schemas import load_object_clicks
 from dextouch.serving import ServedFolder, create_service_app, serve
 from services.episode_store.catalog import Catalog
 from services.episode_store.clicking import clicks_router
+from services.episode_store.committing import PendingUploads
 from services.episode_store.deletions import DeletionWatch, deletions_router
-from services.episode_store.enrolment import Enrolments
-from services.episode_store.enrolment_routes import enrolment_router
+from services.episode_store.enrolment import Enrolments, enrolment_router
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
-from services.episode_store.pending_uploads import PendingUploads
-from services.episode_store.playback import playback_router
-from services.episode_store.reading import content_router
+from services.episode_store.reading import content_router, playback_router
 from services.episode_store.routes import (
     catalog_router,
     idle_uploads_router,

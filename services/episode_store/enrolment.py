@@ -12,27 +12,34 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 import structlog
+from fastapi import APIRouter, Depends, Request, Response
 from pydantic import ValidationError
 
 from dextouch.episodes import disk_errors, replace_file
-from dextouch.errors import (
-    AccessDeniedError,
-    ConflictError,
-    NotFoundError,
-    StorageError,
-)
+from dextouch.errors import AccessDeniedError, ConflictError, NotFoundError, StorageError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
     EnrolmentToken,
+    EnrolStation,
     StationEnrolment,
     StationEnrolments,
     StationKey,
+    UseToken,
     first_problems,
 )
-from dextouch.serving import AccessControl, Grant, secret_digest
+from dextouch.serving import (
+    JSON,
+    KIB,
+    AccessControl,
+    Grant,
+    RequireScope,
+    WrongKeys,
+    secret_digest,
+    takes,
+)
 
 logger = structlog.get_logger(__name__)
 
@@ -256,3 +263,47 @@ def _read(path: Path) -> tuple[StoredEnrolment, ...]:
             f"{path}: no valid list of enrolled stations ({first_problems(error)}); restore it "
             "from a backup, or remove it and enrol the stations again"
         ) from error
+
+
+SCOPE: Final = "enrol"
+
+
+def enrolment_router(enrolments: Enrolments) -> APIRouter:
+    """Create the routes below /v1/enrolments; the exchange of a token needs no key."""
+    router = APIRouter(prefix="/v1/enrolments", tags=["enrolments"])
+    may_enrol = Depends(RequireScope(SCOPE))
+
+    @router.get("", dependencies=[may_enrol])
+    def listing() -> StationEnrolments:
+        """List enrolled, waiting and revoked stations."""
+        return enrolments.listing()
+
+    @router.post("", status_code=201)
+    def issue(
+        wanted: EnrolStation, by: Annotated[str, may_enrol], response: Response
+    ) -> EnrolmentToken:
+        """Issue a one-time token for a station, valid for 15 minutes."""
+        response.headers["cache-control"] = "no-store"
+        return enrolments.issue(wanted.station, by=by)
+
+    @router.post("/exchange", status_code=201)
+    @takes({JSON: KIB}, needs_key=False)
+    def exchange(given: UseToken, request: Request, response: Response) -> StationKey:
+        """Exchange a token for a key of the station's own, once."""
+        response.headers["cache-control"] = "no-store"
+        client = request.client.host if request.client else "unknown"
+        try:
+            return enrolments.exchange(given.token.get_secret_value(), client=client)
+        except AccessDeniedError as error:
+            if error.details["reason"] == "unknown_token":
+                wrong_keys: WrongKeys = request.app.state.wrong_keys
+                wrong_keys.count(request, what="token")
+            raise
+
+    @router.post("/{station}/revoke")
+    def revoke(station: str, by: Annotated[str, may_enrol]) -> StationEnrolments:
+        """Refuse the key of a station from now on, or its unused token."""
+        enrolments.revoke(station, by=by)
+        return enrolments.listing()
+
+    return router

@@ -20,10 +20,9 @@ from dextouch.schemas import (
     RecordingSummary,
     Review,
 )
-from services.episode_store.figures import figures_of
 from services.episode_store.filters import Entry, ItemsKind
 from services.episode_store.limits import beyond_limits
-from services.episode_store.outliers import MIN_ITEMS, find_outliers
+from services.episode_store.signals import MIN_ITEMS, figures_of, find_outliers
 
 AnyEntry = Entry[Any]
 Entries = Mapping[str, AnyEntry]

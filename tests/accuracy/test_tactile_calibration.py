@@ -16,7 +16,6 @@ from services.acquisition.devices.tactile_glove.mock import GloveCalibration as 
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import ReplayStream
-from services.alignment.calibration.tactile_baseline import TactileCalibration
 from services.alignment.calibration.tactile_gain import (
     TaxelPress,
     calibrate_glove,
@@ -26,6 +25,7 @@ from services.alignment.calibration.tactile_gain import (
 )
 from services.alignment.calibration.tactile_tare import (
     STATES,
+    TactileCalibration,
     classify_taxels,
     measure_tare,
     rounding_rms_counts,

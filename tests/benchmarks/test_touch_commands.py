@@ -11,13 +11,14 @@ from benchmarks.closure.touch_commands import (
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert, transform
 from dextouch.hands.robot_hand import RobotHand
-from services.alignment.retargeting.touch_anchor import (
+from services.alignment.retargeting.wrist_transfer import (
+    MatchedPoints,
     TouchAnchorOptions,
     anchored_joints,
     fingertip_jacobians,
+    robot_places_m,
     touch_shares,
 )
-from services.alignment.retargeting.wrist_transfer import MatchedPoints, robot_places_m
 
 SIDES = ("left", "right")
 SERVOS = HandServos(finger_nm_rad=1.2, wrist_n_m=700.0, wrist_nm_rad=15.0)

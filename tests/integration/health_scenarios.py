@@ -13,8 +13,7 @@ from services.acquisition.devices.station_camera.driver import StationCamera
 from services.acquisition.health import STATION, DiskCheck
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
-from services.acquisition.mocks.faults import DeviceFaults, FaultScript
-from services.acquisition.mocks.ledger import Fate, Ledger
+from services.acquisition.mocks.faults import DeviceFaults, Fate, FaultScript, Ledger
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 from services.acquisition.mocks.replay import MockPair, ReplayStream
 

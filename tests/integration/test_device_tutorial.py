@@ -11,7 +11,7 @@ import pytest
 
 from dextouch.episodes.spool import SpoolReader
 from services.acquisition.mocks.pattern import pattern_streams
-from services.alignment.calibration.tactile_baseline import TactileCalibration
+from services.alignment.calibration.tactile_tare import TactileCalibration
 from tests.integration.tutorial_page import ROOT, TutorialPage
 
 PAGE = TutorialPage.read("add_a_device")

@@ -7,8 +7,7 @@ from dextouch.schemas import TakePrompt
 from services.acquisition.clock import VirtualClock
 from services.acquisition.health.history import STREAM_SERIES
 from services.acquisition.mock_station import MockStation
-from services.acquisition.mocks.faults import DeviceFaults, FaultScript
-from services.acquisition.mocks.ledger import Fate
+from services.acquisition.mocks.faults import DeviceFaults, Fate, FaultScript
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")

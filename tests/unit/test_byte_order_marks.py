@@ -10,8 +10,8 @@ from dextouch.bridges.lerobot import source
 from dextouch.serving import configuration_file
 from services.acquisition.devices import load_calibration
 from services.alignment.station_calibration import record
+from services.dashboard.documents import DEFAULT_TASKS, load_tasks
 from services.dashboard.settings import DashboardSettings
-from services.dashboard.tasks import DEFAULT_TASKS, load_tasks
 from services.evaluation.rating.rubrics import BUNDLED, read_rubrics
 
 POSES = "image,x_m,y_m,z_m,qw,qx,qy,qz\r\na.jpg,0,0,0.5,1,0,0,0\r\n"

@@ -23,7 +23,9 @@ from services.acquisition.drivers.base import Decoder, Driver
 from services.acquisition.drivers.packets import SEQUENCE_MODULUS
 from services.acquisition.mocks.faults import (
     DeviceFaults,
+    DeviceLedger,
     Edit,
+    Fate,
     OurPacketEdits,
     PacketEdits,
     Pinned,
@@ -34,7 +36,6 @@ from services.acquisition.mocks.faults import (
     lose_bytes,
     make_schedule,
 )
-from services.acquisition.mocks.ledger import DeviceLedger, Fate
 from services.acquisition.mocks.ports import MockPort, PtyPort
 
 PLAYED_KINDS = ("tactile", "keypoints", "pose", "image", "robot_state")

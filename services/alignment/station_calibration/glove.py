@@ -9,6 +9,7 @@ from dextouch.command_line import progress
 from dextouch.errors import InvalidInputError
 from services.alignment.calibration.tactile_gain import TaxelGain, calibrate_glove
 from services.alignment.calibration.tactile_tare import OK, STATES, TaxelTare, measure_tare
+from services.alignment.station_calibration.camera_views import glove_picture
 from services.alignment.station_calibration.glove_takes import (
     Guide,
     PressRow,
@@ -18,7 +19,6 @@ from services.alignment.station_calibration.glove_takes import (
     read_take,
     record_takes,
 )
-from services.alignment.station_calibration.pictures import glove_picture
 from services.alignment.station_calibration.record import MATRICES_FILE, write_entry, write_picture
 
 

@@ -14,9 +14,8 @@ from dextouch.tactile.layout import SIDES, Side
 from services.alignment.options import WristChoice
 from services.alignment.retargeting import HandRetargeter, RetargetResult, RetargetStatus
 from services.alignment.retargeting.hand_profile import calibrated_profile
-from services.alignment.retargeting.touch_transfer import transfer_by_touch
 from services.alignment.retargeting.wrist_frame import hand_axes_check
-from services.alignment.retargeting.wrist_transfer import NUM_PADS
+from services.alignment.retargeting.wrist_transfer import NUM_PADS, transfer_by_touch
 from services.alignment.synchronization.motion_figures import motion_figures
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import (

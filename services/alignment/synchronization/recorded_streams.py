@@ -18,7 +18,7 @@ from dextouch.geometry import pose_from_transform, transform_from_pose
 from dextouch.schemas import Matrix, matrix_rows
 from dextouch.streams import ENCODED_UNITS, H264_UNIT, StreamDescriptor, encoded_values
 from dextouch.tactile.layout import NUM_TAXELS
-from services.alignment.calibration.tactile_baseline import (
+from services.alignment.calibration.tactile_tare import (
     REASONS,
     TactileCalibration,
     unusable_taxels,

@@ -16,9 +16,8 @@ from services.alignment.station_calibration.boards import (
     read_photos,
     turn_coverage,
 )
-from services.alignment.station_calibration.camera_views import read_lens
+from services.alignment.station_calibration.camera_views import read_lens, turns_picture
 from services.alignment.station_calibration.overview import TRACKERS
-from services.alignment.station_calibration.pictures import turns_picture
 from services.alignment.station_calibration.record import (
     poses_of_photos,
     read_pairs,

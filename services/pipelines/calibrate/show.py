@@ -7,7 +7,7 @@ from datetime import datetime
 from rich.console import Console
 from rich.table import Table
 
-from services.alignment.station_calibration.judgement import (
+from services.alignment.station_calibration.overview import (
     LEVELS,
     Finding,
     judge,

@@ -13,7 +13,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.geometry import transform_from_pose
 from dextouch.geometry.rotations import vector_from_rotation
 from services.alignment.calibration.motion import DegenerateMotionError
-from services.alignment.calibration.tactile_baseline import TactileCalibration
+from services.alignment.calibration.tactile_tare import TactileCalibration
 from services.alignment.calibration.time_offset import (
     TimeOffset,
     estimate_tap_offset,

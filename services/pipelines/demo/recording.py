@@ -21,7 +21,7 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 from dextouch.schemas import RecordingAttributes, TakePrompt
 from services.acquisition.mock_station import MockTake
-from services.acquisition.mocks.ledger import Fate
+from services.acquisition.mocks.faults import Fate
 from services.acquisition.mocks.replay import replay_calibration, replay_streams
 from services.acquisition.uploader import Uploader
 from services.alignment.jobs import align_recording

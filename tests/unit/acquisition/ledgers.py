@@ -5,7 +5,7 @@ from array import array
 
 import numpy as np
 
-from services.acquisition.mocks.ledger import ACCEPTED, FORMAT, DeviceLedger, Ledger
+from services.acquisition.mocks.faults import ACCEPTED, FORMAT, DeviceLedger, Ledger
 
 NUMBERS = ("sequence", "t_true_ns", "t_device_ns", "t_arrival_ns", "flipped_bits")
 

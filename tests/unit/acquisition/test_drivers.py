@@ -21,12 +21,12 @@ from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder,
 from services.acquisition.devices.robot_state.driver import MAGIC as ROBOT_MAGIC
 from services.acquisition.devices.robot_state.driver import PAYLOAD as ROBOT_PAYLOAD
 from services.acquisition.devices.robot_state.driver import RobotStateDecoder
-from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
-from services.acquisition.drivers.reports import (
+from services.acquisition.drivers.base import (
     DATA_REPORT,
     DESCRIPTOR_REPORT,
     split_into_reports,
 )
+from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
 
 POSE = (1.0, 2.0, 3.0, 0.0, 0.0, 1.0, 0.0)
 

@@ -9,8 +9,7 @@ from services.acquisition.health.causes import SIMULATED_ADVICE, find_causes
 from services.acquisition.health.codes import CAUSES, CODES, cause_table
 from services.acquisition.health.evaluation import Evaluation
 from services.acquisition.health.host import HostCheck
-from services.acquisition.transports.ports import TransportInfo
-from services.acquisition.transports.shared_links import shared_link
+from services.acquisition.transports.ports import TransportInfo, shared_link
 
 DOCS = Path(__file__).parents[3] / "docs" / "health.md"
 HUB = SharedLink(kind="hub", name="1-2")

@@ -9,12 +9,16 @@ from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder, pose_descriptor
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.image_quality import ImageQuality
-from services.acquisition.glove_record import GloveRecord
-from services.acquisition.health.cells import TaxelCheck, count_taxels
-from services.acquisition.health.neighbours import neighbour_share
-from services.acquisition.health.queues import SampleQueue
-from services.acquisition.health.streams import CameraCheck, FiniteCheck, PoseCheck, TrackingCheck
+from services.acquisition.health.cells import TaxelCheck, count_taxels, neighbour_share
+from services.acquisition.health.streams import (
+    CameraCheck,
+    FiniteCheck,
+    PoseCheck,
+    SampleQueue,
+    TrackingCheck,
+)
 from services.acquisition.mocks.ports import HidPort
+from services.acquisition.session import GloveRecord
 from services.acquisition.supervisor import StreamCounters
 from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes, judged
 

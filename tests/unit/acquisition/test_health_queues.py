@@ -5,7 +5,7 @@ import threading
 import numpy as np
 
 from dextouch.streams import Sample, StreamDescriptor
-from services.acquisition.health.queues import SampleQueue
+from services.acquisition.health.streams import SampleQueue
 
 POSE = StreamDescriptor(
     name="head", kind="pose", shape=(7,), dtype="float64", unit="pose_m_wxyz", nominal_rate_hz=10

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from services.acquisition.mocks.ledger import FORMAT, DeviceLedger, Fate, Ledger
+from services.acquisition.mocks.faults import FORMAT, DeviceLedger, Fate, Ledger
 from tests.unit.acquisition.ledgers import load
 
 

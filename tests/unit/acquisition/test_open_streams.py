@@ -15,9 +15,9 @@ from services.acquisition.devices import (
     build_drivers,
 )
 from services.acquisition.devices.pose_tracker.driver import MAGIC, PAYLOAD, PoseTrackerDecoder
+from services.acquisition.drivers.base import DATA_REPORT, split_into_reports
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
-from services.acquisition.glove_record import is_ours
+from services.acquisition.session import is_ours
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import LiveView
 from services.acquisition.transports.ports import SerialTransport

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dextouch.errors import InvalidInputError
-from services.acquisition.drivers.reports import (
+from services.acquisition.drivers.base import (
     DATA_REPORT,
     PART_BYTES,
     REPORT_BYTES,

@@ -6,7 +6,7 @@ import pytest
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.schemas import matrix_rows
 from dextouch.tactile.layout import expand_taxels, raw_indices
-from services.alignment.calibration.tactile_baseline import (
+from services.alignment.calibration.tactile_tare import (
     REASONS,
     TactileCalibration,
     unusable_taxels,

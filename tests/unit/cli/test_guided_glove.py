@@ -19,7 +19,7 @@ from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.recorder import Recorder
 from services.acquisition.station import LiveView
-from services.alignment.calibration.tactile_baseline import TactileCalibration
+from services.alignment.calibration.tactile_tare import TactileCalibration
 from services.alignment.station_calibration import glove, glove_takes
 from services.pipelines.calibrate.command import main
 

@@ -15,7 +15,7 @@ from dextouch.hands import mean_hand_m
 from dextouch.tactile import PADS, pad_forces_n
 from dextouch.tactile.layout import split_pads
 from services.dashboard.app import STATIC
-from services.dashboard.live_messages import pose_message, skeleton_bones
+from services.dashboard.feeds import pose_message, skeleton_bones
 
 # Vertical field of view of static/projection.js.
 FOVY_RAD = 0.7

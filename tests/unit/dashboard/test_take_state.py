@@ -5,7 +5,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.responses import JSONResponse
 
-from services.dashboard.take_state import last_take
+from services.dashboard.station_view import last_take
 from services.dashboard.upstream import Upstream
 
 SESSION = {"started_at": "2026-11-24T08:00:00Z", "last_saved": "take-7"}

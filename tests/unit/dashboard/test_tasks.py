@@ -3,7 +3,7 @@
 import pytest
 
 from dextouch.errors import InvalidInputError
-from services.dashboard.tasks import load_tasks
+from services.dashboard.documents import load_tasks
 from services.twin.names import TASK_NAMES
 from services.twin.tasks.registry import get_task
 

@@ -6,7 +6,7 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.images import decode_jpeg, encode_jpeg
 from dextouch.streams import encoded_values, unpack
-from services.episode_store.playback import ImagesQuery, _images
+from services.episode_store.reading import ImagesQuery, _images
 from tests.unit.bridges.lerobot_episodes import make_episode, pictures
 
 CAMERA = "camera_head"

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from services.episode_store.figures import FIGURES, figures_of
-from services.episode_store.outliers import MIN_ITEMS, find_outliers, robust_scores
+from services.episode_store.signals import (
+    FIGURES,
+    MIN_ITEMS,
+    figures_of,
+    find_outliers,
+    robust_scores,
+)
 from tests.unit.episode_store.episodes import write_episode, write_recording
 
 # What usual items of a task look like: mean and standard deviation.

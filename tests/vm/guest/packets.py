@@ -6,12 +6,12 @@ from dextouch.hands import NODES, NUM_KEYPOINTS
 from services.acquisition.devices.finger_tracker import driver as finger_tracker
 from services.acquisition.devices.pose_tracker import driver as pose_tracker
 from services.acquisition.devices.tactile_glove import driver as tactile_glove
-from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.drivers.reports import (
+from services.acquisition.drivers.base import (
     DATA_REPORT,
     DESCRIPTOR_REPORT,
     split_into_reports,
 )
+from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 
 PERIOD_NS = 10_000_000
 

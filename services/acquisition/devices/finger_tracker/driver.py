@@ -17,13 +17,14 @@ from services.acquisition.devices.kinds import (
     TrackerSettings,
     tracker_transport,
 )
-from services.acquisition.drivers.base import Driver, check_packet
-from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder
-from services.acquisition.drivers.reports import (
+from services.acquisition.drivers.base import (
     DESCRIPTOR_REPORT,
     REPORT_BYTES,
+    Driver,
     ReportDecoder,
+    check_packet,
 )
+from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder
 from services.acquisition.drivers.sdk_link import (
     BridgedDevice,
     BridgeDecoder,

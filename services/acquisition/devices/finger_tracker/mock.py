@@ -15,14 +15,13 @@ from services.acquisition.devices.finger_tracker.driver import (
     BridgeFingerTrackerDecoder,
     FingerTracker,
 )
-from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.drivers.reports import (
+from services.acquisition.drivers.base import (
     DATA_REPORT,
     DESCRIPTOR_REPORT,
     split_into_reports,
 )
-from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.ledger import Fate
+from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
+from services.acquisition.mocks.faults import DeviceFaults, Fate
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.mocks.replay import (
     MockDevice,

@@ -24,9 +24,8 @@ from services.acquisition.devices.kinds import (
     TrackerSettings,
     tracker_transport,
 )
-from services.acquisition.drivers.base import Driver, check_packet
+from services.acquisition.drivers.base import Driver, ReportDecoder, check_packet
 from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder
-from services.acquisition.drivers.reports import ReportDecoder
 from services.acquisition.drivers.sdk_link import (
     DROPPED,
     BridgedDevice,

@@ -21,11 +21,9 @@ from services.acquisition.devices.pose_tracker.driver import (
     TrackingState,
     source_of,
 )
-from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.base import DATA_REPORT, Driver, split_into_reports
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
-from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.ledger import Fate
+from services.acquisition.mocks.faults import DeviceFaults, Fate
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.mocks.replay import (
     MockDevice,
