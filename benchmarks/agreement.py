@@ -20,13 +20,14 @@ from benchmarks.rounds import interleaved
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
 from services.evaluation.agreement import CORRELATIONS, FIGURES, figures_of_draws
-from services.evaluation.rate_draws import (
+from services.evaluation.statistics import (
     MatchedScores,
     ScoreDraws,
     bootstrap_scores,
+    central_interval,
     posterior_scores,
+    shortest_interval,
 )
-from services.evaluation.statistics import central_interval, shortest_interval
 
 Draw = Callable[..., ScoreDraws]
 OURS: Final = "posterior"

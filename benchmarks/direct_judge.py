@@ -49,10 +49,10 @@ from services.evaluation.checkpoints import (
     network_tensors,
     save_checkpoint,
 )
+from services.evaluation.matched_starts import start_digest
 from services.evaluation.optimization import optimized
-from services.evaluation.starts import start_digest
 from services.evaluation.statistics import area_under_roc
-from services.evaluation.success_classifier_figures import MIN_OUTCOMES
+from services.evaluation.success_classifier_training import MIN_OUTCOMES
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.world_model.dynamics.core import NUM_PADS, OWN_SIZE, own_features
 from services.world_model.dynamics.features import (

@@ -35,8 +35,8 @@ from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.uploader import Uploader
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings
-from services.evaluation.policies.asking import action_chunk, ask
-from services.evaluation.policies.hold import HoldPolicy
+from services.evaluation.policies.outside import action_chunk, ask
+from services.evaluation.policies.replay import HoldPolicy
 from services.pipelines.servers import served
 
 TAKE_S = 2.0

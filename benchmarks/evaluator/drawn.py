@@ -10,13 +10,13 @@ import numpy as np
 from benchmarks.figures import Requirement, Sense
 from services.evaluation.calibration import expected_calibration_error
 from services.evaluation.comments import UNDEFINED, undefined_by
-from services.evaluation.resampling import (
+from services.evaluation.statistics import (
     area_under_roc_of_draws,
     balanced_accuracy_of_draws,
+    interval_of_draws,
     mean_of_draws,
     start_counts,
 )
-from services.evaluation.statistics import interval_of_draws
 
 NUM_DRAWS: Final = 1000
 _NUM_CALIBRATION_DRAWS: Final = 200

@@ -18,7 +18,7 @@ from benchmarks.evaluator.drawn import (
     undefined,
 )
 from dextouch.metrics.policy import mmrv, pearson
-from services.evaluation.resampling import mmrv_of_draws, pearson_of_draws
+from services.evaluation.statistics import mmrv_of_draws, pearson_of_draws
 from services.twin.scripted_actions import mistake_of
 
 # Rows of a rollout that has no others than these.

@@ -21,7 +21,7 @@ from benchmarks.evaluator.plan import IDLE
 from benchmarks.evaluator.rival_lines import rival_figures, rival_rows
 from dextouch.metrics.policy import mmrv, pearson
 from services.evaluation.calibration import UNDECIDED_RISK
-from services.evaluation.resampling import mmrv_of_draws, pearson_of_draws, rates_of_draws
+from services.evaluation.statistics import mmrv_of_draws, pearson_of_draws, rates_of_draws
 from services.twin.scripted_actions import mistake_of
 
 TRUE, IMAGINED = "true verdict", "imagined verdict"

@@ -19,7 +19,7 @@ from dextouch.schemas import (
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import StartedRollout, State, World
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
-from services.evaluation.policies.asking import action_chunk, ask
+from services.evaluation.policies.outside import action_chunk, ask
 from services.twin.scripted_actions import Actions
 from services.twin.world import TwinState, TwinWorld
 

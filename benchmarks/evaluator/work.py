@@ -16,9 +16,8 @@ from benchmarks.evaluator.rollouts import DEPENDS_ON, PolicyRollout
 from dextouch.clients import Policy
 from dextouch.errors import DexTouchError
 from dextouch.streams import HEAD_CAMERA
-from services.evaluation.matched_starts import first_digest
+from services.evaluation.matched_starts import first_digest, refuse_training_starts
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.starts import refuse_training_starts
 from services.twin.scripted_actions import (
     ELSEWHERE,
     HOLD,

@@ -16,10 +16,9 @@ from dextouch.schemas import CHUNK_STEPS, Observation
 from dextouch.streams import HEAD_CAMERA
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
-from services.evaluation.object_features import known_objects, object_features
 from services.evaluation.policies.behaviour_cloning import KIND, BehaviourCloningPolicy
-from services.evaluation.policies.hold import HoldPolicy
-from services.evaluation.success_classifier import SuccessClassifier
+from services.evaluation.policies.replay import HoldPolicy
+from services.evaluation.success_classifier import SuccessClassifier, known_objects, object_features
 
 STAGE = StageCells("judging")
 _PRETRAINED = Path(services.evaluation.__file__).parent / "pretrained"

@@ -18,15 +18,18 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.metrics import policy
-from services.evaluation.rate_draws import (
+from services.evaluation.statistics import (
+    Interval,
     MatchedScores,
     ScoreDraws,
     bootstrap_scores,
+    central_interval,
     known_mean,
+    mmrv_of_draws,
+    pearson_of_draws,
     posterior_scores,
+    shortest_interval,
 )
-from services.evaluation.resampling import mmrv_of_draws, pearson_of_draws
-from services.evaluation.statistics import Interval, central_interval, shortest_interval
 
 FIGURES: Final[Mapping[str, Callable[..., float]]] = {
     "pearson": policy.pearson,

@@ -12,11 +12,15 @@ from dataclasses import dataclass, field
 
 from dextouch.clients import Policy
 from dextouch.errors import InvalidInputError
-from services.evaluation.matched_starts import FailedStart, MatchedStart, try_matched_start
-from services.evaluation.progress import Progress
+from services.evaluation.matched_starts import (
+    FailedStart,
+    MatchedStart,
+    refuse_training_starts,
+    try_matched_start,
+)
+from services.evaluation.optimization import Progress
 from services.evaluation.rollout_runner import RolloutRunner
 from services.evaluation.scores import ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
-from services.evaluation.starts import refuse_training_starts
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
 

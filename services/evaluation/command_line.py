@@ -17,15 +17,14 @@ from services.evaluation.checkpoints import Checkpoint, load_checkpoint, save_ch
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.policies.cloning_episodes import read_cloning_episodes
+from services.evaluation.policies.cloning_network import read_cloning_episodes
 from services.evaluation.policies.cloning_training import train_cloned_policy
 from services.evaluation.policies.colour_servo import ColourServo
-from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.policies.outside import PolicySource
-from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.policies.replay import HoldPolicy, ReplayPolicy
 from services.evaluation.reporting import ReportPictures, write_report
 from services.evaluation.reporting.sections import failure_rows, figure, undecided_note
-from services.evaluation.results import ResultLog
+from services.evaluation.scores import ResultLog
 from services.evaluation.settings import (
     RunSettings,
     ServedWorld,

@@ -21,7 +21,7 @@ from dextouch.episodes import (
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Observation, RolloutDoubt, is_rollout, rollout_doubt
 from dextouch.streams import HEAD_CAMERA
-from services.evaluation.starts import start_digest
+from services.evaluation.matched_starts import start_digest
 from services.networks.training_settings import USUAL_IMAGE_PX
 
 logger = structlog.get_logger(__name__)

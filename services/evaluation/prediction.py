@@ -19,6 +19,8 @@ from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import CHUNK_STEPS
 from dextouch.worlds import World
 from services.evaluation import scene_geometry
+from services.evaluation.optimization import Progress
+from services.evaluation.perceptual_networks import DESCRIPTIONS, Pairs, weighted_measures
 from services.evaluation.prediction_names import DEFAULT_BASELINES
 from services.evaluation.prediction_scenes import (
     Future,
@@ -32,9 +34,7 @@ from services.evaluation.prediction_scenes import (
     warped,
     with_instruction,
 )
-from services.evaluation.progress import Progress
 from services.evaluation.reporting import PredictionPicture
-from services.evaluation.weighted_metrics import DESCRIPTIONS, Pairs, weighted_measures
 
 MODEL: Final = "model"
 ALL_TASKS: Final = "all"

@@ -13,8 +13,7 @@ from dextouch.hands.actions import CAMERA_HEAD, AnchorPoses, poses_from_actions
 from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import ReconstructingWorld, World
-from services.evaluation.camera_warp import warp_over_table
-from services.evaluation.scene_geometry import SceneGeometry
+from services.evaluation.scene_geometry import SceneGeometry, warp_over_table
 
 _NO_IMAGE = ReturnSelector(cameras=())
 _LAST_STEP = ReturnSelector(cameras=(HEAD_CAMERA,), steps="last")

@@ -24,7 +24,7 @@ from services.evaluation.matched_starts import (
     first_digest,
     rollout_failure,
 )
-from services.evaluation.policies.asking import action_chunk, ask
+from services.evaluation.policies.outside import action_chunk, ask
 from services.evaluation.scores import REAL, Outcome, RolloutScore
 from services.evaluation.study_worlds import StudyWorlds
 from services.evaluation.success_classifier import SuccessClassifier

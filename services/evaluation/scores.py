@@ -1,14 +1,17 @@
 """Success rates of policies with confidence intervals, and their agreement between two worlds."""
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, StorageError
 from services.evaluation.agreement import (
     FIGURES,
     Agreement,
@@ -19,8 +22,7 @@ from services.evaluation.agreement import (
 )
 from services.evaluation.calibration import LEAST_DECIDED
 from services.evaluation.comments import UNDEFINED, task_comments, undefined_by
-from services.evaluation.rate_draws import MatchedScores, known_mean
-from services.evaluation.statistics import wilson_interval
+from services.evaluation.statistics import MatchedScores, known_mean, wilson_interval
 
 REAL = "real"
 _SEED = 0
@@ -344,3 +346,33 @@ def _entries(agreement: Agreement, num_policies: int) -> dict[str, Any]:
 def defined(value: float, num_policies: int) -> float | str:
     """The value, or "undefined" for NaN, which JSON does not have, with the reason if it is few."""
     return value if math.isfinite(value) else undefined_by(num_policies)
+
+
+class ResultLog:
+    """Appends rollouts one by one, so that an interrupted study keeps its results.
+
+    Rows of earlier studies are kept and distinguished by `study`, the start time of the study.
+
+    Args:
+        path: file to append to; it and its folder are created with the first row.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._study = datetime.now(UTC).isoformat(timespec="milliseconds")
+
+    def keep(self, outcome: RolloutScore | RolloutFailure) -> None:
+        """Append one row.
+
+        Raises:
+            StorageError: the file cannot be written.
+        """
+        row = {"study": self._study, **asdict(outcome)}
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row, allow_nan=False) + "\n")
+        except OSError as error:
+            raise StorageError(
+                f"results {self.path}: cannot be written ({error}); choose another --results"
+            ) from error

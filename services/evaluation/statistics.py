@@ -3,10 +3,13 @@
 import math
 from dataclasses import dataclass
 from statistics import NormalDist
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.metrics.policy import MIN_POLICIES
 
 
 @dataclass(frozen=True)
@@ -130,3 +133,371 @@ def interval_of_draws(figures: np.ndarray, *, confidence: float = 0.95) -> Inter
     defined = figures[np.isfinite(figures)]
     enough = 2 * len(defined) > len(figures)
     return central_interval(defined, confidence=confidence) if enough else None
+
+
+Counts = Float64[np.ndarray, "draws starts"]
+
+
+def start_counts(num_starts: int, generator: np.random.Generator, *, num_draws: int) -> Counts:
+    """How often each start is drawn, [draws, starts]; every row sums to the number of starts."""
+    if num_starts < 1 or num_draws < 1:
+        raise ShapeError(
+            f"bootstrap: got {num_starts} starts and {num_draws} draws, expected at least one each"
+        )
+    drawn = generator.integers(0, num_starts, (num_draws, num_starts))
+    counts = np.zeros((num_draws, num_starts))
+    np.add.at(counts, (np.arange(num_draws)[:, None], drawn), 1.0)
+    return counts
+
+
+def _weights(counts: Counts, start_index: np.ndarray) -> Float64[np.ndarray, "draws n"]:
+    return counts[:, np.asarray(start_index)]
+
+
+def rates_of_draws(outcomes: np.ndarray, counts: Counts) -> Float64[np.ndarray, "draws policies"]:
+    """Mean outcome of every policy in every draw.
+
+    Args:
+        outcomes: [policies, starts].
+        counts: from `start_counts`.
+    """
+    return counts @ np.asarray(outcomes, dtype=np.float64).T / counts.sum(axis=1, keepdims=True)
+
+
+def pearson_of_draws(real: np.ndarray, imagined: np.ndarray) -> Float64[np.ndarray, " draws"]:
+    """Linear correlation of every row [draws, policies]; NaN where it is undefined."""
+    if real.shape[1] < MIN_POLICIES:
+        return np.full(len(real), np.nan)
+    a, b = (x - x.mean(axis=1, keepdims=True) for x in (real, imagined))
+    flat = (np.ptp(real, axis=1) == 0) | (np.ptp(imagined, axis=1) == 0)
+    size = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    r = np.sum(a * b, axis=1) / np.where(flat, 1.0, size)
+    return np.where(flat, np.nan, np.clip(r, -1.0, 1.0))
+
+
+def mmrv_of_draws(real: np.ndarray, imagined: np.ndarray) -> Float64[np.ndarray, " draws"]:
+    """Mean maximum rank violation of every row [draws, policies], ties counted."""
+    if real.shape[1] < 2:
+        return np.full(len(real), np.nan)
+    a, b = real[:, :, None] - real[:, None, :], imagined[:, :, None] - imagined[:, None, :]
+    violated = (a > 0) != (b > 0)
+    return np.asarray(np.mean(np.max(np.abs(a) * violated, axis=2), axis=1))
+
+
+def area_under_roc_of_draws(
+    scores: np.ndarray, success: np.ndarray, start_index: np.ndarray, counts: Counts
+) -> Float64[np.ndarray, " draws"]:
+    """Area under the ROC curve of every draw, ties half; NaN where one outcome is missing.
+
+    Args:
+        scores: [n], higher for more certain success.
+        success: [n] outcomes.
+        start_index: [n], start of each rollout.
+        counts: from `start_counts`.
+    """
+    scores, positive = np.asarray(scores), np.asarray(success, dtype=bool)
+    weight = _weights(counts, start_index)
+    wins, losses = weight[:, positive], weight[:, ~positive]
+    ordered = (np.sign(scores[positive][:, None] - scores[~positive][None, :]) + 1) / 2
+    pairs = wins.sum(axis=1) * losses.sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sum((wins @ ordered) * losses, axis=1) / pairs)
+
+
+def balanced_accuracy_of_draws(
+    decisions: np.ndarray, success: np.ndarray, start_index: np.ndarray, counts: Counts
+) -> Float64[np.ndarray, " draws"]:
+    """Balanced accuracy of every draw; NaN where one outcome is missing."""
+    right = np.asarray(decisions, dtype=bool) == np.asarray(success, dtype=bool)
+    positive = np.asarray(success, dtype=bool)
+    weight = _weights(counts, start_index)
+    with np.errstate(invalid="ignore"):
+        shares = [
+            (weight[:, of] @ right[of]) / weight[:, of].sum(axis=1) for of in (positive, ~positive)
+        ]
+    return np.asarray((shares[0] + shares[1]) / 2)
+
+
+def mean_of_draws(
+    values: np.ndarray, start_index: np.ndarray, counts: Counts
+) -> Float64[np.ndarray, " draws"]:
+    """Mean of values [n] over the rollouts of every draw; NaN for a draw without any."""
+    weight = _weights(counts, start_index)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((weight @ np.asarray(values, dtype=np.float64)) / weight.sum(axis=1))
+
+
+# Grid of the spread of policies' true scores in each world, and of their correlation; the prior is
+# uniform in both spreads and in artanh of the correlation.
+_SPREADS: Final = np.array([0.02, 0.04, 0.08, 0.12, 0.17, 0.23, 0.30, 0.40, 0.55])
+_CORRELATIONS: Final = np.tanh(np.linspace(-3.0, 3.0, 25))
+# Starts at which correlations of the noise count fully; with fewer they are shrunk towards zero.
+_SHRINK_STARTS: Final = 4.0
+_BATCH: Final = 1000
+
+
+def known_mean(scores: np.ndarray, *, axis: int) -> np.ndarray:
+    """Mean of the scores that are not NaN; NaN where there are none."""
+    known = np.isfinite(scores)
+    if known.all():
+        return np.asarray(scores.mean(axis=axis))
+    count = known.sum(axis=axis)
+    total = np.where(known, scores, 0.0).sum(axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+@dataclass(frozen=True)
+class MatchedScores:
+    """Scores in 0 … 1 of one task's policies from the same starts in two worlds.
+
+    `real` and `imagined` are [policies, starts, raters]; an absent rater is NaN. Every real rollout
+    has at least one; an imagined one without any is undecided and counts in no mean, and every
+    policy has one that is not. Success is a score of one rater, 0 or 1.
+
+    Raises:
+        ShapeError: different policies or starts, or nothing to compare.
+        InvalidInputError: a score outside 0 … 1, a real rollout that nobody rated, or a policy
+            without any imagined score.
+    """
+
+    real: Float64[np.ndarray, "_ _ _"]
+    imagined: Float64[np.ndarray, "_ _ _"]
+
+    def __post_init__(self) -> None:
+        shapes = self.real.shape, self.imagined.shape
+        if shapes[0][:2] != shapes[1][:2] or 0 in (*shapes[0], *shapes[1]):
+            raise ShapeError(
+                f"scores: got shapes {shapes[0]} and {shapes[1]}, expected [policies, starts, "
+                "raters] with the same policies and starts, at least one each"
+            )
+        for world, scores in (("real", self.real), ("imagined", self.imagined)):
+            known = np.isfinite(scores)
+            rated = known.any(axis=2)
+            if world == "real" and not rated.all():
+                policy, start = np.argwhere(~rated)[0]
+                raise InvalidInputError(
+                    f"scores: policy {policy} from start {start} in the real world has no "
+                    "score; leave the start out in both worlds"
+                )
+            if not rated.any(axis=1).all():
+                raise InvalidInputError(
+                    f"scores: policy {np.argmin(rated.any(axis=1))} has no imagined score; leave "
+                    "the policy out in both worlds"
+                )
+            if ((scores[known] < 0) | (scores[known] > 1)).any():
+                raise InvalidInputError(
+                    f"scores of the {world} world: got {np.nanmin(scores)} … {np.nanmax(scores)}, "
+                    "expected 0 … 1; divide points by the rubric's maximum"
+                )
+
+    @property
+    def num_policies(self) -> int:
+        """Number of policies."""
+        return len(self.real)
+
+    def by_rollout(
+        self,
+    ) -> tuple[Float64[np.ndarray, "policies starts"], Float64[np.ndarray, "policies starts"]]:
+        """Scores of rollouts in both worlds: means over raters; NaN for undecided rollouts."""
+        return known_mean(self.real, axis=2), known_mean(self.imagined, axis=2)
+
+
+@dataclass(frozen=True)
+class ScoreDraws:
+    """Plausible mean scores [draws, policies] of the same policies in two worlds."""
+
+    real: Float64[np.ndarray, "draws policies"]
+    imagined: Float64[np.ndarray, "draws policies"]
+
+
+def bootstrap_scores(
+    scores: MatchedScores, generator: np.random.Generator, *, num_draws: int = 10_000
+) -> ScoreDraws:
+    """Hierarchical bootstrap: starts with replacement, then raters within each drawn rollout.
+
+    A drawn start is drawn for all policies and both worlds, since they share its objects.
+    """
+    num_starts = scores.real.shape[1]
+    starts = generator.integers(0, num_starts, (num_draws, num_starts))
+    return ScoreDraws(
+        _resampled(scores.real, starts, generator), _resampled(scores.imagined, starts, generator)
+    )
+
+
+def _resampled(
+    scores: np.ndarray, starts: np.ndarray, generator: np.random.Generator
+) -> Float64[np.ndarray, "draws policies"]:
+    num_policies, num_starts, num_raters = scores.shape
+    known = np.isfinite(scores)
+    # Present raters first, so that a random index below their number names one of them.
+    order = np.argsort(~known, axis=2, kind="stable")
+    packed = np.nan_to_num(np.take_along_axis(scores, order, axis=2)).reshape(-1)
+    present = known.sum(axis=2)
+    rows = np.arange(num_policies)[:, None]
+    means = []
+    for drawn in np.array_split(starts, -(-len(starts) // _BATCH)):
+        if num_raters == 1:
+            means.append(known_mean(scores[rows, drawn[:, None, :], 0], axis=2))
+            continue
+        here = present[rows, drawn[:, None, :]]
+        uniform = generator.random((*here.shape, num_raters), dtype=np.float32)
+        rater = (uniform * here[..., None]).astype(np.intp)
+        cell = (rows * num_starts + drawn[:, None, :]) * num_raters
+        values = packed[cell[..., None] + rater]
+        if (present == num_raters).all():
+            rollouts = values.mean(axis=3)
+        else:
+            counted = np.arange(num_raters) < here[..., None]
+            total = (values * counted).sum(axis=3)
+            rollouts = np.where(here > 0, total / np.maximum(here, 1), np.nan)
+        means.append(known_mean(rollouts, axis=2))
+    return np.concatenate(means)
+
+
+def posterior_scores(
+    scores: MatchedScores, generator: np.random.Generator, *, num_draws: int = 10_000
+) -> ScoreDraws:
+    """Draws from the posterior of policies' true mean scores in a random-effects model.
+
+    Policies' true scores in the two worlds are drawn from one bivariate normal distribution with
+    unknown means, spreads and correlation; the observed mean scores add normal noise, whose
+    covariance is estimated from the starts (`noise_covariance`). Means have a flat prior and are
+    integrated out; spreads and correlation are integrated over a grid, so nothing is iterated and
+    nothing has to converge. Draws are clipped to 0 … 1.
+
+    Raises:
+        InvalidInputError: fewer than two policies or two starts.
+    """
+    num_policies, num_starts = scores.real.shape[:2]
+    if min(num_policies, num_starts) < 2:
+        raise InvalidInputError(
+            f"posterior of scores: got {num_policies} policies and {num_starts} starts, expected "
+            "at least two of each"
+        )
+    rollouts = np.concatenate(scores.by_rollout())
+    observed, noise = known_mean(rollouts, axis=1), noise_covariance(rollouts)
+    grid = _Grid.of(num_policies, observed, noise)
+    counts = generator.multinomial(num_draws, grid.weight)
+    drawn = np.empty((num_draws, 2 * num_policies))
+    error = generator.standard_normal(drawn.shape) @ np.linalg.cholesky(noise).T
+    stop = np.cumsum(counts)
+    for index in np.flatnonzero(counts).tolist():
+        rows = slice(int(stop[index] - counts[index]), int(stop[index]))
+        prior = grid.prior_draws(index, int(counts[index]), generator)
+        # Matheron's rule: a draw from the prior, corrected by what was observed.
+        gain = np.linalg.solve(grid.covariance(index) + noise, grid.covariance(index))
+        drawn[rows] = prior + (observed - prior - error[rows]) @ gain
+    drawn = np.clip(drawn[generator.permutation(num_draws)], 0.0, 1.0)
+    return ScoreDraws(drawn[:, :num_policies], drawn[:, num_policies:])
+
+
+def noise_covariance(
+    rollouts: Float64[np.ndarray, "series starts"],
+) -> Float64[np.ndarray, "series series"]:
+    """Covariance of the mean scores of several series of rollouts over the same starts.
+
+    Variances include two additional rollouts, one of score 0 and one of score 1 (the rule of
+    Agresti and Coull 1998 for binomial rates), so that ten of ten successes are not certain.
+    Correlations are shrunk towards zero; with four starts or fewer they are zero. Scores that are
+    NaN are missing: variances are those of the known scores, and two series correlate by the starts
+    that both know.
+    """
+    num_series = len(rollouts)
+    known = np.isfinite(rollouts)
+    num_starts, scores = known.sum(axis=1), np.where(known, rollouts, 0.0)
+    mean = (scores.sum(axis=1) + 1) / (num_starts + 2)
+    square = ((scores**2).sum(axis=1) + 1) / (num_starts + 2)
+    deviation = np.sqrt((square - mean**2) / num_starts)
+    centred = np.where(known, rollouts - known_mean(rollouts, axis=1)[:, None], 0.0)
+    size = np.linalg.norm(centred, axis=1)
+    varies = size > 1e-9
+    unit = np.where(varies[:, None], centred / np.where(varies, size, 1.0)[:, None], 0.0)
+    correlation = max(0.0, 1 - _SHRINK_STARTS / num_starts.min()) * (unit @ unit.T)
+    correlation[np.arange(num_series), np.arange(num_series)] = 1.0
+    # Identical series make the matrix singular; a small diagonal term keeps it invertible.
+    correlation += 1e-6 * np.eye(num_series)
+    return np.asarray(correlation * np.outer(deviation, deviation))
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Spreads and correlations with their posterior weights, and the posterior of the means.
+
+    `spread` [grid, 2], `correlation` [grid], `weight` [grid]; `mean` [grid, 2] and `mean_factor`
+    [grid, 2, 2] describe the normal posterior of the policies' mean score in each world.
+    """
+
+    num_policies: int
+    spread: Float64[np.ndarray, "grid 2"]
+    correlation: Float64[np.ndarray, " grid"]
+    weight: Float64[np.ndarray, " grid"]
+    mean: Float64[np.ndarray, "grid 2"]
+    mean_factor: Float64[np.ndarray, "grid 2 2"]
+
+    @classmethod
+    def of(cls, num_policies: int, observed: np.ndarray, noise: np.ndarray) -> "_Grid":
+        real, imagined, correlation = (
+            axis.ravel() for axis in np.meshgrid(_SPREADS, _SPREADS, _CORRELATIONS, indexing="ij")
+        )
+        spread = np.stack([real, imagined], axis=1)
+        width = np.gradient(_SPREADS)
+        prior = np.log(np.outer(width, width)).ravel().repeat(len(_CORRELATIONS))
+        parts = [
+            _marginal(num_policies, spread[rows], correlation[rows], observed, noise)
+            for rows in np.array_split(np.arange(len(spread)), len(_SPREADS))
+        ]
+        log_likelihood, mean, mean_factor = (
+            np.concatenate(part) for part in zip(*parts, strict=True)
+        )
+        weight = np.exp(log_likelihood + prior - (log_likelihood + prior).max())
+        return cls(num_policies, spread, correlation, weight / weight.sum(), mean, mean_factor)
+
+    def covariance(self, index: int) -> Float64[np.ndarray, "series series"]:
+        """Covariance of the true scores: all real ones, then all imagined ones."""
+        return _true_covariance(
+            self.num_policies, self.spread[index][None], self.correlation[index][None]
+        )[0]
+
+    def prior_draws(
+        self, index: int, num_draws: int, generator: np.random.Generator
+    ) -> Float64[np.ndarray, "draws series"]:
+        """Draws of the true scores from the prior, not conditioned on the observed scores."""
+        mean = (
+            self.mean[index] + generator.standard_normal((num_draws, 2)) @ self.mean_factor[index].T
+        )
+        first, second = generator.standard_normal((2, num_draws, self.num_policies))
+        r = self.correlation[index]
+        second = r * first + np.sqrt(1 - r * r) * second
+        real, imagined = self.spread[index]
+        return np.concatenate([mean[:, :1] + real * first, mean[:, 1:] + imagined * second], axis=1)
+
+
+def _true_covariance(
+    num_policies: int, spread: np.ndarray, correlation: np.ndarray
+) -> Float64[np.ndarray, "grid series series"]:
+    pair = spread[:, :, None] * spread[:, None, :]
+    pair[:, [0, 1], [1, 0]] *= correlation[:, None]
+    return np.kron(pair, np.eye(num_policies))
+
+
+def _marginal(
+    num_policies: int,
+    spread: np.ndarray,
+    correlation: np.ndarray,
+    observed: np.ndarray,
+    noise: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Log likelihood with the means integrated out, and the means' posterior (mean, factor)."""
+    factor = np.linalg.cholesky(_true_covariance(num_policies, spread, correlation) + noise)
+    columns = np.zeros((len(observed), 3))
+    columns[:, 0] = observed
+    columns[:num_policies, 1] = columns[num_policies:, 2] = 1.0
+    white = np.linalg.solve(factor, np.broadcast_to(columns, (len(factor), *columns.shape)))
+    seen, design = white[..., :1], white[..., 1:]
+    precision = design.transpose(0, 2, 1) @ design
+    right = design.transpose(0, 2, 1) @ seen
+    mean = np.linalg.solve(precision, right)
+    misfit = (seen**2).sum(axis=(1, 2)) - (right * mean).sum(axis=(1, 2))
+    log_size = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+    log_likelihood = -0.5 * misfit - log_size - 0.5 * np.log(np.linalg.det(precision))
+    return log_likelihood, mean[..., 0], np.linalg.cholesky(np.linalg.inv(precision))

@@ -4,24 +4,299 @@ Its inputs are images, touch and, for imagined endings, the predicted object pos
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from itertools import combinations
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from torch import nn
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
+from dextouch.frozen_model import FrozenModel
+from dextouch.geometry import invert, transform_from_pose
+from dextouch.geometry.rotations import rotation_angle
+from dextouch.schemas import MAX_OBJECTS
+from dextouch.tactile.layout import NUM_TAXELS, split_pads
 from services.evaluation.calibration import UNFITTED, Calibration, Combination, sigmoid
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_network
-from services.evaluation.endings import Ending
-from services.evaluation.judge_network import (
-    ClassifierBatch,
-    ClassifierNetwork,
-    ClassifierShape,
-    probe_batch,
-)
+from services.evaluation.endings import NUM_SEEN_STEPS, Ending
+
+NUM_PAD_FEATURES = 24
+
+
+def pad_features(tactile_kpa: np.ndarray) -> Float32[np.ndarray, "*batch 24"]:
+    """Mean and maximum of √kPa / 4 per hand and pad: where the hand touches, and how hard.
+
+    Args:
+        tactile_kpa: [..., 2, 320]; small negative readings count as zero.
+
+    Raises:
+        ShapeError: not [..., 2, 320].
+        NonFiniteError: NaN or infinity.
+    """
+    taxels = np.asarray(tactile_kpa, dtype=np.float32)
+    if taxels.shape[-2:] != (2, NUM_TAXELS):
+        raise ShapeError(f"tactile: got shape {taxels.shape}, expected [..., 2, {NUM_TAXELS}]")
+    if not np.isfinite(taxels).all():
+        raise NonFiniteError("tactile: NaN or infinite pressure; expected finite kPa")
+    tips, palm = split_pads(np.sqrt(np.maximum(taxels, 0.0)) / 4)
+    parts = [tips.mean((-2, -1)), palm.mean((-2, -1))[..., None]]
+    parts += [tips.max((-2, -1)), palm.max((-2, -1))[..., None]]
+    features = np.concatenate(parts, axis=-1)
+    return features.reshape(*features.shape[:-2], NUM_PAD_FEATURES)
+
+
+_PAIRS: Final = tuple(combinations(range(MAX_OBJECTS), 2))
+_WIDE_M, _NEAR_M, _STILL_M, _STILL_RAD = 0.1, 0.01, 0.002, 0.05
+_OF_OBJECT, _OF_PAIR = 17, 18
+NUM_OBJECT_FEATURES: Final = MAX_OBJECTS * _OF_OBJECT + len(_PAIRS) * _OF_PAIR
+
+
+def object_features(object_poses: np.ndarray) -> Float32[np.ndarray, "105"]:
+    """Features of the poses at the last steps; an absent object and its pairs give zeros.
+
+    Args:
+        object_poses: T_world_object [steps, objects ≤ 3, 7] (x y z m, qw qx qy qz), the last step
+            being the current one. An object with a non-finite number or a zero quaternion counts as
+            absent.
+
+    Raises:
+        ShapeError: other shapes, or more objects.
+    """
+    poses = np.asarray(object_poses, dtype=np.float64)
+    if poses.ndim != 3 or poses.shape[2] != 7 or not 0 < poses.shape[1] <= MAX_OBJECTS:
+        raise ShapeError(
+            f"object poses: got shape {poses.shape}, expected [steps, 1 … {MAX_OBJECTS}, 7]"
+        )
+    present = known_objects(poses)
+    safe = np.where(present[:, None], poses, np.array([0.0, 0, 0, 1, 0, 0, 0]))
+    T = transform_from_pose(safe)
+    parts = []
+    for slot in range(MAX_OBJECTS):
+        there = slot < len(present) and bool(present[slot])
+        parts.append(_of_object(T[:, slot]) if there else np.zeros(_OF_OBJECT))
+    for first, second in _PAIRS:
+        there = second < len(present) and bool(present[first] and present[second])
+        pair = _of_pair(T[-1, first], T[-1, second]) if there else np.zeros(_OF_PAIR)
+        parts.append(pair)
+    return np.concatenate(parts).astype(np.float32)
+
+
+def known_objects(object_poses: np.ndarray) -> Bool[np.ndarray, " objects"]:
+    """Mask of objects in poses [steps, objects, 7] that have a pose at every step."""
+    finite = np.isfinite(object_poses).all(axis=(0, 2))
+    length = np.linalg.norm(np.nan_to_num(object_poses[..., 3:]), axis=-1)
+    return np.asarray(finite & (length > 1e-6).all(axis=0))
+
+
+def _of_object(Ts_world_object: np.ndarray) -> Float64[np.ndarray, "17"]:
+    T = Ts_world_object[-1]
+    moved_m = T[:3, 3] - Ts_world_object[0, :3, 3]
+    turned_rad = rotation_angle(T[:3, :3] @ Ts_world_object[0, :3, :3].T)
+    return np.concatenate(
+        [
+            [1.0, np.arcsinh(T[2, 3] / _NEAR_M)],
+            T[:3, 3] / _WIDE_M,
+            T[:3, :3].ravel(),
+            [
+                np.arcsinh(np.linalg.norm(moved_m) / _STILL_M),
+                np.arcsinh(moved_m[2] / _STILL_M),
+                np.arcsinh(float(turned_rad) / _STILL_RAD),
+            ],
+        ]
+    )
+
+
+def _of_pair(T_world_a: np.ndarray, T_world_b: np.ndarray) -> Float64[np.ndarray, "18"]:
+    """Second object relative to the first, and their horizontal and vertical distance."""
+    T_a_b = invert(T_world_a) @ T_world_b
+    apart_m = T_world_b[:3, 3] - T_world_a[:3, 3]
+    return np.concatenate(
+        [
+            [1.0],
+            T_a_b[:3, 3] / _WIDE_M,
+            np.arcsinh(T_a_b[:3, 3] / _NEAR_M),
+            T_a_b[:3, :3].ravel(),
+            [
+                np.arcsinh(np.linalg.norm(apart_m[:2]) / _NEAR_M),
+                np.arcsinh(apart_m[2] / _NEAR_M),
+            ],
+        ]
+    )
+
+
+NUM_TOUCH_FEATURES = 2 * NUM_PAD_FEATURES
+_CHANNELS = (24, 32, 48, 48)
+_OBJECT_HIDDEN, _OBJECT_OUTPUT = 64, 32
+# Pose features are clipped to this many standard deviations.
+_FARTHEST = 5.0
+
+
+class ClassifierShape(FrozenModel):
+    """Shape of the probe's network; stored in the checkpoint.
+
+    `milestones` are the further outputs of each task, in their order.
+    """
+
+    tasks: tuple[str, ...]
+    hidden: int = 64
+    image_size_px: int = 64
+    milestones: Mapping[str, tuple[str, ...]] = {}
+
+    @property
+    def num_outputs(self) -> int:
+        """Success and the milestones of the task with the most of them."""
+        return 1 + max((len(names) for names in self.milestones.values()), default=0)
+
+
+@dataclass(frozen=True)
+class ClassifierBatch:
+    """Inputs of the network: last images as bytes, touch, features of object poses, task index.
+
+    Missing inputs are zero and marked in `has_image` and `has_objects`. `imagined` is used in
+    training only; the network does not see it.
+    """
+
+    images: UInt8[torch.Tensor, "n 3 h w"]
+    touch: Float32[torch.Tensor, "n 48"]
+    objects: Float32[torch.Tensor, "n 105"]
+    task: Int64[torch.Tensor, " n"]
+    has_image: Bool[torch.Tensor, " n"]
+    has_objects: Bool[torch.Tensor, " n"]
+    imagined: Bool[torch.Tensor, " n"]
+
+    def __getitem__(self, index: torch.Tensor) -> "ClassifierBatch":
+        """Select endings."""
+        return ClassifierBatch(*(getattr(self, part.name)[index] for part in fields(self)))
+
+
+class TaskNetwork(nn.Module):
+    """Network of one task: four strided convolutions on the image, two layers on the poses.
+
+    Few image features reach the last layers, so that they encode positions instead of memorizing
+    training episodes. Pose features are standardized with the task's `object_mean` and
+    `object_std`, which training sets.
+    """
+
+    object_mean: torch.Tensor
+    object_std: torch.Tensor
+
+    def __init__(self, shape: ClassifierShape) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        channels = 3
+        for width in _CHANNELS:
+            layers.append(nn.Conv2d(channels, width, 3, stride=2, padding=1))
+            layers += [nn.BatchNorm2d(width), nn.GELU()]
+            channels = width
+        side = -(-shape.image_size_px // 2 ** len(_CHANNELS))
+        num_features = channels * side * side + NUM_TOUCH_FEATURES + _OBJECT_OUTPUT + 2
+        self.eye = nn.Sequential(*layers, nn.Flatten())
+        self.objects = nn.Sequential(
+            nn.Linear(NUM_OBJECT_FEATURES, _OBJECT_HIDDEN), nn.GELU(),
+            nn.Linear(_OBJECT_HIDDEN, _OBJECT_OUTPUT), nn.GELU(),
+        )  # fmt: skip
+        self.head = nn.Sequential(
+            nn.Dropout(0.3), nn.Linear(num_features, shape.hidden), nn.GELU(),
+            nn.Linear(shape.hidden, shape.num_outputs),
+        )  # fmt: skip
+        self.register_buffer("object_mean", torch.zeros(NUM_OBJECT_FEATURES))
+        self.register_buffer("object_std", torch.ones(NUM_OBJECT_FEATURES))
+
+    def forward(
+        self, images: Float32[torch.Tensor, "n 3 h w"], batch: ClassifierBatch
+    ) -> Float32[torch.Tensor, "n outputs"]:
+        """Log odds of a batch with images given separately in −0.5 … 0.5."""
+        usual = (batch.objects - self.object_mean) / self.object_std
+        poses = self.objects(usual.clamp(-_FARTHEST, _FARTHEST))
+        has_image, has_objects = batch.has_image[:, None], batch.has_objects[:, None]
+        parts = [
+            self.eye(images) * has_image,
+            poses * has_objects,
+            batch.touch,
+            has_image.float(),
+            has_objects.float(),
+        ]
+        return torch.as_tensor(self.head(torch.cat(parts, dim=1)))
+
+
+class ClassifierNetwork(nn.Module):
+    """One network per task.
+
+    A network shared by six tasks has to recognize the task in the image before it can resolve
+    millimetres: at equal cost it separates stacked from tilted bowls far worse.
+    """
+
+    def __init__(self, shape: ClassifierShape) -> None:
+        super().__init__()
+        self.num_outputs = shape.num_outputs
+        self.tasks = nn.ModuleDict({task: TaskNetwork(shape) for task in shape.tasks})
+
+    def of(self, task: str) -> TaskNetwork:
+        """The network of one task."""
+        return cast("TaskNetwork", self.tasks[task])
+
+    def forward(self, batch: ClassifierBatch) -> Float32[torch.Tensor, "n outputs"]:
+        """Log odds [n, outputs] of success and of the milestones of the task."""
+        odds = torch.zeros((len(batch.task), self.num_outputs))
+        for index, network in enumerate(self.tasks.values()):
+            rows = torch.nonzero(batch.task == index)[:, 0]
+            if len(rows):
+                mine = batch[rows]
+                odds[rows] = network(unit_images(mine.images), mine)
+        return odds
+
+
+def unit_images(images: UInt8[torch.Tensor, "n 3 h w"]) -> Float32[torch.Tensor, "n 3 h w"]:
+    """Scale bytes to −0.5 … 0.5."""
+    return images.float() / 255 - 0.5
+
+
+def probe_batch(endings: Sequence[Ending], shape: ClassifierShape) -> ClassifierBatch:
+    """Network tensors of endings, for training and prediction alike.
+
+    Raises:
+        UnknownNameError: a task that the probe was not trained for.
+        InvalidInputError: images of another size, or neither images nor object poses.
+    """
+    for ending in endings:
+        _check(ending, shape)
+    size_px = shape.image_size_px
+    nothing = np.zeros((size_px, size_px, 3), np.uint8)
+    unknown = np.zeros(NUM_OBJECT_FEATURES, np.float32)
+    images = np.stack([nothing if e.images is None else e.images[-1] for e in endings])
+    objects = [
+        unknown if e.object_poses is None else object_features(e.object_poses) for e in endings
+    ]
+    touch = pad_features(np.stack([e.tactile_kpa for e in endings]))
+    return ClassifierBatch(
+        torch.from_numpy(images).permute(0, 3, 1, 2).contiguous(),
+        torch.from_numpy(np.concatenate([touch.mean(axis=1), touch[:, -1]], axis=1)),
+        torch.from_numpy(np.stack(objects)),
+        torch.tensor([shape.tasks.index(e.task) for e in endings]),
+        torch.tensor([e.images is not None for e in endings]),
+        torch.tensor([e.object_poses is not None for e in endings]),
+        torch.tensor([e.imagined for e in endings]),
+    )
+
+
+def _check(ending: Ending, shape: ClassifierShape) -> None:
+    size = (NUM_SEEN_STEPS, shape.image_size_px, shape.image_size_px, 3)
+    if ending.task not in shape.tasks:
+        raise UnknownNameError("task of the success classifier", ending.task, list(shape.tasks))
+    if ending.images is None and ending.object_poses is None:
+        raise InvalidInputError(
+            f"success classifier: an ending of {ending.task!r} has neither images nor object "
+            "poses; request the images of the last chunk"
+        )
+    if ending.images is not None and ending.images.shape != size:
+        raise InvalidInputError(
+            f"success classifier: got images {ending.images.shape}, expected {size}"
+        )
+
 
 # Version 4 of the network, one per task; older checkpoints are rejected by this name.
 KIND = "success-probe-4"

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
 from services.evaluation.endings import Ending, EndingEpisode
-from services.evaluation.judge_network import ClassifierBatch, ClassifierShape, probe_batch
+from services.evaluation.success_classifier import ClassifierBatch, ClassifierShape, probe_batch
 
 # Share of early endings in the weight of a task's failures. They are easy: with more weight they
 # would dominate the near misses, which matter.

@@ -13,8 +13,8 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.serving import configure_logging
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.policies.outside import PolicySource
+from services.evaluation.policies.replay import HoldPolicy
 from services.evaluation.recorded_takes import REPLAY, read_takes, score_lines, score_recorded
 from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier

@@ -23,9 +23,8 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, DeviceError, InvalidInputError, UnknownNameError
 from dextouch.schemas import RolloutStart, SceneObjects
 from dextouch.serving import configure_logging
-from services.evaluation.policies.asking import action_chunk, ask
-from services.evaluation.policies.outside import PolicySource
-from services.evaluation.progress import Progress
+from services.evaluation.optimization import Progress
+from services.evaluation.policies.outside import PolicySource, action_chunk, ask
 from services.pipelines.parsers import training_data_parser
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.data_mix import MIXES, Mix, options_of

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from dextouch.geometry import invert, pinhole_matrix, transform, transform_from_pose
-from services.twin.appearance import Appearance
 from services.twin.markers import Markers
 from services.twin.names import CAMERAS
+from services.twin.object_bodies import Appearance
 from services.twin.scene import Scene
 from services.twin.simulation import Simulation
 

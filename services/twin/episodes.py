@@ -12,10 +12,9 @@ from dextouch.hands.actions import AnchorPoses, actions_from_poses, poses_from_a
 from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.demonstrators import NUM_GRID_STEPS
-from services.twin.events import EventTimes
 from services.twin.mistakes import with_mistakes
 from services.twin.motions import MotionScene, with_motion
-from services.twin.recorder import GridLog, Recorder, TruthStream, action_stream
+from services.twin.recorder import EventTimes, GridLog, Recorder, TruthStream, action_stream
 from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID
 from services.twin.stage import Plan, Stage, command_row
 from services.twin.take_options import PlayedActions, TakeOptions, episode_id

@@ -16,9 +16,10 @@ from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.hands import HumanHand
 from services.twin.mjcf import PHYSICS_RATE_HZ
-from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID
+from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID, Simulation
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
+from services.twin.tasks import Task
 
 TACTILE_RATE_HZ: Final = 60
 POSE_RATE_HZ: Final = 100
@@ -230,3 +231,18 @@ class GridLog:
             joints[:, 1],
             transform_from_pose(np.stack(self._heads)),
         )
+
+
+class EventTimes:
+    """Collects the first time of each milestone; those never reached are absent."""
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        self.times_s: dict[str, float] = {}
+
+    def sample(self, step: int, simulation: Simulation) -> None:
+        """Record the milestones reached at a grid step, counted from the start of the take."""
+        reached = self._task.reached(simulation)
+        for name, holds in zip(self._task.milestones, reached, strict=True):
+            if holds:
+                self.times_s.setdefault(name, step / MODEL_RATE_HZ)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from dextouch.hands.actions import HandTrajectory
-from services.twin.appearance import BACKGROUND
+from services.twin.object_bodies import BACKGROUND
 from services.twin.stage import Stage, command_row
 
 BACKGROUND_LABEL: Final = 0

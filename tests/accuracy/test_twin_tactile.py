@@ -14,7 +14,7 @@ from dextouch.geometry import transform_from_pose
 from dextouch.tactile.layout import NUM_TIP_TAXELS, PALM_PITCH_M, PALM_SHAPE, PALM_TAXEL_AREA_M2
 from services.twin.scene import compile_scene
 from services.twin.simulation import Command, Simulation
-from services.twin.tasks.postures import PALM_DOWN, flat, relaxed
+from services.twin.tasks.task import PALM_DOWN, flat, relaxed
 
 STIFFNESS_PA_M = 2e7
 SUPERSAMPLING = 12

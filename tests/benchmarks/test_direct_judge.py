@@ -24,7 +24,7 @@ from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.schemas import Observation, Review, RolloutStart
 from services.evaluation.calibration import Calibration
 from services.evaluation.checkpoints import save_checkpoint
-from services.evaluation.starts import start_digest
+from services.evaluation.matched_starts import start_digest
 from services.evaluation.statistics import area_under_roc
 from services.twin.episodes import record, write_episode
 from services.twin.motions import Motion

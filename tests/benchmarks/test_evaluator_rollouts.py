@@ -28,8 +28,8 @@ from benchmarks.evaluator.plan import (
 from benchmarks.evaluator.playing import play_in_twin, start_in_twin
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, UnknownNameError
 from dextouch.geometry import transform
-from services.evaluation.camera_warp import warp_over_table
 from services.evaluation.policies.colour_servo import ColourServo
+from services.evaluation.scene_geometry import warp_over_table
 from services.evaluation.settings import DEFAULT_PROBE
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld

@@ -20,13 +20,13 @@ from dextouch.hands.actions import (
 from dextouch.schemas import Observation
 from dextouch.streams import HEAD_CAMERA
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_network
-from services.evaluation.features import pad_features
 from services.evaluation.policies.cloning_network import (
     SLOT_STEPS,
     CloningBatch,
     CloningNetwork,
     phase_features,
 )
+from services.evaluation.success_classifier import pad_features
 
 # Older checkpoints, "behaviour-cloning-policy", are incompatible: chunks began at the reached pose.
 KIND = "cloned-policy"

@@ -11,7 +11,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT
 from dextouch.schemas import CHUNK_STEPS
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
-from services.evaluation.demonstrations import instructions_of
+from services.evaluation.matched_starts import instructions_of
 from services.evaluation.optimization import optimized
 from services.evaluation.policies.behaviour_cloning import (
     KIND,
@@ -22,16 +22,14 @@ from services.evaluation.policies.behaviour_cloning import (
     in_world,
     scaled_images,
 )
-from services.evaluation.policies.cloning_episodes import (
-    DECISION_STRIDE,
-    CloningEpisode,
-)
 from services.evaluation.policies.cloning_network import (
+    DECISION_STRIDE,
     NUM_POSE_FEATURES,
     CloningBatch,
+    CloningEpisode,
     CloningNetwork,
 )
-from services.evaluation.training_settings import CloningSettings
+from services.evaluation.settings import CloningSettings
 
 # Batch size of the held-out evaluation.
 _TESTED_AT_ONCE = 128

@@ -14,10 +14,16 @@ from dextouch.errors import ConflictError
 from dextouch.free_text import FreeLines
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import RequireScope, ServedFolder, create_service_app, serve
-from services.evaluation.rating.marks import Judgement, Mark, MarkLog, RaterName
-from services.evaluation.rating.rated_rollouts import RolloutPictures, rated_rollouts
-from services.evaluation.rating.rating_queue import RatingQueue
-from services.evaluation.rating.rubrics import Rubric, read_rubrics, rubric_of
+from services.evaluation.rating.marks import (
+    Judgement,
+    Mark,
+    MarkLog,
+    RaterName,
+    Rubric,
+    read_rubrics,
+    rubric_of,
+)
+from services.evaluation.rating.rating_queue import RatingQueue, RolloutPictures, rated_rollouts
 from services.evaluation.rating.settings import RatingSettings
 
 STATIC: Final = FilePath(__file__).parent / "static"

@@ -2,11 +2,22 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
 
-from dextouch.errors import NotFoundError
-from services.evaluation.rating.marks import FIRST, REPEAT, MarkLog, StoredMark
+import numpy as np
+from jaxtyping import Float32, UInt8
+from PIL import Image
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.images import encode_jpeg
+from dextouch.schemas import EpisodeAttributes, is_rollout
+from dextouch.streams import HEAD_CAMERA
+from services.evaluation.rating.marks import FIRST, REPEAT, MarkLog, Rubric, StoredMark
+from services.evaluation.reporting.pictures import touch_image
 
 
 @dataclass(frozen=True)
@@ -119,3 +130,115 @@ class RatingQueue:
 
 def _order(rater: str, episode_id: str) -> str:
     return hashlib.sha256(f"{rater}/{episode_id}".encode()).hexdigest()
+
+
+IMAGE_HEIGHT_PX: Final = 384
+_BACKGROUND: Final = 24
+
+
+def rated_rollouts(
+    store: EpisodeStore, tasks: Collection[str], *, study: str | None = None
+) -> list[RatedRollout]:
+    """Rollouts of a store that have head images; what people recorded is none.
+
+    Args:
+        store: of episodes.
+        tasks: tasks with a rubric; episodes of others are skipped.
+        study: the study whose rollouts are rated; None for all rollouts.
+
+    Raises:
+        InvalidInputError: nothing to rate.
+    """
+    found = []
+    for episode_id in store.list():
+        episode = store.open(episode_id)
+        about = episode.attributes
+        is_wanted = _is_rated(about) if study is None else study in _studies(about)
+        if is_wanted and about.task in tasks and HEAD_CAMERA in episode.streams:
+            found.append(
+                RatedRollout(
+                    token_of(episode_id),
+                    episode_id,
+                    about.task,
+                    about.instruction,
+                    episode.num_steps,
+                    about.model_rate_hz,
+                )
+            )
+    if not found:
+        of_study = "" if study is None else f" of the study {study!r}"
+        raise InvalidInputError(
+            f"store {store.root}: has no episode of {', '.join(sorted(tasks))} that is a "
+            f"rollout{of_study} with the stream {HEAD_CAMERA}, expected at least one; takes of "
+            "operators are not rated"
+        )
+    return found
+
+
+def _is_rated(about: EpisodeAttributes) -> bool:
+    """Whether an episode is a rollout: of a study, of a world model, or of the twin by itself."""
+    if is_rollout(about) or about.origin == "imagined":
+        return True
+    return about.origin == "twin" and about.operator is None
+
+
+def _studies(about: EpisodeAttributes) -> set[str]:
+    """Names of the studies whose rollout an episode is."""
+    return {entry.id.partition(": ")[0] for entry in about.lineage if entry.kind == "rollout"}
+
+
+def state_scores(
+    store: EpisodeStore, rollouts: Iterable[RatedRollout], rubrics: Mapping[str, Rubric]
+) -> dict[str, float]:
+    """Ground-truth scores of the twin's rollouts, from their milestones, by episode id.
+
+    Rollouts of other worlds, rubrics that the twin cannot judge, and takes without recorded
+    milestones have none.
+    """
+    found = {}
+    for rollout in rollouts:
+        about, rubric = store.open(rollout.episode_id).attributes, rubrics[rollout.task]
+        was_noted = about.event_times_s or (about.success is False and not is_rollout(about))
+        if about.origin == "twin" and was_noted and rubric.is_seen_by_twin:
+            holds = rubric.holds_in_twin(about.event_times_s)
+            found[rollout.episode_id] = rubric.score(holds)
+    return found
+
+
+class RolloutPictures:
+    """JPEG pictures of single steps: the head image beside taxel maps of both hands."""
+
+    def __init__(self, store: EpisodeStore) -> None:
+        # The page requests the steps of one rollout after another. Only readers are cached:
+        # decoded images of a long rollout would take hundreds of megabytes.
+        self._opened = lru_cache(maxsize=16)(store.open)
+
+    def step(self, episode_id: str, step: int) -> bytes:
+        """JPEG of one step; where it has no image, of the nearest one.
+
+        Raises:
+            NotFoundError: no such step.
+        """
+        episode = self._opened(episode_id)
+        if not 0 <= step < episode.num_steps:
+            raise NotFoundError(
+                f"step {step}: the rollout has the steps 0 … {episode.num_steps - 1}"
+            )
+        window = episode.window(step, 1, cameras=(HEAD_CAMERA,))
+        return encode_jpeg(side_by_side(window.images[HEAD_CAMERA][0], window.tactile_kpa[0]))
+
+
+def side_by_side(
+    image: UInt8[np.ndarray, "h w 3"], tactile_kpa: Float32[np.ndarray, "2 320"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The image, enlarged, beside the taxel maps of the left and the right hand."""
+    height, width = image.shape[:2]
+    size = (round(width * IMAGE_HEIGHT_PX / height), IMAGE_HEIGHT_PX)
+    shown = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC)
+    touch = Image.fromarray(touch_image(tactile_kpa))
+    scale = min(IMAGE_HEIGHT_PX / touch.height, size[0] / touch.width)
+    touch = touch.resize((round(touch.width * scale), round(touch.height * scale)))
+    canvas = Image.new("RGB", (size[0] + touch.width + 8, IMAGE_HEIGHT_PX), (_BACKGROUND,) * 3)
+    canvas.paste(shown, (0, 0))
+    canvas.paste(touch, (size[0] + 8, (IMAGE_HEIGHT_PX - touch.height) // 2), touch)
+    return np.asarray(canvas)

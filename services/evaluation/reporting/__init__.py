@@ -1,12 +1,13 @@
 """HTML report of an evaluation: one self-contained page of figures and images."""
 
-from services.evaluation.reporting.from_episodes import action_picture, episode_picture
 from services.evaluation.reporting.page import write_report
 from services.evaluation.reporting.pictures import (
     ActionPicture,
     EpisodePicture,
     PredictionPicture,
     ReportPictures,
+    action_picture,
+    episode_picture,
 )
 
 __all__ = [

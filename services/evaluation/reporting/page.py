@@ -13,13 +13,13 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from dextouch.free_text import printable
-from services.evaluation.reporting.drawings import (
+from services.evaluation.reporting.pictures import (
+    ReportPictures,
     action_charts,
     clock_chart,
     policy_panels,
     strips,
 )
-from services.evaluation.reporting.pictures import ReportPictures
 from services.evaluation.reporting.sections import (
     calibration_rows,
     clock_rows,

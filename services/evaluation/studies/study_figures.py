@@ -2,13 +2,17 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, Final
 
 from pydantic import AwareDatetime
 
+from dextouch.command_line import write_result
 from dextouch.frozen_model import FrozenModel
 from services.evaluation.calibration import LEAST_DECIDED
 from services.evaluation.comments import UNDEFINED, VAGUE_R, undefined_by
+from services.evaluation.reporting import ReportPictures, write_report
+from services.evaluation.reporting.sections import latex_tables
 from services.evaluation.scores import REAL, ClosedLoopReport, RolloutFailure, RolloutScore
 from services.evaluation.studies.definition import StudyDefinition
 from services.evaluation.studies.results import (
@@ -279,3 +283,35 @@ def _agreed(
         num_starts=found["num_starts"],
         comments=comments,
     )
+
+
+REPORT_FILE: Final = "report.json"
+TABLES_FILE: Final = "tables.tex"
+
+
+def write_reports(results: StudyResults, json_path: Path | None) -> dict[str, Any]:
+    """Write all reports beside the results.
+
+    Args:
+        results: of a study, finished or not.
+        json_path: also write the figures here; see `write_result`.
+
+    Returns:
+        The figures of report.json.
+    """
+    folder = results.path.parent
+    definition = StudyDefinition.model_validate(results.header.definition)
+    report = study_report(definition, results)
+    figures = report.to_report()
+    figures["study"] = {"name": definition.name, "digests": results.header.digests}
+    for path in (folder / REPORT_FILE, json_path):
+        write_result(path, figures, allow_nan=False)
+    for world in definition.imagined:
+        others = tuple(name for name in definition.imagined if name != world)
+        page = ClosedLoopReport(
+            report.scores, (world, *others), report.policies, report.failures
+        ).to_report()
+        title = f"{definition.name}: {world} and the real world"
+        write_report(page | {"title": title}, ReportPictures(), folder / f"report {world}.html")
+    (folder / TABLES_FILE).write_text(latex_tables(report), encoding="utf-8")
+    return figures

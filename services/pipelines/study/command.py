@@ -22,10 +22,9 @@ from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.scores import REAL
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.studies.definition import StudyDefinition, WorldChoice, read_definition
-from services.evaluation.studies.engine import StudyParts, run_study
-from services.evaluation.studies.policies import PolicyFactory, file_digest
-from services.evaluation.studies.reports import REPORT_FILE, write_reports
+from services.evaluation.studies.engine import PolicyFactory, StudyParts, file_digest, run_study
 from services.evaluation.studies.results import StudyHeader, StudyResults, cells_of
+from services.evaluation.studies.study_figures import REPORT_FILE, write_reports
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines.parsers import study_parser

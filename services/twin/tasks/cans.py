@@ -17,8 +17,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import THUMB_UP, relaxed, yawed
-from services.twin.tasks.task import REST_SPEED
+from services.twin.tasks.task import REST_SPEED, THUMB_UP, relaxed, yawed
 
 Goal = Literal["up", "left", "right"]
 

@@ -12,8 +12,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import THUMB_UP, relaxed, yawed
-from services.twin.tasks.task import REST_SPEED
+from services.twin.tasks.task import REST_SPEED, THUMB_UP, relaxed, yawed
 
 _RADIUS_M, _HALF_LENGTH_M, _FOOT_HALF_M = 0.022, 0.090, 0.020
 # Grasp height above the peg's centre, to keep the hand clear of the block.

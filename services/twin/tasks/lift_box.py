@@ -13,8 +13,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import THUMB_UP, flat, yawed
-from services.twin.tasks.task import REST_SPEED
+from services.twin.tasks.task import REST_SPEED, THUMB_UP, flat, yawed
 
 _HALF_M: Final = (0.075, 0.055, 0.031)
 _MASS_KG: Final = 0.4

@@ -13,8 +13,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import PALM_DOWN, flat, relaxed, yawed
-from services.twin.tasks.task import REST_SPEED
+from services.twin.tasks.task import PALM_DOWN, REST_SPEED, flat, relaxed, yawed
 
 # The cabinet's frame: on the table below the middle of its front; the drawer opens along -y.
 _CABINET_HALF_M: Final = (0.085, 0.060, 0.042)

@@ -14,8 +14,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import THUMB_UP, yawed
-from services.twin.tasks.task import REST_SPEED
+from services.twin.tasks.task import REST_SPEED, THUMB_UP, yawed
 
 # A boot's frame: origin below the centre of its sole, y towards the toe, z up.
 _SOLE_HALF_M: Final = (0.030, 0.065, 0.008)

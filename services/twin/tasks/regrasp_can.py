@@ -13,8 +13,7 @@ from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
 from services.twin.tasks.cans import CAN_GRASPS, CAN_RADIUS_M, can_mjcf
-from services.twin.tasks.postures import THUMB_UP, relaxed, yawed
-from services.twin.tasks.task import REST_SPEED
+from services.twin.tasks.task import REST_SPEED, THUMB_UP, relaxed, yawed
 
 _HALF_LENGTH_M, _MASS_KG = 0.100, 0.16
 # The stand: four walls around the can's lower part, so that only its upper half can be grasped.

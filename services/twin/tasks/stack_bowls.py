@@ -12,8 +12,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import THUMB_UP, flat, yawed
-from services.twin.tasks.task import REST_SPEED
+from services.twin.tasks.task import REST_SPEED, THUMB_UP, flat, yawed
 
 _NUM_WALLS: Final = 12
 _WALL_HALF_M: Final = (0.017, 0.024, 0.003)

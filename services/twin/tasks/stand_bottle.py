@@ -13,8 +13,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import PALM_DOWN, relaxed, yawed
-from services.twin.tasks.task import REST_SPEED
+from services.twin.tasks.task import PALM_DOWN, REST_SPEED, relaxed, yawed
 
 _RADIUS_M: Final = 0.025
 _HALF_LENGTH_M: Final = 0.115

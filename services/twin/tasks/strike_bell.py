@@ -12,8 +12,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import PALM_DOWN, flat, relaxed, yawed
-from services.twin.tasks.task import REST_SPEED
+from services.twin.tasks.task import PALM_DOWN, REST_SPEED, flat, relaxed, yawed
 
 # The bell's frame: on the table below the plunger, y away from the viewer. Top of the plunger,
 # its travel and the part of it after which its arm meets the flag's crank.

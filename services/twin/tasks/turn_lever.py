@@ -12,8 +12,7 @@ from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import THUMB_UP, flat, relaxed, yawed
-from services.twin.tasks.task import REST_SPEED
+from services.twin.tasks.task import REST_SPEED, THUMB_UP, flat, relaxed, yawed
 
 # The valve's frame: on the table below the pivot; the closed lever points along x and turns
 # clockwise, seen from above.

@@ -11,8 +11,7 @@ import zarr
 from jaxtyping import Float64
 from zarr.core.common import JSON
 
-from dextouch.bridges.exports import new_file
-from dextouch.bridges.model_grid import BLOCK_IMAGES
+from dextouch.bridges.model_grid import BLOCK_IMAGES, new_file
 from dextouch.episodes import EpisodeReader, disk_errors
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import vector_from_rotation

@@ -31,7 +31,14 @@ from .object_poses import ObjectTrack as ObjectTrack
 from .object_poses import has_object_poses as has_object_poses
 from .object_poses import object_track as object_track
 from .reader import EpisodeReader as EpisodeReader
+from .reader import NativeWindow as NativeWindow
 from .reader import RecordingReader as RecordingReader
+from .reader import StreamData as StreamData
+from .reader import Window as Window
+from .reader import decode_window as decode_window
+from .reader import encode_window as encode_window
+from .reader import mean_over_ranges as mean_over_ranges
+from .reader import step_ranges as step_ranges
 from .rollout_episode import write_rollout as write_rollout
 from .sources import GroupFiles as GroupFiles
 from .sources import LocalGroup as LocalGroup
@@ -54,11 +61,4 @@ from .table import is_rejected as is_rejected
 from .table import select_episodes as select_episodes
 from .trash import TRASH_KINDS as TRASH_KINDS
 from .trash import TrashKind as TrashKind
-from .window import NativeWindow as NativeWindow
-from .window import StreamData as StreamData
-from .window import Window as Window
-from .window import decode_window as decode_window
-from .window import encode_window as encode_window
-from .window import mean_over_ranges as mean_over_ranges
-from .window import step_ranges as step_ranges
 from .writer import EpisodeWriter as EpisodeWriter

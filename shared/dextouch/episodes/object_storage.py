@@ -22,10 +22,9 @@ from dextouch.episodes.format import (
     attributes_id,
 )
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
-from dextouch.episodes.staged_group import new_stage, sweep_stages, unheld_folders
 from dextouch.episodes.stream_writer import WriteOptions
 from dextouch.episodes.uploads import delete_group, group_key, sweep_orphans, upload_group
-from dextouch.episodes.writer import EpisodeWriter
+from dextouch.episodes.writer import EpisodeWriter, new_stage, sweep_stages, unheld_folders
 from dextouch.errors import (
     ConflictError,
     DexTouchError,

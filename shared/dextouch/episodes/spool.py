@@ -16,24 +16,22 @@ import numpy as np
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, try_lock, write_file
 from dextouch.episodes.format import sha256_hex
 from dextouch.episodes.spool_log import (
+    CLOSED_FILE,
     LOG_FILE,
     LOG_MAGIC,
-    LogRecords,
-    SpoolLogWriter,
-    read_batch,
-    read_bodies,
-    read_records,
-    trusted_records,
-)
-from dextouch.episodes.spool_seal import (
-    CLOSED_FILE,
     RECORDING_FILE,
+    LogRecords,
     Seal,
+    SpoolLogWriter,
     decode_attributes,
     encode_attributes,
     has_checksum,
+    read_batch,
+    read_bodies,
     read_recording_file,
+    read_records,
     read_seal,
+    trusted_records,
 )
 from dextouch.errors import (
     ConflictError,

@@ -19,20 +19,21 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.group_contents import read_group
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
-from dextouch.episodes.reviews import CLICKS_FILE, REVIEW_FILE, read_remark
 from dextouch.episodes.sources import GroupFiles, LocalGroup
-from dextouch.episodes.staged_group import new_stage, sweep_stages
 from dextouch.episodes.stream_writer import WriteOptions
 from dextouch.episodes.trash import (
+    CLICKS_FILE,
+    REVIEW_FILE,
     TrashEntry,
     TrashKind,
     list_trash,
     purge_trash,
     put_into_trash,
+    read_remark,
     remove_for_good,
     restore_from_trash,
 )
-from dextouch.episodes.writer import EpisodeWriter
+from dextouch.episodes.writer import EpisodeWriter, new_stage, sweep_stages
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,

@@ -10,11 +10,14 @@ import shutil
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Final, Literal, TypeVar, get_args
+
+from pydantic import BaseModel, ValidationError
 
 from dextouch.episodes.files import disk_errors, folder_bytes, sync_folder
 from dextouch.episodes.format import COMMIT_FILE, KINDS
-from dextouch.errors import ConflictError, NotFoundError, UnknownNameError
+from dextouch.episodes.sources import GroupFiles
+from dextouch.errors import ConflictError, CorruptDataError, NotFoundError, UnknownNameError
 
 TRASH = ".trash"
 # Besides groups: unfinished uploads that were damaged.
@@ -136,3 +139,29 @@ def _home(kind: TrashKind) -> str:
     if kind not in HOMES:
         raise UnknownNameError("kind", kind, list(HOMES))
     return HOMES[kind]
+
+
+REVIEW_FILE: Final = "review.json"
+CLICKS_FILE: Final = "clicks.json"
+# All files beside the content.
+REMARK_FILES: Final = (REVIEW_FILE, CLICKS_FILE)
+
+Remark = TypeVar("Remark", bound=BaseModel)
+
+
+def read_remark(files: GroupFiles, name: str, form: type[Remark], *, what: str) -> Remark | None:
+    """A file beside the content of a group; None if there is none.
+
+    Raises:
+        CorruptDataError: the file has another form.
+    """
+    content = files.get(name)
+    if content is None:
+        return None
+    try:
+        return form.model_validate_json(content, extra="ignore")
+    except ValidationError as error:
+        raise CorruptDataError(
+            f"{what}: {name} is no {name.removesuffix('.json')} ({error.error_count()} fields do "
+            "not fit); delete the file, and enter it again"
+        ) from error

@@ -8,8 +8,10 @@ from .robot_hand import Vector3 as Vector3
 from .skeleton import CHAINS as CHAINS
 from .skeleton import FINGER_CHAINS as FINGER_CHAINS
 from .skeleton import FINGER_JOINTS as FINGER_JOINTS
+from .skeleton import FINGER_METACARPALS as FINGER_METACARPALS
 from .skeleton import KNUCKLE_NODES as KNUCKLE_NODES
 from .skeleton import METACARPAL_NODES as METACARPAL_NODES
+from .skeleton import NO_KEYPOINT as NO_KEYPOINT
 from .skeleton import NODE_INDEX as NODE_INDEX
 from .skeleton import NODES as NODES
 from .skeleton import NUM_KEYPOINTS as NUM_KEYPOINTS
@@ -18,7 +20,5 @@ from .skeleton import WRIST as WRIST
 from .skeleton import WRIST_NODE as WRIST_NODE
 from .skeleton import chain_indices as chain_indices
 from .skeleton import mean_hand_m as mean_hand_m
+from .skeleton import node_order as node_order
 from .skeleton import solver_indices as solver_indices
-from .tracker_nodes import FINGER_METACARPALS as FINGER_METACARPALS
-from .tracker_nodes import NO_KEYPOINT as NO_KEYPOINT
-from .tracker_nodes import node_order as node_order

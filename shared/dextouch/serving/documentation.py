@@ -14,8 +14,7 @@ from fastapi.dependencies.models import Dependant
 from fastapi.routing import APIRoute
 
 from dextouch.schemas import PROBLEM_MEDIA_TYPE, Problem
-from dextouch.serving.guard import JSON, SAFE_METHODS, RequireScope, body_rule
-from dextouch.serving.json_bodies import JsonBody
+from dextouch.serving.guard import JSON, SAFE_METHODS, JsonBody, RequireScope, body_rule
 
 CallT = TypeVar("CallT")
 KEY_SCHEME = "api_key"

@@ -12,10 +12,14 @@ from dataclasses import dataclass
 from email.message import Message
 from functools import cached_property, lru_cache
 from http import HTTPStatus
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 from fastapi import APIRouter
+from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
+from pydantic import BaseModel, ValidationError
+from pydantic_core import from_json
+from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection, Request
@@ -23,8 +27,8 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.types import Message as AsgiMessage
 
-from dextouch.errors import AccessDeniedError, DexTouchError
-from dextouch.schemas import status_of
+from dextouch.errors import AccessDeniedError, DexTouchError, InvalidInputError
+from dextouch.schemas import MAX_NAMED, first_problems, status_of
 from dextouch.serving.host_names import canonical_host, canonical_origin, is_loopback
 from dextouch.serving.keys import AccessControl, no_key, not_signed_in, presented_key
 from dextouch.serving.refusals import RefusalLog, WrongKeys
@@ -320,3 +324,38 @@ class GuardMiddleware:
             if self.admits is None:
                 return
         self.site.check(connection, is_unsafe=is_unsafe)
+
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+# Bodies above it are decoded in a thread, so that others need not wait.
+MAX_INLINE_BYTES = 64 * KIB
+
+
+@dataclass(frozen=True)
+class JsonBody(Generic[ModelT]):
+    """Route dependency for a body of more than 64 KiB: `Depends(JsonBody(RecordingAttributes))`.
+
+    FastAPI by itself decodes on the event loop and describes every mistake, of which 1 MiB has room
+    for 100,000.
+    """
+
+    model: type[ModelT]
+
+    async def __call__(self, request: Request) -> ModelT:
+        """The body; raises RequestValidationError, or InvalidInputError for too many mistakes."""
+        body = await request.body()
+        if len(body) <= MAX_INLINE_BYTES:
+            return self._decode(body)
+        return await run_in_threadpool(self._decode, body)
+
+    def _decode(self, body: bytes) -> ModelT:
+        try:
+            return self.model.model_validate(from_json(body) if body else None)
+        except ValidationError as error:
+            if error.error_count() > MAX_NAMED:
+                raise InvalidInputError(f"body: {first_problems(error)}") from None
+            mistakes = error.errors(include_url=False)
+        except ValueError as error:
+            mistakes = [{"type": "json_invalid", "loc": (), "msg": str(error), "input": {}}]
+        raise RequestValidationError([{**one, "loc": ("body", *one["loc"])} for one in mistakes])

@@ -8,12 +8,6 @@ from .batch import encode_samples as encode_samples
 from .batch import frame_body as frame_body
 from .batch import read_batch as read_batch
 from .batch import sample_ends as sample_ends
-from .limits import LEAST_SHARE_KEPT as LEAST_SHARE_KEPT
-from .limits import RATE_ERROR as RATE_ERROR
-from .limits import RATE_WARN as RATE_WARN
-from .limits import RESIDUAL_ERROR_S as RESIDUAL_ERROR_S
-from .limits import RESIDUAL_WARN_S as RESIDUAL_WARN_S
-from .limits import residual_limits_s as residual_limits_s
 from .openpi import pack_openpi as pack_openpi
 from .openpi import unpack_openpi as unpack_openpi
 from .packing import pack as pack
@@ -22,9 +16,14 @@ from .samples import ENCODED_UNITS as ENCODED_UNITS
 from .samples import H264_UNIT as H264_UNIT
 from .samples import HEAD_CAMERA as HEAD_CAMERA
 from .samples import JPEG_UNIT as JPEG_UNIT
+from .samples import LEAST_SHARE_KEPT as LEAST_SHARE_KEPT
 from .samples import MAX_STREAMS as MAX_STREAMS
 from .samples import NO_DEVICE_TIME as NO_DEVICE_TIME
 from .samples import NO_SEQUENCE as NO_SEQUENCE
+from .samples import RATE_ERROR as RATE_ERROR
+from .samples import RATE_WARN as RATE_WARN
+from .samples import RESIDUAL_ERROR_S as RESIDUAL_ERROR_S
+from .samples import RESIDUAL_WARN_S as RESIDUAL_WARN_S
 from .samples import ClockCapabilities as ClockCapabilities
 from .samples import Sample as Sample
 from .samples import SampleBatch as SampleBatch
@@ -34,3 +33,4 @@ from .samples import check_batch as check_batch
 from .samples import check_encoded_image as check_encoded_image
 from .samples import check_follows as check_follows
 from .samples import encoded_values as encoded_values
+from .samples import residual_limits_s as residual_limits_s

@@ -48,9 +48,8 @@ from dextouch.serving import (
     timed,
 )
 from dextouch.streams import unpack
-from dextouch.worlds.records import ID_LETTERS, Answer
+from dextouch.worlds.records import ID_LETTERS, Answer, RolloutWatch
 from dextouch.worlds.rollouts import RolloutService
-from dextouch.worlds.watching import RolloutWatch
 
 MAX_BODY_BYTES = 2**28
 # Room for 1000 rows of float64, or some hundred rows as JSON.

@@ -9,7 +9,7 @@ from services.evaluation.recorded_takes import REPLAY
 from services.pipelines import evaluate_recorded
 from services.pipelines.parsers import recorded_parser
 
-HOLD = "services.evaluation.policies.hold:HoldPolicy"
+HOLD = "services.evaluation.policies.replay:HoldPolicy"
 
 
 def policies(*words):

@@ -17,7 +17,7 @@ from services.evaluation.agreement import (
     sign_flip_p,
     task_agreement,
 )
-from services.evaluation.rate_draws import (
+from services.evaluation.statistics import (
     MatchedScores,
     ScoreDraws,
     bootstrap_scores,

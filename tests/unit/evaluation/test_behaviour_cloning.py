@@ -18,8 +18,7 @@ from services.evaluation.policies.behaviour_cloning import (
     half_size,
     in_world,
 )
-from services.evaluation.policies.cloning_episodes import CloningEpisode
-from services.evaluation.policies.cloning_network import ChunkCodec, SpatialSoftmax
+from services.evaluation.policies.cloning_network import ChunkCodec, CloningEpisode, SpatialSoftmax
 from services.evaluation.policies.cloning_training import (
     CloningSettings,
     decisions_of,

@@ -14,7 +14,7 @@ from dextouch.worlds.baseline import CopyFirstWorld
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.matched_starts import matched_start
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.policies.hold import HoldPolicy
+from services.evaluation.policies.replay import HoldPolicy
 from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
 from tests.unit.evaluation import toy

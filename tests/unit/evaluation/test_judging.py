@@ -11,12 +11,11 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import Doubt, Observation, RolloutDoubt
 from services.evaluation.calibration import Calibration, Combination
 from services.evaluation.endings import Ending, EndingEpisode, milestones_of
-from services.evaluation.judge_network import ClassifierShape, probe_batch
-from services.evaluation.success_classifier import SuccessClassifier
+from services.evaluation.success_classifier import ClassifierShape, SuccessClassifier, probe_batch
 from services.evaluation.success_classifier_data import labelled_endings
-from services.evaluation.success_classifier_figures import fit_combinations
 from services.evaluation.success_classifier_training import (
     ClassifierSettings,
+    fit_combinations,
     some_parts,
     train_success_classifier,
 )

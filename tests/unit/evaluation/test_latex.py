@@ -1,6 +1,6 @@
 """LaTeX tables, against a table written by hand."""
 
-from services.evaluation.reporting.latex import escape, latex_tables
+from services.evaluation.reporting.sections import escape, latex_tables
 from services.evaluation.scores import ClosedLoopReport, RolloutScore
 
 # Three policies, four starts, two imagined worlds: rates 1, 0, .5 | .75, .25, .5 | .5, .5, .5.

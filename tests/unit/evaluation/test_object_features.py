@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import ShapeError
-from services.evaluation.object_features import (
+from services.evaluation.success_classifier import (
     NUM_OBJECT_FEATURES,
     known_objects,
     object_features,

@@ -6,9 +6,8 @@ import torch
 from safetensors.torch import save_file
 
 from dextouch.errors import InvalidInputError, NotFoundError
-from services.evaluation.perceptual_networks import PerceptualNetworks
+from services.evaluation.perceptual_networks import NO_WEIGHTS, PerceptualNetworks, heat_maps
 from services.evaluation.prediction import all_metrics
-from services.evaluation.weighted_metrics import NO_WEIGHTS, heat_maps
 
 RNG = np.random.default_rng(0)
 SIZES = ((64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3))

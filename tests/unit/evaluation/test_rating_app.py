@@ -13,7 +13,7 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from services.cli.main import main
 from services.evaluation.rating.app import create_rating_app
 from services.evaluation.rating.marks import MarkLog
-from services.evaluation.rating.rated_rollouts import rated_rollouts, side_by_side
+from services.evaluation.rating.rating_queue import rated_rollouts, side_by_side
 from services.evaluation.rating.settings import RatingSettings
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.toy_store import write

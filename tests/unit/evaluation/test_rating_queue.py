@@ -7,10 +7,9 @@ import pytest
 from pydantic import ValidationError
 
 from dextouch.errors import NotFoundError, StorageError
-from services.evaluation.rating.marks import FIRST, REPEAT, Mark, MarkLog
+from services.evaluation.rating.marks import FIRST, REPEAT, Mark, MarkLog, read_rubrics
 from services.evaluation.rating.rating_queue import RatedRollout, RatingQueue, token_of
 from services.evaluation.rating.rating_report import rating_report
-from services.evaluation.rating.rubrics import read_rubrics
 
 IDS = [f"rollout-{number}" for number in range(12)]
 

@@ -10,7 +10,8 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.images import scaled_square
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.evaluation.policies.hold import HoldPolicy
+from services.evaluation.matched_starts import start_digest
+from services.evaluation.policies.replay import HoldPolicy
 from services.evaluation.recorded_takes import (
     REPLAY,
     RecordedScores,
@@ -20,7 +21,6 @@ from services.evaluation.recorded_takes import (
     score_recorded,
 )
 from services.evaluation.scores import RolloutScore
-from services.evaluation.starts import start_digest
 from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
 from tests.unit.evaluation import toy, toy_store

@@ -17,8 +17,15 @@ from services.evaluation.reporting import (
     ReportPictures,
     write_report,
 )
-from services.evaluation.reporting.charts import Line, Point, agreement_chart, line_chart, ticks
-from services.evaluation.reporting.pictures import data_address, touch_image
+from services.evaluation.reporting.pictures import (
+    Line,
+    Point,
+    agreement_chart,
+    data_address,
+    line_chart,
+    ticks,
+    touch_image,
+)
 from services.evaluation.reporting.sections import clock_rows, error_rows, figure, tiles
 
 rng = np.random.default_rng(11)

@@ -6,7 +6,7 @@ from scipy.stats import mannwhitneyu
 
 from dextouch.errors import ShapeError
 from dextouch.metrics.policy import mmrv, pearson
-from services.evaluation.resampling import (
+from services.evaluation.statistics import (
     area_under_roc_of_draws,
     balanced_accuracy_of_draws,
     mean_of_draws,

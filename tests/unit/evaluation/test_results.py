@@ -5,8 +5,7 @@ import json
 import pytest
 
 from dextouch.errors import StorageError
-from services.evaluation.results import ResultLog
-from services.evaluation.scores import RolloutFailure, RolloutScore
+from services.evaluation.scores import ResultLog, RolloutFailure, RolloutScore
 
 SCORE = RolloutScore("real", "mine", "reach", 3, "abc", success=True, probability=0.75)
 FAILURE = RolloutFailure("real", "mine", "reach", 4, "InvalidInputError", "act raised …", "trace")

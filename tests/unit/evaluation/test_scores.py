@@ -11,8 +11,7 @@ from scipy.stats import binomtest
 from dextouch.errors import InvalidInputError
 from services.evaluation.command_line import print_scores
 from services.evaluation.reporting import ReportPictures, write_report
-from services.evaluation.reporting.latex import latex_tables
-from services.evaluation.reporting.sections import tiles
+from services.evaluation.reporting.sections import latex_tables, tiles
 from services.evaluation.scores import ClosedLoopReport, RolloutFailure, RolloutScore
 
 

@@ -5,8 +5,7 @@ import pytest
 
 from dextouch.clients.policy import Policy, PolicyStart
 from dextouch.errors import InvalidInputError, NonFiniteError, NotFoundError
-from services.evaluation.policies.hold import HoldPolicy
-from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.policies.replay import HoldPolicy, ReplayPolicy
 from tests.unit.evaluation import toy
 
 

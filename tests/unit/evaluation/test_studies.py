@@ -15,13 +15,12 @@ from services.evaluation.checkpoints import save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.endings import read_ending_episode
 from services.evaluation.policies.colour_servo import ColourServo
-from services.evaluation.policies.hold import HoldPolicy
-from services.evaluation.rating.rated_rollouts import rated_rollouts, state_scores
-from services.evaluation.rating.rubrics import Rubric
+from services.evaluation.policies.replay import HoldPolicy
+from services.evaluation.rating.marks import Rubric
+from services.evaluation.rating.rating_queue import rated_rollouts, state_scores
 from services.evaluation.scores import ClosedLoopReport, RolloutFailure, RolloutScore
 from services.evaluation.studies.definition import StudyDefinition, read_definition
-from services.evaluation.studies.engine import StudyParts, run_study
-from services.evaluation.studies.policies import PolicyFactory
+from services.evaluation.studies.engine import PolicyFactory, StudyParts, run_study
 from services.evaluation.studies.results import (
     PlannedRollout,
     StudyHeader,

@@ -9,8 +9,7 @@ from scipy.stats import mannwhitneyu
 
 from dextouch.episodes import split_by_scene
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
-from services.evaluation.judge_network import ClassifierShape
-from services.evaluation.success_classifier import SuccessClassifier
+from services.evaluation.success_classifier import ClassifierShape, SuccessClassifier
 from services.evaluation.success_classifier_data import labelled_endings
 from services.evaluation.success_classifier_training import (
     ClassifierSettings,

@@ -16,13 +16,13 @@ from dextouch.worlds.world import (
     SteppedRollout,
     WorldDescription,
 )
-from services.evaluation.policies.cloning_episodes import (
+from services.evaluation.matched_starts import start_digest
+from services.evaluation.policies.cloning_network import (
     DECISION_STRIDE,
     CloningEpisode,
     Moment,
 )
 from services.evaluation.policies.replay import ReplayPolicy
-from services.evaluation.starts import start_digest
 
 SIZE = 32
 STEPS = 81

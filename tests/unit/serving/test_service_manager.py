@@ -8,9 +8,8 @@ import pytest
 import uvicorn
 
 from dextouch.serving.app import create_service_app
-from dextouch.serving.service_manager import ServiceManager
 from dextouch.serving.settings import ServiceSettings
-from dextouch.serving.workers import DrainingServer
+from dextouch.serving.workers import DrainingServer, ServiceManager
 
 LIMIT_S = 30.0
 

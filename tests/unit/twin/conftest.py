@@ -7,7 +7,7 @@ from services.twin.cameras import HEAD_HOME
 from services.twin.settings import TwinSettings
 from services.twin.simulation import Command
 from services.twin.stage import Stage
-from services.twin.tasks.postures import relaxed
+from services.twin.tasks.task import relaxed
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ from services.twin.cameras import HEAD_HOME, CameraRig
 from services.twin.names import CAMERAS
 from services.twin.scene import compile_scene
 from services.twin.simulation import Command, Simulation
-from services.twin.tasks.postures import relaxed
+from services.twin.tasks.task import relaxed
 
 MARK = (
     '<body name="mark"><freejoint/><geom class="object" type="sphere" size="0.006" '

@@ -13,7 +13,7 @@ from services.twin.episodes import TakeOptions, record
 from services.twin.scene import compile_scene
 from services.twin.simulation import STEPS_PER_GRID, STEPS_PER_TACTILE, Command, Simulation
 from services.twin.stage import _displaced, command_row
-from services.twin.tasks.postures import relaxed
+from services.twin.tasks.task import relaxed
 
 HALF_TURN = np.sqrt(0.5)
 # A box with a drawer that pulls along -y, a door on its right edge, and a ball on the table.

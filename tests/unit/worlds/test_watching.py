@@ -15,10 +15,9 @@ from dextouch.schemas import Doubt, RolloutDoubt, decode_answer
 from dextouch.serving.keys import ApiKey
 from dextouch.streams import unpack
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from dextouch.worlds.records import RecordStore
+from dextouch.worlds.records import RecordStore, RolloutWatch
 from dextouch.worlds.rollouts import RolloutService
 from dextouch.worlds.settings import RolloutLimits
-from dextouch.worlds.watching import RolloutWatch
 from tests.unit.worlds.begun import ALL, START, begin, decoded
 from tests.unit.worlds.fakes import SumWorld, actions
 from tests.unit.worlds.running import served

@@ -12,7 +12,6 @@ from mcap.writer import CompressionType, Writer
 from pydantic import ValidationError
 
 from dextouch import __version__
-from dextouch.bridges.exports import Reader, blocks, exported_samples, new_file
 from dextouch.bridges.mcap.messages import (
     CALIBRATION,
     MessageCodec,
@@ -20,8 +19,9 @@ from dextouch.bridges.mcap.messages import (
     calibration_message,
     descriptor_set,
     raw_encoding,
+    records,
 )
-from dextouch.bridges.mcap.records import records
+from dextouch.bridges.model_grid import Reader, blocks, exported_samples, new_file
 from dextouch.episodes import EpisodeReader, EpisodeStore, EpisodeWriter, Kind
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.images import encode_jpeg

@@ -26,8 +26,7 @@ from dextouch.episodes.care.store_facts import (
 )
 from dextouch.episodes.files import disk_errors, replace_file, try_lock
 from dextouch.episodes.format import Kind, sha256_hex
-from dextouch.episodes.reviews import REVIEW_FILE
-from dextouch.episodes.trash import TRASH, put_into_trash, remove_for_good
+from dextouch.episodes.trash import REVIEW_FILE, TRASH, put_into_trash, remove_for_good
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 
 RECEIPT_VERSION = 1

@@ -8,16 +8,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dextouch.episodes.care.inspection import (
-    UPLOADS,
-    inspect_group,
-    inspect_upload,
-    open_contents,
-)
 from dextouch.episodes.care.salvage import (
     group_streams,
     spool_streams,
     write_salvaged,
+)
+from dextouch.episodes.care.store_facts import (
+    UPLOADS,
+    inspect_group,
+    inspect_upload,
+    open_contents,
 )
 from dextouch.episodes.files import disk_errors, replace_file
 from dextouch.episodes.format import (
@@ -41,8 +41,8 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.spool import read_attributes
-from dextouch.episodes.staged_group import unheld_folders
 from dextouch.episodes.trash import TrashKind, put_into_trash
+from dextouch.episodes.writer import unheld_folders
 from dextouch.errors import ConflictError, CorruptDataError, DexTouchError, StorageError
 from dextouch.schemas import LineageEntry
 

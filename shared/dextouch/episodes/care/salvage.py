@@ -17,7 +17,7 @@ import google_crc32c
 import numpy as np
 import zstandard
 
-from dextouch.episodes.care.inspection import open_contents
+from dextouch.episodes.care.store_facts import open_contents
 from dextouch.episodes.format import (
     GOP_IMAGES,
     STAMPS,
@@ -39,10 +39,8 @@ from dextouch.episodes.shards import (
     decode_rows,
 )
 from dextouch.episodes.sources import LocalFile, LocalGroup
-from dextouch.episodes.spool_log import body_at, find_records, open_log, read_batch
-from dextouch.episodes.spool_seal import read_seal
-from dextouch.episodes.staged_group import new_stage
-from dextouch.episodes.writer import Block, write_blocks
+from dextouch.episodes.spool_log import body_at, find_records, open_log, read_batch, read_seal
+from dextouch.episodes.writer import Block, new_stage, write_blocks
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.schemas import LineageEntry
 from dextouch.streams import StreamDescriptor, check_batch, decode_body, encoded_values
