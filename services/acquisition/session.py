@@ -82,6 +82,8 @@ class SessionCount:
             return None
 
 
+# Calibration record of a glove: tare and gain of its cells, and the cell of each of its taxels.
+
 # In the calibration's map, of a taxel that no cell measures.
 NO_CELL = -1
 

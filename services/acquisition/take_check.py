@@ -27,6 +27,8 @@ from services.acquisition.health.causes import SIMULATED_ADVICE
 from services.acquisition.session import is_ours
 from services.acquisition.supervisor import StreamCounters
 
+# Root cause of what the check of a take found: one sentence and one advice for the operator.
+
 # What the check of the take reports itself, by the code of the health finding behind it.
 IN_THE_CHECK: Final[Mapping[str, tuple[str, ...]]] = {
     "silent": ("gap", "missing_stream"),

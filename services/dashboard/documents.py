@@ -102,6 +102,8 @@ def _anchor(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
 
 
+# Tasks that the recorder offers, with their instructions, goals and reset times, from TOML.
+
 # The twin's tasks.
 DEFAULT_TASKS: Final = Path(__file__).with_name("tasks.toml")
 

@@ -45,6 +45,8 @@ from services.dashboard.station_view import (
 )
 from services.dashboard.upstream import Upstream
 
+# Binary messages of live taxels and poses, and the layout by which the page draws them.
+
 # Of the taxel maps.
 FULL_SCALE_KPA = 40.0
 RAMP_STEPS = 128

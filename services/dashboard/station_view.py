@@ -268,6 +268,8 @@ def _summary(streams: Sequence[StreamView], causes: Sequence[CauseView]) -> str:
     return f"{'1 cause' if len(causes) == 1 else f'{len(causes)} causes'} · {words}"
 
 
+# Where the last saved take is on its way: upload, store and alignment, in one line.
+
 Stage = Literal["saved", "uploading", "refused", "stored", "aligning", "aligned", "failed"]
 
 

@@ -159,6 +159,8 @@ if __name__ == "__main__":
     serve(sys.argv[1])
 
 
+# Completes uploads to a bucket that failed or were interrupted, while the service runs.
+
 logger = structlog.get_logger(__name__)
 
 # Chosen: an operator waits no longer after an outage, and a bucket that is away gets few requests.

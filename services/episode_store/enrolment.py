@@ -265,6 +265,8 @@ def _read(path: Path) -> tuple[StoredEnrolment, ...]:
         ) from error
 
 
+# HTTP routes of the enrolment of stations: tokens, keys for them, and revocation.
+
 SCOPE: Final = "enrol"
 
 

@@ -31,6 +31,10 @@ from services.episode_store.signals import SignalsQuery, reduce_signals
 
 # To be incremented whenever the same query gives other bytes.
 ANSWER_VERSION = 1
+
+
+# HTTP routes for players: extents and gaps of an item, JPEG images of a span, reduced signals.
+
 MAY_READ = Depends(RequireScope("store_read"))
 WINDOW_MSGPACK = "application/vnd.dextouch.window+msgpack"
 # Committed content is immutable but may be deleted: clients must revalidate.
@@ -193,6 +197,8 @@ def is_known(etag: str, known: str | None) -> bool:
     tags = {tag.strip().removeprefix("W/") for tag in known.split(",")}
     return etag in tags or "*" in tags
 
+
+# Robot hands of an episode's actions as points in the world, for 3-D views.
 
 STREAMS: dict[ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
 MAX_STEPS = 10_000

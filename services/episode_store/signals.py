@@ -131,6 +131,9 @@ def _reduction(descriptor: StreamDescriptor, what: str) -> Callable[[np.ndarray]
     return lambda samples: samples[:, index]
 
 
+# Figures of an item's quality by which the items of a task are compared.
+
+
 @dataclass(frozen=True)
 class Figure:
     """A figure that all items may have.
@@ -203,6 +206,11 @@ def _clock_figures(clocks: Iterable[ClockReport]) -> dict[str, float]:
         found["lost_share"] = dropped / offered
     return found
 
+
+# Outliers among items of the same task, by robust z-scores of their figures.
+#
+# The score is 0.6745 (x − median) / MAD, and items above 3.5 are outliers (Iglewicz and Hoaglin,
+# How to Detect and Handle Outliers, 1993).
 
 # MAD of a normal distribution with standard deviation 1 (Iglewicz and Hoaglin, section 3.3).
 MAD_OF_SIGMA: Final = 0.6745

@@ -16,6 +16,8 @@ from dextouch.streams import HEAD_CAMERA
 from services.evaluation.scores import RolloutFailure
 from services.evaluation.study_worlds import WorldAddress
 
+# Digests of first observations, which keep training and evaluation starts disjoint.
+
 
 def start_digest(head_image: np.ndarray, tactile_kpa: np.ndarray) -> str:
     """SHA-256 of a first observation: head camera image [h, w, 3] and taxels [2, 320] in kPa.
@@ -138,6 +140,9 @@ def rollout_failure(
 def _printable(text: str) -> str:
     """Text of a policy's error without lone surrogates, which JSON readers refuse."""
     return text.encode("utf-8", "replace").decode()
+
+
+# Robot episodes with instructions, as every training of this service has them.
 
 
 @runtime_checkable

@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from dextouch.command_line import ProgressLines
 from services.networks.optimizer import Budget, OptimizerLoop, OptimizerOptions
 
+# Progress of a long job on standard error: a bar on a terminal, lines elsewhere.
+
 
 class Progress:
     """A progress bar on a terminal; elsewhere a line at every tenth and every few seconds.

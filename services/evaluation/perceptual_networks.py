@@ -212,6 +212,8 @@ def _resized(images: Float32[Tensor, "n 3 h w"]) -> Float32[Tensor, "n 3 224 224
     return large[..., top : top + _INPUT_PX, left : left + _INPUT_PX]
 
 
+# Prediction metrics that need pretrained networks, by their own definitions or not at all.
+
 Pairs = list[tuple[Scene, Future]]
 # Subfolders of weights that each metric needs.
 FOLDERS: Final[dict[str, tuple[str, ...]]] = {

@@ -131,6 +131,9 @@ def geometry_error(
     return float(np.mean(found)) if found else float("nan")
 
 
+# Baseline image: an earlier image, warped by the camera's known motion over the table.
+
+
 def warp_over_table(
     image: UInt8[np.ndarray, "h w 3"],
     K: np.ndarray,

@@ -348,6 +348,9 @@ def defined(value: float, num_policies: int) -> float | str:
     return value if math.isfinite(value) else undefined_by(num_policies)
 
 
+# Append-only result file: one JSON line per rollout, written when the rollout ends.
+
+
 class ResultLog:
     """Appends rollouts one by one, so that an interrupted study keeps its results.
 

@@ -26,6 +26,8 @@ from services.networks.training_settings import (
     WeightDecay,
 )
 
+# Settings of the trainings of policies and judges; imports no torch, so that they can be shown.
+
 
 class CloningSettings(FrozenModel):
     """Training settings of behaviour cloning."""

@@ -135,6 +135,13 @@ def interval_of_draws(figures: np.ndarray, *, confidence: float = 0.95) -> Inter
     return central_interval(defined, confidence=confidence) if enough else None
 
 
+# Bootstrap of evaluation figures over matched starts, vectorized over all draws.
+#
+# A draw resamples the starts with replacement; all rollouts of a start are drawn together, since
+# they share its objects and errors. Call `start_counts` once and pass its counts to every figure of
+# a table, so that all figures use the same draws. Figures of single rollouts are in
+# `services.evaluation.statistics` and `dextouch.metrics.policy`.
+
 Counts = Float64[np.ndarray, "draws starts"]
 
 
@@ -226,6 +233,14 @@ def mean_of_draws(
     with np.errstate(invalid="ignore"):
         return np.asarray((weight @ np.asarray(values, dtype=np.float64)) / weight.sum(axis=1))
 
+
+# Draws of policies' true scores given a few rollouts: posterior, and hierarchical bootstrap.
+#
+# Ten starts give little information about a policy, and a bootstrap of a correlation is biased:
+# noise in the scores of both worlds shrinks every correlation towards zero, and resampling adds the
+# same noise again. `posterior_scores` models that noise; use it for intervals. `bootstrap_scores`
+# is the baseline, and shows how often a figure is undefined. `python -m benchmarks agreement`
+# measures how often the intervals of both contain the true value.
 
 # Grid of the spread of policies' true scores in each world, and of their correlation; the prior is
 # uniform in both spreads and in artanh of the correlation.

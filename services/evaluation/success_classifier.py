@@ -24,6 +24,8 @@ from services.evaluation.calibration import UNFITTED, Calibration, Combination, 
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_network
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 
+# Features of taxel pressures for small networks: a few numbers per pad.
+
 NUM_PAD_FEATURES = 24
 
 
@@ -48,6 +50,11 @@ def pad_features(tactile_kpa: np.ndarray) -> Float32[np.ndarray, "*batch 24"]:
     features = np.concatenate(parts, axis=-1)
     return features.reshape(*features.shape[:-2], NUM_PAD_FEATURES)
 
+
+# Features of object poses that predict success: heights, axes, relative positions, motion.
+#
+# Success is decided by millimetres within half a metre, so distances enter twice: linearly, and
+# compressed by asinh.
 
 _PAIRS: Final = tuple(combinations(range(MAX_OBJECTS), 2))
 _WIDE_M, _NEAR_M, _STILL_M, _STILL_RAD = 0.1, 0.01, 0.002, 0.05
@@ -127,6 +134,8 @@ def _of_pair(T_world_a: np.ndarray, T_world_b: np.ndarray) -> Float64[np.ndarray
         ]
     )
 
+
+# Network of the success classifier: final image, touch and, where known, object poses.
 
 NUM_TOUCH_FEATURES = 2 * NUM_PAD_FEATURES
 _CHANNELS = (24, 32, 48, 48)

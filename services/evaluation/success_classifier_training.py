@@ -49,6 +49,8 @@ from services.evaluation.success_classifier import (
 )
 from services.evaluation.success_classifier_data import Labelled, labelled_endings, object_scale
 
+# Calibration of a trained success classifier, and its metrics on held-out endings.
+
 # No calibration is fitted with fewer endings of either outcome.
 MIN_OUTCOMES: Final = 5
 # Milestones with a lower area under the ROC curve are not reported by the probe.

@@ -177,6 +177,8 @@ def _body_pose(data: mujoco.MjData, body: int) -> Float64[np.ndarray, "4 4"]:
     return transform_from_pose(np.concatenate([data.xpos[body], data.xquat[body]]))
 
 
+# Appearance of a scene: colours of geoms, light and table, fixed or varied from take to take.
+
 TO_LIGHT: Final = np.array([0.30, -0.40, 0.85])
 AMBIENT: Final = 0.35
 BACKGROUND: Final = np.array([0.16, 0.17, 0.20])

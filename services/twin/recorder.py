@@ -233,6 +233,9 @@ class GridLog:
         )
 
 
+# Times at which a task's milestones are first reached in a take.
+
+
 class EventTimes:
     """Collects the first time of each milestone; those never reached are absent."""
 

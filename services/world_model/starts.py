@@ -120,6 +120,9 @@ def check_geometry(anchor: AnchorPoses, K_head: Float64[np.ndarray, "3 3"]) -> N
         )
 
 
+# Objects of an observed or imagined step, as the start readers of a state model see them.
+
+
 class SceneReader:
     """Finds the objects of requests, for a model that is conditioned on contact geometry.
 

@@ -60,6 +60,8 @@ from services.world_model.rendering.scene_states import SceneState
 from services.world_model.starts import ObservedStart, check_geometry, observed_start
 from services.world_model.state_checkpoints import StateCheckpoint, StateMetadata
 
+# Rollout state of a state model, and its snapshot.
+
 MAX_SNAPSHOT_BYTES = 2**20
 
 

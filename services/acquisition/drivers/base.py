@@ -224,6 +224,8 @@ def check_packet(packet: Packet, *, device: str, source: str | None) -> None:
         )
 
 
+# Numbered 64-byte reports ↔ a packet's bytes, and the decoders of trackers that send them.
+
 REPORT_BYTES = 64
 DATA_REPORT = 0x01
 DESCRIPTOR_REPORT = 0x02

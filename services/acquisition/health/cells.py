@@ -34,6 +34,8 @@ from services.acquisition.health.codes import CODES
 from services.acquisition.health.evaluation import Evaluation, Finding
 from services.acquisition.session import NO_CELL, GloveRecord, mapped_cells
 
+# Share of the neighbours of pressure cells for which something holds, on pads and grids.
+
 
 def neighbour_share(moved: Bool[np.ndarray, "320"]) -> Float64[np.ndarray, "320"]:
     """Share of the up to 8 neighbours on its pad that moved, for each taxel."""

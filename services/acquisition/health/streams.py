@@ -281,6 +281,8 @@ class CameraCheck:
         }
 
 
+# Ring buffers of the newest samples, which wait there for the next evaluation.
+
 # What is kept between two evaluations, which are a second apart.
 KEPT_S = 4.0
 JUDGED_VALUES = ("tactile", "pose", "keypoints")

@@ -380,6 +380,8 @@ def _edited(data: bytes, edits: Sequence[Edit]) -> bytes:
     return data
 
 
+# Ledger of a mock's packets and their faults, against which counters are tested.
+
 FORMAT = "dextouch mock ledger 1"
 # A column of signed 64-bit numbers: 8 bytes a packet, where a list takes 40.
 _numbers = partial(array, "q")

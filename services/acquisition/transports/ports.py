@@ -345,6 +345,8 @@ def unix_transport(path: str) -> SocketTransport:
     return SocketTransport(connect, address=path)
 
 
+# What a device shares with others on its way to this computer: USB hub, network or program.
+
 SYSFS = Path("/sys/class")
 # Kernel classes of the device files that transports open.
 CLASSES = ("tty", "video4linux", "hidraw")

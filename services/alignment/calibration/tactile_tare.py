@@ -244,6 +244,8 @@ def _least_neighbour(moved: Float64[np.ndarray, "time 320"]) -> Float64[np.ndarr
     return np.take_along_axis(around, rank[None, :, None], axis=2)[..., 0]
 
 
+# Conversion of a glove's raw counts to pressures in kPa, and detection of unusable taxels.
+
 # Why a taxel of a take is not measured: what the calibration says, or that it has no reading.
 REASONS = (*STATES, "absent")
 ABSENT = len(STATES)

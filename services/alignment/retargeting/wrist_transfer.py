@@ -214,6 +214,13 @@ def shifted_wrist(
     return Ts
 
 
+# Correction of retargeted joint angles that moves fingertips in contact to the human positions.
+#
+# Retargeting by bone directions gives the same posture, but on a larger hand: around an object its
+# fingertips miss the human contact points. The solver closes pinches; with an object in between,
+# only touch shows which fingertips matter. Those are moved to the human positions, each finger by
+# its own four joints, near the retargeted angles. Fingers without contact are unchanged.
+
 # A few steps converge to micrometres; unreachable positions take more.
 _ITERATIONS: Final = 15
 # Smaller shares would move a fingertip by micrometres only: these fingers are unchanged.
@@ -346,6 +353,13 @@ def _led(
         step = np.linalg.solve(square, wanted[..., None])[..., 0]
         joints = np.clip(joints + step.reshape(-1, NUM_JOINTS), hand.lower_rad, hand.upper_rad)
     return joints
+
+
+# Transfer of a tracked hand to the robot so that it touches where the person did.
+#
+# Retargeting gives the person's posture on a larger hand. Where touch was recorded, the robot's
+# wrist is shifted (`wrist_transfer`) and its touching fingertips are moved (`touch_anchor`), so
+# that the points in contact coincide. Without touch only a constant shift remains.
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,8 @@ from services.alignment.station_calibration.record import (
     write_picture,
 )
 
+# SVG pictures of calibration results: coverage, residuals, rotations, taxel maps.
+
 INK, LINE, GOOD, BAD, FAINT = "#1e293b", "#cbd5e1", "#0f766e", "#c2410c", "#94a3b8"
 _WIDTH, _ROW, _CELL = 480.0, 18.0, 9
 _RESIDUAL_SCALE = 100.0

@@ -23,6 +23,8 @@ from services.alignment.station_calibration.schemas import (
     RunRequest,
 )
 
+# Age and accuracy of everything in a calibration, and what is missing.
+
 # Alignment refuses takes without these, or without those of the recorded gloves.
 NEEDED = ("K_head",)
 LEVELS = {"OK": "green", "WARN": "yellow", "ERROR": "bold red"}

@@ -213,6 +213,8 @@ class CloningNetwork(nn.Module):
         return state[:, _POSES]
 
 
+# Training episodes of behaviour cloning: successful robot episodes at decision steps only.
+
 # Training uses every such step; an evaluation with chunks of 16 decides at every second of them.
 DECISION_STRIDE: Final = SLOT_STEPS
 # What an episode of a cloned policy must have.

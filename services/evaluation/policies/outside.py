@@ -19,6 +19,8 @@ from dextouch.errors import InvalidInputError, NotFoundError, ShapeError, Unknow
 from dextouch.hands.actions import ACTION_DIM, check_actions
 from dextouch.schemas import Observation, WorldDescription
 
+# Calls into policy code, with validation of results and errors that name the policy.
+
 # Frames cut from tracebacks: this file and the import machinery.
 _OUR_FRAMES = (__file__, "<frozen importlib", importlib.__file__)
 

@@ -86,6 +86,9 @@ class ReplayPolicy:
         return self._playing[np.minimum(wanted, len(self._playing) - 1)]
 
 
+# Hold policy: keeps the hands where they are; the weakest baseline.
+
+
 class HoldPolicy:
     """Keeps the pose of the first observation.
 

@@ -152,6 +152,8 @@ class MarkLog:
         return connection
 
 
+# Rubrics: criteria with points by which a rollout is scored, the same for people and the twin.
+
 BUNDLED: Final = Path(__file__).with_name("rubrics.toml")
 _NAME: Final = r"^[a-z][a-z0-9_]{0,63}$"
 

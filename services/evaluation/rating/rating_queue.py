@@ -132,6 +132,8 @@ def _order(rater: str, episode_id: str) -> str:
     return hashlib.sha256(f"{rater}/{episode_id}".encode()).hexdigest()
 
 
+# Rollouts of an episode store as raters see them: prompts, and pictures of image and touch.
+
 IMAGE_HEIGHT_PX: Final = 384
 _BACKGROUND: Final = 24
 

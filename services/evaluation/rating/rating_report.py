@@ -18,6 +18,11 @@ from services.evaluation.statistics import (
     start_counts,
 )
 
+# Agreement between raters: Krippendorff's alpha, intraclass correlation, bias of each rater.
+#
+# Ratings are arrays [rollouts, raters] with NaN where a rater did not rate. Read alpha first: below
+# 0.667 even tentative conclusions are not supported (Krippendorff, Content Analysis, 2004, p. 241).
+
 Level = Literal["nominal", "interval"]
 LEAST_ALPHA: Final = 0.667
 

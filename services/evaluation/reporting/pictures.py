@@ -106,6 +106,8 @@ def touch_image(tactile_kpa: np.ndarray, *, scale: int = 3) -> UInt8[np.ndarray,
     return both.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
+# Small SVG charts that take their colours from the page, and pictures that stand alone.
+
 MAX_POINTS = 600
 NUM_STYLES = 8
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 10, 36
@@ -281,6 +283,8 @@ def _svg(body: Sequence[str], axes: _Axes, title: str) -> Markup:
     )
 
 
+# Charts and image strips of the report.
+
 # S2 of every finger is abduction; the other three joints are flexion.
 _FLEXION_HINGES = [0, 2, 3]
 
@@ -416,6 +420,9 @@ def strips(pictures: ReportPictures) -> list[Strip]:
         predicted = moments(p.times_s, p.predicted_images, p.predicted_tactile_kpa)
         found.append(Strip(p.title, "prediction", [("true", true), ("predicted", predicted)]))
     return found
+
+
+# Report pictures of stored episodes.
 
 
 def episode_picture(reader: EpisodeReader, *, num_moments: int = 8) -> EpisodePicture:

@@ -326,6 +326,11 @@ def _agreement_tile(name: str, key: str, what: str, tasks: Sequence[Mapping[str,
     return Tile(name, value, f"{what}, {len(defined)} of {len(tasks)} tasks; {interval}")
 
 
+# LaTeX tables of a study: success rates by policy and world, and agreement by world.
+#
+# They have the form of tables `policy_evaluator` and `wm_real_corr` of the paper, and need the
+# packages booktabs and multirow.
+
 _ESCAPED: Final = {letter: rf"\{letter}" for letter in "#$%&_{}"} | {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",

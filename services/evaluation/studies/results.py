@@ -242,6 +242,8 @@ def _refuse_others(path: Path, old: Mapping[str, str], new: Mapping[str, str]) -
         )
 
 
+# Rollouts of a study as episodes, to be played, rated or trained on.
+
 _ORIGINS: Final[dict[str, Origin]] = {"twin": "twin", "robot": "recorded"}
 
 

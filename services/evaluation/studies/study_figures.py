@@ -285,6 +285,8 @@ def _agreed(
     )
 
 
+# Reports of a study: JSON, a page for each imagined world, and LaTeX tables.
+
 REPORT_FILE: Final = "report.json"
 TABLES_FILE: Final = "tables.tex"
 

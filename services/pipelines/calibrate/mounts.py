@@ -203,6 +203,9 @@ def _with_photos(poses: dict[str, np.ndarray], options: argparse.Namespace) -> P
     )
 
 
+# Command `dextouch station calibrate show`: contents, age and sigma of a calibration.
+
+
 def show(options: argparse.Namespace, *, now: datetime | None = None) -> dict[str, object]:
     """Print every calibration with age and sigma, and return them as data."""
     matrices = load(options.folder)

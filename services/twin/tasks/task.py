@@ -87,6 +87,8 @@ class Task(Protocol):
         ...
 
 
+# Hand orientations and postures shared by several tasks.
+
 # R_world_wrist with fingers forward (world +y) and the palm down, for the right and left hand.
 PALM_DOWN: Final = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
 PALM_DOWN_LEFT: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

@@ -19,6 +19,8 @@ from dextouch.tactile.layout import NUM_TAXELS
 from services.networks.principal_axes import principal_axes, root_pressure
 from services.world_model.dynamics.members import mapped
 
+# Hand and head camera motion in the world for given actions; the input of the core.
+
 # Of each hand: the wrist, five fingertips, five PIP joints, and the middle of the palm.
 NUM_POINTS: Final = 12
 
@@ -81,6 +83,12 @@ def hand_motion(
     )
 
 
+# Contact geometry: hand points relative to the surface of every object at its present pose.
+#
+# Success is decided within millimetres, which a wrist pose relative to its own start does not
+# resolve. Distances are compressed by asinh(d / 1 cm), so that a millimetre near an object and a
+# decimetre far from it both change a feature by about a tenth. The scale is the same for all tasks.
+
 NEAR_M = 0.01
 # Features are computed at these of the four steps of a latent: hands may shake within one.
 LOOKS = (1, 2, 3, 4)
@@ -123,6 +131,8 @@ def slot_features(
     each = compressed(torch.cat([distance, from_middle, offset], dim=-1))
     return each.permute(0, 2, 4, 1, 3, 5).flatten(3)
 
+
+# Configuration of start readers and recurrent cores; stored in every checkpoint of them.
 
 # Largest number of objects of a task; unused slots are masked.
 # What models of older releases know.
@@ -169,6 +179,9 @@ class DynamicsConfig(FrozenModel):
         return self
 
 
+# Commanded motion of both hands, sampled for the recurrent core.
+
+
 @dataclass(frozen=True)
 class Commands:
     """Motion of both hands at the sampled steps of each latent.
@@ -211,6 +224,8 @@ class Commands:
         """The single latent step, with resting hands, that starts a rollout (one step each)."""
         return cls.of([motion[np.zeros(STEPS_PER_LATENT, dtype=np.int64)] for motion in motions])
 
+
+# Object poses of a scene as network tensors: a position and two axes per slot.
 
 # Objects farther than this from the world's origin count as absent.
 MAX_DISTANCE_M = 1.0
@@ -306,6 +321,8 @@ def _unit(vectors: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > _SHORTEST, vectors / np.maximum(length, _SHORTEST), otherwise)
 
+
+# Linear codec of a hand's taxels for the core: principal axes of the root of pressure.
 
 # Pads with a lower peak pressure count as free when contact is learned.
 FREE_KPA = 2.0

@@ -10,6 +10,8 @@ from jaxtyping import Float32
 from torch import Tensor, nn
 from torch.nn import functional
 
+# Operations on all tensors of a dataclass, also of dataclasses within it.
+
 Part = TypeVar("Part")
 
 
@@ -64,6 +66,13 @@ def unfolded(part: Part, members: int) -> Part:
 def stacked(parts: Sequence[Part]) -> Part:
     """Parts stacked along a new first axis."""
     return combined(parts, torch.stack)
+
+
+# Layers with separate weights for every member of an ensemble, computed for all members at once.
+#
+# Inputs and outputs have one batch axis in which each member's entries follow each other, all
+# members with equally many. At the sizes of a single rollout a small network takes as long as its
+# number of operations, so that an ensemble costs about as much as one of its members.
 
 
 class MemberLinear(nn.Module):

@@ -34,6 +34,11 @@ from services.world_model.dynamics.members import folded, stacked, unfolded
 from services.world_model.dynamics.start_reader import FirstStep, Reading, StartReader
 from services.world_model.dynamics.traces import Traced
 
+# Detection of resting hands and resting scenes, per latent step.
+#
+# Counting latent steps instead of chunks makes the result independent of how a client splits its
+# commands into chunks.
+
 # Hands that move less than this between latent steps count as still.
 STILL_M = 1e-4
 # After this many still latent steps (2 s) the scene counts as settled.

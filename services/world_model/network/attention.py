@@ -16,6 +16,11 @@ from dextouch.hands.actions import unpack_action
 from dextouch.hands.robot_hand import RobotHand
 from services.world_model.network.configuration import FRAMES_PER_LATENT
 
+# Per-hand features of 67-D actions, with the left hand mirrored into the right-hand frame.
+#
+# In the wrist frame fingers point along -z, the thumb along +x; the right palm faces +y, the left
+# -y. So the mirror image of a left hand is y → -y; in the head camera's optical frame it is x → -x.
+
 HAND_DIM = 29
 CAMERA_DIM = 9
 MIRROR_WRIST = np.array([1.0, -1.0, 1.0])
@@ -63,11 +68,20 @@ def camera_features(actions: np.ndarray) -> Float64[np.ndarray, "*batch 2 9"]:
     return np.stack([mirrored, camera], axis=-2)
 
 
+# Splitting one axis of a tensor into several.
+
+
 def split_axis(tensor: Tensor, axis: int, sizes: tuple[int, ...]) -> Tensor:
     """Split one axis into several; one size may be -1. Typed, unlike `Tensor.unflatten`."""
     axis = axis % tensor.ndim
     return tensor.reshape(*tensor.shape[:axis], *sizes, *tensor.shape[axis + 1 :])
 
+
+# Rotary positions in three dimensions, as in Wan2.2: latent time, row and column.
+#
+# Tactile tokens lie on the time axis of the video, at a quarter of a latent per step, so that step
+# 4j has the time of latent j, which ends with it. They have no place in the image; their row and
+# column are 0.
 
 _THETA = 1e4
 
@@ -107,6 +121,12 @@ def rotate(
     turned = torch.stack([first * cos - second * sin, first * sin + second * cos], dim=-1)
     return turned.flatten(-2).to(heads.dtype)
 
+
+# Cross-attention from tokens to the actions that they depend on, an alternative to AdaLN.
+#
+# Dual rate (equation 4 of the paper): tokens of video latent j attend to the actions 4j-3 … 4j,
+# those of tactile step t to action t, and those of index 0 to nothing. Every action is three
+# tokens: own hand, other hand and camera.
 
 PART_DIMS = [HAND_DIM, HAND_DIM, CAMERA_DIM]
 
@@ -164,6 +184,11 @@ class ActionAttention(nn.Module):
         )
         return self.to_out(attended.transpose(1, 2).flatten(2)).reshape(tokens.shape)
 
+
+# Joint transformer layer of both experts.
+#
+# Mixture-of-Transformers: each stream has its own projections, norms, modulation and feed-forward
+# network; only the attention is shared, over the tokens of both.
 
 NUM_MODULATIONS = 6
 

@@ -19,6 +19,12 @@ from dextouch.errors import InvalidInputError
 from services.world_model.network.attention import JointLayer, KeysValues, Stream
 from services.world_model.network.configuration import Sampler
 
+# Solvers of the flow: how a sample moves from one time to the next, given predictions of x_0.
+#
+# Both write a step with the share `keep` = t' / t of the noisy sample that remains. For straight
+# paths that is the exact solution for a constant prediction, without a logarithm, so that t = 1 and
+# t' = 0 are exact.
+
 # UniPC's half log-odds of data are infinite at t = 1; the same bound as in diffusers.
 _MAX_TIME = 1.0 - 1e-6
 
@@ -204,6 +210,13 @@ def sample(
         video = of_video.step(video, guess_video, t, t_next)
         tactile = of_tactile.step(tactile, guess_tactile, t, t_next)
     return video, tactile
+
+
+# Clean tokens of a chunk, computed once for all steps of the sampler.
+#
+# Clean tokens (first latent frame and first touch) attend to each other only and have flow time 0,
+# so that in every layer their keys and values are the same at every step. Noisy tokens attend to
+# these and to each other, which needs no mask.
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,12 @@ from services.world_model.network.attention import (
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
 from services.world_model.network.instruction import instruction_ids
 
+# Contact geometry as a condition of the joint model: hand points relative to the objects' boxes.
+#
+# The same features that the state model's core receives (`services.world_model.dynamics.features`),
+# for the objects as they lie at the first step of a window: millimetres decide contact, which
+# pixels of a centimetre and actions relative to each hand's own start do not show.
+
 _PER_SLOT = SLOT_SIZE // len(LOOKS) + 6 + 1
 # Of a hand: every slot's features, its box and whether it holds an object; and the side.
 GEOMETRY_SIZE = MAX_OBJECTS * _PER_SLOT + 1
@@ -91,6 +97,11 @@ def contact_geometry(
     side = torch.tensor([-1.0, 1.0])[None, :, None].expand(steps, -1, -1)
     return torch.cat([slots.flatten(2), side], dim=-1).numpy()
 
+
+# Raster of both hands in the head image, drawn from the poses and joint angles of a window.
+#
+# The paper conditions by AdaLN alone; the raster of the projected hands is an addition. It shows
+# the network, to within about one cell, where in the image the hands will be.
 
 # Standard deviation of a point's Gaussian blot, in raster cells.
 BLOT_CELLS = 1.0

@@ -22,6 +22,11 @@ from services.networks.principal_axes import principal_axes, root_pressure, root
 from services.world_model.network.attention import split_axis
 from services.world_model.network.configuration import NetworkConfig
 
+# Interface of tactile tokenizers, which turn the pressures of a hand into tokens and back.
+#
+# All of them work on the square root of pressure, which gives light touch more weight, and are
+# frozen while a world model is trained on their latents. `NetworkConfig.tokenizer` chooses one.
+
 # For checkpoints without a stored training peak: twice the peak of eight demonstrations of the
 # twin's first two tasks.
 UNKNOWN_PEAK_KPA = 200.0
@@ -70,6 +75,11 @@ class TactileTokenizer(nn.Module, ABC):
         return torch.minimum(tactile_kpa, highest_kpa[:, None, None, None])
 
 
+# Learned tactile tokenizers: what Split-Hands and Grid share.
+#
+# `dextouch train tokenizer` trains one, and the paper's form of the world model uses it
+# (`dextouch train world-model --preset paper --tokenizer PATH`).
+
 NUM_PADS = 6
 
 
@@ -116,6 +126,12 @@ class LearnedTokenizer(TactileTokenizer):
         """Root pressures (√kPa), which the loss compares; values may be below zero."""
         flat = latents.reshape(-1, self.num_tokens * self.channels)
         return split_axis(self.decode_roots(flat), 0, latents.shape[:-2]) * self.root_scale
+
+
+# Convolutional autoencoder of pressure maps, the building block of learned tokenizers.
+#
+# Layers have no biases and embeddings multiply features instead of being added, so that an
+# untouched map is the zero latent and the zero latent an untouched map, whatever the weights are.
 
 
 @dataclass(frozen=True)
@@ -226,6 +242,13 @@ def _convolution(in_width: int, out_width: int, *, stride: int = 1) -> nn.Conv2d
     return nn.Conv2d(in_width, out_width, 3, stride=stride, padding=1, bias=False)
 
 
+# Grid tokenizer: palm and fingertips on one canvas under one network, the paper's baseline.
+#
+# On the canvas of 20 by 20 cells, rows 0 to 3 hold the fingertips side by side, thumb to little
+# finger in columns 0 to 19. Rows 4 to 18 hold the palm in columns 2 to 17. The other 80 cells are
+# empty. Inside every pad rows run from distal to proximal and columns from radial to ulnar. The
+# canvas makes neighbours of taxels that are far apart on the hand.
+
 CANVAS_SHAPE = (20, 20)
 _PALM_COLUMN = 2
 
@@ -265,6 +288,14 @@ class GridTokenizer(LearnedTokenizer):
         return self.decoder(latents[:, None]).flatten(1)[:, self._cells]
 
 
+# Split-Hands tokenizer of the paper: fingertips and palm apart, by their physical topology.
+#
+# All ten fingertips share one encoder and both palms another. An identity embedding tells the pads
+# apart, and an embedding of the position the taxels of a pad. A hand is one token per pad
+# (`tactile_tokens` "pad", as in the paper) or all of them in one token ("hand", several times
+# cheaper in the world model); the weights are the same.
+
+
 class SplitHandsTokenizer(LearnedTokenizer):
     """One autoencoder for fingertips, one for palms."""
 
@@ -293,6 +324,11 @@ class SplitHandsTokenizer(LearnedTokenizer):
         tips = self.tip_decoder(pads[:, :NUM_FINGERTIPS]).flatten(1)
         return torch.cat([tips, self.palm_decoder(pads[:, NUM_FINGERTIPS:]).flatten(1)], dim=1)
 
+
+# Principal-axes tokenizer: one token per hand in closed form, the default of the world model.
+#
+# Tips keep all sixteen values, palms their strongest axes. It is fitted in a second and loses
+# little touch, but learns nothing about the hand; `services.world_model.network.split_hands` does.
 
 # Amplitude of palms relative to that of tips; the best value in an ablation on touch.
 PALM_SCALE = 0.7
@@ -340,6 +376,9 @@ class PrincipalAxesTokenizer(TactileTokenizer):
         tips = latents[..., 0, :NUM_TIP_TAXELS] * self.tip_scale
         palm = (latents[..., 0, NUM_TIP_TAXELS:] * self.palm_scale) @ self.palm_basis.T
         return torch.cat([tips, palm], dim=-1).clamp_min(0.0).square()
+
+
+# Tactile tokenizer of a network configuration.
 
 
 def build_tokenizer(config: NetworkConfig) -> TactileTokenizer:

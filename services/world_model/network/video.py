@@ -51,6 +51,9 @@ if TYPE_CHECKING:
     from diffusers import WanTransformer3DModel
 
 
+# Video expert: embeds video latents for the joint layers and predicts clean ones.
+
+
 class VideoExpert(nn.Module):
     """Visual stream: `tokens_per_latent` tokens per latent frame; the first frame is clean."""
 
@@ -130,6 +133,13 @@ class VideoExpert(nn.Module):
         grid = split_axis(split_axis(groups, 5, cells), 4, cells)
         # [B, L, 4, 2, rows, 4, cols, 4] -> [B, L, rows, cols, 4, 2, 4, 4]
         return grid.permute(0, 1, 4, 6, 2, 3, 5, 7).flatten(4).flatten(2, 3)
+
+
+# Visual codec: latent tokens of 1 + 4k images by principal axes of 8×8×4 patches.
+#
+# The first image forms a group of its own (repeated four times), followed by groups of four, as in
+# causal video autoencoders. Closed form: fitted once on training images, then frozen in the
+# checkpoint.
 
 
 class VisualCodec(nn.Module):
@@ -224,6 +234,12 @@ def to_uint8(images: Float32[Tensor, "..."]) -> UInt8[Tensor, "..."]:
     return (images * 255.0).round().clamp(0, 255).to(torch.uint8)
 
 
+# Visual codec of the full-size model: the video autoencoder of Wan2.2, frozen.
+#
+# It maps 1 + 4k images to 1 + k latent frames of 48 channels at a sixteenth of the resolution. It
+# is causal: a latent frame depends on earlier images only, and an image on earlier latents only.
+
+
 class WanVideoCodec(nn.Module):
     """Latent tokens, two by two latents each, with mean 0 and deviation 1 by channel."""
 
@@ -275,6 +291,14 @@ def _statistics(
     values = (like.new_tensor(constant).view(-1, 1, 1, 1) for constant in (LATENT_MEAN, LATENT_STD))
     mean, std = values
     return mean, std
+
+
+# Video side of the full-size model: the transformer of Wan2.2 around the shared attention.
+#
+# Equal to diffusers' `WanTransformer3DModel` if there are no tactile tokens and no actions. Each
+# latent frame has its own time, 0 for the clean first one, so modulations are computed per latent
+# frame, not per token. Actions are added to the embedding of the time, with an effect of zero
+# before training.
 
 
 @dataclass(frozen=True)
@@ -463,6 +487,12 @@ class WanVideoExpert(nn.Module):
         normed = self.norm_out(tokens.float()) * (1.0 + scale) + shift
         predicted: Tensor = self.proj_out(normed.to(tokens.dtype)).float()
         return predicted
+
+
+# Video side of the joint model by its configuration: a small one, or the transformer of Wan2.2.
+#
+# Both give a codec, a condition, an expert and the expert's blocks with the same methods, so that
+# the joint model and its training know only one.
 
 
 class TinyVideoSide:

@@ -312,6 +312,9 @@ def _camera_change(positions: Float32[np.ndarray, "n h w 2"]) -> Float64[np.ndar
     return np.asarray((farthest / _CAMERA_MOVED_PX).clip(0, 1)[:, None, None, None])
 
 
+# Training clips of the renderer: images of an episode with the states they show.
+
+
 @dataclass(frozen=True)
 class SceneClip:
     """Images of one episode at `steps`, with the ground-truth state at each of them.

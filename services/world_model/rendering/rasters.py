@@ -14,6 +14,11 @@ from dextouch.hands.robot_hand import chain_points_of_both_m
 from services.world_model.rendering.configuration import Interpolation
 from services.world_model.rendering.scene_states import SceneStates
 
+# Ray casting of objects as bounding boxes; the nearest box wins.
+#
+# Hits take their colour from the start image: the point moves with its object back to its pose at
+# the start and is projected there.
+
 # Minimum half size of a box; thinner boxes are drawn this thick.
 MIN_HALF_M = 1e-3
 # Points nearer along the optical axis are neither hit nor visible.
@@ -163,6 +168,11 @@ def colours_at_positions(
     lower += layers[owner, :, v_next, u_next] * right[:, None]
     return np.asarray(upper * (1 - down)[:, None] + lower * down[:, None])
 
+
+# Drawing of both hands as coloured bones, by splatting points of the kinematic chains.
+#
+# Each bone is a ribbon of points that faces the camera; a point keeps the colour of its position in
+# the start image. A soft depth test resolves occlusion.
 
 MIN_DEPTH_M = 0.05
 # Radii of drawn bones and forearms, and the length of the forearm drawn behind the wrist.
@@ -348,6 +358,11 @@ def _taps(
     return np.concatenate(places), np.concatenate(weights), np.tile(source, 4)
 
 
+# Image motion caused by a known motion of the head camera over the table.
+#
+# Pixels of the table plane (z = 0 in the world) move by a homography; rays that meet the plane
+# beyond `FAR_M`, or never, move as if they came from infinity.
+
 FAR_M = 20.0
 # A camera nearer to the plane than this sees it edge-on.
 MIN_HEIGHT_M = 1e-3
@@ -456,6 +471,8 @@ def is_inside(
     u, v = positions[..., 0], positions[..., 1]
     return np.asarray((u >= 0) & (u <= width) & (v >= 0) & (v <= height))
 
+
+# Image motion of hands and objects relative to the start image warped by the camera motion.
 
 # A body shifted less than the first against the warped image is still, one shifted more than the
 # second has moved; in between its motion share is interpolated.

@@ -27,6 +27,8 @@ from services.world_model.training.augmentation import as_another_camera
 from services.world_model.training.averaging import OnStep, train_averaged
 from services.world_model.training.scene_table import MEASURED_ERROR_M, SceneTable
 
+# Training of a start reader on steps whose object poses are known.
+
 _UNIT_M = 0.05
 _FIT_EPISODES = 1000
 # Largest standard deviation of the logarithm of a size.

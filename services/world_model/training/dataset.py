@@ -32,6 +32,12 @@ from dextouch.schemas import ActionKind, Domain
 from dextouch.streams import HEAD_CAMERA
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
 
+# Random training windows of episodes in memory, as requests and targets.
+#
+# Episodes are read once and cut with the same re-anchoring as in the store's reader, so that an
+# epoch reads nothing from disk. `services.world_model.training.streaming` provides the same windows
+# for episodes that stay on disk.
+
 
 @dataclass(frozen=True)
 class WindowPosition:
@@ -318,6 +324,8 @@ class WindowSampler:
         )
 
 
+# Episodes of a store in memory, and subsets of them by their content.
+
 # What an episode must have for windows to be cut from it.
 CUT: Final = (needs.EVERY_IMAGE,)
 
@@ -374,6 +382,11 @@ def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> Episo
         boxes_m=boxes_m,
     )
 
+
+# Streaming dataset: reads windows from disk when they are needed.
+#
+# For data larger than memory. A window is read through the store's reader, which decodes one camera
+# and only the span of the window.
 
 # Open readers per process; each holds an episode's timestamps and actions.
 MAX_OPEN_READERS = 512

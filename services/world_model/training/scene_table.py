@@ -461,6 +461,9 @@ def _checked_tracks(episodes: Sequence[EpisodeGrid], config: DynamicsConfig) -> 
     return tracks
 
 
+# Conversion of episodes with object poses to training clips of the renderer.
+
+
 def scene_clips(episodes: Sequence[EpisodeGrid]) -> list[SceneClip]:
     """Clips of the images of which all objects are known, where an episode has two or more."""
     clips = []

@@ -49,6 +49,8 @@ from services.world_model.tokenizer_files import (
 from services.world_model.tokenizer_settings import TrainTokenizerSettings
 from services.world_model.training.dataset import E, TrainingEpisode
 
+# Touch of single hands from episode stores, to train and evaluate tactile tokenizers.
+
 # By scene: the touch of each episode, and its content.
 _Side = dict[str, list[tuple[np.ndarray, str]]]
 
@@ -266,6 +268,9 @@ def _ms_per_1000_hands(tokenizer: TactileTokenizer, hands: TactileHands) -> floa
         _through(tokenizer, batch)
         times_ms.append(1000 * (time.process_time() - begin_s))
     return float(np.median(times_ms))
+
+
+# Pretrained tactile tokenizer of a training run, which stays frozen while the experts train.
 
 
 def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokenizer | None]:

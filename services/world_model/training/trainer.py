@@ -64,6 +64,8 @@ from services.world_model.training.training_state import (
 from services.world_model.training_set import learned_tasks
 from services.world_model.wan.configuration import WanFiles
 
+# One training run of the joint model: its network, weight average, optimizer and clock.
+
 LOG_EVERY_STEPS = 20
 MIN_LEARNING_RATE_SHARE = 0.01
 

@@ -26,6 +26,11 @@ if TYPE_CHECKING:
     from diffusers import AutoencoderKLWan, WanTransformer3DModel
 
 
+# Tensor names of the Wan2.2 networks in their original files and in diffusers, mapped both ways.
+#
+# A rule is a pair of names, original and diffusers; `#` stands for a number and `*` for the last
+# part of a name. Every tensor has exactly one rule, so that the same table works both ways.
+
 Rules = tuple[tuple[str, str], ...]
 Layout = Literal["original", "diffusers"]
 
@@ -284,6 +289,9 @@ def _checked_names(
                 "of another size"
             )
     return names
+
+
+# The Wan2.2 networks of diffusers without memory for their weights, which come from files.
 
 
 def empty_transformer(

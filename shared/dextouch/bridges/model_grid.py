@@ -149,6 +149,8 @@ def _store_images(writer: EpisodeWriter, name: str, camera: GridImages, unit: Im
         pass
 
 
+# What exporters share: iteration over samples in bounded memory, and a file that appears whole.
+
 Reader = EpisodeReader | RecordingReader
 BLOCK_SECONDS: Final = 1.0
 

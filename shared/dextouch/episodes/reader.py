@@ -20,6 +20,8 @@ from dextouch.schemas import ActionKind, EpisodeAttributes, RecordingAttributes,
 from dextouch.streams import HEAD_CAMERA, SampleBatch, pack, unpack
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
+# Windows of an episode, resampling to the model grid, and their form on the wire (msgpack).
+
 # Stamps of one instant may differ by rounding.
 SAME_INSTANT_NS = 1_000
 _IMAGES, _IMAGE_DT = "images/", "image_dt_ns/"

@@ -374,6 +374,12 @@ class ShardWriter:
             write_all(self._file, data)
 
 
+# Zarr-python codecs `dextouch.jpeg` and `dextouch.h264`, for reading image arrays.
+#
+# zarr-python finds them through this package's entry points. They only decode; writing goes through
+# `EpisodeWriter`.
+
+
 @dataclass(frozen=True)
 class _ImageCodec(ArrayBytesCodec):
     """Decodes image chunks to uint8 [n, h, w, 3]; padding rows are zero."""

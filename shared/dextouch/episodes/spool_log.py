@@ -317,6 +317,8 @@ def trusted_records(folder: Path, records: LogRecords) -> LogRecords:
     return replace(records, rows=records.rows[:num_rows])
 
 
+# Checksums of a spool: of its attributes, and the seal that shows what a closed spool has lost.
+
 RECORDING_FILE: Final = "recording.json"
 CLOSED_FILE: Final = "closed"
 # The last member of `recording.json`: of the bytes before it, closed by a brace.

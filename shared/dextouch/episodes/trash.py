@@ -141,6 +141,11 @@ def _home(kind: TrashKind) -> str:
     return HOMES[kind]
 
 
+# What people say of stored items, kept beside their content: reviews, and clicks on objects.
+#
+# Each is a file of the item's group. It is no part of the content, so it may change, and it goes
+# where the item goes: to the trash, back, and away for good.
+
 REVIEW_FILE: Final = "review.json"
 CLICKS_FILE: Final = "clicks.json"
 # All files beside the content.

@@ -48,6 +48,10 @@ from dextouch.streams import (
 )
 from dextouch.system_files import is_system_file
 
+# A stage: the folder in which a group is written, and its commit to the final place.
+#
+# What an interrupted writer leaves of a stage is never read: a sweep removes it.
+
 STAGING = ".staging"
 
 

@@ -95,6 +95,12 @@ def _chain(
     return np.array(base_m) + np.concatenate([np.zeros((1, 3)), steps])
 
 
+# Mapping of a hand tracker's nodes, in any order and naming, to our 25 keypoints.
+#
+# Node ids are opaque and orders differ even between products of one manufacturer, so nodes are
+# identified by chain and joint. Joint names differ as well, and some are shifted by one joint; the
+# names of a chain are interpreted together.
+
 Node = tuple[str, str]
 
 # Nodes that trackers without metacarpals lack (MediaPipe: 21 nodes).

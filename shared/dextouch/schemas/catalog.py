@@ -212,6 +212,9 @@ class HoursByField(FrozenModel):
     rows: tuple[HoursOf, ...]
 
 
+# Schemas for playing recordings and episodes: their streams, extents and gaps.
+
+
 class PlayedStream(FrozenModel):
     """A stream on the item's clock; `gaps_ns` are the longest gaps in order of time.
 

@@ -61,6 +61,8 @@ class StationEnrolments(FrozenModel):
     needs_key: bool
 
 
+# Bodies by which a station asks the store which of its spooled takes were deleted.
+
 # Reason of the store's ConflictError for a take that was deleted: the station removes it.
 TAKE_DELETED = "take_deleted"
 # And for one that began after its operator was deleted, which a person has to judge.

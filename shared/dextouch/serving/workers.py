@@ -20,6 +20,10 @@ from uvicorn.supervisors import Multiprocess
 
 from dextouch.errors import DexTouchError, UnavailableError
 
+# Messages of a service to systemd: ready, stopping, and a watchdog that only a working one feeds.
+#
+# The protocol is sd_notify(3): datagrams to the socket that NOTIFY_SOCKET names.
+
 logger = structlog.get_logger(__name__)
 
 IsWorking = Callable[[], bool]

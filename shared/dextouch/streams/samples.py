@@ -225,6 +225,8 @@ def check_encoded_image(descriptor: StreamDescriptor, data: object, *, where: st
         raise ShapeError(f"{where} is {size} pixels, expected {descriptor.shape[:2]}")
 
 
+# Limits of what a stream may deviate, the same in live health and in the review of takes.
+
 # Deviation from the nominal rate, and so the share of a take's steps that may be missing.
 RATE_WARN: Final = 0.02
 RATE_ERROR: Final = 0.10

@@ -27,6 +27,8 @@ from dextouch.worlds.routes import ChunkShortcut, rollout_router, watch_router
 from dextouch.worlds.settings import WorldServiceSettings
 from dextouch.worlds.world import World
 
+# Prometheus metrics of the worlds of a process: queues, rollouts and sizes of batches.
+
 
 class WorldMetrics(Collector):
     """Shows a process's rollouts."""

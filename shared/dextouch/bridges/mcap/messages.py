@@ -345,6 +345,8 @@ def _type(name: str) -> FieldDescriptorProto.Type.ValueType:
     return FieldDescriptorProto.Type.Value(f"TYPE_{name.upper()}")
 
 
+# Record-by-record reading of untrusted MCAP files, with bounded allocations.
+
 MAX_RECORD_BYTES: Final = 1 << 28
 MAGIC: Final = b"\x89MCAP0\r\n"
 _WANTED = (Attachment, Channel, DataEnd, Message, Metadata, Schema)

@@ -34,6 +34,10 @@ from dextouch.errors import NotFoundError, StorageError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 from dextouch.system_files import is_system_file
 
+# Full inspection of a store: all damage by item, array and storage chunk, foreign files, stages.
+#
+# A reader stops at the first damage; an inspection continues and lists all of it.
+
 UPLOADS = HOMES["upload"]
 Group = GroupContents[EpisodeAttributes] | GroupContents[RecordingAttributes]
 # Called after every storage chunk with the number of bytes read.
