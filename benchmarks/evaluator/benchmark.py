@@ -4,9 +4,8 @@ import argparse
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,6 +30,7 @@ from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
+from dextouch.worker_pool import worker_pool
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE, EARLY_POLICY
 from services.twin.scripted_actions import mistake_of
 from services.twin.tasks import EVALUATED
@@ -269,8 +269,7 @@ def _results(
         for task, seed, missing in units:
             yield unit_rows(plan, task, seed, missing), f"{task} {seed}"
         return
-    # A fresh interpreter: a forked one would share the threads of torch.
-    with ProcessPoolExecutor(num_jobs, mp_context=get_context("spawn")) as pool:
+    with worker_pool(num_jobs) as pool:
         running = {pool.submit(unit_rows, plan, *unit): unit for unit in units}
         for done in as_completed(running):
             task, seed, _ = running[done]

@@ -5,10 +5,9 @@ Three disjoint sets of episodes: training, development (to calibrate the probabi
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
-from multiprocessing import get_context
 from typing import Final
 
 import numpy as np
@@ -19,6 +18,7 @@ from torch.nn import functional
 
 from dextouch.episodes import data_hash, split_by_scene
 from dextouch.errors import InvalidInputError
+from dextouch.worker_pool import worker_pool
 from services.evaluation.calibration import (
     Calibration,
     Combination,
@@ -433,9 +433,7 @@ _Optimized = tuple[dict[str, Tensor], float]
 def _all_optimized(orders: Sequence[_Order], jobs: int) -> list[_Optimized]:
     if jobs == 1 or len(orders) < 2:
         return [_optimized(*order) for order in orders]
-    # A fresh interpreter: a forked one would share the threads of torch.
-    spawned = get_context("spawn")
-    with ProcessPoolExecutor(jobs, spawned, torch.set_num_threads, (1,)) as pool:
+    with worker_pool(jobs, partial(torch.set_num_threads, 1)) as pool:
         running = [pool.submit(_optimized, *order) for order in orders]
         return [one.result() for one in running]
 

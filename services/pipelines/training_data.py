@@ -2,15 +2,13 @@
 
 import hashlib
 import json
-import multiprocessing
 import os
 import re
 import shlex
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import ExitStack
+from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Final, TypeVar
@@ -23,6 +21,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, DeviceError, InvalidInputError, UnknownNameError
 from dextouch.schemas import RolloutStart, SceneObjects
 from dextouch.serving import configure_logging
+from dextouch.worker_pool import worker_pool
 from services.evaluation.optimization import Progress
 from services.evaluation.policies.outside import PolicySource, action_chunk, ask
 from services.pipelines.parsers import training_data_parser
@@ -341,17 +340,7 @@ def in_processes(
     if num_jobs == 1 or len(items) < 2:
         yield from map(function, items)
         return
-    with ExitStack() as stack:
-        # Spawned, not forked: threads and locks of the caller must not be copied half-way.
-        pool = stack.enter_context(
-            ProcessPoolExecutor(
-                min(num_jobs, len(items)),
-                multiprocessing.get_context("spawn"),
-                initializer=log_warnings,
-            )
-        )
-        # If the caller stops, pending items are cancelled.
-        stack.callback(pool.shutdown, wait=False, cancel_futures=True)
+    with worker_pool(min(num_jobs, len(items)), log_warnings) as pool:
         for future in as_completed([pool.submit(function, item) for item in items]):
             yield future.result()
 

@@ -1,7 +1,6 @@
 """Command line `dextouch twin`: record ground-truth episodes of the physics twin to a store."""
 
 import argparse
-import multiprocessing
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 from dextouch.command_line import progress, write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
+from dextouch.worker_pool import worker_pool
 from services.twin.episodes import record, write_episode
 from services.twin.mistakes import Mistake
 from services.twin.motions import Motion
@@ -88,9 +88,8 @@ def _work(orders: Sequence[TakeOrder], num_jobs: int) -> Iterator[TakeReport]:
     if num_jobs == 1:
         yield from map(_take, orders)
         return
-    # Spawned processes: forking would copy the caller's threads and locks.
-    with multiprocessing.get_context("spawn").Pool(num_jobs) as pool:
-        yield from pool.imap(_take, orders)
+    with worker_pool(num_jobs) as pool:
+        yield from pool.map(_take, orders)
 
 
 def _summary(

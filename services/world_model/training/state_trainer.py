@@ -5,10 +5,9 @@ run resumes with the missing ones.
 """
 
 import hashlib
-import multiprocessing
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +23,7 @@ from dextouch.episodes import (
     data_hash,
 )
 from dextouch.errors import InvalidInputError
+from dextouch.worker_pool import worker_pool
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.core import RecurrentCore
@@ -325,8 +325,7 @@ def _prefixed(codec: TouchCodec) -> dict[str, Tensor]:
 def _train_parts(work: _Work) -> None:
     """Train missing parts, several in parallel."""
     members = range(work.settings.num_members)
-    spawned = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(work.settings.jobs, spawned) as pool:
+    with worker_pool(work.settings.jobs) as pool:
         orders = []
         if not (work.reads_starts or work.keeps_readers):
             orders += [pool.submit(_train_reader, work, m) for m in members]
