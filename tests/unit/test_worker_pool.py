@@ -35,11 +35,10 @@ def is_running(pid):
 def test_workers_end_with_a_parent_that_is_killed(tmp_path, number):
     script = tmp_path / "parent.py"
     script.write_text(PARENT)
-    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
-    worker = int(parent.stdout.readline())
-    assert is_running(worker)
-    parent.send_signal(number)
-    parent.wait(30)
+    with subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True) as parent:
+        worker = int(parent.stdout.readline())
+        assert is_running(worker)
+        parent.send_signal(number)
     deadline_s = time.monotonic() + 30
     while is_running(worker) and time.monotonic() < deadline_s:
         time.sleep(0.05)
