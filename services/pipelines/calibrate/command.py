@@ -125,12 +125,12 @@ _COMMANDS = {
     "camera": (
         "photos of a board → K and distortion of a camera",
         _CAMERA,
-        "cli.calibrate.camera:calibrate",
+        "pipelines.calibrate.camera:calibrate",
     ),
     "hand-eye": (
         "photos and poses → camera on its tracker",
         _HAND_EYE,
-        "cli.calibrate.mounts:calibrate_mount",
+        "pipelines.calibrate.mounts:calibrate_mount",
     ),
     "glove": (
         "rest and known pressures → tare, gain, faults",
@@ -140,27 +140,27 @@ _COMMANDS = {
     "wrist": (
         "flat hand → wrist axes of a glove's keypoints",
         _WRIST,
-        "cli.calibrate.takes:measure_wrist",
+        "pipelines.calibrate.takes:measure_wrist",
     ),
     "profile": (
         "moving hand → the person's bones and knuckles",
         _PROFILE,
-        "cli.calibrate.takes:measure_person",
+        "pipelines.calibrate.takes:measure_person",
     ),
     "robot-base": (
         "pairs of poses → the robot's base in the world",
         _ROBOT_BASE,
-        "cli.calibrate.mounts:calibrate_base",
+        "pipelines.calibrate.mounts:calibrate_base",
     ),
     "latency": (
         "common motion or taps → path delay",
         _LATENCY,
-        "cli.calibrate.takes:measure_latency",
+        "pipelines.calibrate.takes:measure_latency",
     ),
     "show": (
         "contents, age and accuracy of a calibration",
         _SHOW,
-        "cli.calibrate.show:show",
+        "pipelines.calibrate.mounts:show",
     ),
 }
 
