@@ -34,7 +34,7 @@ CHUNK_BYTES = 1 << 20
 ZSTD_LEVEL = 1
 # Images per closed group of pictures, which is one storage chunk.
 GOP_IMAGES = 8
-# Names under which zarr-python finds the image codecs (dextouch.episodes.shards).
+# Names under which zarr-python finds the image codecs (dextouch.episodes.zarr_codecs).
 ZARR_CODECS: Mapping[Codec, str] = {"jpeg": "dextouch.jpeg", "h264": "dextouch.h264"}
 # Far above any real array; a forged one must not overflow later arithmetic.
 MAX_ROWS = 1 << 40

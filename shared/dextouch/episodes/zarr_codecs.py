@@ -1,0 +1,67 @@
+"""Zarr-python codecs `dextouch.jpeg` and `dextouch.h264`, for reading image arrays.
+
+zarr-python finds them through this package's entry points. They only decode; writing goes through
+`EpisodeWriter`.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+from zarr.abc.codec import ArrayBytesCodec
+from zarr.core.array_spec import ArraySpec
+from zarr.core.buffer import Buffer, NDBuffer
+
+from dextouch.episodes.format import ZARR_CODECS, Codec
+from dextouch.episodes.image_codecs import FULL_FORM, ImageChunks
+from dextouch.errors import InvalidInputError
+
+
+@dataclass(frozen=True)
+class _ImageCodec(ArrayBytesCodec):
+    """Decodes image chunks to uint8 [n, h, w, 3]; padding rows are zero."""
+
+    is_fixed_size = False
+    codec: Codec = "jpeg"
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> "_ImageCodec":
+        """Create the codec from array metadata; it has no configuration."""
+        return cls()
+
+    def to_dict(self) -> dict[str, Any]:
+        """The codec's entry of the array metadata."""
+        return {"name": ZARR_CODECS[self.codec]}
+
+    def compute_encoded_size(self, input_byte_length: int, chunk_spec: ArraySpec) -> NoReturn:
+        """Unknown before images are encoded."""
+        raise NotImplementedError
+
+    async def _encode_single(self, chunk_array: NDBuffer, chunk_spec: ArraySpec) -> NoReturn:
+        raise InvalidInputError(
+            f"{ZARR_CODECS[self.codec]}: got images to encode, but this codec only reads; write "
+            "through dextouch.episodes.EpisodeStore.writer"
+        )
+
+    async def _decode_single(self, chunk_bytes: Buffer, chunk_spec: ArraySpec) -> NDBuffer:
+        shape = chunk_spec.shape
+        chunks = ImageChunks(self.codec, shape[1:], shape[0], ZARR_CODECS[self.codec])
+        payload = chunk_bytes.to_bytes()
+        images = np.zeros(shape, dtype=np.uint8)
+        count = len(chunks.unpack(payload, 0))
+        chunks.decode(payload, 0, list(range(count)), FULL_FORM, images[:count])
+        return chunk_spec.prototype.nd_buffer.from_numpy_array(images)
+
+
+@dataclass(frozen=True)
+class JpegCodec(_ImageCodec):
+    """`dextouch.jpeg`."""
+
+    codec: Codec = "jpeg"
+
+
+@dataclass(frozen=True)
+class H264Codec(_ImageCodec):
+    """`dextouch.h264`."""
+
+    codec: Codec = "h264"
