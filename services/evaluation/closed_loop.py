@@ -18,7 +18,7 @@ from services.evaluation.matched_starts import (
     refuse_training_starts,
     try_matched_start,
 )
-from services.evaluation.optimization import Progress
+from services.evaluation.progress import Progress
 from services.evaluation.rollout_runner import RolloutRunner
 from services.evaluation.scores import ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress

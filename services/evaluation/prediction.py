@@ -19,7 +19,6 @@ from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import CHUNK_STEPS
 from dextouch.worlds import World
 from services.evaluation import scene_geometry
-from services.evaluation.optimization import Progress
 from services.evaluation.perceptual_networks import DESCRIPTIONS, Pairs, weighted_measures
 from services.evaluation.prediction_names import DEFAULT_BASELINES
 from services.evaluation.prediction_scenes import (
@@ -34,6 +33,7 @@ from services.evaluation.prediction_scenes import (
     warped,
     with_instruction,
 )
+from services.evaluation.progress import Progress
 from services.evaluation.reporting import PredictionPicture
 
 MODEL: Final = "model"

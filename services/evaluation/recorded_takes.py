@@ -26,8 +26,8 @@ from dextouch.images import square_of_at_most
 from dextouch.schemas import WorldDescription
 from dextouch.streams import HEAD_CAMERA
 from services.evaluation.matched_starts import MatchedStart, refuse_training_starts, start_digest
-from services.evaluation.optimization import Progress
 from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.progress import Progress
 from services.evaluation.rollout_runner import RolloutRunner
 from services.evaluation.scores import Outcome, RolloutFailure, RolloutScore
 from services.evaluation.statistics import area_under_roc, wilson_interval

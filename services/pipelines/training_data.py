@@ -22,8 +22,8 @@ from dextouch.errors import ConflictError, DeviceError, InvalidInputError, Unkno
 from dextouch.schemas import RolloutStart, SceneObjects
 from dextouch.serving import configure_logging
 from dextouch.worker_pool import worker_pool
-from services.evaluation.optimization import Progress
 from services.evaluation.policies.outside import PolicySource, action_chunk, ask
+from services.evaluation.progress import Progress
 from services.pipelines.parsers import training_data_parser
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.data_mix import MIXES, Mix, options_of

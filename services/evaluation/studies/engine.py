@@ -14,11 +14,11 @@ from dextouch.episodes import EpisodeStore, select_episodes
 from dextouch.errors import UnavailableError
 from services.evaluation.closed_loop import EvaluationPlan, begin_matched
 from services.evaluation.matched_starts import FailedStart, MatchedStart
-from services.evaluation.optimization import Progress
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.colour_servo import ColourServo
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import HoldPolicy, ReplayPolicy
+from services.evaluation.progress import Progress
 from services.evaluation.rollout_runner import RolloutRunner
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure
 from services.evaluation.settings import DEFAULT_POLICY

@@ -160,7 +160,7 @@ _COMMANDS = {
     "show": (
         "contents, age and accuracy of a calibration",
         _SHOW,
-        "pipelines.calibrate.mounts:show",
+        "pipelines.calibrate.show:show",
     ),
 }
 

@@ -29,7 +29,7 @@ from services.alignment.options import AlignmentOptions
 from services.alignment.recording_error import compare_with_truth, match_streams
 from services.alignment.schemas import AlignmentJob
 from services.episode_store.committing import commit_spool
-from services.evaluation.optimization import Progress
+from services.evaluation.progress import Progress
 from services.pipelines.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan
 from services.pipelines.mock_takes import TakePlan, measure_gloves, origin_in_truth_ns, play_take
 from services.pipelines.training_data import Order, in_processes, make_episode

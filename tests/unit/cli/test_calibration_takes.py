@@ -15,7 +15,7 @@ from dextouch.schemas import RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition.devices import load_calibration
 from services.alignment.calibration.motion import DegenerateMotionError
-from services.alignment.station_calibration.overview import load
+from services.alignment.station_calibration.judgement import load
 from services.cli import main as command_line
 from services.pipelines.calibrate.command import main
 from services.pipelines.calibrate.mounts import show

@@ -17,7 +17,16 @@ def load(*paths):
 
 def test_a_small_state_model_is_trained_before_its_endings_are_judged(tmp_path, monkeypatch):
     called = []
-    monkeypatch.setattr(scoring, "run_command", lambda words: called.append(list(words[1:])) or 0)
+    for word, (place, name) in {
+        "data": (scoring.training_data, "main"),
+        "world-model": (scoring, "run_train"),
+        "policy": (scoring, "run_train_policy"),
+        "imagined": (scoring.imagined_data, "main"),
+        "judge": (scoring, "run_train_judge"),
+    }.items():
+        monkeypatch.setattr(
+            place, name, lambda words, word=word: called.append([word, *words]) or 0
+        )
     monkeypatch.setattr(scoring, "_load", load)
     with pytest.raises(LoadedError) as caught:
         scoring.train_models(tmp_path)

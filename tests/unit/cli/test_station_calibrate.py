@@ -27,7 +27,7 @@ from services.acquisition.devices.tactile_glove.mock import GloveCalibration
 from services.alignment.station_calibration import record
 from services.cli import main as command_line
 from services.pipelines.calibrate.command import main
-from services.pipelines.calibrate.mounts import show
+from services.pipelines.calibrate.show import show
 from tests.unit.cli.rendered_boards import (
     BOARD,
     SIZE,

@@ -1,6 +1,6 @@
 """Long jobs say how far they are where no terminal shows a bar."""
 
-from services.evaluation.optimization import Progress
+from services.evaluation.progress import Progress
 
 
 def test_a_line_at_every_tenth_goes_to_a_pipe(capsys):
