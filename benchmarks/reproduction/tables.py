@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.stats import t as students_t
@@ -30,8 +30,11 @@ from benchmarks.reproduction.experiments import (
 )
 from benchmarks.reproduction.steps import Step
 from dextouch.errors import NotFoundError
+from dextouch.metrics.policy import mmrv, pearson
 from services.evaluation.prediction import MODEL
-from services.evaluation.scores import REAL
+from services.evaluation.scores import REAL, RolloutScore
+from services.evaluation.statistics import area_under_roc
+from services.evaluation.studies.results import StudyResults
 from services.networks.weight_files import notes_of
 from services.twin.names import DOWNSTREAM
 
@@ -363,6 +366,7 @@ def _evaluator_pages(folder: Path, experiments: Experiments) -> list[Page]:
     prediction = _prediction_rows(folder, experiments, adapted)
     title = "Policy evaluation"
     success = tuple(_success_rows(report, experiments))
+    *estimates, pooled = _estimate_rows(folder)
     return [
         Page("Adapted world models on held-out robot episodes", prediction, BASES["evaluator"]),
         Page(f"{title}: success rates", success),
@@ -372,8 +376,81 @@ def _evaluator_pages(folder: Path, experiments: Experiments) -> list[Page]:
             tuple(_agreement_rows(report, experiments)),
             BASES["evaluator"],
         ),
+        Page(f"{title}: the worlds' own estimates of success", tuple(estimates)),
+        Page(f"{title}: the two worlds' own estimates", (pooled,)),
         _paper_page(title, PAPER["policies"]),
     ]
+
+
+def _estimate_rows(folder: Path) -> Iterator[Row]:
+    """How well the worlds' own estimates say what succeeds in the twin, by task and seed.
+
+    AUC is of single rollouts; correlation and MMRV are of the means of policies. The judge takes no
+    part in them. The last row compares the two worlds.
+    """
+    outcomes = StudyResults.read(folder / "evaluator/study/results").outcomes.values()
+    scores = [one for one in outcomes if isinstance(one, RolloutScore)]
+    succeeded = {(o.task, o.policy, o.seed): o.success for o in scores if o.world == REAL}
+    found: dict[tuple[str, str], list[EstimateFigures]] = {}
+    means: dict[str, list[np.ndarray]] = {world: [] for world in ADAPTED}
+    for world in ADAPTED:
+        names = sorted({one.world for one in scores if one.world.startswith(f"{world} ")})
+        for name in names:
+            own = [one for one in scores if one.world == name]
+            figures = {task: estimate_figures(own, succeeded, task) for task in DOWNSTREAM}
+            for task, figure in figures.items():
+                found.setdefault((world, task), []).append(figure)
+            means[world].append(np.concatenate([one.policy_means for one in figures.values()]))
+    rows = (("AUC", "auc", True), ("Pearson", "pearson", True), ("MMRV", "mmrv", False))
+    for title, key, higher in rows:
+        for task in DOWNSTREAM:
+            cells = {
+                world: Measured(tuple(getattr(one, key) for one in found.get((world, task), [])))
+                for world in ADAPTED
+            }
+            yield Row(f"{title}, {task}", cells, higher_is_better=higher)
+    pooled = [pearson(real=a, imagined=b) for a, b in zip(*means.values(), strict=True)]
+    yield Row("Pearson of the two worlds", {" and ".join(ADAPTED): Measured(tuple(pooled))})
+
+
+class EstimateFigures(NamedTuple):
+    """Agreement of a world's own estimates with success, and their means by policy."""
+
+    auc: float
+    pearson: float
+    mmrv: float
+    policy_means: np.ndarray
+
+
+def estimate_figures(
+    scores: Sequence[RolloutScore], succeeded: Mapping[tuple[str, str, int], bool], task: str
+) -> EstimateFigures:
+    """Figures of one world and task; NaN where it is undefined or the world has no estimate.
+
+    Args:
+        scores: of rollouts in one imagined world.
+        succeeded: real outcome by task, policy and seed; rollouts without one are left out.
+        task: to measure.
+    """
+    used = [
+        (one.policy, one.world_probability, succeeded[one.task, one.policy, one.seed])
+        for one in scores
+        if one.task == task
+        and one.world_probability is not None
+        and (one.task, one.policy, one.seed) in succeeded
+    ]
+    outcomes = np.array([success for _, _, success in used], dtype=bool)
+    policies = sorted({policy for policy, _, _ in used})
+    own = np.array([np.mean([p for name, p, _ in used if name == policy]) for policy in policies])
+    real = np.array([np.mean([s for name, _, s in used if name == policy]) for policy in policies])
+    if outcomes.all() or not outcomes.any():
+        auc = math.nan
+    else:
+        auc = area_under_roc(np.array([estimate for _, estimate, _ in used]), outcomes)
+    if not policies:
+        return EstimateFigures(auc, math.nan, math.nan, own)
+    agreement = pearson(real=real, imagined=own), mmrv(real=real, imagined=own)
+    return EstimateFigures(auc, *agreement, own)
 
 
 def _pooled_row(success: Sequence[Row]) -> Row:

@@ -139,8 +139,7 @@ def interval_of_draws(figures: np.ndarray, *, confidence: float = 0.95) -> Inter
 #
 # A draw resamples the starts with replacement; all rollouts of a start are drawn together, since
 # they share its objects and errors. Call `start_counts` once and pass its counts to every figure of
-# a table, so that all figures use the same draws. Figures of single rollouts are in
-# `services.evaluation.statistics` and `dextouch.metrics.policy`.
+# a table, so that all figures use the same draws.
 
 Counts = Float64[np.ndarray, "draws starts"]
 

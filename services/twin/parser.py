@@ -24,6 +24,12 @@ def twin_parser() -> argparse.ArgumentParser:
         epilog="example:\n  dextouch twin serve --port 8084",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="{record,serve}")
+    _add_record(commands)
+    commands.add_parser("serve", help="serve rollouts in the twin; flags: serve --help")
+    return parser
+
+
+def _add_record(commands: "argparse._SubParsersAction[CommandParser]") -> None:
     does = "record ground-truth episodes of a scripted demonstrator"
     make = commands.add_parser("record", help=does, description=does.capitalize(), epilog=EXAMPLE)
     make.add_argument("--task", required=True, choices=TASK_NAMES, help="task to demonstrate")
@@ -96,8 +102,6 @@ def twin_parser() -> argparse.ArgumentParser:
     )
     make.add_argument("--jobs", default=1, type=int, metavar="N", help="processes (%(default)s)")
     add_json(make)
-    commands.add_parser("serve", help="serve rollouts in the twin; flags: serve --help")
-    return parser
 
 
 def _seed_range(text: str) -> range:

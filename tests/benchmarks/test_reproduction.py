@@ -20,11 +20,20 @@ from benchmarks.command import stage_parser
 from benchmarks.reproduction import benchmark
 from benchmarks.reproduction.experiments import ADAPTED, QUICK, TABLES, Experiments, Sizes
 from benchmarks.reproduction.steps import Step, run
-from benchmarks.reproduction.tables import METRICS, Measured, Page, Row, data_table, make_pages
+from benchmarks.reproduction.tables import (
+    METRICS,
+    Measured,
+    Page,
+    Row,
+    data_table,
+    estimate_figures,
+    make_pages,
+)
 from dextouch.errors import NotFoundError
 from services.cli.main import find_command, main
 from services.evaluation.scores import ClosedLoopReport, RolloutScore
 from services.evaluation.studies.definition import read_definition
+from services.evaluation.studies.results import StudyHeader, StudyResults
 from services.twin.names import DOWNSTREAM
 
 # A command that appends its last word to a file and writes the result that its first word names.
@@ -296,11 +305,39 @@ def test_a_table_of_two_policies_says_that_these_are_no_correlation(tmp_path):
     study = ClosedLoopReport(tuple(scores), tuple(worlds), ("first", "second")).to_report()
     (tmp_path / "evaluator/study").mkdir(parents=True)
     (tmp_path / "evaluator/study/result.json").write_text(json.dumps(study))
+    header = StudyHeader("evaluator", {}, {})
+    results = StudyResults.create_or_resume(tmp_path / "evaluator/study/results", header)
+    for one in scores:
+        estimate = None if one.world == "real" else 0.9 if one.success else 0.2
+        results.keep(replace(one, world_probability=estimate))
     pages = make_pages(tmp_path, experiments, "evaluator")
     shown = [row for page in pages for table in page.tables() for row in table.rows]
     rows = [cells for name, *cells in shown if name.startswith("Pearson, ")]
     assert sum("undefined (2 policies)" in row[0] for row in rows) == len(DOWNSTREAM)
     assert not any(cell.startswith(("1 ", "1.0")) or cell == "1" for row in rows for cell in row)
+    named = {page.title: page for page in pages}
+    (auc, *_) = named["Policy evaluation: the worlds' own estimates of success"].rows
+    assert {world: one.values for world, one in auc.cells.items()} == dict.fromkeys(ADAPTED, (1.0,))
+
+
+def test_own_estimates_are_compared_with_success_by_hand():
+    """Three policies that succeed always, at every other start, and never."""
+    estimates = {"good": (0.9, 0.8), "fair": (0.45, 0.4), "poor": (0.5, 0.2)}
+    wins = {"good": 2, "fair": 1, "poor": 0}
+    scores, succeeded = [], {}
+    for policy, own in estimates.items():
+        for seed, estimate in enumerate(own):
+            succeeded["reach", policy, seed] = seed < wins[policy]
+            score = RolloutScore("W", policy, "reach", seed, "d", success=False, probability=0.5)
+            scores.append(replace(score, world_probability=estimate))
+    found = estimate_figures(scores, succeeded, "reach")
+    # Of nine pairs of a success and a failure, 0.45 and 0.5 alone are in the wrong order.
+    assert found.auc == pytest.approx(8 / 9)
+    # Means 0.85, 0.425 and 0.35 (fair, good, poor by name) for rates of 1, 0.5 and 0.
+    np.testing.assert_allclose(found.policy_means, [0.425, 0.85, 0.35])
+    assert found.pearson == pytest.approx(0.25 / math.sqrt(0.5 * 0.145416667))
+    assert found.mmrv == 0.0
+    assert math.isnan(estimate_figures(scores, succeeded, "another").auc)
 
 
 def test_the_table_of_options_has_those_that_are_measured(tmp_path):

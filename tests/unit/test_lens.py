@@ -113,10 +113,10 @@ def test_images_are_undistorted_as_by_opencv(distortion):
         cv2.remap(one, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for one in images
     ]
     got = undistorted(images, K, distortion)
-    # OpenCV interpolates at 32 places of a pixel.
+    # Only the map is ours: a rounding of it may choose another of 32 places within a pixel.
     off = np.abs(got.astype(int) - np.stack(expected))
     assert off.max() <= 4
-    assert off.mean() < 0.4
+    assert off.mean() < 0.1
     assert np.abs(got.astype(int) - images).mean() > 3 * off.mean()
 
 

@@ -1,8 +1,7 @@
 """Random training windows of episodes in memory, as requests and targets.
 
 Episodes are read once and cut with the same re-anchoring as in the store's reader, so that an epoch
-reads nothing from disk. `services.world_model.training.dataset` provides the same windows for
-episodes that stay on disk.
+reads nothing from disk; or, for episodes that stay on disk, read by each window.
 """
 
 import hashlib

@@ -9,7 +9,7 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from dextouch.geometry.transforms import apply, invert
 
@@ -51,41 +51,32 @@ def undistorted(
     lens = tuple(np.asarray(distortion, dtype=np.float64).ravel().tolist())
     if not images.size or not any(lens):
         return images
+    # Needed for the images of such lenses alone, so that other episodes are read without OpenCV.
+    import cv2
+
     matrix = tuple(np.asarray(K, dtype=np.float64).ravel().tolist())
-    corners, weights = _sources(images.shape[1], images.shape[2], matrix, lens)
-    flat = images.reshape(len(images), -1, 3)
-    mixed = np.zeros((len(images), corners.shape[1], 3), dtype=np.float32)
-    for corner, weight in zip(corners, weights, strict=True):
-        mixed += weight[:, None] * flat[:, corner]
-    return (mixed + 0.5).astype(np.uint8).reshape(images.shape)
+    x, y = _sources(images.shape[1], images.shape[2], matrix, lens)
+    return np.stack(
+        [
+            cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            for image in images
+        ]
+    )
 
 
-# The maps of the cameras in use; one of 640 x 480 px takes 15 MB.
+# The maps of the cameras in use; one of 640 x 480 px takes 2.5 MB.
 @lru_cache(maxsize=8)
 def _sources(
     height_px: int, width_px: int, matrix: tuple[float, ...], lens: tuple[float, ...]
-) -> tuple[Int64[np.ndarray, "4 pixels"], Float32[np.ndarray, "4 pixels"]]:
-    """Of every undistorted pixel, the four pixels of the image around it and their weights."""
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """Where an image shows each undistorted pixel, counted as in OpenCV: the first centre is 0."""
     K = np.array(matrix).reshape(3, 3)
     rows, columns = np.mgrid[0:height_px, 0:width_px] + 0.5
-    rays = np.stack(
-        [
-            (columns.ravel() - K[0, 2]) / K[0, 0],
-            (rows.ravel() - K[1, 2]) / K[1, 1],
-            np.ones(rows.size),
-        ],
-        axis=-1,
-    )
+    x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
     seen, _ = lens_pixels(K, np.array(lens), rays)
-    # A pixel's value is that at its centre.
-    x = (seen[:, 0] - 0.5).clip(0, width_px - 1)
-    y = (seen[:, 1] - 0.5).clip(0, height_px - 1)
-    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    right, below = np.minimum(left + 1, width_px - 1), np.minimum(top + 1, height_px - 1)
-    across, down = x - left, y - top
-    corners = [row * width_px + column for row in (top, below) for column in (left, right)]
-    weights = [v * h for v in (1 - down, down) for h in (1 - across, across)]
-    return np.stack(corners), np.stack(weights).astype(np.float32)
+    maps = (seen - 0.5).astype(np.float32).reshape(height_px, width_px, 2)
+    return np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1])
 
 
 def points_on_level(
