@@ -5,6 +5,7 @@ as the path of a URL, and for texts of libraries.
 """
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from urllib.parse import quote, urlsplit
 
@@ -13,6 +14,11 @@ from pydantic import BaseModel, SecretStr
 MASK = "***"
 # Shorter ones would be found in ordinary words.
 MIN_LENGTH = 8
+# Tokens and keys that the store issues, of which it keeps hashes alone: 32 bytes in URL-safe base64
+# (`secrets.token_urlsafe`), unlike names of this length by a digit and letters of both cases.
+ISSUED_KEY = re.compile(
+    r"(?<![\w-])(?=[\w-]*\d)(?=[\w-]*[A-Z])(?=[\w-]*[a-z])[\w-]{43}(?![\w-])", re.ASCII
+)
 _secrets: dict[str, None] = {}
 
 
@@ -29,11 +35,11 @@ def hide_secrets(settings: BaseModel) -> None:
 
 
 def masked(text: str) -> str:
-    """The text without the secrets of this process."""
+    """The text without the secrets of this process, and without what looks like an issued key."""
     for secret in tuple(_secrets):
         if secret in text:
             text = text.replace(secret, MASK)
-    return text
+    return ISSUED_KEY.sub(MASK, text)
 
 
 def _secrets_in(value: object) -> Iterator[str]:

@@ -18,7 +18,7 @@ from services.alignment.calibration.motion import DegenerateMotionError
 from services.alignment.station_calibration.judgement import load
 from services.cli import main as command_line
 from services.pipelines.calibrate.command import main
-from services.pipelines.calibrate.mounts import show
+from services.pipelines.calibrate.show import show
 from tests.accuracy.test_robot_base import pairs
 from tests.accuracy.test_time_offset import taps
 from tests.unit.alignment.tracked_hands import any_rotation, flat_hand, moving_hand

@@ -1,5 +1,7 @@
 """Secrets of settings that turn up in a text are hidden there."""
 
+import secrets
+
 import pytest
 from pydantic import BaseModel, SecretStr
 
@@ -48,3 +50,25 @@ def test_secrets_of_all_services_of_a_process_are_hidden():
     hide_secrets(settings("of-the-first"))
     hide_secrets(settings("of-the-other"))
     assert masked("of-the-first of-the-other") == "*** ***"
+
+
+def test_keys_that_no_service_knows_are_hidden_by_their_shape():
+    issued = [secrets.token_urlsafe(32) for _ in range(200)]
+    assert [masked(f"/v1/episodes/{key}?x") for key in issued].count("/v1/episodes/***?x") >= 198
+    assert masked('{"request_id": "OFg77JhGsnxhA7KNGv7OGUSxqffmEYi3YGvKPreDGv4"}').endswith(
+        '"***"}'
+    )
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "take_with_a_very_long_name_of_43_letters_01",
+        "a" * 43,
+        "0123456789abcdef" * 4,
+        "Take-20261128-112753-abc123",
+        "3f0c1a2b-aaaa-4bbb-8ccc-0123456789AB",
+    ],
+)
+def test_names_are_not_hidden(name):
+    assert masked(f"episode {name} not found") == f"episode {name} not found"
