@@ -78,6 +78,10 @@ SCRIPTS: Final = (
 _STATE_METRICS: Final = "psnr,tactile_mse,contact_iou,contact_f1,pad_contact_f1,object_error"
 STATE_REFERENCES: Final = ("copy", OTHER_ACTIONS)
 _MODEL: Final = "model.safetensors"
+_JUDGE: Final = "judge.safetensors"
+# Scenes of downstream episodes that no adapted model has seen: judges are calibrated on them, and
+# demonstrations are imagined in them.
+_UNSEEN_SPLIT: Final = "A"
 _POLICY: Final = "policy.safetensors"
 _EARLY_POLICY: Final = "policy_early.safetensors"
 
@@ -349,7 +353,6 @@ class Experiments:
             "--human data/downstream-human/store",
         }
         name = f"evaluator/{world}/seed-{seed}/model"
-        # Scenes of split A are left for generation.
         return _step(
             name,
             f"train adapt --init {ancestor.name}/{_MODEL} --episodes data/downstream/store "
@@ -359,6 +362,27 @@ class Experiments:
             f"--drawing.cpu-budget-s {sizes.drawing_cpu_s} --output {name}/{_MODEL}",
             _MODEL,
             needs=(*(s for n, s in self._data.items() if n.startswith("downstream")), ancestor),
+        )
+
+    def _judge(self, world: str, seed: int) -> Step:
+        """The package's success classifier, calibrated for an adapted model."""
+        model = self._adapted(world, seed)
+        name = f"evaluator/{world}/seed-{seed}/imagined"
+        chosen = f"--split {_UNSEEN_SPLIT} --jobs 1"
+        imagined = _step(
+            name,
+            f"train imagined --episodes data/downstream/store --store {name}/store {chosen} "
+            f"--checkpoint {model.name}/{_MODEL}",
+            "store",
+            needs=(self._data["downstream"], model),
+        )
+        name = f"evaluator/{world}/seed-{seed}/judge"
+        return _step(
+            name,
+            f"train judge --base package --splits {_UNSEEN_SPLIT} "
+            f"--episodes data/downstream/store,{imagined.name}/store --output {name}/{_JUDGE}",
+            _JUDGE,
+            needs=(imagined,),
         )
 
     def _policy(self, name: str, flags: str, *needs: Step, early: bool = False) -> Step:
@@ -372,19 +396,22 @@ class Experiments:
         )
 
     def _evaluator(self) -> Iterator[Step]:
-        """Adapted world models, and a study of policies in them and in the twin."""
-        worlds = {
-            f"{world} {seed}": self._adapted(world, seed)
-            for world in ADAPTED
-            for seed in self.seeds
-        }
+        """Adapted world models and their judges, and a study of policies in them and the twin."""
+        named = [(world, seed) for world in ADAPTED for seed in self.seeds]
+        worlds = {f"{world} {seed}": self._adapted(world, seed) for world, seed in named}
+        judges = {f"{world} {seed}": self._judge(world, seed) for world, seed in named}
         for model in worlds.values():
             yield self._rolled_out(model, data="downstream")
         cloned = self._policy("evaluator/policy", "--splits A,B --early-at 0.15", early=True)
         policies = {"cloned": _POLICY, "cloned early": _EARLY_POLICY}
         files = {name: f"{cloned.name}/{made}" for name, made in policies.items()}
         scripts = "".join(f'[policies."{name}"]\nscript = "{name}"\n' for name in SCRIPTS)
-        yield self._study("evaluator", worlds, files, (cloned, *worlds.values()), scripts)
+        needs = (cloned, *judges.values())
+        lines = {
+            world: f'checkpoint = "{model.name}/{_MODEL}"\nprobe = "{judges[world].name}/{_JUDGE}"'
+            for world, model in worlds.items()
+        }
+        yield self._study("evaluator", lines, files, needs, scripts)
 
     def _generation(self) -> Iterator[Step]:
         """Policies from real and from generated demonstrations, and their study in the twin."""
@@ -408,9 +435,9 @@ class Experiments:
         name = f"generation/{column}/seed-{seed}/demonstrations"
         return _step(
             name,
-            f"generate --episodes data/downstream/store --split A --store {name}/store "
-            f"--checkpoint {model.name}/{_MODEL} --count {self.sizes.num_generated} "
-            f"--strips {name}/strips.html",
+            f"generate --episodes data/downstream/store --split {_UNSEEN_SPLIT} "
+            f"--store {name}/store --checkpoint {model.name}/{_MODEL} "
+            f"--count {self.sizes.num_generated} --strips {name}/strips.html",
             "store",
             needs=(self._data["downstream"], model),
         )
@@ -418,12 +445,15 @@ class Experiments:
     def _study(
         self,
         table: Table,
-        worlds: Mapping[str, Step],
+        worlds: Mapping[str, str],
         policies: Mapping[str, str],
         needs: tuple[Step, ...],
         more: str = "",
     ) -> Step:
-        """Study of cloned policies, by the paths of their files, in the twin and in some worlds."""
+        """Study of cloned policies, by the paths of their files, in the twin and in some worlds.
+
+        `worlds` are the keys of imagined worlds in the study file, by name.
+        """
         tasks = ", ".join(f'"{task}"' for task in DOWNSTREAM)
         lines = [
             f'name = "{table}"',
@@ -432,8 +462,8 @@ class Experiments:
             f"num_starts = {self.sizes.num_starts}",
             "keep_rollouts = false",
         ]
-        for world, step in worlds.items():
-            lines += [f'[imagined."{world}"]', f'checkpoint = "{step.name}/{_MODEL}"']
+        for world, keys in worlds.items():
+            lines += [f'[imagined."{world}"]', keys]
         for policy, path in policies.items():
             lines += [f'[policies."{policy}"]', 'builtin = "behaviour-cloning"']
             lines += [f'checkpoint = "{path}"']

@@ -26,6 +26,8 @@ from services.evaluation.reporting import ReportPictures, write_report
 from services.evaluation.reporting.sections import failure_rows, figure, undecided_note
 from services.evaluation.scores import ResultLog
 from services.evaluation.settings import (
+    DEFAULT_PROBE,
+    PACKAGE,
     RunSettings,
     ServedWorld,
     TrainJudgeSettings,
@@ -84,7 +86,9 @@ def run_train_judge(arguments: list[str]) -> int:
                 "the figures of the base's weights are kept"
             )
         calibrated = calibrate_success_classifier(
-            load_checkpoint(settings.base, kind=KIND),
+            load_checkpoint(
+                DEFAULT_PROBE if settings.base == PACKAGE else settings.base, kind=KIND
+            ),
             [*read(settings.episodes), *read(settings.development)],
             settings.training,
             command=command_line("probe", arguments),

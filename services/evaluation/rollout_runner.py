@@ -1,7 +1,7 @@
 """One rollout of a policy in a world from a matched start, and its score."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -64,16 +64,18 @@ class RolloutRunner:
 
     Args:
         worlds: the real world and the imagined ones.
-        probe: classifier of imagined success.
+        probe: success classifier of all worlds that have none of their own.
         num_steps: steps of a rollout on the model grid.
         shows_all: whether the head camera's images of all steps are requested. Otherwise worlds
             render only the images that the policy uses, and the ending.
+        own_probes: success classifiers that were calibrated for single worlds, by world.
     """
 
     worlds: StudyWorlds
     probe: SuccessClassifier
     num_steps: int
     shows_all: bool = False
+    own_probes: Mapping[str, SuccessClassifier] = field(default_factory=dict)
 
     def outcome(
         self, start: MatchedStart | FailedStart, actor: Policy, policy: str, world: str
@@ -111,7 +113,7 @@ class RolloutRunner:
             )
         except DexTouchError as error:
             return rollout_failure(error, start, policy, world, repeat), None
-        verdict = self.probe.verdict(ending)
+        verdict = self.own_probes.get(world, self.probe).verdict(ending)
         score = RolloutScore(
             world,
             policy,

@@ -120,6 +120,8 @@ class ClassifierSettings(FrozenModel):
 PRETRAINED = Path(__file__).parent / "pretrained"
 DEFAULT_POLICY = PRETRAINED / "behaviour_cloning.safetensors"
 EARLY_POLICY = PRETRAINED / "behaviour_cloning_early.safetensors"
+# Word of `--base` for the next.
+PACKAGE = Path("package")
 DEFAULT_PROBE = PRETRAINED / "success_probe.safetensors"
 _SEEDS = re.compile(r"(\d+):(\d+)")
 
@@ -166,7 +168,7 @@ class TrainJudgeSettings(CommandSettings):
       dextouch train judge --episodes runs/true,runs/imagined --output runs/probe.safetensors
 
     To calibrate a trained probe to another world model, on what that imagined:
-      dextouch train judge --base runs/probe.safetensors --episodes runs/true,runs/imagined_anew \
+      dextouch train judge --base package --episodes runs/true,runs/imagined_anew \
         --output runs/calibrated.safetensors
     """
 
@@ -175,8 +177,8 @@ class TrainJudgeSettings(CommandSettings):
     episodes: Stores
     base: Path | None = Field(
         default=None,
-        description="success classifier whose weights are kept: only its probabilities and bands "
-        "are fitted, to all of --episodes and --development",
+        description="success classifier whose weights are kept, `package` for the package's: only "
+        "its probabilities and bands are fitted, to all of --episodes and --development",
     )
     development: tuple[str, ...] = Field(
         default=(), description="stores to calibrate on (default: a share of the scenes)"

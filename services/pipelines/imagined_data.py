@@ -114,7 +114,10 @@ def imagine(options: argparse.Namespace, wanted: Sequence[str], *, only_judged: 
 def main(argv: Sequence[str]) -> int:
     """Run `dextouch train imagined`."""
     options = imagined_parser().parse_args(list(argv))
-    chosen = chosen_episodes(EpisodeStore(options.episodes), options.tasks, options.seeds)
+    splits = (options.split,) if options.split else ()
+    chosen = chosen_episodes(
+        EpisodeStore(options.episodes), options.tasks, options.seeds, splits=splits
+    )
     wanted = [about.episode_id for about in chosen]
     count = len(imagine(options, wanted, only_judged=True))
     print(f"{count} imagined")

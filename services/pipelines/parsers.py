@@ -244,6 +244,7 @@ def _imagination_parser(**about: str) -> CommandParser:
     add("--checkpoint", type=Path, default=default_checkpoint(), metavar="PATH", help=model)
     add("--tasks", type=comma_separated, metavar="TASK,…", help="default: all")
     add("--seeds", type=seed_range, metavar="FIRST:LAST+1", help="default: all")
+    add("--split", choices=SPLITS, help="only scenes of this split (default: all)")
     jobs = "processes (default: one per core)"
     add("--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help=jobs)
     add_json(parser)
@@ -265,7 +266,6 @@ def generate_parser() -> argparse.ArgumentParser:
         prog="dextouch generate", description=_GENERATE, epilog=_GENERATE_EXAMPLE
     )
     add = parser.add_argument
-    add("--split", choices=SPLITS, help="only scenes of this split (default: all)")
     add("--count", type=positive, metavar="N", help="largest number of episodes, over all tasks")
     add("--with-failures", action="store_true", help="also imagine episodes that failed")
     add("--strips", type=Path, metavar="PATH", help="HTML page of recorded and imagined images")

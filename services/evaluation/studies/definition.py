@@ -24,7 +24,8 @@ class WorldChoice(FrozenModel):
 
     Exactly one of `url` (with `world`, its name at the service), `checkpoint` (a world model's
     file) and `builtin` is given. The API key is read from the environment variable
-    `api_key_variable`, so that no study file holds a secret.
+    `api_key_variable`, so that no study file holds a secret. `probe` is the success classifier that
+    was calibrated for this imagined world; by default the study's.
     """
 
     url: str | None = None
@@ -32,6 +33,7 @@ class WorldChoice(FrozenModel):
     api_key_variable: str | None = None
     checkpoint: Path | None = None
     builtin: Literal["twin", "world-model"] | None = None
+    probe: Path | None = None
 
     @model_validator(mode="after")
     def _is_one(self) -> "WorldChoice":
@@ -102,6 +104,8 @@ class StudyDefinition(FrozenModel):
             raise ValueError(f"tasks: got {', '.join(self.tasks)}, expected no task twice")
         if REAL in self.imagined:
             raise ValueError(f"imagined: {REAL!r} names the real world; choose another name")
+        if self.real.probe is not None:
+            raise ValueError("real.probe: the success classifier of the real world is `probe`")
         if len(self.tasks) * self.num_starts > MAX_STARTS:
             raise ValueError(
                 f"got {len(self.tasks) * self.num_starts} starts, expected at most {MAX_STARTS}"

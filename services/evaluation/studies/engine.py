@@ -44,10 +44,11 @@ class StudyParts:
         connect: opens connections to all worlds; called once per thread.
         load_policies: creates all policies by name; called once per thread, since a policy may keep
             a state between calls.
-        probe: classifier of imagined success.
+        probe: success classifier of all worlds that have none of their own.
         instructions: of every task.
         trained_on: digests of training starts of each trained component, which are refused.
         store: where rollouts are kept; None to keep none.
+        own_probes: success classifiers that were calibrated for single worlds, by world.
     """
 
     connect: Callable[[ExitStack], StudyWorlds]
@@ -56,6 +57,7 @@ class StudyParts:
     instructions: Mapping[str, str]
     trained_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     store: EpisodeStore | None = None
+    own_probes: Mapping[str, SuccessClassifier] = field(default_factory=dict)
 
 
 def run_study(
@@ -99,11 +101,15 @@ def _run_missing(
             worlds = parts.connect(connections)
             size_px = parts.probe.shape.image_size_px
             worlds.check(list(definition.tasks), definition.num_steps, size_px)
+            judged = {
+                f"the success classifier of world {world!r}": own.metadata.training_starts
+                for world, own in parts.own_probes.items()
+            }
             plan = EvaluationPlan(
                 {task: parts.instructions[task] for task in definition.tasks},
                 definition.seeds,
                 definition.num_steps,
-                trained_on=parts.trained_on,
+                trained_on={**parts.trained_on, **judged},
             )
             starts = begin_matched(worlds.addresses[REAL], plan, parts.probe)
             for one in starts:
@@ -191,6 +197,7 @@ class _Workers:
                 self._parts.probe,
                 self._definition.num_steps,
                 shows_all=self._parts.store is not None,
+                own_probes=self._parts.own_probes,
             )
         runner: RolloutRunner = self._local.runner
         policies: Mapping[str, Policy] = self._local.policies

@@ -52,11 +52,13 @@ def _run(options: argparse.Namespace) -> int:
     refuse_training_seeds(definition)
     probe_path = definition.probe or DEFAULT_PROBE
     probe = SuccessClassifier.load(probe_path)
+    own_probes = _own_probes(definition, probe)
     instructions = instructions_for(definition.tasks, probe.metadata.settings["instructions"])
     policies = PolicyFactory(definition, partial(demonstrator, definition.tasks, definition.seeds))
     policies.load()
     with served_worlds(definition) as addresses:
         digests = {"definition": definition.digest, "probe": file_digest(probe_path)}
+        digests |= {f"probe of {name}": file_digest(path) for name, path in own_paths(definition)}
         digests |= policies.digests()
         with ExitStack() as connections:
             digests |= connect(addresses, connections).digests
@@ -80,10 +82,39 @@ def _run(options: argparse.Namespace) -> int:
                 instructions,
                 policies.training_starts(),
                 store,
+                own_probes,
             ),
             retry_failed=options.retry_failed,
         )
     return _finish(results, options.json)
+
+
+def own_paths(definition: StudyDefinition) -> list[tuple[str, Path]]:
+    """Names of worlds that have a success classifier of their own, and its file."""
+    return [(name, one.probe) for name, one in definition.imagined.items() if one.probe is not None]
+
+
+def _own_probes(
+    definition: StudyDefinition, probe: SuccessClassifier
+) -> dict[str, SuccessClassifier]:
+    """Success classifiers of single worlds, by world.
+
+    Raises:
+        InvalidInputError: one does not know a task of the study, or sees images of another size
+            than `probe`.
+        NotFoundError, CorruptDataError: a checkpoint that cannot be read.
+    """
+    own: dict[str, SuccessClassifier] = {}
+    for name, path in own_paths(definition):
+        own[name] = SuccessClassifier.load(path)
+        instructions_for(definition.tasks, own[name].metadata.settings["instructions"])
+        size_px, expected_px = own[name].shape.image_size_px, probe.shape.image_size_px
+        if size_px != expected_px:
+            raise InvalidInputError(
+                f"world {name!r}: its success classifier {path} sees images of {size_px} px, "
+                f"expected {expected_px} as the study's; train both with the same --image-px"
+            )
+    return own
 
 
 def _report(options: argparse.Namespace) -> int:

@@ -1,6 +1,8 @@
 """Studies: their definition, results that survive a kill, and rollouts that are kept."""
 
 import json
+from contextlib import ExitStack
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +14,7 @@ from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 from dextouch.schemas import Doubt
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.checkpoints import save_checkpoint
-from services.evaluation.closed_loop import EvaluationPlan, evaluate
+from services.evaluation.closed_loop import EvaluationPlan, begin_matched, evaluate
 from services.evaluation.endings import read_ending_episode
 from services.evaluation.policies.colour_servo import ColourServo
 from services.evaluation.policies.replay import HoldPolicy
@@ -81,6 +83,7 @@ def test_a_study_counts_its_rollouts(tmp_path):
         ('world = "dream"', "", "`world` names a world"),
         ('url = "http://127.0.0.1:1"\nworld = "dream"', "", "exactly one of url, checkpoint"),
         ("[imagined.dream]", "[imagined.real]", "names the real world"),
+        ('world = "judge"', 'world = "judge"\nprobe = "a"', "of the real world is `probe`"),
         ('"reach far"', '"reach"', "expected no task twice"),
         ('builtin = "hold"', 'builtin = "hold"\nscript = "script 5 mm"', "got builtin, script"),
         ('builtin = "hold"', 'builtin = "hold"\narguments = {a = 1}', "belong to `factory`"),
@@ -169,6 +172,43 @@ def test_a_study_gives_the_rows_of_an_evaluation(tmp_path, url, study, parts):
     assert [s.world for s in report.scores] == sorted(
         (s.world for s in report.scores), reverse=True
     )
+
+
+def test_a_world_with_a_success_classifier_of_its_own_is_scored_by_that(
+    tmp_path, url, study, parts, trained_probe
+):
+    own = SuccessClassifier(trained_probe)
+    results = StudyResults.create_or_resume(tmp_path, header_of(study))
+    report = run_study(study, results, replace(parts, own_probes={"dream": own}))
+    with RolloutClient(url) as client:
+        expected = {
+            which: evaluate(
+                real=WorldAddress(client, "judge"),
+                imagined={"dream": WorldAddress(client, "dream")},
+                policies=parts.load_policies(),
+                plan=EvaluationPlan(toy.INSTRUCTIONS, study.seeds, study.num_steps),
+                probe=probe,
+            ).scores
+            for which, probe in (("real", parts.probe), ("dream", own))
+        }
+    wanted = {s for which, rows in expected.items() for s in rows if s.world == which}
+    assert set(report.scores) == wanted
+    assert {s for s in expected["real"] if s.world == "dream"} - wanted
+
+
+def test_starts_that_the_success_classifier_of_a_world_was_trained_on_are_refused(
+    tmp_path, study, parts
+):
+    seen = EvaluationPlan(toy.INSTRUCTIONS, study.seeds, study.num_steps)
+    with ExitStack() as connections:
+        real = parts.connect(connections).addresses["real"]
+        digests = tuple(start.digest for start in begin_matched(real, seen, parts.probe))
+    metadata = parts.probe.metadata.model_copy(update={"training_starts": digests})
+    own = copy(parts.probe)
+    own.metadata = metadata
+    results = StudyResults.create_or_resume(tmp_path, header_of(study))
+    with pytest.raises(ConflictError, match="success classifier of world 'dream'"):
+        run_study(study, results, replace(parts, own_probes={"dream": own}))
 
 
 @pytest.mark.slow
