@@ -147,11 +147,12 @@ check-lerobot-policy: $(VENV)/.dev $(LEROBOT_POLICY_VENV)/.complete   ## opt-in:
 
 $(RAY_VENV)/.complete: pyproject.toml
 	$(PYTHON) -m venv $(RAY_VENV)
-	$(RAY_VENV)/bin/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[scale]' psutil pytest
+	$(RAY_VENV)/bin/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[scale,twin]' psutil pytest
 	touch $@
 
-check-ray: $(RAY_VENV)/.complete   ## opt-in: kill replicas of a local Ray Serve deployment while rollouts run; 500 MB; apt-get install redis-server
+check-ray: $(RAY_VENV)/.complete   ## opt-in: kill replicas of a local Ray Serve deployment while rollouts run, and workers of a cluster while takes are recorded; 600 MB; apt-get install redis-server
 	RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S=60 PYTHONPATH=.:shared $(RAY_VENV)/bin/python -m tests.system.ray_serve.check $(ARGS)
+	PYTHONPATH=.:shared $(RAY_VENV)/bin/python -m tests.system.ray_jobs.check
 
 # The site reads the docstrings of dextouch and needs neither torch nor mujoco, so it has an environment of its own.
 $(DOCS_VENV)/.complete: pyproject.toml constraints.txt

@@ -30,7 +30,7 @@ from benchmarks.machine import describe_machine
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
-from dextouch.worker_pool import worker_pool
+from dextouch.jobs import worker_pool
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE, EARLY_POLICY
 from services.twin.scripted_actions import mistake_of
 from services.twin.tasks import EVALUATED

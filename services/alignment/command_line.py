@@ -13,14 +13,15 @@ from rich.console import Console
 from rich.progress import Progress as Bars
 from rich.progress import TaskID
 
-from dextouch.command_line import ProgressLines, write_result
+from dextouch.command_line import ProgressLines, progress, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, disk_errors
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.free_text import printable
 from dextouch.hands.hand_files import load_hand
+from dextouch.jobs import Workers, run_jobs
 from dextouch.schemas import json_ready, load_scene_objects
 from dextouch.serving import load_settings
-from services.alignment.jobs import AlignmentWorker, check_recording, episode_id_of
+from services.alignment.jobs import AlignmentWorker, align_recording, check_recording, episode_id_of
 from services.alignment.options import AlignmentOptions
 from services.alignment.parser import align_parser
 from services.alignment.report import AlignmentReport, report_line, report_of, report_page
@@ -61,13 +62,16 @@ def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     console = Console(highlight=False, soft_wrap=True)
     reports, num_failed = [], 0
     with _bars(console, len(wanted)) as on_progress:
-        outcomes = align_batch(
-            parsed.store,
-            wanted,
-            settings.wanted_options,
-            num_workers=parsed.workers,
-            on_progress=on_progress,
-        )
+        if parsed.ray is None:
+            outcomes = align_batch(
+                parsed.store,
+                wanted,
+                settings.wanted_options,
+                num_workers=parsed.workers,
+                on_progress=on_progress,
+            )
+        else:
+            outcomes = align_on_cluster(parsed.store, wanted, settings.wanted_options, parsed.ray)
         for _, result in chain(refused, outcomes):
             if isinstance(result, DexTouchError):
                 print(f"dextouch align: {printable(result.message)}", file=sys.stderr)
@@ -201,6 +205,24 @@ def align_batch(
         for worker in workers:
             worker.stop()
         threads.shutdown()
+
+
+def align_on_cluster(
+    store_url: str, recording_ids: Sequence[str], options: AlignmentOptions, ray_address: str
+) -> Iterator[Outcome]:
+    """The same as `align_batch` on a Ray cluster, whose machines see the store."""
+    jobs = run_jobs(
+        partial(_align_one, store_url, options),
+        recording_ids,
+        Workers(ray_address=ray_address),
+        folders=EpisodeStore(store_url).folders,
+    )
+    for job in progress(jobs, "align", len(recording_ids)):
+        yield job.item, job.error or job.result()
+
+
+def _align_one(store_url: str, options: AlignmentOptions, recording_id: str) -> AlignmentReport:
+    return align_recording(EpisodeStore(store_url), recording_id, options)
 
 
 def not_aligned(store: EpisodeStore, options: AlignmentOptions) -> tuple[list[str], list[Outcome]]:

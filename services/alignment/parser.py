@@ -3,13 +3,14 @@
 import argparse
 from pathlib import Path
 
-from dextouch.command_line import CommandParser, add_json
+from dextouch.command_line import RAY_HELP, CommandParser, add_json
 from dextouch.serving import load_settings
 from services.alignment.settings import AlignmentSettings, usable_cores
 
 EPILOG = """examples:
   dextouch align run take-7 take-8           align two recordings in parallel
   dextouch align run --all --workers 2       align all recordings without an episode
+  dextouch align run --all --ray auto        the same on the machines of a Ray cluster
   dextouch align run --all --objects objects.json
                                              with the poses of objects that have markers
   dextouch align report take-7               clock fits, retargeting errors, omitted parts
@@ -51,6 +52,7 @@ def align_parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
     )
     running.add_argument("recordings", nargs="*", metavar="ID", help="of a recording")
     running.add_argument("--all", action="store_true", help="all recordings without an episode")
+    running.add_argument("--ray", metavar="ADDRESS", help=RAY_HELP)
     running.add_argument(
         "--workers",
         type=_positive,

@@ -16,8 +16,9 @@ _PACKAGES = {
     "export": "pyarrow mcap foxglove_schemas_protobuf",
     "rerun": "rerun",
     "s3": "obstore",
+    "scale": "ray",
 }
-_NOT_IN_ALL = ("full", "rerun")
+_NOT_IN_ALL = ("full", "rerun", "scale")
 EXTRA_OF = {package: extra for extra, names in _PACKAGES.items() for package in names.split()}
 
 

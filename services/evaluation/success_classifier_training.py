@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from dextouch.episodes import data_hash, split_by_scene
 from dextouch.errors import InvalidInputError
-from dextouch.worker_pool import worker_pool
+from dextouch.jobs import worker_pool
 from services.evaluation.calibration import (
     Calibration,
     Combination,

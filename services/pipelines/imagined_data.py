@@ -4,9 +4,9 @@ import argparse
 from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 import torch
-from rich.progress import track
 
 from dextouch.clients import RolloutClient
 from dextouch.command_line import write_result
@@ -18,18 +18,21 @@ from dextouch.episodes import (
     scene_of,
     select_episodes,
 )
+from dextouch.jobs import Workers, results_of, run_jobs
 from dextouch.schemas import EpisodeAttributes
 from dextouch.serving import configure_logging
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
+from services.evaluation.progress import Progress
 from services.generation.demonstrations import SHORT_CHUNK_STEPS, imagine_episode, whole_steps
 from services.pipelines.parsers import imagined_parser
 from services.pipelines.servers import served
-from services.pipelines.training_data import in_processes
 from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
 
 WORLD = "world_model"
+# Episodes of a job on a cluster, which opens the model: some ten times as long as opening it.
+_IN_A_JOB: Final = 16
 
 
 def chosen_episodes(
@@ -83,7 +86,7 @@ def imagine_all(
     with served({"imagined": app}) as urls, RolloutClient(urls["imagined"]) as client:
         is_drawn_apart = only_judged and isinstance(world, StateWorld)
         made = []
-        for episode_id in track(episode_ids, description="imagined episodes"):
+        for episode_id in episode_ids:
             reader = source.open(episode_id)
             steps = judged_steps(reader) if is_drawn_apart else None
             made.append(imagine_episode(reader, client, WORLD, target, image_steps=steps))
@@ -107,8 +110,18 @@ def imagine(options: argparse.Namespace, wanted: Sequence[str], *, only_judged: 
         checkpoint=options.checkpoint,
         only_judged=only_judged,
     )
-    parts = [wanted[first :: options.jobs] for first in range(min(options.jobs, len(wanted)))]
-    return [one for made in in_processes(part, parts, options.jobs) for one in made]
+    workers = Workers(options.jobs, options.ray)
+    # Each part opens the model once.
+    num_parts = -(-len(wanted) // _IN_A_JOB) if workers.ray_address else 4 * options.jobs
+    parts = [wanted[first::num_parts] for first in range(min(num_parts, len(wanted)))]
+    made = list[str]()
+    with Progress("imagined episodes", len(wanted)) as progress:
+        jobs = run_jobs(part, parts, workers, folders=EpisodeStore(options.store).folders)
+        for ids in results_of(jobs):
+            made += ids
+            for _ in ids:
+                progress.advance()
+    return made
 
 
 def main(argv: Sequence[str]) -> int:

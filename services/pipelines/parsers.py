@@ -3,14 +3,13 @@
 import argparse
 import json
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from dextouch.command_line import CommandParser, add_json
+from dextouch.command_line import RAY_HELP, CommandParser, add_json, add_workers
 from dextouch.data_folder import default_store
 from dextouch.episodes import SPLITS
 from services.evaluation.prediction_names import BASELINES, DEFAULT_BASELINES, METRIC_NAMES
@@ -229,7 +228,7 @@ def training_data_parser() -> argparse.ArgumentParser:
     sizes = "share of takes whose objects are wider, narrower, higher or lower (%(default)s)"
     add("--resized", type=float, default=0.0, metavar="SHARE", help=sizes)
     add("--streams", choices=STREAM_CHOICES, default="training", help="(%(default)s)")
-    add("--jobs", type=int, help="processes (default: one per core)")
+    add_workers(parser)
     add_json(parser)
     return parser
 
@@ -245,8 +244,7 @@ def _imagination_parser(**about: str) -> CommandParser:
     add("--tasks", type=comma_separated, metavar="TASK,…", help="default: all")
     add("--seeds", type=seed_range, metavar="FIRST:LAST+1", help="default: all")
     add("--split", choices=SPLITS, help="only scenes of this split (default: all)")
-    jobs = "processes (default: one per core)"
-    add("--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help=jobs)
+    add_workers(parser)
     add_json(parser)
     return parser
 
@@ -360,6 +358,7 @@ def study_parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--retry-failed", action="store_true", help="run rollouts again that failed before"
     )
+    run.add_argument("--ray", metavar="ADDRESS", help=RAY_HELP)
     report = words.add_parser(
         "report",
         help="write the report of a study's results so far",

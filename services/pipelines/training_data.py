@@ -7,11 +7,10 @@ import re
 import shlex
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,9 +18,9 @@ from dextouch.clients import Policy, PolicyStart
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, DeviceError, InvalidInputError, UnknownNameError
+from dextouch.jobs import Workers, run_jobs
 from dextouch.schemas import RolloutStart, SceneObjects
 from dextouch.serving import configure_logging
-from dextouch.worker_pool import worker_pool
 from services.evaluation.policies.outside import PolicySource, action_chunk, ask
 from services.evaluation.progress import Progress
 from services.pipelines.parsers import training_data_parser
@@ -45,9 +44,6 @@ _MARKED_IMAGE_PX: Final = 400
 _VARIED_DRAW, _SIZES_DRAW = 103, 104
 # How a take becomes an episode: written as it is; by devices, drivers, recorder and alignment, with
 # the twin's labels; or the same without them, objects being measured by the markers on them.
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -260,7 +256,7 @@ def make_training_data(
     seeds: range,
     mix: Mix,
     *,
-    num_jobs: int | None = None,
+    workers: Workers | None = None,
     scope: Scope | None = None,
     policy: PolicyChoice | None = None,
 ) -> dict[str, int]:
@@ -270,7 +266,7 @@ def make_training_data(
         store: folder of the store.
         seeds: seeds of the scenes.
         mix: kinds of takes.
-        num_jobs: processes; default: one per core.
+        workers: where they are recorded; default: one process per core.
         scope: tasks, domains and streams.
         policy: policy that acts instead of the scripts; `mix` is then ignored.
 
@@ -282,10 +278,10 @@ def make_training_data(
         InvalidInputError: no seeds, tasks or domains, or a policy with human hands.
     """
     scope = scope or Scope()
-    if not seeds or not scope.tasks or not scope.domains or (num_jobs is not None and num_jobs < 1):
+    if not seeds or not scope.tasks or not scope.domains:
         raise InvalidInputError(
-            f"training data: got seeds {seeds}, tasks {scope.tasks}, domains {scope.domains} and "
-            f"{num_jobs} jobs, expected at least one of each"
+            f"training data: got seeds {seeds}, tasks {scope.tasks} and domains {scope.domains}, "
+            "expected at least one of each"
         )
     if policy is not None and scope.path == "station":
         raise InvalidInputError("training data: got a policy and --path station; it plays scripts")
@@ -311,8 +307,15 @@ def make_training_data(
     counts = {"made": 0, "kept": len(orders) - len(missing), "succeeded": 0, "refused": 0}
     started_s = time.monotonic()
     with Progress("twin episodes", len(missing)) as progress:
-        answers = in_processes(make_episode, missing, num_jobs or os.cpu_count() or 1)
-        for done, answer in enumerate(answers, start=1):
+        jobs = run_jobs(
+            make_episode,
+            missing,
+            workers or Workers(os.cpu_count() or 1),
+            prepare=log_warnings,
+            folders=target.folders,
+        )
+        for done, job in enumerate(jobs, start=1):
+            answer = job.value or Answer(job.item.episode_id, refusal=str(job.error))
             if answer.refusal is not None:
                 counts["refused"] += 1
                 print(f"{answer.episode_id}: {answer.refusal}")
@@ -333,18 +336,6 @@ def _sizes(task: str, seed: int, scope: Scope) -> Sizes:
     return Sizes.drawn(draw) if draw.random() < scope.resized else Sizes()
 
 
-def in_processes(
-    function: Callable[[Item], Result], items: Sequence[Item], num_jobs: int
-) -> Iterator[Result]:
-    """Results of a function of the items, as they are done; one job needs no other process."""
-    if num_jobs == 1 or len(items) < 2:
-        yield from map(function, items)
-        return
-    with worker_pool(min(num_jobs, len(items)), log_warnings) as pool:
-        for future in as_completed([pool.submit(function, item) for item in items]):
-            yield future.result()
-
-
 def log_warnings() -> None:
     """Log no more than warnings: a take has a dozen events."""
     configure_logging(service="train_data", log_format="auto", level="warning")
@@ -361,7 +352,12 @@ def main(argv: Sequence[str]) -> int:
     log_warnings()
     policy = arguments.policy and PolicyChoice.parse(arguments.policy, arguments.policy_arguments)
     counts = make_training_data(
-        arguments.store, seeds, mix, num_jobs=arguments.jobs, scope=scope, policy=policy
+        arguments.store,
+        seeds,
+        mix,
+        workers=Workers(arguments.jobs, arguments.ray),
+        scope=scope,
+        policy=policy,
     )
     print(", ".join(f"{count} {name}" for name, count in counts.items()))
     write_result(arguments.json, counts)

@@ -2,7 +2,7 @@
 
 import argparse
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from dextouch.command_line import progress, write_result
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError
-from dextouch.worker_pool import worker_pool
+from dextouch.errors import ConflictError, InvalidInputError
+from dextouch.jobs import Workers, results_of, run_jobs
 from services.twin.episodes import record, write_episode
 from services.twin.mistakes import Mistake
 from services.twin.motions import Motion
@@ -38,12 +38,13 @@ class TakeOrder:
 
 @dataclass(frozen=True)
 class TakeReport:
-    """Result of one order."""
+    """Result of one order; `kept` if the episode was recorded before."""
 
     episode_id: str
     seed: int
     success: bool
     miss: bool
+    kept: bool = False
 
 
 @lru_cache(maxsize=2)
@@ -54,15 +55,22 @@ def _stage(task: str, domain: Domain) -> Stage:
 
 def _take(order: TakeOrder) -> TakeReport:
     episode = record(_stage(order.task, order.domain), order.seed, order.options)
-    episode_id = write_episode(EpisodeStore(order.store_url), episode)
-    return TakeReport(episode_id, order.seed, bool(episode.attributes.success), order.options.miss)
+    about, store = episode.attributes, EpisodeStore(order.store_url)
+    kept = False
+    try:
+        write_episode(store, episode)
+    except ConflictError:
+        # The id says task, seed and options.
+        kept = True
+    return TakeReport(
+        about.episode_id, order.seed, bool(about.success), order.options.miss, kept=kept
+    )
 
 
 def _orders(arguments: argparse.Namespace) -> list[TakeOrder]:
-    if not 0.0 <= arguments.miss_fraction <= 1.0 or arguments.jobs < 1:
+    if not 0.0 <= arguments.miss_fraction <= 1.0:
         raise InvalidInputError(
-            f"twin record: got --miss-fraction {arguments.miss_fraction} and --jobs "
-            f"{arguments.jobs}, expected a fraction 0 … 1 and at least one job"
+            f"twin record: got --miss-fraction {arguments.miss_fraction}, expected 0 … 1"
         )
     orders = []
     for seed in arguments.seeds:
@@ -82,14 +90,6 @@ def _orders(arguments: argparse.Namespace) -> list[TakeOrder]:
         )
         orders.append(TakeOrder(arguments.task, arguments.domain, seed, options, arguments.store))
     return orders
-
-
-def _work(orders: Sequence[TakeOrder], num_jobs: int) -> Iterator[TakeReport]:
-    if num_jobs == 1:
-        yield from map(_take, orders)
-        return
-    with worker_pool(num_jobs) as pool:
-        yield from pool.map(_take, orders)
 
 
 def _summary(
@@ -112,7 +112,10 @@ def main(argv: Sequence[str]) -> int:
     arguments = twin_parser().parse_args(list(argv))
     start_s = time.monotonic()
     orders = _orders(arguments)
-    reports = list(progress(_work(orders, arguments.jobs), "twin record", len(orders)))
+    workers = Workers(arguments.jobs, arguments.ray)
+    jobs = run_jobs(_take, orders, workers, folders=EpisodeStore(arguments.store).folders)
+    done = results_of(progress(jobs, "twin record", len(orders)))
+    reports = sorted(done, key=lambda report: report.seed)
     summary = _summary(arguments, reports, time.monotonic() - start_s)
     write_result(arguments.json, summary)
     succeeded = sum(report.success for report in reports)

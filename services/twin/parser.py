@@ -2,7 +2,7 @@
 
 import argparse
 
-from dextouch.command_line import CommandParser, add_json
+from dextouch.command_line import CommandParser, add_json, add_workers
 from dextouch.data_folder import default_store
 from services.twin.names import (
     CAMERAS,
@@ -100,7 +100,7 @@ def _add_record(commands: "argparse._SubParsersAction[CommandParser]") -> None:
         help="store for the episodes (%(default)s)",
         metavar="URL",
     )
-    make.add_argument("--jobs", default=1, type=int, metavar="N", help="processes (%(default)s)")
+    add_workers(make, default=1)
     add_json(make)
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import re
 import sys
 import textwrap
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
 STANDARD_OUTPUT = Path("-")
+RAY_HELP = (
+    "run the jobs on this Ray cluster instead: auto, ray://HOST:10001, or local for one on this "
+    "machine (docs/scaling.md)"
+)
 JSON_HELP = "also write the result as JSON to this file; - for standard output"
 # Of lines in a log or pipe.
 LINE_PERIOD_S = 5.0
@@ -117,6 +122,20 @@ def progress(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:
     for done, item in enumerate(shown, start=1):
         yield item
         lines.show(f"{done} of {total}", is_last=done == total)
+
+
+def add_workers(parser: argparse.ArgumentParser, default: int | None = None) -> None:
+    """Add `--jobs N` (default: one per core) and `--ray ADDRESS`, for `dextouch.jobs.Workers`."""
+    jobs = f"processes (default: {default or 'one per core'})"
+    default = default or len(os.sched_getaffinity(0))
+    parser.add_argument("--jobs", type=_at_least_one, default=default, metavar="N", help=jobs)
+    parser.add_argument("--ray", metavar="ADDRESS", help=RAY_HELP)
+
+
+def _at_least_one(text: str) -> int:
+    if text.isdecimal() and int(text) >= 1:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number of at least 1")
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

@@ -36,6 +36,14 @@ class DexTouchError(Exception):
         self.message = message
         self.details = details
 
+    def __reduce__(self) -> tuple[object, ...]:
+        # Subclasses have other arguments than those of the built-in class, which pickle would use.
+        return _restored, (type(self), self.args), self.__dict__
+
+
+def _restored(kind: type[DexTouchError], arguments: tuple[object, ...]) -> DexTouchError:
+    return kind.__new__(kind, *arguments)
+
 
 class InvalidInputError(DexTouchError):
     """Input from the caller is invalid."""

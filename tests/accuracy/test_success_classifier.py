@@ -8,6 +8,7 @@ import torch
 from scipy.stats import mannwhitneyu
 
 from dextouch.episodes import EpisodeStore
+from dextouch.jobs import Workers
 from services.evaluation.endings import read_ending_episodes
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_classifier import SuccessClassifier
@@ -27,7 +28,7 @@ def test_it_tells_successes_from_near_misses(tmp_path):
     seeds = range(FIRST_SEED, FIRST_SEED + 4 * len(LADDER_M))
     probe = SuccessClassifier.load(DEFAULT_PROBE)
     scope = Scope(probe.metadata.tasks)
-    make_training_data(str(tmp_path), seeds, MIXES["ladder"], num_jobs=1, scope=scope)
+    make_training_data(str(tmp_path), seeds, MIXES["ladder"], workers=Workers(1), scope=scope)
     episodes = read_ending_episodes(EpisodeStore(tmp_path))
     assert not {e.start_digest for e in episodes} & set(probe.metadata.training_starts)
     for task in probe.metadata.tasks:

@@ -2,7 +2,7 @@
 
 import hashlib
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from copy import copy
@@ -25,6 +25,7 @@ from services.evaluation.settings import DEFAULT_POLICY
 from services.evaluation.studies.definition import PolicyChoice, StudyDefinition
 from services.evaluation.studies.results import (
     PlannedRollout,
+    StudyHeader,
     StudyResults,
     cells_of,
     keep_rollout,
@@ -83,19 +84,43 @@ def run_study(
         UnavailableError: a world stopped answering; the other results are kept.
     """
     with results.locked():
-        _run_missing(definition, results, parts, retry_failed=retry_failed)
+        missing = missing_rollouts(definition, results, retry_failed=retry_failed)
+        run_rollouts(definition, missing, results.header, parts, results.keep)
     return study_report(definition, results)
 
 
-def _run_missing(
-    definition: StudyDefinition, results: StudyResults, parts: StudyParts, *, retry_failed: bool
-) -> None:
-    missing = [
+def missing_rollouts(
+    definition: StudyDefinition, results: StudyResults, *, retry_failed: bool = False
+) -> list[PlannedRollout]:
+    """Rollouts of a study that have no result yet, or failed and are to be run again."""
+    return [
         cell
         for cell in cells_of(definition)
         if cell not in results.outcomes
         or (retry_failed and isinstance(results.outcomes[cell], RolloutFailure))
     ]
+
+
+def run_rollouts(
+    definition: StudyDefinition,
+    missing: Sequence[PlannedRollout],
+    header: StudyHeader,
+    parts: StudyParts,
+    keep: Callable[[Outcome], None],
+) -> None:
+    """Run some rollouts of a study; its starts are those of `definition`.
+
+    Args:
+        definition: whose tasks and seeds are those of the rollouts; the study's, or a part of it.
+        missing: rollouts to run.
+        header: of the whole study.
+        parts: worlds, policies and probe.
+        keep: is called with each outcome, as soon as it is known.
+
+    Raises:
+        ConflictError: a start was trained on.
+        UnavailableError: a world stopped answering.
+    """
     if missing:
         with ExitStack() as connections:
             worlds = parts.connect(connections)
@@ -116,7 +141,7 @@ def _run_missing(
                 if isinstance(one, FailedStart) and isinstance(one.error, UnavailableError):
                     raise one.error
         by_key: dict[tuple[str, int], Start] = {(one.task, one.seed): one for one in starts}
-        _Workers(definition, results, parts, by_key).run(missing)
+        _Workers(definition, header, parts, by_key).run(missing, keep)
 
 
 class _Workers:
@@ -125,19 +150,19 @@ class _Workers:
     def __init__(
         self,
         definition: StudyDefinition,
-        results: StudyResults,
+        header: StudyHeader,
         parts: StudyParts,
         starts: Mapping[tuple[str, int], Start],
     ) -> None:
-        self._definition, self._results, self._parts = definition, results, parts
+        self._definition, self._header, self._parts = definition, header, parts
         self._starts = starts
         self._local = threading.local()
         self._connections = ExitStack()
         self._lock = threading.Lock()
         self._stopping = threading.Event()
 
-    def run(self, cells: list[PlannedRollout]) -> None:
-        """Run rollouts and keep their outcomes.
+    def run(self, cells: Sequence[PlannedRollout], keep: Callable[[Outcome], None]) -> None:
+        """Run rollouts; `keep` is called with each outcome.
 
         Raises:
             UnavailableError: a world stopped answering.
@@ -162,7 +187,7 @@ class _Workers:
                     for future in done:
                         outcome = future.result()
                         if outcome is not None:
-                            self._results.keep(outcome)
+                            keep(outcome)
                             num_failed += isinstance(outcome, RolloutFailure)
                             progress.advance(failed=float(num_failed))
             finally:
@@ -184,7 +209,7 @@ class _Workers:
         store = self._parts.store
         if store is not None and played is not None and isinstance(start, MatchedStart):
             world = runner.worlds.descriptions[cell.world]
-            keep_rollout(store, self._results.header, cell, start, played, world)
+            keep_rollout(store, self._header, cell, start, played, world)
         return outcome
 
     def _of_this_thread(self) -> tuple[RolloutRunner, Mapping[str, Policy]]:

@@ -19,6 +19,7 @@ from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.episodes.care import UPLOADS
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
+from dextouch.jobs import Workers, results_of, run_jobs
 from dextouch.schemas import RecordingAttributes, TakePrompt
 from services.acquisition.mock_station import MockTake
 from services.acquisition.mocks.faults import Fate
@@ -32,7 +33,7 @@ from services.episode_store.committing import commit_spool
 from services.evaluation.progress import Progress
 from services.pipelines.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan
 from services.pipelines.mock_takes import TakePlan, measure_gloves, origin_in_truth_ns, play_take
-from services.pipelines.training_data import Order, in_processes, make_episode
+from services.pipelines.training_data import Order, log_warnings, make_episode
 from services.twin.names import CAMERAS, Domain
 from services.twin.take_options import TakeOptions
 
@@ -80,7 +81,8 @@ def make_truth(plan: DemoPlan, store_folder: Path) -> tuple[list[str], list[str]
     ]
     orders = takes + demonstrations
     with Progress("episodes", len(orders)) as progress:
-        for answer in in_processes(make_episode, orders, min(MAX_PROCESSES, os.cpu_count() or 1)):
+        workers = Workers(min(MAX_PROCESSES, os.cpu_count() or 1))
+        for answer in results_of(run_jobs(make_episode, orders, workers, prepare=log_warnings)):
             if answer.refusal is not None:
                 raise InvalidInputError(f"{answer.episode_id}: {answer.refusal}")
             progress.advance()

@@ -11,6 +11,7 @@ from pathlib import Path
 from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.jobs import Workers, results_of, run_jobs
 from dextouch.serving import ChildProcess
 from services.evaluation.command_line import (
     EXIT_FAILED,
@@ -19,11 +20,24 @@ from services.evaluation.command_line import (
     print_scores,
 )
 from services.evaluation.policies.replay import ReplayPolicy
-from services.evaluation.scores import REAL
+from services.evaluation.progress import Progress
+from services.evaluation.scores import REAL, Outcome
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.studies.definition import StudyDefinition, WorldChoice, read_definition
-from services.evaluation.studies.engine import PolicyFactory, StudyParts, file_digest, run_study
-from services.evaluation.studies.results import StudyHeader, StudyResults, cells_of
+from services.evaluation.studies.engine import (
+    PolicyFactory,
+    StudyParts,
+    file_digest,
+    missing_rollouts,
+    run_rollouts,
+    run_study,
+)
+from services.evaluation.studies.results import (
+    PlannedRollout,
+    StudyHeader,
+    StudyResults,
+    cells_of,
+)
 from services.evaluation.studies.study_figures import REPORT_FILE, write_reports
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
@@ -33,6 +47,8 @@ from services.twin.scripted_actions import scripted_actions
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 
+# Chosen: a block opens its worlds anew, in some ten seconds, and plays all policies from these.
+_STARTS_IN_A_BLOCK = 10
 _CHILD = "services.pipelines.study.world_process"
 
 
@@ -50,43 +66,122 @@ def _run(options: argparse.Namespace) -> int:
     definition = read_definition(options.study)
     folder = options.folder or options.study.with_suffix("")
     refuse_training_seeds(definition)
-    probe_path = definition.probe or DEFAULT_PROBE
-    probe = SuccessClassifier.load(probe_path)
-    own_probes = _own_probes(definition, probe)
-    instructions = instructions_for(definition.tasks, probe.metadata.settings["instructions"])
-    policies = PolicyFactory(definition, partial(demonstrator, definition.tasks, definition.seeds))
-    policies.load()
-    with served_worlds(definition) as addresses:
-        digests = {"definition": definition.digest, "probe": file_digest(probe_path)}
-        digests |= {f"probe of {name}": file_digest(path) for name, path in own_paths(definition)}
-        digests |= policies.digests()
+    store_url = str(options.store or folder / "rollouts") if definition.keep_rollouts else None
+    addresses = dict[str, Address]()
+    parts, digests = _parts(definition, addresses, store_url)
+    with served_worlds(definition) as served:
+        addresses |= served
+        digests["definition"] = definition.digest
         with ExitStack() as connections:
             digests |= connect(addresses, connections).digests
         header = StudyHeader(definition.name, definition.model_dump(mode="json"), digests)
         results = StudyResults.create_or_resume(folder, header)
         num_cells = sum(1 for _ in cells_of(definition))
-        store = (
-            EpisodeStore(options.store or folder / "rollouts") if definition.keep_rollouts else None
-        )
-        if store is not None:
+        if parts.store is not None:
             # What a killed run left unfinished.
-            store.sweep()
+            parts.store.sweep()
         print(f"{definition.name}: {len(results.outcomes)} of {num_cells} rollouts have a result")
-        run_study(
-            definition,
-            results,
-            StudyParts(
-                partial(connect, addresses),
-                policies.load,
-                probe,
-                instructions,
-                policies.training_starts(),
-                store,
-                own_probes,
-            ),
-            retry_failed=options.retry_failed,
-        )
+        if options.ray is None:
+            run_study(definition, results, parts, retry_failed=options.retry_failed)
+    if options.ray is not None:
+        with results.locked():
+            missing = missing_rollouts(definition, results, retry_failed=options.retry_failed)
+            _run_on_cluster(definition, missing, results, store_url, options.ray)
     return _finish(results, options.json)
+
+
+def _parts(
+    definition: StudyDefinition, addresses: Mapping[str, "Address"], store_url: str | None
+) -> tuple[StudyParts, dict[str, str]]:
+    """What the rollouts of a study need, and digests of the files among it.
+
+    `addresses` are those of its worlds by name, at the latest when rollouts begin.
+    """
+    probe_path = definition.probe or DEFAULT_PROBE
+    probe = SuccessClassifier.load(probe_path)
+    policies = PolicyFactory(definition, partial(demonstrator, definition.tasks, definition.seeds))
+    policies.load()
+    digests = {"probe": file_digest(probe_path), **policies.digests()}
+    digests |= {f"probe of {name}": file_digest(path) for name, path in own_paths(definition)}
+    parts = StudyParts(
+        partial(connect, addresses),
+        policies.load,
+        probe,
+        instructions_for(definition.tasks, probe.metadata.settings["instructions"]),
+        policies.training_starts(),
+        None if store_url is None else EpisodeStore(store_url),
+        _own_probes(definition, probe),
+    )
+    return parts, digests
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Rollouts in one world from some starts of a task, for a machine of a cluster.
+
+    `definition` is the study's with these starts and this world alone.
+    """
+
+    definition: StudyDefinition
+    rollouts: tuple[PlannedRollout, ...]
+    header: StudyHeader
+    store_url: str | None
+
+
+def _run_on_cluster(
+    definition: StudyDefinition,
+    missing: Sequence[PlannedRollout],
+    results: StudyResults,
+    store_url: str | None,
+    ray_address: str,
+) -> None:
+    """Run rollouts on the machines of a Ray cluster, which see the study's files.
+
+    Raises:
+        DexTouchError: a block of rollouts failed; those of the others are kept.
+    """
+    blocks = blocks_of(definition, missing, results.header, store_url)
+    folders = [results.path.parent, *(EpisodeStore(store_url).folders if store_url else ())]
+    jobs = run_jobs(run_block, blocks, Workers(ray_address=ray_address), folders=folders)
+    with Progress("rollouts", len(missing)) as progress:
+        for outcomes in results_of(jobs):
+            for outcome in outcomes:
+                results.keep(outcome)
+                progress.advance()
+
+
+def blocks_of(
+    definition: StudyDefinition,
+    missing: Sequence[PlannedRollout],
+    header: StudyHeader,
+    store_url: str | None,
+) -> list[_Block]:
+    """Rollouts by world, task and `_STARTS_IN_A_BLOCK` seeds."""
+    by_place: dict[tuple[str, str, int], list[PlannedRollout]] = {}
+    for one in missing:
+        number = (one.seed - definition.first_seed) // _STARTS_IN_A_BLOCK
+        by_place.setdefault((one.world, one.task, number), []).append(one)
+    blocks = []
+    for (world, task, _), rollouts in by_place.items():
+        seeds = [one.seed for one in rollouts]
+        changes: dict[str, object] = {
+            "tasks": (task,),
+            "first_seed": min(seeds),
+            "num_starts": max(seeds) - min(seeds) + 1,
+            "imagined": {n: one for n, one in definition.imagined.items() if n == world},
+        }
+        part = definition.model_copy(update=changes)
+        blocks.append(_Block(part, tuple(rollouts), header, store_url))
+    return blocks
+
+
+def run_block(block: _Block) -> list[Outcome]:
+    """Outcomes of the rollouts of a block, whose worlds are served on this machine."""
+    outcomes: list[Outcome] = []
+    with served_worlds(block.definition) as addresses:
+        parts, _ = _parts(block.definition, addresses, block.store_url)
+        run_rollouts(block.definition, block.rollouts, block.header, parts, outcomes.append)
+    return outcomes
 
 
 def own_paths(definition: StudyDefinition) -> list[tuple[str, Path]]:

@@ -23,7 +23,7 @@ from dextouch.episodes import (
     data_hash,
 )
 from dextouch.errors import InvalidInputError
-from dextouch.worker_pool import worker_pool
+from dextouch.jobs import worker_pool
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.core import RecurrentCore

@@ -77,6 +77,11 @@ class EpisodeStore:
         self._storage = _open_storage(url, storage_options or {})
         self.root = self._storage.root
 
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """The folder that other machines must see to use this store; none for a bucket."""
+        return (self.root,) if isinstance(self._storage, _LocalStorage) else ()
+
     def writer(
         self,
         *,

@@ -8,6 +8,7 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ClockFitError, InvalidInputError, UnknownNameError
+from dextouch.jobs import Workers
 from services.pipelines import training_data
 from services.pipelines.training_data import PolicyChoice, Scope, make_training_data
 from services.twin.data_mix import MIXES, STRENGTHS, Mix, options_of
@@ -113,11 +114,15 @@ def test_shares_changed_to_more_than_all_are_refused(changes):
 
 def test_a_run_goes_on_where_it_was_interrupted(tmp_path, capsys):
     scope = Scope(("stand_bottle",), image_every=40)
-    first = make_training_data(str(tmp_path), range(2), MIXES["exact"], num_jobs=1, scope=scope)
+    first = make_training_data(
+        str(tmp_path), range(2), MIXES["exact"], workers=Workers(1), scope=scope
+    )
     assert first == {"made": 2, "kept": 0, "succeeded": 2, "refused": 0}
     store = EpisodeStore(tmp_path)
     before = {name: store.open(name).content_sha256 for name in store.list()}
-    again = make_training_data(str(tmp_path), range(2), MIXES["exact"], num_jobs=1, scope=scope)
+    again = make_training_data(
+        str(tmp_path), range(2), MIXES["exact"], workers=Workers(1), scope=scope
+    )
     assert again == {"made": 0, "kept": 2, "succeeded": 0, "refused": 0}
     assert before == {name: store.open(name).content_sha256 for name in store.list()}
     capsys.readouterr()

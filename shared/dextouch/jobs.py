@@ -1,0 +1,305 @@
+"""Independent jobs, in processes of this machine or on a Ray cluster.
+
+`run_jobs` calls a function once for each item and yields a `Job` as each ends, with its result or
+its error: one that fails does not stop the others. A worker process that is killed costs nothing
+but time, since its job is repeated. So jobs must be repeatable: what they write is written at once
+and under a name that the item decides, as episodes are.
+"""
+
+import multiprocessing
+import os
+import secrets
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import cache, partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final, Generic, TypeVar, cast
+
+from dextouch.episodes import disk_errors
+from dextouch.errors import ConflictError, DexTouchError, NotFoundError, UnavailableError
+
+# Chosen: of the jobs that ran when a worker was killed, some had not even begun.
+_TRIES_ALONE: Final = 2
+# Chosen: machines of a cluster may go away more than once during a long job.
+_RAY_RETRIES: Final = 3
+# Jobs that wait at a Ray cluster: enough that no worker idles, few enough that the driver's memory
+# does not grow with the number of items.
+_MAX_SUBMITTED: Final = 1000
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where jobs run.
+
+    Attributes:
+        num_processes: processes of this machine; with one, jobs run in this process.
+        ray_address: of a Ray cluster, which is then used instead: `auto`, `ray://HOST:10001`, or
+            `local` for one on this machine.
+    """
+
+    num_processes: int = 1
+    ray_address: str | None = None
+
+
+@dataclass(frozen=True)
+class Job(Generic[Item, Result]):
+    """A job that ended: its item, and its result or its error."""
+
+    item: Item
+    value: Result | None = None
+    error: DexTouchError | None = None
+
+    def result(self) -> Result:
+        """The result.
+
+        Raises:
+            DexTouchError: the job failed.
+        """
+        if self.error is not None:
+            raise self.error
+        # None may be a result.
+        return cast(Result, self.value)
+
+
+def run_jobs(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    workers: Workers,
+    *,
+    prepare: Callable[[], object] | None = None,
+    folders: Sequence[str | Path] = (),
+) -> Iterator[Job[Item, Result]]:
+    """Call a function for each item and yield what comes of it, in the order in which jobs end.
+
+    A `DexTouchError` is the error of its job; any other exception ends the run. A job whose worker
+    is killed is repeated: on this machine up to twice, after all others and alone, so that only the
+    one that kills its worker fails; on a cluster three times.
+
+    Args:
+        function: of a module, so that other processes can import it; it and the items are pickled.
+        items: one for each job.
+        workers: where the jobs run.
+        prepare: called once in each worker process.
+        folders: folders of this machine that jobs write to; on a cluster, machines that do not see
+            them refuse their jobs.
+
+    Raises:
+        UnavailableError: there is no cluster at the address.
+    """
+    if workers.ray_address is not None:
+        with _marked(folders) as marks:
+            yield from _on_ray(
+                (function, prepare, marks, version("dextouch-wm")), items, workers.ray_address
+            )
+    elif workers.num_processes == 1 or len(items) < 2:
+        for item in items:
+            yield Job(item, *_attempt(function, None, (), "", item))
+    else:
+        call = partial(_attempt, function, None, (), "")
+        yield from _in_processes(call, items, workers.num_processes, prepare)
+
+
+def results_of(jobs: Iterable[Job[Any, Result]]) -> Iterator[Result]:
+    """Results as jobs end; the first error is raised once all others have ended."""
+    errors = []
+    for job in jobs:
+        if job.error is None:
+            yield job.result()
+        else:
+            errors.append(job.error)
+    if errors:
+        raise errors[0]
+
+
+Ending = tuple[Any, DexTouchError | None]
+
+
+def _in_processes(
+    call: Callable[[Item], Ending],
+    items: Sequence[Item],
+    num_processes: int,
+    prepare: Callable[[], object] | None,
+) -> Iterator[Job[Item, Any]]:
+    todo, suspects = list(reversed(items)), list[Item]()
+    while todo:
+        running: dict[Future[Ending], Item] = {}
+        with worker_pool(min(num_processes, len(todo)), prepare) as pool:
+            is_broken = False
+            while running or (todo and not is_broken):
+                # No more than there are workers: those of a broken pool are the suspects.
+                while todo and not is_broken and len(running) < num_processes:
+                    try:
+                        future = pool.submit(call, todo[-1])
+                    except BrokenProcessPool:
+                        is_broken = True
+                    else:
+                        running[future] = todo.pop()
+                ended = wait(running, return_when=FIRST_COMPLETED).done
+                for future in ended:
+                    item = running.pop(future)
+                    if isinstance(future.exception(), BrokenProcessPool):
+                        is_broken = True
+                        suspects.append(item)
+                    else:
+                        yield Job(item, *future.result())
+    for item in suspects:
+        yield Job(item, *_alone(call, item, prepare))
+
+
+def _alone(
+    call: Callable[[Item], Ending], item: Item, prepare: Callable[[], object] | None
+) -> Ending:
+    for _ in range(_TRIES_ALONE):
+        with worker_pool(1, prepare) as pool:
+            future = pool.submit(call, item)
+            if not isinstance(future.exception(), BrokenProcessPool):
+                return future.result()
+    return None, _lost(f"again and again, {_TRIES_ALONE} times without other jobs beside it")
+
+
+def _on_ray(
+    call: tuple[object, ...], items: Sequence[Item], address: str
+) -> Iterator[Job[Item, Any]]:
+    """Jobs on a cluster; `call` are the arguments of `_attempt` before the item."""
+    import ray
+    from ray.exceptions import RayError, RayTaskError
+
+    with _connected(address):
+        remote = ray.remote(_attempt).options(num_cpus=1, max_retries=_RAY_RETRIES)
+        todo, running = list(reversed(items)), dict[Any, Item]()
+        while todo or running:
+            while todo and len(running) < _MAX_SUBMITTED:
+                item = todo.pop()
+                running[remote.remote(*call, item)] = item
+            (reference,), _ = ray.wait(list(running), num_returns=1)
+            item = running.pop(reference)
+            try:
+                yield Job(item, *ray.get(reference))
+            except RayTaskError as error:
+                raise error.cause from error
+            except RayError as error:
+                times = f"{1 + _RAY_RETRIES} times ({str(error).splitlines()[0]})"
+                yield Job(item, None, _lost(times))
+
+
+@contextmanager
+def _connected(address: str) -> Iterator[None]:
+    import ray
+
+    if ray.is_initialized():
+        yield
+        return
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level="error")
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise UnavailableError(
+            f"Ray cluster {address}: cannot be reached ({error}); start it with "
+            "`ray start --head`, or check the address"
+        ) from error
+    try:
+        yield
+    finally:
+        # Ends the jobs that still run, as after Ctrl-C.
+        ray.shutdown()
+
+
+def _lost(times: str) -> UnavailableError:
+    return UnavailableError(
+        f"the worker process was killed {times}; it may have needed more memory than there is"
+    )
+
+
+@cache
+def _prepared(prepare: Callable[[], object]) -> None:
+    prepare()
+
+
+def _attempt(
+    function: Callable[[Item], Result],
+    prepare: Callable[[], object] | None,
+    marks: tuple[Path, ...],
+    expected_version: str,
+    item: Item,
+) -> Ending:
+    """Result and error of one call, in a worker; `marks` must be seen from there."""
+    try:
+        if marks or expected_version:
+            _check_machine(marks, expected_version)
+        if prepare is not None:
+            _prepared(prepare)
+        return function(item), None
+    except DexTouchError as error:
+        return None, error
+
+
+def _check_machine(marks: tuple[Path, ...], expected_version: str) -> None:
+    machine = os.uname().nodename
+    for mark in marks:
+        if not mark.exists():
+            raise NotFoundError(
+                f"{machine}: does not see the folder {mark.parent} of the machine that ordered the "
+                "job; mount it on all machines of the cluster, or use a store at s3://…"
+            )
+    if (got := version("dextouch-wm")) != expected_version:
+        raise ConflictError(
+            f"{machine}: has dextouch-wm {got}, expected {expected_version} as on the machine that "
+            "ordered the job; install the same version on all machines of the cluster"
+        )
+
+
+@contextmanager
+def _marked(folders: Sequence[str | Path]) -> Iterator[tuple[Path, ...]]:
+    """Files in these folders while the block lasts, by which other machines recognize them."""
+    name = f".jobs-{secrets.token_hex(8)}"
+    with ExitStack() as cleaning:
+        marks = []
+        for folder in folders:
+            mark = Path(folder).absolute() / name
+            with disk_errors(f"write {mark}"):
+                mark.parent.mkdir(parents=True, exist_ok=True)
+                mark.touch()
+            cleaning.callback(mark.unlink, missing_ok=True)
+            marks.append(mark)
+        yield tuple(marks)
+
+
+@contextmanager
+def worker_pool(
+    num_workers: int, prepare: Callable[[], object] | None = None
+) -> Iterator[ProcessPoolExecutor]:
+    """Fresh interpreters, which share no threads and locks with this process.
+
+    If the block fails, waiting jobs are cancelled. If this process is killed, its workers end at
+    once; those of a bare pool would go on with their jobs.
+
+    Args:
+        num_workers: processes.
+        prepare: called once in each worker; picklable.
+    """
+    spawned = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(num_workers, spawned, _begin, (prepare,))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin(prepare: Callable[[], object] | None) -> None:
+    threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
+    if prepare is not None:
+        prepare()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
