@@ -16,12 +16,11 @@ from dextouch.serving import load_settings
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
-from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
+from services.evaluation.policies.bundled import bundled_policy, training_starts_of
 from services.evaluation.policies.cloning_network import read_cloning_episodes
 from services.evaluation.policies.cloning_training import train_cloned_policy
-from services.evaluation.policies.colour_servo import ColourServo
 from services.evaluation.policies.outside import PolicySource
-from services.evaluation.policies.replay import HoldPolicy, ReplayPolicy
+from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import ReportPictures, write_report
 from services.evaluation.reporting.sections import failure_rows, figure, undecided_note
 from services.evaluation.scores import ResultLog
@@ -172,14 +171,11 @@ def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str,
         )
         policies[name] = ReplayPolicy.of(found)
     trained_on: dict[str, Sequence[str]] = {}
-    if "behaviour-cloning" in settings.builtin:
-        cloned = BehaviourCloningPolicy.load(settings.cloned_policy)
-        policies["behaviour-cloning"] = cloned
-        trained_on["the cloned policy"] = cloned.metadata.training_starts
-    if "colour-servo" in settings.builtin:
-        policies["colour-servo"] = ColourServo()
-    if "hold" in settings.builtin:
-        policies["hold"] = HoldPolicy()
+    for name in settings.builtin:
+        given = settings.cloned_policy if name == "behaviour-cloning" else None
+        policies[name] = bundled_policy(name, given)
+        if starts := training_starts_of(policies[name]):
+            trained_on[f"policy {name!r}"] = starts
     return policies, trained_on
 
 

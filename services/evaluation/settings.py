@@ -3,13 +3,14 @@
 import re
 import shlex
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
 from dextouch.command_line import JSON_HELP
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import CommandSettings, service_config
+from services.evaluation.policies.bundled import DEFAULT_POLICY, BundledName
 from services.networks.training_settings import (
     USUAL_IMAGE_PX,
     Batch,
@@ -118,7 +119,6 @@ class ClassifierSettings(FrozenModel):
 
 
 PRETRAINED = Path(__file__).parent / "pretrained"
-DEFAULT_POLICY = PRETRAINED / "behaviour_cloning.safetensors"
 EARLY_POLICY = PRETRAINED / "behaviour_cloning_early.safetensors"
 # Word of `--base` for the next.
 PACKAGE = Path("package")
@@ -237,7 +237,7 @@ class RunSettings(CommandSettings):
     scripts: dict[str, str] = Field(
         default={}, description="stores of episodes to replay, by policy name"
     )
-    builtin: tuple[Literal["behaviour-cloning", "colour-servo", "hold"], ...] = Field(
+    builtin: tuple[BundledName, ...] = Field(
         default=("behaviour-cloning", "hold"),
         description="bundled policies; [] for none; colour-servo knows only stand_bottle and "
         "open_drawer",

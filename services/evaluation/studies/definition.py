@@ -10,6 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 from dextouch.errors import InvalidInputError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
+from services.evaluation.policies.bundled import BUNDLED, BundledName, checkpoint_of
 from services.evaluation.scores import REAL
 
 NAME_PATTERN: Final = r"^[A-Za-z0-9][A-Za-z0-9 ._+-]{0,63}$"
@@ -58,7 +59,7 @@ class PolicyChoice(FrozenModel):
 
     factory: str | None = None
     arguments: dict[str, Any] = Field(default={})
-    builtin: Literal["behaviour-cloning", "colour-servo", "hold"] | None = None
+    builtin: BundledName | None = None
     checkpoint: Path | None = None
     replay: str | None = None
     script: str | None = None
@@ -73,8 +74,9 @@ class PolicyChoice(FrozenModel):
             )
         if self.arguments and not self.factory:
             raise ValueError("`arguments` belong to `factory`")
-        if self.checkpoint and self.builtin != "behaviour-cloning":
-            raise ValueError('`checkpoint` belongs to builtin = "behaviour-cloning"')
+        if self.checkpoint and (self.builtin is None or checkpoint_of(self.builtin) is None):
+            having = [name for name in BUNDLED if checkpoint_of(name) is not None]
+            raise ValueError(f"`checkpoint` belongs to builtin = {' or '.join(having)}")
         return self
 
 

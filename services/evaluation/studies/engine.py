@@ -14,14 +14,12 @@ from dextouch.episodes import EpisodeStore, select_episodes
 from dextouch.errors import UnavailableError
 from services.evaluation.closed_loop import EvaluationPlan, begin_matched
 from services.evaluation.matched_starts import FailedStart, MatchedStart
-from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.policies.colour_servo import ColourServo
+from services.evaluation.policies.bundled import bundled_policy, checkpoint_of, training_starts_of
 from services.evaluation.policies.outside import PolicySource
-from services.evaluation.policies.replay import HoldPolicy, ReplayPolicy
+from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.progress import Progress
 from services.evaluation.rollout_runner import RolloutRunner
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure
-from services.evaluation.settings import DEFAULT_POLICY
 from services.evaluation.studies.definition import PolicyChoice, StudyDefinition
 from services.evaluation.studies.results import (
     PlannedRollout,
@@ -267,13 +265,13 @@ class PolicyFactory:
         return {name: self._load(name, one) for name, one in self._definition.policies.items()}
 
     def training_starts(self) -> dict[str, tuple[str, ...]]:
-        """Digests of training starts of bundled and cloned policies, by description."""
+        """Digests of training starts of bundled policies, by description."""
         return {
-            f"policy {name!r}": BehaviourCloningPolicy.load(
-                choice.checkpoint or DEFAULT_POLICY
-            ).metadata.training_starts
+            f"policy {name!r}": training_starts_of(
+                bundled_policy(choice.builtin, choice.checkpoint)
+            )
             for name, choice in self._definition.policies.items()
-            if choice.builtin == "behaviour-cloning"
+            if choice.builtin is not None and checkpoint_of(choice.builtin) is not None
         }
 
     def digests(self) -> dict[str, str]:
@@ -285,8 +283,9 @@ class PolicyFactory:
         }
 
     def _digest(self, choice: PolicyChoice) -> str | None:
-        if choice.builtin == "behaviour-cloning":
-            return file_digest(choice.checkpoint or DEFAULT_POLICY)
+        if choice.builtin is not None:
+            path = checkpoint_of(choice.builtin, choice.checkpoint)
+            return None if path is None else file_digest(path)
         if choice.replay is None:
             return None
         store = EpisodeStore(choice.replay)
@@ -296,10 +295,6 @@ class PolicyFactory:
     def _load(self, name: str, choice: PolicyChoice) -> Policy:
         if choice.factory is not None:
             return PolicySource.parse(f"{name}={choice.factory}").load(choice.arguments)
-        if name in self._replays:
-            return copy(self._replays[name])
-        if choice.builtin == "hold":
-            return HoldPolicy()
-        if choice.builtin == "colour-servo":
-            return ColourServo()
-        return BehaviourCloningPolicy.load(choice.checkpoint or DEFAULT_POLICY)
+        if choice.builtin is not None:
+            return bundled_policy(choice.builtin, choice.checkpoint)
+        return copy(self._replays[name])

@@ -11,8 +11,9 @@ from dextouch.worlds import BatchWorld
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.command_line import run_train_judge, run_train_policy
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
+from services.evaluation.policies.bundled import DEFAULT_POLICY
 from services.evaluation.scores import REAL, RolloutScore
-from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
+from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines import imagined_data, training_data

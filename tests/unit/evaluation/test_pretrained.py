@@ -11,7 +11,8 @@ from dextouch.errors import UnknownNameError
 from dextouch.worlds.world import ReturnSelector, RolloutStart
 from services.evaluation.checkpoints import MAX_CHECKPOINT_BYTES
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE, EARLY_POLICY
+from services.evaluation.policies.bundled import DEFAULT_POLICY
+from services.evaluation.settings import DEFAULT_PROBE, EARLY_POLICY
 from services.evaluation.success_classifier import SuccessClassifier
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld

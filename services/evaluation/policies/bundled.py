@@ -1,0 +1,66 @@
+"""Bundled policies by name: a new one is its module and a line of `BUNDLED`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+_PRETRAINED = Path(__file__).parents[1] / "pretrained"
+DEFAULT_POLICY = _PRETRAINED / "behaviour_cloning.safetensors"
+
+
+@dataclass(frozen=True)
+class Bundled:
+    """A bundled policy.
+
+    Attributes:
+        factory: MODULE:FACTORY, imported when it is used; called with the checkpoint if there is
+            one, otherwise without arguments.
+        checkpoint: file of its weights; a user may give another.
+    """
+
+    factory: str
+    checkpoint: Path | None = None
+
+
+_POLICIES: Final = "services.evaluation.policies"
+BUNDLED: Final[Mapping[str, Bundled]] = {
+    "behaviour-cloning": Bundled(
+        f"{_POLICIES}.behaviour_cloning:BehaviourCloningPolicy.load", DEFAULT_POLICY
+    ),
+    # Knows only the tasks stand_bottle and open_drawer.
+    "colour-servo": Bundled(f"{_POLICIES}.colour_servo:ColourServo"),
+    "hold": Bundled(f"{_POLICIES}.replay:HoldPolicy"),
+}
+if TYPE_CHECKING:
+    from dextouch.clients import Policy
+
+    BundledName = str
+else:
+    BundledName = Literal[tuple(BUNDLED)]
+
+
+def checkpoint_of(name: str, given: Path | None = None) -> Path | None:
+    """File of a bundled policy's weights: the one given, or its own; None if it has no weights."""
+    return given or BUNDLED[name].checkpoint
+
+
+def bundled_policy(name: str, checkpoint: Path | None = None) -> "Policy":
+    """Create a bundled policy, with other weights if they are given.
+
+    Raises:
+        NotFoundError, CorruptDataError: a checkpoint that cannot be read.
+    """
+    module, _, factory = BUNDLED[name].factory.partition(":")
+    path = checkpoint_of(name, checkpoint)
+    make: Any = attrgetter(factory)(import_module(module))
+    made: Policy = make() if path is None else make(path)
+    return made
+
+
+def training_starts_of(policy: "Policy") -> tuple[str, ...]:
+    """Digests of the starts that a bundled policy was trained on; none without training."""
+    metadata = getattr(policy, "metadata", None)
+    return () if metadata is None else tuple(metadata.training_starts)
