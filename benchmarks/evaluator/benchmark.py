@@ -31,7 +31,7 @@ from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
 from dextouch.jobs import worker_pool
-from services.evaluation.policies.bundled import DEFAULT_POLICY
+from services.evaluation.bundled_policies import DEFAULT_POLICY
 from services.evaluation.settings import DEFAULT_PROBE, EARLY_POLICY
 from services.twin.scripted_actions import mistake_of
 from services.twin.tasks import EVALUATED

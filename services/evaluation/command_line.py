@@ -13,10 +13,10 @@ from dextouch.episodes import EpisodeStore, select_episodes
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.free_text import printable
 from dextouch.serving import load_settings
+from services.evaluation.bundled_policies import bundled_policy, training_starts_of
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
-from services.evaluation.policies.bundled import bundled_policy, training_starts_of
 from services.evaluation.policies.cloning_network import read_cloning_episodes
 from services.evaluation.policies.cloning_training import train_cloned_policy
 from services.evaluation.policies.outside import PolicySource

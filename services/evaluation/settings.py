@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 from dextouch.command_line import JSON_HELP
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import CommandSettings, service_config
-from services.evaluation.policies.bundled import DEFAULT_POLICY, BundledName
+from services.evaluation.bundled_policies import DEFAULT_POLICY, BundledName
 from services.networks.training_settings import (
     USUAL_IMAGE_PX,
     Batch,

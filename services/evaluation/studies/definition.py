@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 from dextouch.errors import InvalidInputError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
-from services.evaluation.policies.bundled import BUNDLED, BundledName, checkpoint_of
+from services.evaluation.bundled_policies import BUNDLED, BundledName, checkpoint_of
 from services.evaluation.scores import REAL
 
 NAME_PATTERN: Final = r"^[A-Za-z0-9][A-Za-z0-9 ._+-]{0,63}$"

@@ -12,9 +12,9 @@ from pathlib import Path
 from dextouch.clients import Policy
 from dextouch.episodes import EpisodeStore, select_episodes
 from dextouch.errors import UnavailableError
+from services.evaluation.bundled_policies import bundled_policy, checkpoint_of, training_starts_of
 from services.evaluation.closed_loop import EvaluationPlan, begin_matched
 from services.evaluation.matched_starts import FailedStart, MatchedStart
-from services.evaluation.policies.bundled import bundled_policy, checkpoint_of, training_starts_of
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.progress import Progress

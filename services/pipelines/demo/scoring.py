@@ -8,10 +8,10 @@ from typing import Any
 from dextouch.clients import Policy, RolloutClient
 from dextouch.errors import DexTouchError
 from dextouch.worlds import BatchWorld
+from services.evaluation.bundled_policies import DEFAULT_POLICY
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.command_line import run_train_judge, run_train_policy
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.policies.bundled import DEFAULT_POLICY
 from services.evaluation.scores import REAL, RolloutScore
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.study_worlds import WorldAddress

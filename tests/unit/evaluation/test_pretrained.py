@@ -9,9 +9,9 @@ from scipy.stats import mannwhitneyu
 from dextouch.clients.policy import PolicyStart
 from dextouch.errors import UnknownNameError
 from dextouch.worlds.world import ReturnSelector, RolloutStart
+from services.evaluation.bundled_policies import DEFAULT_POLICY
 from services.evaluation.checkpoints import MAX_CHECKPOINT_BYTES
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.policies.bundled import DEFAULT_POLICY
 from services.evaluation.settings import DEFAULT_PROBE, EARLY_POLICY
 from services.evaluation.success_classifier import SuccessClassifier
 from services.twin.settings import TwinSettings

@@ -7,7 +7,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-_PRETRAINED = Path(__file__).parents[1] / "pretrained"
+_PRETRAINED = Path(__file__).parent / "pretrained"
 DEFAULT_POLICY = _PRETRAINED / "behaviour_cloning.safetensors"
 
 
