@@ -75,11 +75,8 @@ def uploads_router(
         """Begin an upload, or return the status of an existing one."""
         attributes = given.attributes()
         sender.check_station(attributes.station)
-        with (
-            metrics.counting_refusals(),
-            _unless(partial(ingest.is_begun, attributes.recording_id)),
-        ):
-            limits.check_new(attributes.station)
+        with metrics.counting_refusals():
+            _check_begin(ingest, limits, attributes.recording_id, attributes.station)
         status = ingest.create(attributes, sender)
         if status.state == "open":
             limits.begin(attributes)
@@ -140,6 +137,11 @@ def uploads_router(
         return ingest.status(recording_id, sender)
 
     return router
+
+
+def _check_begin(ingest: Ingest, limits: StorageLimits, recording_id: str, station: str) -> None:
+    with _unless(partial(ingest.is_begun, recording_id)):
+        limits.check_new(station)
 
 
 def idle_uploads_router(ingest: Ingest, limits: StorageLimits) -> APIRouter:

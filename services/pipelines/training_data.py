@@ -290,19 +290,7 @@ def make_training_data(
     target = EpisodeStore(store)
     # Remove partial episodes of killed runs; those of running writers are not touched.
     target.sweep()
-    present, orders = set(target.list()), []
-    for seed in seeds:
-        for task in scope.tasks:
-            made = TakeOptions() if policy is not None else options_of(task, seed, mix)
-            options = replace(
-                made, images=CAMERAS, image_every=scope.image_every, streams=scope.streams,
-                varied=bool(np.random.default_rng([seed, _VARIED_DRAW]).random() < scope.varied),
-                sizes=_sizes(task, seed, scope),
-            )  # fmt: skip
-            orders += [
-                Order(task, domain, seed, options, store, policy, scope.path_of(domain))
-                for domain in scope.domains
-            ]
+    present, orders = set(target.list()), _orders(store, seeds, mix, scope, policy)
     missing = [order for order in orders if order.episode_id not in present]
     counts = {"made": 0, "kept": len(orders) - len(missing), "succeeded": 0, "refused": 0}
     started_s = time.monotonic()
@@ -329,6 +317,25 @@ def make_training_data(
                 episodes_per_s=1 / each_s, minutes_left=each_s * (len(missing) - done) / 60
             )
     return counts
+
+
+def _orders(
+    store: str, seeds: range, mix: Mix, scope: Scope, policy: PolicyChoice | None
+) -> list[Order]:
+    orders = []
+    for seed in seeds:
+        for task in scope.tasks:
+            made = TakeOptions() if policy is not None else options_of(task, seed, mix)
+            options = replace(
+                made, images=CAMERAS, image_every=scope.image_every, streams=scope.streams,
+                varied=bool(np.random.default_rng([seed, _VARIED_DRAW]).random() < scope.varied),
+                sizes=_sizes(task, seed, scope),
+            )  # fmt: skip
+            orders += [
+                Order(task, domain, seed, options, store, policy, scope.path_of(domain))
+                for domain in scope.domains
+            ]
+    return orders
 
 
 def _sizes(task: str, seed: int, scope: Scope) -> Sizes:

@@ -8,7 +8,7 @@ remembered (`dextouch.episodes.care.deletion_records`), so that stations remove 
 import json
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -257,22 +257,16 @@ def delete_for_good(
     intent = _read_intent(path, root, request)
     records = DeletionRecords(root)
     key = records.key_of(operator=request.operator, recording=request.recording)
-    known, reviewed = intent.victims, list[Facts]()
-    for _ in range(_MAX_ROUNDS):
-        known += [v for v in plan_deletion(root, request, known=known) if v not in known]
-        if not (known or reviewed or unsent or reviews_by(root, request)):
-            raise NotFoundError(_nothing(root, request))
+    known = intent.victims
+
+    def remember() -> None:
         with disk_errors("write down what is to be deleted"):
             path.parent.mkdir(parents=True, exist_ok=True)
             replace_file(path, json.dumps(intent.model_dump()).encode())
         takes = [take for take in (victim.as_take() for victim in known) if take is not None]
         records.add(key, takes, operator=request.operator)
-        went = [_remove(root, victim) for victim in known]
-        for facts in reviews_by(root, request):
-            _remove_reviewer(facts)
-            reviewed.append(facts)
-        if not any(went):
-            break
+
+    reviewed = _remove_all(root, request, known, remember, unsent=unsent)
     words = {v.id for v in known} | {v.sha256 for v in known if v.sha256} | {request.name}
     wanted = IdentifierSearch(words)
     remaining, unreadable, num_files = _search(root, wanted, checkpoints, skip=path)
@@ -298,6 +292,33 @@ def delete_for_good(
             with suppress(OSError):
                 path.parent.rmdir()
     return receipt
+
+
+def _remove_all(
+    root: Path,
+    request: DeletionRequest,
+    known: list[Victim],
+    remember: Callable[[], None],
+    *,
+    unsent: bool,
+) -> list[Facts]:
+    """Remove what a request covers until nothing more appears; returns the reviews without names.
+
+    `known` grows by what is found, and `remember` is called before anything is removed.
+    """
+    reviewed = list[Facts]()
+    for _ in range(_MAX_ROUNDS):
+        known += [v for v in plan_deletion(root, request, known=known) if v not in known]
+        if not (known or reviewed or unsent or reviews_by(root, request)):
+            raise NotFoundError(_nothing(root, request))
+        remember()
+        went = [_remove(root, victim) for victim in known]
+        for facts in reviews_by(root, request):
+            _remove_reviewer(facts)
+            reviewed.append(facts)
+        if not any(went):
+            break
+    return reviewed
 
 
 def _nothing(root: Path, request: DeletionRequest) -> str:
