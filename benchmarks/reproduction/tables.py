@@ -366,7 +366,13 @@ def _evaluator_pages(folder: Path, experiments: Experiments) -> list[Page]:
     prediction = _prediction_rows(folder, experiments, adapted)
     title = "Policy evaluation"
     success = tuple(_success_rows(report, experiments))
-    *estimates, pooled = _estimate_rows(folder)
+    pages = []
+    for of, estimate in (("judges' probabilities", _judged), ("worlds' own estimates", _own)):
+        *estimates, pooled = _estimate_rows(folder, estimate)
+        pages += [
+            Page(f"{title}: the {of} of success", tuple(estimates)),
+            Page(f"{title}: the two worlds by the {of}", (pooled,)),
+        ]
     return [
         Page("Adapted world models on held-out robot episodes", prediction, BASES["evaluator"]),
         Page(f"{title}: success rates", success),
@@ -376,17 +382,25 @@ def _evaluator_pages(folder: Path, experiments: Experiments) -> list[Page]:
             tuple(_agreement_rows(report, experiments)),
             BASES["evaluator"],
         ),
-        Page(f"{title}: the worlds' own estimates of success", tuple(estimates)),
-        Page(f"{title}: the two worlds' own estimates", (pooled,)),
+        *pages,
         _paper_page(title, PAPER["policies"]),
     ]
 
 
-def _estimate_rows(folder: Path) -> Iterator[Row]:
-    """How well the worlds' own estimates say what succeeds in the twin, by task and seed.
+def _judged(score: RolloutScore) -> float | None:
+    return score.probability
 
-    AUC is of single rollouts; correlation and MMRV are of the means of policies. The judge takes no
-    part in them. The last row compares the two worlds.
+
+def _own(score: RolloutScore) -> float | None:
+    """The world's estimate, in which no judge takes part."""
+    return score.world_probability
+
+
+def _estimate_rows(folder: Path, estimate: Callable[[RolloutScore], float | None]) -> Iterator[Row]:
+    """How well estimates of success say what succeeds in the twin, by task and seed.
+
+    AUC is of single rollouts; correlation and MMRV are of the means of policies, over all rollouts,
+    decided or not. The last row compares the two worlds.
     """
     outcomes = StudyResults.read(folder / "evaluator/study/results").outcomes.values()
     scores = [one for one in outcomes if isinstance(one, RolloutScore)]
@@ -397,7 +411,9 @@ def _estimate_rows(folder: Path) -> Iterator[Row]:
         names = sorted({one.world for one in scores if one.world.startswith(f"{world} ")})
         for name in names:
             own = [one for one in scores if one.world == name]
-            figures = {task: estimate_figures(own, succeeded, task) for task in DOWNSTREAM}
+            figures = {
+                task: estimate_figures(own, succeeded, task, estimate) for task in DOWNSTREAM
+            }
             for task, figure in figures.items():
                 found.setdefault((world, task), []).append(figure)
             means[world].append(np.concatenate([one.policy_means for one in figures.values()]))
@@ -414,7 +430,7 @@ def _estimate_rows(folder: Path) -> Iterator[Row]:
 
 
 class EstimateFigures(NamedTuple):
-    """Agreement of a world's own estimates with success, and their means by policy."""
+    """Agreement of estimates in a world with success, and their means by policy."""
 
     auc: float
     pearson: float
@@ -423,20 +439,24 @@ class EstimateFigures(NamedTuple):
 
 
 def estimate_figures(
-    scores: Sequence[RolloutScore], succeeded: Mapping[tuple[str, str, int], bool], task: str
+    scores: Sequence[RolloutScore],
+    succeeded: Mapping[tuple[str, str, int], bool],
+    task: str,
+    estimate: Callable[[RolloutScore], float | None] = _own,
 ) -> EstimateFigures:
-    """Figures of one world and task; NaN where it is undefined or the world has no estimate.
+    """Figures of one world and task; NaN where it is undefined or there are no estimates.
 
     Args:
         scores: of rollouts in one imagined world.
         succeeded: real outcome by task, policy and seed; rollouts without one are left out.
         task: to measure.
+        estimate: of a rollout's success.
     """
     used = [
-        (one.policy, one.world_probability, succeeded[one.task, one.policy, one.seed])
+        (one.policy, value, succeeded[one.task, one.policy, one.seed])
         for one in scores
         if one.task == task
-        and one.world_probability is not None
+        and (value := estimate(one)) is not None
         and (one.task, one.policy, one.seed) in succeeded
     ]
     outcomes = np.array([success for _, _, success in used], dtype=bool)
@@ -446,7 +466,7 @@ def estimate_figures(
     if outcomes.all() or not outcomes.any():
         auc = math.nan
     else:
-        auc = area_under_roc(np.array([estimate for _, estimate, _ in used]), outcomes)
+        auc = area_under_roc(np.array([value for _, value, _ in used]), outcomes)
     if not policies:
         return EstimateFigures(auc, math.nan, math.nan, own)
     agreement = pearson(real=real, imagined=own), mmrv(real=real, imagined=own)
