@@ -38,7 +38,7 @@ class TakeOrder:
 
 @dataclass(frozen=True)
 class TakeReport:
-    """Result of one order; `kept` if the episode was recorded before."""
+    """Result of one order; `kept` if the same command had recorded the episode before."""
 
     episode_id: str
     seed: int
@@ -60,7 +60,10 @@ def _take(order: TakeOrder) -> TakeReport:
     try:
         write_episode(store, episode)
     except ConflictError:
-        # The id says task, seed and options.
+        # Not every option is in the id.
+        existing = store.open(about.episode_id).attributes
+        if existing.generator_command != about.generator_command:
+            raise
         kept = True
     return TakeReport(
         about.episode_id, order.seed, bool(about.success), order.options.miss, kept=kept
@@ -102,6 +105,7 @@ def _summary(
         "noise_m": arguments.noise,
         "episodes": [report.episode_id for report in reports],
         "num_misses": len(reports) - len(aimed),
+        "num_kept": sum(report.kept for report in reports),
         "success_rate": sum(report.success for report in aimed) / len(aimed) if aimed else None,
         "seconds": seconds,
     }
@@ -121,6 +125,7 @@ def main(argv: Sequence[str]) -> int:
     succeeded = sum(report.success for report in reports)
     print(
         f"{len(reports)} episodes of {arguments.task} ({arguments.domain}) in {arguments.store}: "
-        f"{succeeded} succeeded, {summary['num_misses']} were misses, {summary['seconds']:.1f} s"
+        f"{succeeded} succeeded, {summary['num_misses']} were misses, "
+        f"{summary['num_kept']} existed already, {summary['seconds']:.1f} s"
     )
     return 0

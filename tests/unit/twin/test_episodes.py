@@ -247,11 +247,16 @@ def test_the_command_line_records_and_says_so(tmp_path, capsys):
     assert status == 0
     assert "twin-stack_bowls-robot-000007" in summary.read_text()
     assert EpisodeStore(tmp_path / "store").open("twin-stack_bowls-robot-000007")
-    assert main([*arguments, "--store", str(tmp_path / "store")]) == 3
+    # The same again keeps it; other options that give the same id are refused.
+    capsys.readouterr()
+    assert main([*arguments, "--store", str(tmp_path / "store")]) == 0
+    assert "1 existed already" in capsys.readouterr().out
     told = shlex.split(
         EpisodeStore(tmp_path / "store")
         .open("twin-stack_bowls-robot-000007")
         .attributes.generator_command
     )
-    assert main([*told[1:], "--store", str(tmp_path / "store")]) == 3
+    assert main([*told[1:], "--store", str(tmp_path / "store")]) == 0
+    others = [*arguments[:-1], "camera_wrist_left", "--store", str(tmp_path / "store")]
+    assert main(others) == 3
     assert "exists already" in capsys.readouterr().err
