@@ -127,7 +127,7 @@ def progress(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:
 def add_workers(parser: argparse.ArgumentParser, default: int | None = None) -> None:
     """Add `--jobs N` (default: one per core) and `--ray ADDRESS`, for `dextouch.jobs.Workers`."""
     jobs = f"processes (default: {default or 'one per core'})"
-    default = default or len(os.sched_getaffinity(0))
+    default = default or os.cpu_count() or 1
     parser.add_argument("--jobs", type=_at_least_one, default=default, metavar="N", help=jobs)
     parser.add_argument("--ray", metavar="ADDRESS", help=RAY_HELP)
 

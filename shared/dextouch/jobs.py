@@ -20,8 +20,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar, cast
 
+import structlog
+
 from dextouch.episodes import disk_errors
 from dextouch.errors import ConflictError, DexTouchError, NotFoundError, UnavailableError
+
+logger = structlog.get_logger(__name__)
 
 # Chosen: of the jobs that ran when a worker was killed, some had not even begun.
 _TRIES_ALONE: Final = 2
@@ -97,23 +101,26 @@ def run_jobs(
     if workers.ray_address is not None:
         with _marked(folders) as marks:
             yield from _on_ray(
-                (function, prepare, marks, version("dextouch-wm")), items, workers.ray_address
+                (function, prepare, _Here(marks, version("dextouch-wm"), Path.cwd())),
+                items,
+                workers.ray_address,
             )
     elif workers.num_processes == 1 or len(items) < 2:
         for item in items:
-            yield Job(item, *_attempt(function, None, (), "", item))
+            yield Job(item, *_attempt(function, None, None, item))
     else:
-        call = partial(_attempt, function, None, (), "")
+        call = partial(_attempt, function, None, None)
         yield from _in_processes(call, items, workers.num_processes, prepare)
 
 
 def results_of(jobs: Iterable[Job[Any, Result]]) -> Iterator[Result]:
-    """Results as jobs end; the first error is raised once all others have ended."""
+    """Results as jobs end; errors are logged, and the first is raised once all jobs have ended."""
     errors = []
     for job in jobs:
         if job.error is None:
             yield job.result()
         else:
+            logger.warning("job_failed", reason=job.error.message)
             errors.append(job.error)
     if errors:
         raise errors[0]
@@ -225,14 +232,13 @@ def _prepared(prepare: Callable[[], object]) -> None:
 def _attempt(
     function: Callable[[Item], Result],
     prepare: Callable[[], object] | None,
-    marks: tuple[Path, ...],
-    expected_version: str,
+    here: "_Here | None",
     item: Item,
 ) -> Ending:
-    """Result and error of one call, in a worker; `marks` must be seen from there."""
+    """Result and error of one call, in a worker that must see what is `here`."""
     try:
-        if marks or expected_version:
-            _check_machine(marks, expected_version)
+        if here is not None:
+            here.enter()
         if prepare is not None:
             _prepared(prepare)
         return function(item), None
@@ -240,19 +246,36 @@ def _attempt(
         return None, error
 
 
-def _check_machine(marks: tuple[Path, ...], expected_version: str) -> None:
-    machine = os.uname().nodename
-    for mark in marks:
-        if not mark.exists():
+@dataclass(frozen=True)
+class _Here:
+    """What machines of a cluster must share with the one that orders their jobs."""
+
+    marks: tuple[Path, ...]
+    version: str
+    folder: Path
+
+    def enter(self) -> None:
+        """Work in the same folder, so that relative paths mean the same files.
+
+        Raises:
+            NotFoundError: a folder that this machine does not see.
+            ConflictError: another version of DexTouch.
+        """
+        machine = os.uname().nodename
+        missing = [mark.parent for mark in self.marks if not mark.exists()]
+        missing += [] if self.folder.is_dir() else [self.folder]
+        if missing:
             raise NotFoundError(
-                f"{machine}: does not see the folder {mark.parent} of the machine that ordered the "
-                "job; mount it on all machines of the cluster, or use a store at s3://…"
+                f"{machine}: does not see the folder {missing[0]} of the machine that ordered the "
+                "job; mount it on all machines of the cluster, run the command in a folder that "
+                "all have, or use a store at s3://…"
             )
-    if (got := version("dextouch-wm")) != expected_version:
-        raise ConflictError(
-            f"{machine}: has dextouch-wm {got}, expected {expected_version} as on the machine that "
-            "ordered the job; install the same version on all machines of the cluster"
-        )
+        if (got := version("dextouch-wm")) != self.version:
+            raise ConflictError(
+                f"{machine}: has dextouch-wm {got}, expected {self.version} as on the machine that "
+                "ordered the job; install the same version on all machines of the cluster"
+            )
+        os.chdir(self.folder)
 
 
 @contextmanager

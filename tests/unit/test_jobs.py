@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -135,14 +136,23 @@ def test_workers_are_prepared(tmp_path, monkeypatch):
     assert 1 <= len(list(tmp_path.iterdir())) <= 2
 
 
-def test_a_machine_that_does_not_see_the_folder_or_has_another_version_refuses_jobs(tmp_path):
+def test_a_machine_that_does_not_see_the_folder_or_has_another_version_refuses_jobs(
+    tmp_path, monkeypatch
+):
     here = version("dextouch-wm")
     with jobs_module._marked([tmp_path / "store"]) as marks:
-        assert jobs_module._attempt(square, None, marks, here, 3) == (9, None)
-        _, error = jobs_module._attempt(square, None, (tmp_path / "elsewhere/x",), here, 3)
-        assert isinstance(error, NotFoundError)
-        assert "mount it" in error.message
-        _, error = jobs_module._attempt(square, None, marks, "0.0.1", 3)
+        monkeypatch.chdir(tmp_path)
+        seen = jobs_module._Here(marks, here, tmp_path / "store")
+        assert jobs_module._attempt(square, None, seen, 3) == (9, None)
+        assert Path.cwd() == tmp_path / "store"
+        for other in (
+            replace(seen, marks=(tmp_path / "elsewhere/x",)),
+            replace(seen, folder=tmp_path / "elsewhere"),
+        ):
+            _, error = jobs_module._attempt(square, None, other, 3)
+            assert isinstance(error, NotFoundError)
+            assert "mount it" in error.message
+        _, error = jobs_module._attempt(square, None, replace(seen, version="0.0.1"), 3)
         assert isinstance(error, ConflictError)
         assert "expected 0.0.1" in error.message
     assert list((tmp_path / "store").iterdir()) == []

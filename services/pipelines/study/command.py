@@ -102,7 +102,7 @@ def _parts(
     policies = PolicyFactory(definition, partial(demonstrator, definition.tasks, definition.seeds))
     policies.load()
     digests = {"probe": file_digest(probe_path), **policies.digests()}
-    digests |= {f"probe of {name}": file_digest(path) for name, path in own_paths(definition)}
+    digests |= {f"probe of {name}": file_digest(path) for name, path in _own_paths(definition)}
     parts = StudyParts(
         partial(connect, addresses),
         policies.load,
@@ -184,7 +184,7 @@ def run_block(block: _Block) -> list[Outcome]:
     return outcomes
 
 
-def own_paths(definition: StudyDefinition) -> list[tuple[str, Path]]:
+def _own_paths(definition: StudyDefinition) -> list[tuple[str, Path]]:
     """Names of worlds that have a success classifier of their own, and its file."""
     return [(name, one.probe) for name, one in definition.imagined.items() if one.probe is not None]
 
@@ -200,7 +200,7 @@ def _own_probes(
         NotFoundError, CorruptDataError: a checkpoint that cannot be read.
     """
     own: dict[str, SuccessClassifier] = {}
-    for name, path in own_paths(definition):
+    for name, path in _own_paths(definition):
         own[name] = SuccessClassifier.load(path)
         instructions_for(definition.tasks, own[name].metadata.settings["instructions"])
         size_px, expected_px = own[name].shape.image_size_px, probe.shape.image_size_px

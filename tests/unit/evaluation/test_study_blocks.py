@@ -11,7 +11,7 @@ from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.checkpoints import save_checkpoint
 from services.evaluation.scores import RolloutScore
 from services.evaluation.studies.definition import StudyDefinition
-from services.evaluation.studies.results import StudyHeader, StudyResults, cells_of
+from services.evaluation.studies.results import StudyResults, cells_of
 from services.pipelines.study.command import blocks_of, main, run_block
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
@@ -88,4 +88,3 @@ def test_blocks_hold_what_is_missing(tmp_path, study_file):
     assert [len(block.rollouts) for block in blocks] == [4, 4]
     assert {block.definition.seeds for block in blocks} == {range(2003, 2008)}
     assert all(list(block.definition.imagined) == ["dream"] for block in blocks)
-    assert isinstance(header, StudyHeader)
