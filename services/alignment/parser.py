@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from dextouch.command_line import RAY_HELP, CommandParser, add_json
+from dextouch.command_line import RAY_HELP, CommandParser, add_json, positive
 from dextouch.serving import load_settings
 from services.alignment.settings import AlignmentSettings, usable_cores
 
@@ -55,7 +55,7 @@ def align_parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
     running.add_argument("--ray", metavar="ADDRESS", help=RAY_HELP)
     running.add_argument(
         "--workers",
-        type=_positive,
+        type=positive,
         default=usable_cores(),
         metavar="N",
         help="recordings at once, each in a process of its own (default: one a processor)",
@@ -95,13 +95,6 @@ def align_parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
     sheet.add_argument("--to", type=Path, required=True, metavar="FILE", help="SVG to write")
     commands.add_parser("serve", help="run the HTTP service (serve --help lists its settings)")
     return parser
-
-
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"got {number}, expected at least 1")
-    return number
 
 
 def default_parser() -> argparse.ArgumentParser:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from dextouch.command_line import RAY_HELP, CommandParser, add_json, add_workers
+from dextouch.command_line import RAY_HELP, CommandParser, add_json, add_workers, positive
 from dextouch.data_folder import default_store
 from dextouch.episodes import SPLITS
 from services.evaluation.prediction_names import BASELINES, DEFAULT_BASELINES, METRIC_NAMES
@@ -144,13 +144,6 @@ def seed_range(text: str) -> range:
     if not (first.isdecimal() and stop.isdecimal() and int(first) < int(stop)):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected FIRST:LAST+1 such as 0:100")
     return range(int(first), int(stop))
-
-
-def positive(text: str) -> int:
-    """Parse a number of processes, for argparse."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a number of at least 1")
-    return int(text)
 
 
 def _named_path(text: str) -> tuple[str, Path]:

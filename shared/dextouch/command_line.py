@@ -128,14 +128,15 @@ def add_workers(parser: argparse.ArgumentParser, default: int | None = None) -> 
     """Add `--jobs N` (default: one per core) and `--ray ADDRESS`, for `dextouch.jobs.Workers`."""
     jobs = f"processes (default: {default or 'one per core'})"
     default = default or os.cpu_count() or 1
-    parser.add_argument("--jobs", type=_at_least_one, default=default, metavar="N", help=jobs)
+    parser.add_argument("--jobs", type=positive, default=default, metavar="N", help=jobs)
     parser.add_argument("--ray", metavar="ADDRESS", help=RAY_HELP)
 
 
-def _at_least_one(text: str) -> int:
-    if text.isdecimal() and int(text) >= 1:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number of at least 1")
+def positive(text: str) -> int:
+    """Parse a count of at least 1, for argparse."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a number of at least 1")
+    return int(text)
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dextouch.clients import RolloutClient
+from dextouch.command_line import positive
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import NotFoundError
 from dextouch.worlds import WorldServiceSettings, create_world_app
@@ -18,7 +19,7 @@ from services.pipelines.imagined_data import (
     judged_steps,
     main,
 )
-from services.pipelines.parsers import positive, seed_range
+from services.pipelines.parsers import seed_range
 from services.pipelines.servers import served
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
