@@ -38,8 +38,9 @@ BOUNDS = {
     "clock ms": 0.2,
     "delay ms": 1.0,
     "label ms": 0.3,
-    "CPU s": 4.0,
 }
+# On an idle 3 GHz core. Only the slow test demands it: other machines and load change it.
+CPU_BOUND_S = {"CPU s": 4.0}
 
 
 @pytest.fixture(scope="module")
@@ -64,13 +65,14 @@ def measured(truth, store):
     return {**errors(store.open(name_of(truth)), original, truth), "CPU s": cpu_s}
 
 
-def check(rows, capsys):
+def check(rows, bounds, capsys):
     with capsys.disabled():
         sys.stdout.write(f"\n{len(rows)} human takes: error | mean | worst | bound\n")
-        for figure, bound in BOUNDS.items():
+        for figure in rows[0]:
             found = [row[figure] for row in rows]
+            bound = bounds.get(figure, "none")
             sys.stdout.write(f"{figure} | {np.mean(found):.3f} | {max(found):.3f} | {bound}\n")
-    for figure, bound in BOUNDS.items():
+    for figure, bound in bounds.items():
         assert max(row[figure] for row in rows) <= bound, figure
 
 
@@ -79,7 +81,7 @@ def test_a_human_take_becomes_actions_of_the_robot_within_a_stations_errors(
 ):
     truth, before = first
     store = EpisodeStore(tmp_path)
-    check([measured(truth, store)], capsys)
+    check([measured(truth, store)], BOUNDS, capsys)
     # Equal takes give equal episodes, whatever is kept of them.
     again = store.open(name_of(truth))
     for stream in ("action", "tactile_left", "object_poses"):
@@ -95,7 +97,7 @@ def test_six_human_takes(first, tmp_path, capsys):
         stage = Stage(task, "human", TwinSettings())
         truths = (record(stage, seed, device_options(OPTIONS)) for seed in (0, 7, 31))
         rows += [measured(truth, EpisodeStore(tmp_path)) for truth in truths]
-    check(rows, capsys)
+    check(rows, BOUNDS | CPU_BOUND_S, capsys)
 
 
 def test_an_episode_for_training_has_labels_and_the_calibration_of_its_session(first):
