@@ -12,37 +12,37 @@ from benchmarks.figures import Figure
 from benchmarks.rounds import interleaved
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.streams import StreamDescriptor
-from services.acquisition.devices.camera.driver import (
+from services.acquisition.devices.camera import (
     CameraDecoder,
     camera_descriptor,
 )
-from services.acquisition.devices.camera.mock import CameraSource
-from services.acquisition.devices.finger_tracker.driver import (
+from services.acquisition.devices.finger_tracker import (
     BridgeFingerTrackerDecoder,
     FingerTrackerDecoder,
     keypoints_descriptor,
 )
-from services.acquisition.devices.finger_tracker.mock import (
-    BridgeFingerTrackerSource,
-    FingerTrackerSource,
-)
-from services.acquisition.devices.pose_tracker.driver import (
+from services.acquisition.devices.pose_tracker import (
     BridgePoseTrackerDecoder,
     PoseTrackerDecoder,
     pose_descriptor,
 )
-from services.acquisition.devices.pose_tracker.mock import BridgePoseSource, PoseTrackerSource
-from services.acquisition.devices.robot_state.driver import (
+from services.acquisition.devices.robot_state import (
     STREAM_SIZES,
     RobotStateDecoder,
     robot_descriptor,
 )
-from services.acquisition.devices.robot_state.mock import RobotStateSource
 from services.acquisition.drivers.base import DESCRIPTOR_REPORT, Decoder
-from services.acquisition.drivers.image_encoding import ImageEncoding
+from services.acquisition.drivers.images import ImageEncoding
+from services.acquisition.mocks.cameras_and_robot import CameraSource, RobotStateSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
-from services.acquisition.transports.ports import READ_BYTES
+from services.acquisition.mocks.trackers import (
+    BridgeFingerTrackerSource,
+    BridgePoseSource,
+    FingerTrackerSource,
+    PoseTrackerSource,
+)
+from services.acquisition.transports import READ_BYTES
 
 NUM_PACKETS = 300
 NUM_IMAGES = 24

@@ -8,14 +8,13 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from dextouch.streams import Sample
-from services.acquisition.devices.justfloat_glove.driver import TAIL, JustFloatGloveDecoder
-from services.acquisition.devices.justfloat_glove.mock import encode_justfloat
-from services.acquisition.devices.tactile_glove.driver import (
+from services.acquisition.devices.justfloat_glove import TAIL, JustFloatGloveDecoder
+from services.acquisition.devices.tactile_glove import (
     MAGIC,
     PAYLOAD_BYTES,
     TactileGloveDecoder,
 )
-from services.acquisition.devices.wuji_glove.driver import (
+from services.acquisition.devices.wuji_glove import (
     CRC_OFFSET,
     HEAD,
     MARK,
@@ -25,10 +24,10 @@ from services.acquisition.devices.wuji_glove.driver import (
     WujiGloveDecoder,
     WujiPacket,
 )
-from services.acquisition.devices.wuji_glove.mock import encode_wuji
 from services.acquisition.drivers.base import StreamDecoder
 from services.acquisition.drivers.packets import HEADER, OVERHEAD, SOURCES, VERSION, Packet
 from services.acquisition.drivers.packets import encode_packet as encode_ours
+from services.acquisition.mocks.gloves import encode_justfloat, encode_wuji
 
 NUM_VALUES = 401
 FULL_SCALE = 4095.0

@@ -18,9 +18,9 @@ import numpy as np
 
 from dextouch.errors import DeviceError
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.tactile_glove.driver import MAGIC, TactileGloveDecoder
+from services.acquisition.devices.tactile_glove import MAGIC, TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.transports.ports import SerialTransport
+from services.acquisition.transports import SerialTransport
 
 NUM_STREAMS = 8
 RATE_HZ = 60

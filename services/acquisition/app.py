@@ -10,20 +10,19 @@ from starlette.concurrency import run_in_threadpool
 from dextouch.episodes import disk_errors
 from dextouch.serving import create_service_app, serve
 from services.acquisition.clock import StationClock
-from services.acquisition.deleted_takes import DeletedTakes, OperatorNames
 from services.acquisition.devices import build_drivers, load_calibration
-from services.acquisition.enrolment import with_enrolment
 from services.acquisition.health import HealthCollector
+from services.acquisition.health.metrics import RecorderCollector, SpoolCollector
 from services.acquisition.memory import keep_for_life
-from services.acquisition.metrics import RecorderCollector, SpoolCollector
 from services.acquisition.recorder import Recorder
+from services.acquisition.retention import DeletedTakes, OperatorNames
 from services.acquisition.routes import (
     live_router,
     recorder_router,
     station_router,
     uploads_router,
 )
-from services.acquisition.settings import AcquisitionSettings
+from services.acquisition.settings import AcquisitionSettings, with_enrolment
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader, ids_in_store, recover_spool
 
@@ -58,7 +57,7 @@ def _mock_station(settings: AcquisitionSettings) -> "MockStation":
         episode = EpisodeStore(settings.mock_store).open(settings.mock_episode_id)
         streams, known = replay_streams(episode), {**known, **replay_calibration(episode)}
     elif settings.mock_practice:
-        from services.acquisition.mocks.practice import practice_streams
+        from services.acquisition.mocks.pattern import practice_streams
 
         streams, known = practice_streams(settings.seed), {}
     scripts = {"first_light": FaultScript.first_light, "worn_glove": FaultScript.worn_glove}

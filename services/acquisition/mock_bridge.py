@@ -15,11 +15,13 @@ import time
 import numpy as np
 
 from dextouch.tactile.layout import Side
-from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource
-from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import ROUND_S, pattern_streams
-from services.acquisition.mocks.sdk_link import BridgeSource
+from services.acquisition.mocks.trackers import (
+    BridgeFingerTrackerSource,
+    BridgePoseSource,
+    BridgeSource,
+)
 
 ROUND_NS = round(ROUND_S * 1e9)
 

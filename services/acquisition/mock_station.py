@@ -13,21 +13,21 @@ from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.schemas import Matrix, SaveTake, TakeCheck, TakePrompt
 from dextouch.tactile.layout import SIDES
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
-from services.acquisition.devices.camera.driver import CameraDecoder
-from services.acquisition.devices.camera.mock import CameraSource
-from services.acquisition.devices.finger_tracker.mock import mock_finger_tracker
+from services.acquisition.devices.camera import CameraDecoder
 from services.acquisition.devices.kinds import (
     ENTRY_POINT_GROUP,
     IMPORT_FAILURES,
     device_kind,
     kind_names,
 )
-from services.acquisition.devices.pose_tracker.mock import mock_pose_tracker
-from services.acquisition.devices.robot_state.driver import STREAM_SIZES, RobotStateDecoder
-from services.acquisition.devices.robot_state.mock import RobotStateSource
-from services.acquisition.devices.station_camera.mock import video_camera
+from services.acquisition.devices.robot_state import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.drivers.base import Decoder, Driver
 from services.acquisition.mock_links import MockLinks
+from services.acquisition.mocks.cameras_and_robot import (
+    CameraSource,
+    RobotStateSource,
+    video_camera,
+)
 from services.acquisition.mocks.faults import FaultScript, Ledger
 from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import (
@@ -38,6 +38,7 @@ from services.acquisition.mocks.replay import (
     ReplayStream,
     device_rng,
 )
+from services.acquisition.mocks.trackers import mock_finger_tracker, mock_pose_tracker
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.station import Station
 

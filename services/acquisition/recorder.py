@@ -1,4 +1,4 @@
-"""Recorder of a station: one take at a time, in a spool that outlives the process."""
+"""Recorder of a station: one take at a time in a spool, and the count of saved ones."""
 
 import shutil
 import threading
@@ -8,19 +8,23 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from secrets import token_hex
+from typing import Final
 
 import structlog
+from pydantic import ValidationError
 
 from dextouch.clocks import PathLatency
-from dextouch.episodes import disk_errors
+from dextouch.episodes import disk_errors, replace_file
 from dextouch.episodes.spool import SpoolWriter
-from dextouch.errors import ConflictError
+from dextouch.errors import ConflictError, StorageError
 from dextouch.schemas import (
     Matrix,
     RecorderAction,
+    RecorderSession,
     RecorderState,
     RecorderStatus,
     RecordingAttributes,
+    SavedTakes,
     SaveTake,
     TakeCheck,
     TakePrompt,
@@ -32,13 +36,13 @@ from services.acquisition.drivers.base import Driver
 from services.acquisition.health import HealthMonitor
 from services.acquisition.memory import give_back_free_memory
 from services.acquisition.path_latency import add_latencies
-from services.acquisition.session import SessionCount
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.take import Take, check_free_space
 from services.acquisition.take_check import DeviceEvents, TakeWatch, incomplete_cause
 
 logger = structlog.get_logger(__name__)
 
+SESSION_FILE: Final = "session.json"
 ACTIONS: Mapping[RecorderState, tuple[RecorderAction, ...]] = {
     "idle": ("arm",),
     "armed": ("arm", "record", "discard"),
@@ -344,3 +348,62 @@ class Recorder:
         own = self.take.problems() if self.take else ()
         found = self._check.problems if self._check else ()
         return (*own, *(problem.message for problem in found))
+
+
+class SessionCount:
+    """The present session; counts survive a restart and the deletion of uploaded takes.
+
+    A session that cannot be written is counted in memory: a take that is saved must stay saved.
+
+    Args:
+        spool_root: folder of the takes.
+    """
+
+    def __init__(self, spool_root: Path) -> None:
+        self._path = spool_root / SESSION_FILE
+        self.now = self._read() or RecorderSession(started_at=datetime.now(UTC))
+
+    def begin(self) -> None:
+        """Begin a new session, in which nothing was saved yet."""
+        fresh = {"started_at": datetime.now(UTC), "saved": ()}
+        self._write(self.now.model_copy(update=fresh))
+
+    def add(self, prompt: TakePrompt, recording_id: str, *, incomplete: str = "") -> None:
+        """Count a saved take; `incomplete` says why it is, if it is."""
+        key = (prompt.task, prompt.operator)
+        counts = {(item.task, item.operator): item.num_saved for item in self.now.saved}
+        counts[key] = counts.get(key, 0) + 1
+        saved = tuple(
+            SavedTakes(task=task, operator=operator, num_saved=count)
+            for (task, operator), count in counts.items()
+        )
+        last = {"last_saved": recording_id, "last_incomplete": incomplete}
+        self._write(self.now.model_copy(update={"saved": saved, **last}))
+
+    def operators(self) -> tuple[str, ...]:
+        """All operators that the counts name."""
+        names = {item.operator for item in self.now.saved}
+        return tuple(sorted(name for name in names if name is not None))
+
+    def forget(self, operator: str) -> None:
+        """Remove an operator's counts."""
+        saved = tuple(item for item in self.now.saved if item.operator != operator)
+        self._write(self.now.model_copy(update={"saved": saved}))
+
+    def _write(self, session: RecorderSession) -> None:
+        self.now = session
+        try:
+            with disk_errors(f"write {self._path.name}"):
+                # In a spool that is gone this fails: only a take may create it.
+                replace_file(self._path, session.model_dump_json().encode())
+        except StorageError as error:
+            logger.warning("fail_session_count", error=error.message)
+
+    def _read(self) -> RecorderSession | None:
+        try:
+            return RecorderSession.model_validate_json(self._path.read_bytes())
+        except FileNotFoundError:
+            return None
+        except (OSError, ValidationError) as error:
+            logger.warning("fail_session_count", error=str(error))
+            return None

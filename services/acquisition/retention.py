@@ -1,23 +1,43 @@
-"""Removal of takes from a station's spool: those that the store has had for long enough.
+"""Removal of takes from a station's spool: uploaded long enough ago, or deleted in the store.
 
-A take that the store has not acknowledged is never removed here.
+A take that the store has not acknowledged is removed only where it was deleted there.
 """
 
+import json
 import shutil
 import time
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import structlog
 from pydantic import Field, ValidationError
 
 from dextouch.episodes import disk_errors, folder_bytes
-from dextouch.episodes.spool import LOG_FILE
-from dextouch.errors import StorageError
+from dextouch.episodes.spool import LOG_FILE, SpoolReader
+from dextouch.errors import (
+    AccessDeniedError,
+    DexTouchError,
+    NotFoundError,
+    StorageError,
+)
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import RecordingStatus
+from dextouch.schemas import (
+    MAX_CHECKED_TAKES,
+    CheckTakes,
+    ConfirmRemoval,
+    PendingDeletion,
+    RecordingAttributes,
+    RecordingStatus,
+    SpooledTake,
+)
+
+if TYPE_CHECKING:
+    from dextouch.clients import EpisodeStoreClient
 
 logger = structlog.get_logger(__name__)
 
@@ -28,6 +48,8 @@ REFUSED_FILE: Final = "refused.txt"
 _REMOVED: Final = ".removed"
 DAY_S: Final = 86_400.0
 GIGABYTE: Final = 1e9
+# One line of JSON for each take that was removed because it was deleted in the store.
+REMOVALS_FILE: Final = "removals.jsonl"
 
 
 class Retention(FrozenModel):
@@ -156,3 +178,179 @@ def sweep_safely(retention: SpoolRetention) -> None:
         retention.sweep()
     except StorageError as error:
         logger.warning("fail_retention", error=error.message)
+
+
+@dataclass(frozen=True)
+class OperatorNames:
+    """Operators that the station remembers besides those of takes, and how it forgets one."""
+
+    known: Callable[[], Sequence[str]]
+    forget: Callable[[str], None]
+
+
+class DeletedTakes:
+    """Asks the store which takes of the spool were deleted, removes them and confirms it.
+
+    The store says by a revision whether there was a deletion, so that the spool is only read then,
+    and once after a start.
+
+    Args:
+        spool_root: folder of the takes.
+        station: name of this station; takes of an earlier name are asked about under that.
+        stored_as: the ids under which the store has a take, or would have it.
+        operators: of the session.
+    """
+
+    def __init__(
+        self,
+        spool_root: Path,
+        station: str,
+        *,
+        stored_as: Callable[[Path, RecordingAttributes | None], Sequence[str]],
+        operators: OperatorNames,
+    ) -> None:
+        self._spool_root, self._station = spool_root, station
+        self._stored_as, self._operators = stored_as, operators
+        self._revision: str | None = None
+        self._problem: str | None = None
+
+    def remove(self, store: "EpisodeStoreClient") -> list[str]:
+        """Remove what was deleted since the last call; ids of what was removed.
+
+        A store that does not answer is asked again by the next call, which a warning says once.
+        """
+        removed: list[str] = []
+        try:
+            empty_removed(self._spool_root)
+            revision = store.deletions_revision()
+            if revision != self._revision:
+                # What cannot be removed yet, such as a take that is being recorded, is tried again.
+                is_done = self._work_off(store, removed)
+                self._revision = revision if is_done else None
+            self._problem = None
+        except DexTouchError as error:
+            if error.message != self._problem:
+                logger.warning("fail_deletions", error=error.message)
+            self._problem = error.message
+        return removed
+
+    def remove_refused(self, path: Path) -> None:
+        """Remove a take whose upload the store refused since it was deleted.
+
+        Raises:
+            StorageError: it cannot be removed.
+        """
+        self._remove(path, "refused by the store as deleted")
+
+    def _work_off(self, store: "EpisodeStoreClient", removed: list[str]) -> bool:
+        """Remove all deleted takes; whether none of them is left to try again."""
+        takes: defaultdict[str, list[SpooledTake]] = defaultdict(list, {self._station: []})
+        for station, take in self._spooled():
+            takes[station].append(take)
+        confirmed, unknown = [], []
+        for station, spooled in takes.items():
+            try:
+                held, revision = self._remove_of(store, station, spooled, removed)
+            except AccessDeniedError:
+                # Recorded under an earlier name, of which this key may not ask.
+                unknown += [take.recording_id for take in spooled]
+                continue
+            gone = {*removed, *(one.recording_id for one in held)}
+            unknown += [
+                take.recording_id
+                for take in spooled
+                if take.is_damaged and take.recording_id not in gone
+            ]
+            confirmed.append(
+                ConfirmRemoval(
+                    station=station, revision=revision, held=tuple(held[:MAX_CHECKED_TAKES])
+                )
+            )
+        if unknown:
+            # A take of a deleted operator may be among them: then nothing is confirmed, and the
+            # store goes on to list this station as outstanding.
+            logger.warning(
+                "unknown_takes",
+                recording_ids=sorted(unknown),
+                advice="damaged, or of another station name, so that the store cannot say whether "
+                "they were deleted: restore, send or remove them, then start the station again",
+            )
+            return True
+        for one in confirmed:
+            store.confirm_removal(one)
+        return not any(one.held for one in confirmed)
+
+    def _remove_of(
+        self,
+        store: "EpisodeStoreClient",
+        station: str,
+        spooled: Sequence[SpooledTake],
+        removed: list[str],
+    ) -> tuple[list[PendingDeletion], str]:
+        """Remove the deleted takes of a station; those that are held, and the first revision."""
+        operators = tuple(self._operators.known())
+        held: list[PendingDeletion] = []
+        first_revision: str | None = None
+        for start in range(0, max(1, len(spooled)), MAX_CHECKED_TAKES):
+            part = tuple(spooled[start : start + MAX_CHECKED_TAKES])
+            checked = store.check_takes(
+                CheckTakes(station=station, takes=part, operators=operators)
+            )
+            # A deletion in between makes the confirmation of an earlier revision fail.
+            first_revision = first_revision or checked.revision
+            for found in checked.takes:
+                if self._try_remove(self._spool_root / found.recording_id):
+                    removed.append(found.recording_id)
+                else:
+                    held.append(found)
+            for operator in checked.operators:
+                self._operators.forget(operator)
+        return held, first_revision or ""
+
+    def _try_remove(self, path: Path) -> bool:
+        """Remove a take, unless it is being recorded or the disk refuses."""
+        try:
+            if not SpoolReader(path).closed:
+                return False
+        except NotFoundError:
+            return True  # removed meanwhile
+        except StorageError:
+            pass  # damaged, and deleted all the same
+        try:
+            self._remove(path, "deleted in the store")
+        except StorageError as error:
+            logger.warning("fail_remove_deleted", recording_id=path.name, error=error.message)
+            return False
+        return True
+
+    def _remove(self, path: Path, why: str) -> None:
+        remove_take(path)
+        logger.warning("remove_deleted_take", recording_id=path.name, reason=why)
+        line = {"at": datetime.now(UTC).isoformat(), "recording_id": path.name, "reason": why}
+        with disk_errors(f"write {REMOVALS_FILE}"), self._removals.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    @property
+    def _removals(self) -> Path:
+        return self._spool_root / REMOVALS_FILE
+
+    def _spooled(self) -> Iterator[tuple[str, SpooledTake]]:
+        """All takes of the spool, with the station that recorded each."""
+        for path in spooled_takes(self._spool_root):
+            try:
+                about = SpoolReader(path).attributes
+            except NotFoundError:
+                continue
+            except StorageError:
+                ids = tuple(self._stored_as(path, None))
+                damaged = SpooledTake(recording_id=path.name, stored_as=ids, is_damaged=True)
+                yield self._station, damaged
+                continue
+            take = SpooledTake(
+                recording_id=path.name,
+                stored_as=tuple(self._stored_as(path, about)),
+                operator=about.operator,
+                started_at=about.started_at,
+                started_t_host_ns=about.started_t_host_ns,
+            )
+            yield about.station, take

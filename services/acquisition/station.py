@@ -14,11 +14,11 @@ from dextouch.schemas import CameraLive, Matrix
 from dextouch.streams import H264_UNIT, Sample, StreamDescriptor, StreamKind
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
-from services.acquisition.drivers.image_encoding import GroupPreview
+from services.acquisition.drivers.images import GroupPreview
+from services.acquisition.glove_record import NO_CELL, glove_record
 from services.acquisition.health import HealthMonitor
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.recorder import Recorder, TakeOptions
-from services.acquisition.session import NO_CELL, glove_record
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.supervisor import DeviceSupervisor
 from services.acquisition.take_check import DeviceEvents

@@ -1,18 +1,21 @@
 """Reader threads of devices, with reconnection."""
 
+import re
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import structlog
 from jaxtyping import UInt16
 
 from dextouch.errors import DeviceError
+from dextouch.schemas import SharedLink
 from dextouch.streams import Sample
 from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.drivers.base import Driver, Readings
-from services.acquisition.transports.ports import shared_link
+from services.acquisition.transports import TransportInfo
 
 logger = structlog.get_logger(__name__)
 
@@ -34,6 +37,12 @@ EVENTS = (
     "silent_bridge",
     "driver_failure",
 )
+SYSFS = Path("/sys/class")
+# Kernel classes of the device files that transports open.
+CLASSES = ("tty", "video4linux", "hidraw")
+# A port of a hub in sysfs: bus, then ports from the root on, as in 1-2.4.
+_USB_PORT = re.compile(r"^\d+-\d+(?:\.\d+)*$")
+_LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1", "[::1]"})
 Sink = Callable[[Readings], None]
 
 
@@ -207,3 +216,40 @@ class DeviceSupervisor:
             if self._waiter is not None:
                 self._waiter.close()
                 self._waiter = None
+
+
+def shared_link(info: TransportInfo, *, sysfs: Path = SYSFS) -> SharedLink | None:
+    """The hub, remote host or local program that a transport leads through.
+
+    None where it is plugged into this computer directly, or where nothing is known.
+
+    Args:
+        info: where the transport leads now.
+        sysfs: folder of the kernel's device classes.
+    """
+    if info.kind == "socket":
+        return _of_socket(info.address)
+    hub = _usb_hub(info.address, sysfs) if info.address.startswith("/dev/") else None
+    return None if hub is None else SharedLink(kind="hub", name=hub)
+
+
+def _of_socket(address: str) -> SharedLink | None:
+    if address.startswith("/"):
+        return SharedLink(kind="bridge", name=address)
+    host, separator, port = address.rpartition(":")
+    if not separator or not port.isdecimal():
+        return None
+    if host in _LOOPBACK:
+        return SharedLink(kind="bridge", name=address)
+    return SharedLink(kind="network", name=host)
+
+
+def _usb_hub(address: str, sysfs: Path) -> str | None:
+    """Path of the hub above a device file, such as 1-2; None for a port of the root hub."""
+    name = Path(address).resolve().name
+    for kind in CLASSES:
+        link = sysfs / kind / name / "device"
+        if link.exists():
+            ports = [part for part in link.resolve().parts if _USB_PORT.match(part)]
+            return ports[-1].rpartition(".")[0] or None if ports else None
+    return None

@@ -22,12 +22,10 @@ from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_TAXELS
 from services.acquisition.clock import HostWatch, StationClock
 from services.acquisition.drivers.base import Driver
+from services.acquisition.glove_record import is_ours
 from services.acquisition.health import CODES, HealthMonitor, count_taxels
 from services.acquisition.health.causes import SIMULATED_ADVICE
-from services.acquisition.session import is_ours
 from services.acquisition.supervisor import StreamCounters
-
-# Root cause of what the check of a take found: one sentence and one advice for the operator.
 
 # What the check of the take reports itself, by the code of the health finding behind it.
 IN_THE_CHECK: Final[Mapping[str, tuple[str, ...]]] = {
@@ -50,6 +48,16 @@ _ADVICE: Final = {
     "stuck_taxels": "taxels_stuck",
     "saturated_taxels": "taxels_saturated",
 }
+# A take may lose more than a running station before it is not worth keeping.
+LOSS_ERROR = 0.05
+# Shorter takes say nothing about rates and loss ratios.
+MIN_JUDGED_S = 1.0
+MAX_GAP_S = {"image": 0.5}
+MAX_GAP_OTHERS_S = 0.2
+# What stands in the take's quality in a form of its own (`_rate_hz`), or counts from the
+# station's start.
+OTHER_FIGURES = {"rate_hz", "clock_offset_seconds", "clock_resets"}
+DeviceEvents = Mapping[str, Mapping[str, int]]
 
 
 def root_cause(
@@ -94,18 +102,6 @@ def _rank(problem: TakeProblem) -> tuple[bool, int]:
 
 def _explains(cause: HealthCause, problem: TakeProblem) -> bool:
     return any(problem.code in IN_THE_CHECK.get(code, (code,)) for code in cause.findings)
-
-
-# A take may lose more than a running station before it is not worth keeping.
-LOSS_ERROR = 0.05
-# Shorter takes say nothing about rates and loss ratios.
-MIN_JUDGED_S = 1.0
-MAX_GAP_S = {"image": 0.5}
-MAX_GAP_OTHERS_S = 0.2
-# What stands in the take's quality in a form of its own (`_rate_hz`), or counts from the
-# station's start.
-OTHER_FIGURES = {"rate_hz", "clock_offset_seconds", "clock_resets"}
-DeviceEvents = Mapping[str, Mapping[str, int]]
 
 
 @dataclass(frozen=True)

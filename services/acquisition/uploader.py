@@ -32,12 +32,12 @@ from dextouch.schemas import (
 )
 from dextouch.streams import StreamDescriptor, decode_body, frame_body
 from dextouch.tracing import in_trace, new_trace
-from services.acquisition.deleted_takes import DeletedTakes
 from services.acquisition.memory import give_back_free_memory
 from services.acquisition.retention import (
     RECORDING_FILE,
     REFUSED_FILE,
     UPLOADED_FILE,
+    DeletedTakes,
     Retention,
     SpoolRetention,
     acknowledgement,

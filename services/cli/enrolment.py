@@ -46,7 +46,7 @@ def station_enrol_main(argv: Sequence[str]) -> int:
     options = parser.parse_args(list(argv))
     from dextouch.clients import HttpLink
     from dextouch.schemas import StationKey
-    from services.acquisition.enrolment import Enrolment, check_writable, write_enrolment
+    from services.acquisition.settings import Enrolment, check_writable, write_enrolment
 
     path, url = options.output or default_enrolment(), options.url.rstrip("/")
     check_writable(path)

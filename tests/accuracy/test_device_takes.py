@@ -14,7 +14,7 @@ from dextouch.hands import CHAINS, NODE_INDEX
 from dextouch.hands.actions import poses_from_actions
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile import pad_forces_n
-from services.acquisition.devices.tactile_glove.mock import GloveCalibration
+from services.acquisition.mocks.gloves import GloveCalibration
 from services.alignment.recording_error import compare_with_truth, match_streams
 from services.pipelines.device_takes import SESSION_SEEDS, device_options, write_through_devices
 from services.twin.episodes import TakeOptions, record, write_episode

@@ -9,8 +9,8 @@ import numpy as np
 
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
-from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mock_glove
 from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.gloves import GloveCalibration, mock_glove
 from services.acquisition.mocks.replay import MockSlot, ReplayStream
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor

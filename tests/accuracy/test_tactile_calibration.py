@@ -12,9 +12,9 @@ from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_TAXELS, expand_taxels, raw_indices, select_taxels
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices import load_calibration
-from services.acquisition.devices.tactile_glove.mock import GloveCalibration as MockGlove
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
+from services.acquisition.mocks.gloves import GloveCalibration as MockGlove
 from services.acquisition.mocks.replay import ReplayStream
 from services.alignment.calibration.tactile_gain import (
     TaxelPress,

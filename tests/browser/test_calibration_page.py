@@ -9,8 +9,8 @@ import pytest
 from playwright.sync_api import expect
 
 from services.acquisition.app import create_app as create_station
-from services.acquisition.devices.tactile_glove.mock import GloveCalibration
-from services.acquisition.mocks import practice
+from services.acquisition.mocks import pattern
+from services.acquisition.mocks.gloves import GloveCalibration
 from services.acquisition.settings import AcquisitionSettings
 from services.alignment.app import create_app as create_alignment
 from services.alignment.settings import AlignmentSettings
@@ -34,12 +34,12 @@ def folder(tmp_path):
 @pytest.fixture
 def address(serve, tmp_path, monkeypatch):
     """A dashboard over a station with a board before its camera and a glove at rest."""
-    whole = practice.pattern_streams
+    whole = pattern.pattern_streams
     few = {"tactile_left", "head"}
     monkeypatch.setattr(
-        practice,
+        pattern,
         "pattern_streams",
-        lambda round_s: [s for s in whole(round_s) if s.descriptor.name in few],
+        lambda round_s=pattern.ROUND_S: [s for s in whole(round_s) if s.descriptor.name in few],
     )
     spool = tmp_path / "spool"
     station = serve(
@@ -59,7 +59,7 @@ def address(serve, tmp_path, monkeypatch):
 @pytest.fixture
 def few_poses(monkeypatch):
     """A board with few places, for tests that need no lens."""
-    monkeypatch.setattr(practice, "NUM_POSES", 4)
+    monkeypatch.setattr(pattern, "NUM_POSES", 4)
 
 
 def tab_to(page, selector):
@@ -93,9 +93,7 @@ def moved_px(K, distortion):
     """
     grid = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 21), np.linspace(-0.36, 0.36, 15)), -1)
     rays = grid.reshape(-1, 2)
-    difference = project(K, distortion, rays) - project(
-        practice.K, (*practice.DISTORTION, 0.0), rays
-    )
+    difference = project(K, distortion, rays) - project(pattern.K, (*pattern.DISTORTION, 0.0), rays)
     return float(np.linalg.norm(difference - difference.mean(axis=0), axis=1).max())
 
 
@@ -124,8 +122,8 @@ def test_a_lens_is_calibrated_from_the_page_by_keyboard(page, address, folder, c
         for name, rows in json.loads((folder / "calibration.json").read_text()).items()
     }
     K, distortion = found["K_head"], found["distortion_head"][0]
-    focal = np.abs(np.diag(K)[:2] / np.diag(practice.K)[:2] - 1).max()
-    centre_px = np.abs(K[:2, 2] - practice.K[:2, 2]).max()
+    focal = np.abs(np.diag(K)[:2] / np.diag(pattern.K)[:2] - 1).max()
+    centre_px = np.abs(K[:2, 2] - pattern.K[:2, 2]).max()
     moved = moved_px(K, distortion)
     with capsys.disabled():
         sys.stdout.write(

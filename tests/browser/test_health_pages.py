@@ -12,7 +12,7 @@ from playwright.sync_api import expect
 from dextouch.schemas import TakePrompt
 from dextouch.serving import create_service_app
 from services.acquisition.clock import VirtualClock
-from services.acquisition.health import history_body
+from services.acquisition.health import history
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
@@ -139,7 +139,7 @@ def scripted(serve, tmp_path, monkeypatch):
     routes = station_router(mock.station, Uploader(tmp_path, None, period_s=1.0))
     with mock:
         take = mock.run_take(PROMPT, recording_id="take-1")
-    monkeypatch.setattr(history_body, "time", SimpleNamespace(time=lambda: NOW_UNIX_S))
+    monkeypatch.setattr(history, "time", SimpleNamespace(time=lambda: NOW_UNIX_S))
     app = create_service_app(name="acquisition", settings=settings, routers=[routes])
     began_s = NOW_UNIX_S - (clock.now_ns() - take.ledger.start_host_ns) * 1e-9
     return serve(create_dashboard(DashboardSettings(acquisition_url=serve(app)))), began_s

@@ -15,11 +15,9 @@ import pytest
 from dextouch.errors import DeviceError
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.finger_tracker.driver import BridgeFingerTrackerDecoder
-from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource
-from services.acquisition.devices.pose_tracker.driver import BridgePoseTrackerDecoder
-from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
-from services.acquisition.devices.robot_state.driver import STREAM_SIZES
+from services.acquisition.devices.finger_tracker import BridgeFingerTrackerDecoder
+from services.acquisition.devices.pose_tracker import BridgePoseTrackerDecoder
+from services.acquisition.devices.robot_state import STREAM_SIZES
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.sdk_link import BridgeDriver
 from services.acquisition.mock_links import MockLinks
@@ -27,7 +25,11 @@ from services.acquisition.mock_station import build_mocks
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
-from services.acquisition.mocks.sdk_link import BridgePort
+from services.acquisition.mocks.trackers import (
+    BridgeFingerTrackerSource,
+    BridgePort,
+    BridgePoseSource,
+)
 from tests.unit.acquisition.sleepy_clock import SleepyClock
 from tests.unit.acquisition.usb_bus import usb_trackers
 

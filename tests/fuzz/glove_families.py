@@ -5,16 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.acquisition.devices.justfloat_glove.driver import JustFloatGloveDecoder
-from services.acquisition.devices.justfloat_glove.mock import encode_justfloat
-from services.acquisition.devices.tactile_glove.driver import (
+from services.acquisition.devices.justfloat_glove import JustFloatGloveDecoder
+from services.acquisition.devices.tactile_glove import (
     COMMAND_MAGIC,
     MAGIC,
     REQUEST,
     TactileGloveDecoder,
 )
-from services.acquisition.devices.wuji_glove.driver import WujiGloveDecoder
-from services.acquisition.devices.wuji_glove.mock import encode_wuji
+from services.acquisition.devices.wuji_glove import WujiGloveDecoder
 from services.acquisition.drivers.packets import (
     SOURCES,
     VERSION,
@@ -22,6 +20,7 @@ from services.acquisition.drivers.packets import (
     PacketDecoder,
     encode_packet,
 )
+from services.acquisition.mocks.gloves import encode_justfloat, encode_wuji
 
 NUM_VALUES = 401
 FULL_SCALE = 4095.0

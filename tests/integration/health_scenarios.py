@@ -9,7 +9,7 @@ import numpy as np
 from dextouch.errors import DeviceError
 from dextouch.schemas import HealthEvent, TakePrompt
 from services.acquisition.clock import StationClock, VirtualClock
-from services.acquisition.devices.station_camera.driver import StationCamera
+from services.acquisition.devices.station_camera import StationCamera
 from services.acquisition.health import STATION, DiskCheck
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation

@@ -3,7 +3,7 @@
 import numpy as np
 
 from dextouch.streams import StreamDescriptor
-from services.acquisition.devices.robot_state.driver import STREAM_SIZES
+from services.acquisition.devices.robot_state import STREAM_SIZES
 from services.acquisition.mocks.replay import ReplayStream
 
 

@@ -15,9 +15,9 @@ from dextouch.images import decode_jpeg
 from dextouch.schemas import RecordingAttributes, SaveTake, TakePrompt
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.station_camera.mock import video_camera
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
+from services.acquisition.mocks.cameras_and_robot import video_camera
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import MockSlot, ReplayStream
 from services.acquisition.settings import SpoolSafety

@@ -8,7 +8,8 @@ import pytest
 
 from dextouch.schemas import TakePrompt
 from services.acquisition.clock import PeriodicCall, VirtualClock
-from services.acquisition.health import DiskCheck, host
+from services.acquisition.health import DiskCheck
+from services.acquisition.health.station import HostCheck
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
@@ -39,7 +40,7 @@ class SleepyHost(VirtualClock):
 
 def host_judge(station):
     """The check of the station's computer."""
-    return next(j for j in station.health._itself.judges if isinstance(j, host.HostCheck))
+    return next(j for j in station.health._itself.judges if isinstance(j, HostCheck))
 
 
 def busy(station):

@@ -11,8 +11,8 @@ from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import StreamDescriptor
 from services.acquisition import path_latency
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mock_glove
 from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.gloves import GloveCalibration, mock_glove
 from services.acquisition.mocks.replay import MockSlot, ReplayStream
 from services.acquisition.station import Station
 

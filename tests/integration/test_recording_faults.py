@@ -10,7 +10,7 @@ import pytest
 from dextouch.episodes.spool import SpoolReader
 from dextouch.schemas import TakePrompt
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.robot_state.driver import STREAM_SIZES
+from services.acquisition.devices.robot_state import STREAM_SIZES
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, Fate, FaultScript

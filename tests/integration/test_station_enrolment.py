@@ -14,9 +14,8 @@ import httpx
 import pytest
 
 from services.acquisition.app import create_app
-from services.acquisition.enrolment import with_enrolment
 from services.acquisition.mocks import pattern
-from services.acquisition.settings import AcquisitionSettings
+from services.acquisition.settings import AcquisitionSettings, with_enrolment
 from services.cli.main import main
 from services.pipelines.servers import served
 

@@ -6,7 +6,7 @@ import pytest
 from dextouch.errors import ShapeError, UnknownNameError
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile import contact, heatmap, layout
-from services.acquisition.devices.tactile_glove.mock import GloveCalibration, TactileGloveSource
+from services.acquisition.mocks.gloves import GloveCalibration, TactileGloveSource
 from services.acquisition.mocks.replay import ReplayStream
 
 

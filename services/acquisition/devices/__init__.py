@@ -31,7 +31,7 @@ from services.acquisition.drivers.packets import (
     FrameSearch,
     SequenceCounter,
 )
-from services.acquisition.transports.ports import Transport, TransportInfo
+from services.acquisition.transports import Transport, TransportInfo
 
 __all__ = [
     "ENTRY_POINT_GROUP",

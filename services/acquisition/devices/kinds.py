@@ -1,8 +1,8 @@
 """Kinds of devices: what a kind is, how it is found by its name, and the drivers of a station.
 
 Kinds of this package and of others are entry points of one group and are loaded by the same code,
-when a station names them. Every folder beside this file is one of ours, with or without an
-installation: its `driver` holds `KIND`.
+when a station names them. Every other module of this package is one of ours, with or without an
+installation: it holds `KIND`.
 """
 
 import pkgutil
@@ -23,16 +23,17 @@ from dextouch.schemas import Matrix
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, hand_name
-from services.acquisition.transports.ports import (
+from services.acquisition.transports import (
     HidTransport,
     SerialTransport,
     Transport,
+    UsbAddress,
+    UsbTransport,
     find_port,
     hid_opener,
     tcp_transport,
     unix_transport,
 )
-from services.acquisition.transports.usb import UsbAddress, UsbTransport
 
 ENTRY_POINT_GROUP = "dextouch.devices"
 OWN_PACKAGE = "dextouch-wm"
@@ -232,9 +233,9 @@ def _package_of(point: EntryPoint) -> str:
 def _points(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     """Ours, then those of installed packages; looking through the folders of `path` takes 0.1 s."""
     ours = [
-        EntryPoint(folder.name, f"{__package__}.{folder.name}.driver:KIND", ENTRY_POINT_GROUP)
-        for folder in pkgutil.iter_modules([str(Path(__file__).parent)])
-        if folder.ispkg
+        EntryPoint(module.name, f"{__package__}.{module.name}:KIND", ENTRY_POINT_GROUP)
+        for module in pkgutil.iter_modules([str(Path(__file__).parent)])
+        if module.name != Path(__file__).stem
     ]
     others = {(point.name, point.value): point for point in entry_points(group=ENTRY_POINT_GROUP)}
     return (*ours, *others.values())

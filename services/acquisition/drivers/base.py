@@ -11,7 +11,7 @@ from dextouch.schemas import Matrix
 from dextouch.streams import Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
-from services.acquisition.drivers.image_quality import ImageQuality
+from services.acquisition.drivers.images import ImageQuality
 from services.acquisition.drivers.packets import (
     SOURCES,
     VERSION,
@@ -21,9 +21,16 @@ from services.acquisition.drivers.packets import (
     PacketDecoder,
     PortionedSearch,
 )
-from services.acquisition.transports.ports import Transport, TransportInfo
+from services.acquisition.transports import Transport, TransportInfo
 
 Readings = dict[str, list[Sample]]
+REPORT_BYTES = 64
+DATA_REPORT = 0x01
+DESCRIPTOR_REPORT = 0x02
+# report id, message counter, part, number of parts, bytes of payload in this part
+REPORT_HEADER = struct.Struct("<BBBBB")
+PART_BYTES = REPORT_BYTES - REPORT_HEADER.size
+MAX_PARTS = 255
 
 
 @dataclass(frozen=True)
@@ -222,17 +229,6 @@ def check_packet(packet: Packet, *, device: str, source: str | None) -> None:
             device=device,
             event="wrong_side",
         )
-
-
-# Numbered 64-byte reports ↔ a packet's bytes, and the decoders of trackers that send them.
-
-REPORT_BYTES = 64
-DATA_REPORT = 0x01
-DESCRIPTOR_REPORT = 0x02
-# report id, message counter, part, number of parts, bytes of payload in this part
-REPORT_HEADER = struct.Struct("<BBBBB")
-PART_BYTES = REPORT_BYTES - REPORT_HEADER.size
-MAX_PARTS = 255
 
 
 def split_into_reports(report_id: int, counter: int, data: bytes) -> list[bytes]:

@@ -17,7 +17,7 @@ from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings, StreamDecoder, check_packet
 from services.acquisition.drivers.packets import Packet, PacketDecoder
-from services.acquisition.transports.ports import Transport
+from services.acquisition.transports import Transport
 
 PROTOCOL: Final = "dextouch-bridge"
 PROTOCOL_VERSION = 1

@@ -3,6 +3,6 @@
 The driver itself is `services.acquisition.devices.tactile_glove`.
 """
 
-from services.acquisition.devices.tactile_glove.driver import TactileGloveDecoder
+from services.acquisition.devices.tactile_glove import TactileGloveDecoder
 
 __all__ = ["TactileGloveDecoder"]

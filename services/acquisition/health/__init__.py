@@ -6,8 +6,12 @@ the streams, and `HealthCollector` shows its report to Prometheus.
 
 from services.acquisition.health.cells import count_taxels
 from services.acquisition.health.codes import CODES
-from services.acquisition.health.history import NUM_ROWS
-from services.acquisition.health.history_body import history_facts, json_history, packed_history
+from services.acquisition.health.history import (
+    NUM_ROWS,
+    history_facts,
+    json_history,
+    packed_history,
+)
 from services.acquisition.health.metrics import STATION_FIGURES, HealthCollector
 from services.acquisition.health.monitor import PERIOD_NS, STATION, TICK_NS, HealthMonitor
 from services.acquisition.health.station import DiskCheck, judge_uploads

@@ -28,32 +28,11 @@ from dextouch.tactile.layout import (
     raw_indices,
     split_pads,
 )
-from services.acquisition.devices.tactile_glove.driver import FULL_SCALE_COUNTS
+from services.acquisition.devices.tactile_glove import FULL_SCALE_COUNTS
 from services.acquisition.drivers.base import CellLayout, Decoder
+from services.acquisition.glove_record import NO_CELL, GloveRecord, mapped_cells
 from services.acquisition.health.codes import CODES
 from services.acquisition.health.evaluation import Evaluation, Finding
-from services.acquisition.session import NO_CELL, GloveRecord, mapped_cells
-
-# Share of the neighbours of pressure cells for which something holds, on pads and grids.
-
-
-def neighbour_share(moved: Bool[np.ndarray, "320"]) -> Float64[np.ndarray, "320"]:
-    """Share of the up to 8 neighbours on its pad that moved, for each taxel."""
-    tips, palm = (share_around(pads, np.ones_like(pads)) for pads in split_pads(moved))
-    return join_pads(tips, palm)
-
-
-def share_around(moved: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Share of the up to 8 existing neighbours that moved, of each cell [..., rows, columns].
-
-    A cell that moved exists.
-    """
-    edges = [(0, 0)] * (moved.ndim - 2) + [(1, 1), (1, 1)]
-    padded = np.pad(np.stack([moved, exists]).astype(np.float64), [(0, 0), *edges])
-    blocks = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(-2, -1))
-    num_moved, num = blocks.sum(axis=(-2, -1)) - blocks[..., 1, 1]
-    return num_moved / np.maximum(num, 1.0)
-
 
 RECENT_NS = 500_000_000
 MIN_RECENT_SPAN_NS = 400_000_000
@@ -81,6 +60,24 @@ DRIFT_NS = 10_000_000_000
 MAX_STEP_NS = 1_500_000_000
 PINNED_STATES: Final[tuple[TaxelState, ...]] = ("dead", "stuck", "saturated")
 _SCAN_COLUMNS = 20
+
+
+def neighbour_share(moved: Bool[np.ndarray, "320"]) -> Float64[np.ndarray, "320"]:
+    """Share of the up to 8 neighbours on its pad that moved, for each taxel."""
+    tips, palm = (share_around(pads, np.ones_like(pads)) for pads in split_pads(moved))
+    return join_pads(tips, palm)
+
+
+def share_around(moved: np.ndarray, exists: np.ndarray) -> np.ndarray:
+    """Share of the up to 8 existing neighbours that moved, of each cell [..., rows, columns].
+
+    A cell that moved exists.
+    """
+    edges = [(0, 0)] * (moved.ndim - 2) + [(1, 1), (1, 1)]
+    padded = np.pad(np.stack([moved, exists]).astype(np.float64), [(0, 0), *edges])
+    blocks = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(-2, -1))
+    num_moved, num = blocks.sum(axis=(-2, -1)) - blocks[..., 1, 1]
+    return num_moved / np.maximum(num, 1.0)
 
 
 class _PressureCheck(ABC):

@@ -16,6 +16,7 @@ from dextouch.schemas import (
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.drivers.base import Driver
+from services.acquisition.glove_record import glove_record, is_ours
 from services.acquisition.health.causes import SIMULATED_ADVICE, find_causes
 from services.acquisition.health.cells import TaxelCheck, cell_judge, refused_taxels
 from services.acquisition.health.clock import ClockCheck, CountingCheck
@@ -30,8 +31,13 @@ from services.acquisition.health.evaluation import (
     worst,
 )
 from services.acquisition.health.history import STATION_FIGURES, HealthHistory, StreamMeter
-from services.acquisition.health.host import HostCheck, HostClockCheck
-from services.acquisition.health.station import CalibrationCheck, PathCheck, tared_unix_s
+from services.acquisition.health.station import (
+    CalibrationCheck,
+    HostCheck,
+    HostClockCheck,
+    PathCheck,
+    tared_unix_s,
+)
 from services.acquisition.health.streams import (
     CameraCheck,
     FiniteCheck,
@@ -41,7 +47,6 @@ from services.acquisition.health.streams import (
     TrackingCheck,
 )
 from services.acquisition.path_latency import PathWatch
-from services.acquisition.session import glove_record, is_ours
 from services.acquisition.supervisor import DeviceSupervisor
 
 TICK_NS = 100_000_000

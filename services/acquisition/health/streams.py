@@ -38,6 +38,13 @@ EVENTS = (
     ("reordered", "late", "late packets dropped"),
     ("restart", "restarts", "restarts of the device"),
 )
+MAX_SPEED_M_S = 5.0
+REST_SPEED_M_S = 0.02
+REST_NS = 1_000_000_000
+MIN_REST_SAMPLES = 40
+# What is kept between two evaluations, which are a second apart.
+KEPT_S = 4.0
+JUDGED_VALUES = ("tactile", "pose", "keypoints")
 
 
 class LinkCheck:
@@ -168,12 +175,6 @@ class TrackingCheck:
         evaluation.figures["tracking_lost_ratio"] = lost
 
 
-MAX_SPEED_M_S = 5.0
-REST_SPEED_M_S = 0.02
-REST_NS = 1_000_000_000
-MIN_REST_SAMPLES = 40
-
-
 class PoseCheck:
     """Judges the poses of one body: jumps that came through, and its trembling at rest."""
 
@@ -279,13 +280,6 @@ class CameraCheck:
             "image_frozen": float(quality.frozen),
             "image_blurred": float(quality.blurred),
         }
-
-
-# Ring buffers of the newest samples, which wait there for the next evaluation.
-
-# What is kept between two evaluations, which are a second apart.
-KEPT_S = 4.0
-JUDGED_VALUES = ("tactile", "pose", "keypoints")
 
 
 class SampleQueue:

@@ -56,6 +56,9 @@ SOURCE_NAMES = {number: name for name, number in SOURCES.items()}
 Edit = Callable[[bytes], bytes]
 Pinned = Literal["stuck", "saturated"]
 WINDOWS = ("stalls_s", "unplugged_s", "occluded_s", "not_running_s", "jumped_s")
+FORMAT = "dextouch mock ledger 1"
+# A column of signed 64-bit numbers: 8 bytes a packet, where a list takes 40.
+_numbers = partial(array, "q")
 
 
 class DeviceFaults(FrozenModel):
@@ -378,13 +381,6 @@ def _edited(data: bytes, edits: Sequence[Edit]) -> bytes:
     for edit in edits:
         data = edit(data)
     return data
-
-
-# Ledger of a mock's packets and their faults, against which counters are tested.
-
-FORMAT = "dextouch mock ledger 1"
-# A column of signed 64-bit numbers: 8 bytes a packet, where a list takes 40.
-_numbers = partial(array, "q")
 
 
 class Fate(StrEnum):

@@ -1,11 +1,13 @@
-"""Made-up streams of two moving, pressing hands."""
+"""Made-up streams: two moving, pressing hands, and a board and resting gloves for calibration."""
 
+from dataclasses import replace
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.geometry import pinhole_matrix
+from dextouch.geometry import pinhole_matrix, transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands import CHAINS, chain_indices, mean_hand_m
 from dextouch.schemas import Matrix, matrix_rows
@@ -20,6 +22,22 @@ PEAK_KPA = 30.0
 PATCH_PX = 4
 PATCH_CONTRAST = 20
 ROUND_S = 8.0
+# The practice camera as it is: calibration has to find this out from its images. The first pixel
+# spans 0 … 1; distortion is k1 k2 p1 p2 of OpenCV's model.
+SIZE_PX: Final = (480, 360)
+K: Final = np.array([[431.7, 0.0, 244.6], [0.0, 429.2, 176.3], [0.0, 0.0, 1.0]])
+DISTORTION: Final = (-0.11, 0.06, 0.0012, -0.0009)
+# chessboard:9x6:25mm
+COLUMNS, ROWS, SQUARE_M = 9, 6, 0.025
+RIM_M = 0.02
+RATE_HZ = 10.0
+STILL_IMAGES, MOVING_IMAGES, NUM_POSES = 7, 3, 40
+NOISE_COUNTS = 1.5
+# Width of an edge in pixels, as that of a lens in focus.
+EDGE_PX = 1.6
+DEPTHS_M = (0.42, 0.55, 0.72)
+TILTS_RAD = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5), (0.0, 0.0))
+PAPER, INK, WALL = 225.0, 30.0, 125.0
 
 
 def pattern_streams(round_s: float = ROUND_S) -> list[ReplayStream]:
@@ -123,3 +141,118 @@ def _images(turn_rad: np.ndarray) -> UInt8[np.ndarray, "n 64 64 3"]:
     ground = np.broadcast_to(40 + rows + columns + patches, ball.shape)
     red = np.where(ball, 230, ground)
     return np.stack([red, np.where(ball, 120, ground), ground], axis=-1).astype(np.uint8)
+
+
+def practice_streams(seed: int = 0) -> list[ReplayStream]:
+    """All human streams, with a board before the head camera and gloves at rest.
+
+    Args:
+        seed: of the image noise.
+    """
+    images = board_images(seed)
+    board = ReplayStream(
+        StreamDescriptor(
+            name="camera_head",
+            kind="image",
+            shape=images.shape[1:],
+            dtype="uint8",
+            unit="rgb8",
+            nominal_rate_hz=RATE_HZ,
+        ),
+        np.rint(np.arange(len(images)) * (1e9 / RATE_HZ)).astype(np.int64),
+        images,
+    )
+    # One round for all: a shorter stream would pause until the board is done.
+    others = [s for s in pattern_streams(len(images) / RATE_HZ) if s.descriptor.kind != "image"]
+    return [*(_at_rest(stream) for stream in others), board]
+
+
+def _at_rest(stream: ReplayStream) -> ReplayStream:
+    if stream.descriptor.kind != "tactile":
+        return stream
+    return replace(stream, values=np.zeros_like(stream.values))
+
+
+def board_images(seed: int) -> UInt8[np.ndarray, "n h w 3"]:
+    """Images of the board, which rests at each pose and then moves to the next one."""
+    rng, rays = np.random.default_rng(seed), _rays()
+    poses = _board_poses()
+    grey = []
+    for here, there in pairwise([*poses, poses[0]]):
+        still = render(here, rays)
+        moving = [
+            render(here + share * (there - here), rays)
+            for share in np.linspace(0, 1, MOVING_IMAGES + 2)[1:-1]
+        ]
+        grey += [still] * STILL_IMAGES + moving
+    noisy = [image + NOISE_COUNTS * rng.standard_normal(image.shape) for image in grey]
+    images = np.stack([np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in noisy])
+    # Three equal channels without three copies.
+    return np.broadcast_to(images[..., None], (*images.shape, 3))
+
+
+def render(pose: np.ndarray, rays: Float64[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+    """Grey image of the board at a pose: rotation vector, then the place of its middle (m).
+
+    Args:
+        pose: [6] of the board in the camera.
+        rays: direction of every pixel.
+    """
+    R = rotation_from_vector(pose[:3])
+    middle = np.array([(COLUMNS - 1) * SQUARE_M / 2, (ROWS - 1) * SQUARE_M / 2, 0.0])
+    T_camera_board = transform(R, pose[3:] - R @ middle)
+    normal, origin = T_camera_board[:3, 2], T_camera_board[:3, 3]
+    points = rays * ((normal @ origin) / (rays @ normal))[..., None] - origin
+    x, y = (points @ T_camera_board[:3, axis] / SQUARE_M for axis in (0, 1))
+    ink = _stripes(x) * _stripes(y)
+    rim = RIM_M / SQUARE_M
+    squares = _inside(x, -1.0, float(COLUMNS)) * _inside(y, -1.0, float(ROWS))
+    paper = _inside(x, -1 - rim, COLUMNS + rim) * _inside(y, -1 - rim, ROWS + rim)
+    sheet = PAPER + squares * 0.5 * (1 + ink) * (INK - PAPER)
+    return (WALL + paper * (sheet - WALL)).astype(np.float32)
+
+
+def _stripes(a: np.ndarray) -> np.ndarray:
+    """+1 and -1 in turn between whole numbers, with edges as wide as a lens makes them."""
+    cell = np.floor(a)
+    distance = (0.5 - np.abs(a - cell - 0.5)) * np.where(cell % 2, 1.0, -1.0)
+    return 2 * np.clip(distance / _edge(a), -0.5, 0.5)
+
+
+def _inside(a: np.ndarray, low: float, high: float) -> np.ndarray:
+    """1 between two values, 0 outside of them."""
+    return np.clip(np.minimum(a - low, high - a) / _edge(a) + 0.5, 0, 1)
+
+
+def _edge(a: np.ndarray) -> np.ndarray:
+    down, right = np.gradient(a)
+    return EDGE_PX * np.hypot(down, right)
+
+
+def _rays() -> Float64[np.ndarray, "h w 3"]:
+    """Direction of every pixel's centre, by fixed-point iteration of OpenCV's distortion."""
+    v, u = np.mgrid[0 : SIZE_PX[1], 0 : SIZE_PX[0]] + 0.5
+    x_seen, y_seen = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+    k1, k2, p1, p2 = DISTORTION
+    x, y = x_seen, y_seen
+    for _ in range(20):
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2 * r2
+        dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        x, y = (x_seen - dx) / radial, (y_seen - dy) / radial
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def _board_poses() -> list[Float64[np.ndarray, "6"]]:
+    """Everywhere in the image, near and far, tilted towards each edge."""
+    poses = []
+    for index in range(NUM_POSES):
+        depth = DEPTHS_M[index % len(DEPTHS_M)]
+        across, down = (index * 3 % 5 - 2) / 2, (index * 3 // 5 % 5 - 2) / 2
+        # As far out as the whole board with its rim stays in the image.
+        reach_x, reach_y = 0.54 * depth - 0.15, 0.40 * depth - 0.11
+        tilt = TILTS_RAD[index * 2 % len(TILTS_RAD)]
+        roll = 0.15 * ((index * 7) % 5 - 2)
+        poses.append(np.array([*tilt, roll, across * reach_x, down * reach_y, depth]))
+    return poses

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import ClassVar
 
 from dextouch.errors import DeviceError
-from services.acquisition.transports.ports import (
+from services.acquisition.transports import (
     HandleTransport,
     HidTransport,
     SerialTransport,

@@ -14,8 +14,7 @@ from pydantic import ValidationError
 
 from dextouch.errors import DeviceError
 from dextouch.streams import Sample, StreamDescriptor
-from services.acquisition.devices.pose_tracker.driver import pose_descriptor
-from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
+from services.acquisition.devices.pose_tracker import pose_descriptor
 from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
 from services.acquisition.drivers.sdk_link import (
     MAX_HELLO_BYTES,
@@ -26,6 +25,7 @@ from services.acquisition.drivers.sdk_link import (
 )
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.trackers import BridgePoseSource
 
 MAGIC = b"DXFT"
 MS = 1_000_000

@@ -18,27 +18,25 @@ from dextouch.geometry.rotations import (
 )
 from dextouch.hands import NODES
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.finger_tracker.driver import BridgeFingerTrackerDecoder
-from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource
-from services.acquisition.devices.pose_tracker.driver import (
+from services.acquisition.devices.finger_tracker import BridgeFingerTrackerDecoder
+from services.acquisition.devices.pose_tracker import (
     POSE_PAYLOAD,
     BridgePoseTrackerDecoder,
     SenderFrame,
     TrackingResult,
     quaternion_of_one,
 )
-from services.acquisition.devices.pose_tracker.mock import (
-    POSE_INDEX,
-    BridgePoseSource,
-)
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.sdk_link import BridgeDriver, FrameConvention
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.sdk_link import (
+from services.acquisition.mocks.trackers import (
     LEFT_HANDED,
+    POSE_INDEX,
     Y_UP,
+    BridgeFingerTrackerSource,
     BridgePort,
+    BridgePoseSource,
 )
 
 MS = 1_000_000

@@ -8,16 +8,16 @@ from dextouch.errors import DeviceError
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.devices.camera.driver import (
+from services.acquisition.devices.camera import (
     ENCODING_CODES,
     MAGIC,
     PAYLOAD_HEADER,
     CameraDecoder,
 )
-from services.acquisition.devices.camera.mock import CameraSource
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.image_encoding import ImageEncoder
+from services.acquisition.drivers.images import ImageEncoder
 from services.acquisition.drivers.packets import Packet, encode_packet
+from services.acquisition.mocks.cameras_and_robot import CameraSource
 from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.settings import AcquisitionSettings

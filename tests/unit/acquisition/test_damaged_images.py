@@ -8,7 +8,7 @@ from PIL import Image
 
 from dextouch.episodes import GopEncoder, VideoSettings
 from dextouch.errors import DeviceError
-from services.acquisition.devices.camera.driver import (
+from services.acquisition.devices.camera import (
     ENCODING_CODES,
     MAGIC,
     PAYLOAD_HEADER,

@@ -21,9 +21,9 @@ from dextouch.schemas import (
     SavedTakes,
 )
 from dextouch.streams import SampleBatch, StreamDescriptor
-from services.acquisition import deleted_takes
-from services.acquisition.deleted_takes import DeletedTakes, OperatorNames
-from services.acquisition.session import SessionCount
+from services.acquisition import retention
+from services.acquisition.recorder import SessionCount
+from services.acquisition.retention import DeletedTakes, OperatorNames
 from services.acquisition.uploader import Uploader, ids_in_store, second_id
 
 HEAD = StreamDescriptor(
@@ -95,7 +95,7 @@ def test_the_spool_is_asked_about_once_for_every_deletion(tmp_path, deleted, for
 
 
 def test_a_large_spool_is_asked_about_in_parts(tmp_path, deleted, monkeypatch):
-    monkeypatch.setattr(deleted_takes, "MAX_CHECKED_TAKES", 2)
+    monkeypatch.setattr(retention, "MAX_CHECKED_TAKES", 2)
     for number in range(5):
         spool(tmp_path, f"take-{number}")
     store = Store()

@@ -63,7 +63,7 @@ OWN_KINDS = [
 ]
 
 
-def test_every_folder_of_a_family_is_a_kind_without_a_table():
+def test_every_module_of_a_family_is_a_kind_without_a_table():
     assert kind_names() == OWN_KINDS
 
 

@@ -4,9 +4,9 @@ import pytest
 from dextouch.errors import DeviceError, PacketError
 from dextouch.hands import NODES
 from dextouch.images import decode_jpeg, encode_jpeg
-from services.acquisition.devices.camera.driver import ENCODING_CODES, PAYLOAD_HEADER, CameraDecoder
-from services.acquisition.devices.camera.driver import MAGIC as CAMERA_MAGIC
-from services.acquisition.devices.finger_tracker.driver import (
+from services.acquisition.devices.camera import ENCODING_CODES, PAYLOAD_HEADER, CameraDecoder
+from services.acquisition.devices.camera import MAGIC as CAMERA_MAGIC
+from services.acquisition.devices.finger_tracker import (
     CHAIN_IDS,
     DESCRIPTOR_MAGIC,
     JOINT_IDS,
@@ -14,13 +14,13 @@ from services.acquisition.devices.finger_tracker.driver import (
     FingerTrackerDecoder,
     parse_node_order,
 )
-from services.acquisition.devices.finger_tracker.driver import MAGIC as FINGER_MAGIC
-from services.acquisition.devices.pose_tracker.driver import MAGIC as POSE_MAGIC
-from services.acquisition.devices.pose_tracker.driver import PAYLOAD as POSE_PAYLOAD
-from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder, TrackingState
-from services.acquisition.devices.robot_state.driver import MAGIC as ROBOT_MAGIC
-from services.acquisition.devices.robot_state.driver import PAYLOAD as ROBOT_PAYLOAD
-from services.acquisition.devices.robot_state.driver import RobotStateDecoder
+from services.acquisition.devices.finger_tracker import MAGIC as FINGER_MAGIC
+from services.acquisition.devices.pose_tracker import MAGIC as POSE_MAGIC
+from services.acquisition.devices.pose_tracker import PAYLOAD as POSE_PAYLOAD
+from services.acquisition.devices.pose_tracker import PoseTrackerDecoder, TrackingState
+from services.acquisition.devices.robot_state import MAGIC as ROBOT_MAGIC
+from services.acquisition.devices.robot_state import PAYLOAD as ROBOT_PAYLOAD
+from services.acquisition.devices.robot_state import RobotStateDecoder
 from services.acquisition.drivers.base import (
     DATA_REPORT,
     DESCRIPTOR_REPORT,

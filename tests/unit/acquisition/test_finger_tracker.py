@@ -9,7 +9,7 @@ from dextouch.errors import DeviceError, PacketError
 from dextouch.hands import NODE_INDEX, NODES, NUM_KEYPOINTS
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.finger_tracker.driver import (
+from services.acquisition.devices.finger_tracker import (
     ALL_SEEN,
     CHAIN_IDS,
     JOINT_IDS,
@@ -20,9 +20,9 @@ from services.acquisition.devices.finger_tracker.driver import (
     resolve_nodes,
     unpack_keypoints,
 )
-from services.acquisition.devices.finger_tracker.mock import FingerTrackerSource
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.trackers import FingerTrackerSource
 
 ORDERS = st.permutations(range(NUM_KEYPOINTS))
 
@@ -132,7 +132,7 @@ def test_a_shuffled_device_over_hid(seed):
 
 
 def test_a_device_that_says_nothing_of_its_nodes_is_refused(monkeypatch):
-    monkeypatch.setattr("services.acquisition.devices.finger_tracker.driver.DESCRIPTOR_READS", 2)
+    monkeypatch.setattr("services.acquisition.devices.finger_tracker.DESCRIPTOR_READS", 2)
     port = HidPort("mock", answer=lambda report: [])
     port.plug()
     driver = FingerTracker("fingers", "left", transport=port.transport, clock=VirtualClock())

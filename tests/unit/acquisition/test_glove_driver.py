@@ -8,17 +8,20 @@ import pytest
 from dextouch.errors import DeviceError, InvalidInputError, PacketError
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.justfloat_glove.mock import mock_justfloat_glove
-from services.acquisition.devices.tactile_glove.driver import (
+from services.acquisition.devices.tactile_glove import (
     TactileGlove,
     encode_identity,
     parse_identity,
     parse_reply,
 )
-from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mock_glove
-from services.acquisition.devices.wuji_glove.mock import mock_wuji_glove
 from services.acquisition.drivers.packets import Packet
 from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.gloves import (
+    GloveCalibration,
+    mock_glove,
+    mock_justfloat_glove,
+    mock_wuji_glove,
+)
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.mocks.replay import MockSlot, ReplayStream
 

@@ -5,15 +5,14 @@ import numpy as np
 import pytest
 
 from dextouch.errors import DeviceError, InvalidInputError
-from services.acquisition.devices.justfloat_glove.driver import (
+from services.acquisition.devices.justfloat_glove import (
     TAIL,
     JustFloatGloveDecoder,
     are_readings,
     bits_of,
 )
-from services.acquisition.devices.justfloat_glove.mock import encode_justfloat
-from services.acquisition.devices.wuji_glove.driver import WujiGloveDecoder, are_pressures, crc16
-from services.acquisition.devices.wuji_glove.mock import encode_wuji
+from services.acquisition.devices.wuji_glove import WujiGloveDecoder, are_pressures, crc16
+from services.acquisition.mocks.gloves import encode_justfloat, encode_wuji
 
 
 def cells(rng):

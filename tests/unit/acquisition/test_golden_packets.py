@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from dextouch.streams import StreamDescriptor
-from services.acquisition.devices.camera.mock import CameraSource
-from services.acquisition.devices.finger_tracker.mock import FingerTrackerSource
-from services.acquisition.devices.pose_tracker.mock import PoseTrackerSource
-from services.acquisition.devices.robot_state.driver import STREAM_SIZES
-from services.acquisition.devices.robot_state.mock import RobotStateSource
-from services.acquisition.devices.tactile_glove.mock import GloveCalibration, TactileGloveSource
+from services.acquisition.devices.robot_state import STREAM_SIZES
+from services.acquisition.mocks.cameras_and_robot import CameraSource, RobotStateSource
 from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.gloves import GloveCalibration, TactileGloveSource
 from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.trackers import FingerTrackerSource, PoseTrackerSource
 
 FLAT = GloveCalibration(np.full(360, 120.0), np.full(360, 40.0))
 

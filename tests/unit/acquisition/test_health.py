@@ -6,9 +6,9 @@ from prometheus_client import CollectorRegistry, generate_latest
 
 from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.camera.driver import camera_descriptor
-from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
-from services.acquisition.devices.tactile_glove.driver import TactileGloveDecoder
+from services.acquisition.devices.camera import camera_descriptor
+from services.acquisition.devices.pose_tracker import PoseTrackerDecoder
+from services.acquisition.devices.tactile_glove import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health import CODES, DiskCheck, HealthCollector, HealthMonitor
 from services.acquisition.health.codes import table

@@ -8,8 +8,9 @@ from dextouch.schemas import DeviceHealth, RaisedFinding, SharedLink, StreamHeal
 from services.acquisition.health.causes import SIMULATED_ADVICE, find_causes
 from services.acquisition.health.codes import CAUSES, CODES, cause_table
 from services.acquisition.health.evaluation import Evaluation
-from services.acquisition.health.host import HostCheck
-from services.acquisition.transports.ports import TransportInfo, shared_link
+from services.acquisition.health.station import HostCheck
+from services.acquisition.supervisor import shared_link
+from services.acquisition.transports import TransportInfo
 
 DOCS = Path(__file__).parents[3] / "docs" / "health.md"
 HUB = SharedLink(kind="hub", name="1-2")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError
-from services.acquisition.devices.justfloat_glove.driver import JustFloatGloveDecoder
-from services.acquisition.devices.wuji_glove.driver import WujiGloveDecoder
+from services.acquisition.devices.justfloat_glove import JustFloatGloveDecoder
+from services.acquisition.devices.wuji_glove import WujiGloveDecoder
 from services.acquisition.drivers.base import CellLayout
 from services.acquisition.health.cells import CellCheck, cell_judge
 from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes, judged

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dextouch.streams import StreamDescriptor
-from services.acquisition.devices.tactile_glove.driver import glove_descriptor
+from services.acquisition.devices.tactile_glove import glove_descriptor
 from services.acquisition.health.clock import ClockCheck, CountingCheck
 from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes, judged
 

@@ -6,9 +6,10 @@ import pytest
 from dextouch.streams import Sample, StreamDescriptor
 from dextouch.tactile.layout import expand_taxels, raw_indices
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder, pose_descriptor
+from services.acquisition.devices.pose_tracker import PoseTrackerDecoder, pose_descriptor
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.image_quality import ImageQuality
+from services.acquisition.drivers.images import ImageQuality
+from services.acquisition.glove_record import GloveRecord
 from services.acquisition.health.cells import TaxelCheck, count_taxels, neighbour_share
 from services.acquisition.health.streams import (
     CameraCheck,
@@ -18,7 +19,6 @@ from services.acquisition.health.streams import (
     TrackingCheck,
 )
 from services.acquisition.mocks.ports import HidPort
-from services.acquisition.session import GloveRecord
 from services.acquisition.supervisor import StreamCounters
 from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes, judged
 

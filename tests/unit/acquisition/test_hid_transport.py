@@ -4,7 +4,7 @@ import hidraw
 import pytest
 
 from dextouch.errors import DeviceError
-from services.acquisition.transports.ports import HidTransport, hid_opener
+from services.acquisition.transports import HidTransport, hid_opener
 
 REPORT = bytes(range(64))
 

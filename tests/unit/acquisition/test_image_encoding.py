@@ -7,8 +7,8 @@ from dextouch.episodes import GOP_IMAGES, is_keyframe
 from dextouch.errors import DeviceError, InvalidInputError, NotFoundError
 from dextouch.images import decode_jpeg
 from dextouch.streams import Sample
-from services.acquisition.devices.camera.driver import CameraDecoder
-from services.acquisition.drivers.image_encoding import (
+from services.acquisition.devices.camera import CameraDecoder
+from services.acquisition.drivers.images import (
     MAX_WAITING_IMAGES,
     EncodingQueue,
     GroupPreview,

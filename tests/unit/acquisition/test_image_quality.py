@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError
-from services.acquisition.drivers.image_quality import (
+from services.acquisition.drivers.images import (
     MAX_SHARPNESSES,
     ImageChecker,
     ImageQuality,

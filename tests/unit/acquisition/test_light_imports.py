@@ -12,7 +12,7 @@ HEAVY = ("torch", "cv2", "zarr", "scipy", "mujoco", "serial", "hidraw")
     "module",
     [
         "services.acquisition",
-        "services.acquisition.devices.tactile_glove.driver",
+        "services.acquisition.devices.tactile_glove",
         "services.acquisition.station",
         "services.acquisition.mock_station",
         "services.acquisition.app",

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from dextouch.streams import Sample
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.devices.finger_tracker.driver import FingerTrackerSettings
-from services.acquisition.devices.pose_tracker.driver import PoseTrackerSettings
+from services.acquisition.devices.finger_tracker import FingerTrackerSettings
+from services.acquisition.devices.pose_tracker import PoseTrackerSettings
 from services.acquisition.station import LiveView
 
 HALF_SECOND_NS = 500_000_000

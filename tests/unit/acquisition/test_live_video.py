@@ -9,7 +9,7 @@ from dextouch.images import decode_jpeg
 from dextouch.streams import Sample, encoded_values
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.devices.camera.driver import CameraSettings
+from services.acquisition.devices.camera import CameraSettings
 from services.acquisition.station import LiveView
 
 CAMERA = CameraSettings(stream="camera_head", port=1, height_px=48, width_px=64, encoding="h264")

@@ -8,8 +8,8 @@ from dextouch.errors import DeviceError
 from dextouch.schemas import TakePrompt
 from services.acquisition.app import create_app
 from services.acquisition.clock import StationClock, VirtualClock
-from services.acquisition.devices.camera.driver import CameraDecoder
-from services.acquisition.devices.station_camera.driver import StationCamera
+from services.acquisition.devices.camera import CameraDecoder
+from services.acquisition.devices.station_camera import StationCamera
 from services.acquisition.drivers.sdk_link import BridgeDriver
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation, build_mocks

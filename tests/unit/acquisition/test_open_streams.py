@@ -14,13 +14,13 @@ from services.acquisition.devices import (
     Driver,
     build_drivers,
 )
-from services.acquisition.devices.pose_tracker.driver import MAGIC, PAYLOAD, PoseTrackerDecoder
+from services.acquisition.devices.pose_tracker import MAGIC, PAYLOAD, PoseTrackerDecoder
 from services.acquisition.drivers.base import DATA_REPORT, split_into_reports
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.session import is_ours
+from services.acquisition.glove_record import is_ours
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import LiveView
-from services.acquisition.transports.ports import SerialTransport
+from services.acquisition.transports import SerialTransport
 
 IDS = {"vendor_id": 1, "product_id": 2}
 

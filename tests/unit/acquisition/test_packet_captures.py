@@ -13,25 +13,25 @@ import zlib
 import numpy as np
 import pytest
 
-from services.acquisition.devices.camera.driver import CameraDecoder
-from services.acquisition.devices.finger_tracker.driver import (
+from services.acquisition.devices.camera import CameraDecoder
+from services.acquisition.devices.finger_tracker import (
     BridgeFingerTrackerDecoder,
     FingerTrackerDecoder,
 )
-from services.acquisition.devices.justfloat_glove.driver import JustFloatGloveDecoder
-from services.acquisition.devices.pose_tracker.driver import (
+from services.acquisition.devices.justfloat_glove import JustFloatGloveDecoder
+from services.acquisition.devices.pose_tracker import (
     BridgePoseTrackerDecoder,
     PoseTrackerDecoder,
 )
-from services.acquisition.devices.robot_state.driver import RobotStateDecoder
-from services.acquisition.devices.tactile_glove.driver import (
+from services.acquisition.devices.robot_state import RobotStateDecoder
+from services.acquisition.devices.tactile_glove import (
     TactileGloveDecoder,
     encode_request,
     parse_identity,
     parse_reply,
     parse_time,
 )
-from services.acquisition.devices.wuji_glove.driver import WujiGloveDecoder
+from services.acquisition.devices.wuji_glove import WujiGloveDecoder
 
 ARRIVED_NS = 5_000_000_000
 SEQUENCE = 0x0A0B0C0D

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dextouch.errors import DeviceError, InvalidInputError
-from services.acquisition.devices.tactile_glove.driver import (
+from services.acquisition.devices.tactile_glove import (
     MAGIC,
     PAYLOAD_BYTES,
     TactileGloveDecoder,

@@ -11,7 +11,7 @@ from dextouch.errors import DeviceError
 from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition.clock import StationClock, VirtualClock
-from services.acquisition.devices.tactile_glove.driver import TactileGloveDecoder
+from services.acquisition.devices.tactile_glove import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health import HealthCollector, HealthMonitor
 from services.acquisition.health.station import PathCheck

@@ -12,14 +12,14 @@ from dextouch.geometry.rotations import (
     rotation_from_vector,
 )
 from dextouch.streams import StreamDescriptor
-from services.acquisition.devices.pose_tracker.driver import (
+from services.acquisition.devices.pose_tracker import (
     PoseGate,
     PoseTrackerDecoder,
     TrackingState,
 )
-from services.acquisition.devices.pose_tracker.mock import PoseTrackerSource
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.trackers import PoseTrackerSource
 
 PERIOD_NS = 10_000_000
 BOOT_NS = 10_000_000_000_000

@@ -12,8 +12,8 @@ from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
-from services.acquisition.devices.tactile_glove.driver import TactileGloveDecoder
+from services.acquisition.devices.pose_tracker import PoseTrackerDecoder
+from services.acquisition.devices.tactile_glove import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort, PtyPort
 from services.acquisition.recorder import Recorder

@@ -7,7 +7,7 @@ import pytest
 from dextouch.errors import ConflictError
 from dextouch.schemas import SaveTake, TakePrompt
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
+from services.acquisition.devices.pose_tracker import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.recorder import Recorder

@@ -16,7 +16,7 @@ from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition import take
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
+from services.acquisition.devices.pose_tracker import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.recorder import Recorder, TakeOptions

@@ -7,7 +7,7 @@ import pytest
 from prometheus_client import CollectorRegistry
 
 from services.acquisition import retention as retention_module
-from services.acquisition.metrics import SpoolCollector
+from services.acquisition.health.metrics import SpoolCollector
 from services.acquisition.retention import Retention, SpoolRetention, spooled_takes
 
 DAY_S = 86_400

@@ -9,8 +9,8 @@ import serial
 from structlog.testing import capture_logs
 
 from dextouch.errors import DeviceError
-from services.acquisition.transports import ports as serial_transport
-from services.acquisition.transports.ports import SerialTransport
+from services.acquisition import transports as serial_transport
+from services.acquisition.transports import SerialTransport
 
 
 @pytest.fixture

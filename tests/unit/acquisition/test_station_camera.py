@@ -8,13 +8,13 @@ from dextouch.episodes import is_keyframe
 from dextouch.errors import DeviceError, InvalidInputError
 from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.devices.station_camera.capture import (
+from services.acquisition.devices.station_camera import (
     CapturedImage,
     CaptureLink,
+    StationCamera,
     StationCameraSettings,
 )
-from services.acquisition.devices.station_camera.driver import StationCamera
-from services.acquisition.drivers import image_encoding
+from services.acquisition.drivers import images
 from services.acquisition.settings import AcquisitionSettings
 
 MS = 1_000_000
@@ -278,9 +278,9 @@ def test_a_take_begins_a_group_of_pictures():
 
 def test_the_encoder_is_loaded_before_the_first_image(monkeypatch):
     loaded = []
-    make = image_encoding.GopEncoder
+    make = images.GopEncoder
     monkeypatch.setattr(
-        image_encoding, "GopEncoder", lambda *size, **how: loaded.append(size) or make(*size, **how)
+        images, "GopEncoder", lambda *size, **how: loaded.append(size) or make(*size, **how)
     )
     FakeCamera([]).driver(encoding="h264").open()
     assert len(loaded) == 1

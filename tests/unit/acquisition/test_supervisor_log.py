@@ -4,7 +4,7 @@ from structlog.testing import capture_logs
 
 from dextouch.errors import DeviceError
 from services.acquisition.clock import StationClock, Waiter
-from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
+from services.acquisition.devices.pose_tracker import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.supervisor import DeviceSupervisor

@@ -8,21 +8,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dextouch.errors import DeviceError
-from services.acquisition.devices.finger_tracker.driver import (
+from services.acquisition.devices.finger_tracker import (
     BridgeFingerTrackerDecoder,
     FingerTrackerDecoder,
 )
-from services.acquisition.devices.finger_tracker.mock import (
-    BridgeFingerTrackerSource,
-    FingerTrackerSource,
-)
-from services.acquisition.devices.pose_tracker.driver import (
+from services.acquisition.devices.pose_tracker import (
     BridgePoseTrackerDecoder,
     PoseTrackerDecoder,
 )
-from services.acquisition.devices.pose_tracker.mock import BridgePoseSource, PoseTrackerSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
+from services.acquisition.mocks.trackers import (
+    BridgeFingerTrackerSource,
+    BridgePoseSource,
+    FingerTrackerSource,
+    PoseTrackerSource,
+)
 
 NUM_SENT = 6
 STREAMS = {stream.descriptor.name: stream for stream in pattern_streams(1.0)}

@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.pose_tracker.driver import (
+from services.acquisition.devices.pose_tracker import (
     BridgePoseTrackerDecoder,
     PoseTrackerDecoder,
 )
-from services.acquisition.devices.pose_tracker.mock import BridgePoseSource, PoseTrackerSource
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.sdk_link import BridgeDriver
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.ports import HidPort
-from services.acquisition.mocks.sdk_link import BridgePort
+from services.acquisition.mocks.trackers import BridgePort, BridgePoseSource, PoseTrackerSource
 from services.acquisition.supervisor import DeviceSupervisor
 from tests.unit.acquisition.usb_bus import UsbPort
 

@@ -6,7 +6,7 @@ import pytest
 import usb.core
 
 from dextouch.errors import DeviceError
-from services.acquisition.transports.usb import UsbAddress, UsbTransport
+from services.acquisition.transports import UsbAddress, UsbTransport
 from tests.unit.acquisition.usb_bus import (
     ENDPOINT_IN,
     ENDPOINT_OUT,
@@ -177,7 +177,7 @@ def test_unconfigured_device_is_configured():
 
 @pytest.mark.parametrize(("settings", "interface"), [({"endpoints": ()}, 0), ({}, 1)])
 def test_device_without_the_endpoint_is_refused_and_released(settings, interface, monkeypatch):
-    monkeypatch.setattr("services.acquisition.transports.usb.INTERFACE", interface)
+    monkeypatch.setattr("services.acquisition.transports.INTERFACE", interface)
     device = model(**settings)
     with pytest.raises(DeviceError, match="no interrupt endpoint"):
         transport(device).open()

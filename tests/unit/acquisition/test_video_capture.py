@@ -7,13 +7,13 @@ from pydantic import ValidationError
 
 from dextouch.errors import DeviceError
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.station_camera.capture import (
+from services.acquisition.devices.station_camera import (
     CapturedImage,
     OpenCvCapture,
+    StationCamera,
     StationCameraSettings,
     find_camera,
 )
-from services.acquisition.devices.station_camera.driver import StationCamera
 
 
 def wanted(**settings):

@@ -17,7 +17,7 @@ from usb.backend import IBackend
 from usb.core import USBError, USBTimeoutError
 
 from services.acquisition.mocks.ports import MockPort, WatchedTransport
-from services.acquisition.transports.usb import UsbAddress, UsbTransport
+from services.acquisition.transports import UsbAddress, UsbTransport
 
 SET_REPORT = 9
 FIFO_REPORTS = 32

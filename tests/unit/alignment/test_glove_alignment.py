@@ -8,10 +8,15 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import RecordingAttributes, matrix_rows
 from dextouch.streams import ClockCapabilities, SampleBatch, StreamDescriptor
 from dextouch.tactile.layout import expand_taxels, raw_indices
-from services.acquisition.devices.justfloat_glove.driver import JustFloatGloveDecoder
-from services.acquisition.devices.justfloat_glove.mock import COUNTS_PER_KPA, JustFloatGloveSource
-from services.acquisition.devices.wuji_glove.driver import WujiGloveDecoder
-from services.acquisition.devices.wuji_glove.mock import FULL_SCALE_KPA, WujiGloveSource, grid_of
+from services.acquisition.devices.justfloat_glove import JustFloatGloveDecoder
+from services.acquisition.devices.wuji_glove import WujiGloveDecoder
+from services.acquisition.mocks.gloves import (
+    COUNTS_PER_KPA,
+    FULL_SCALE_KPA,
+    JustFloatGloveSource,
+    WujiGloveSource,
+    grid_of,
+)
 from services.acquisition.mocks.replay import ReplayStream
 from services.alignment.command_line import main
 from services.alignment.jobs import align_recording

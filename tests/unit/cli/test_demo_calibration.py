@@ -6,9 +6,9 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolReader
 from dextouch.schemas import TakePrompt, matrix_rows
-from services.acquisition.devices.tactile_glove.mock import GloveCalibration
 from services.acquisition.mock_station import LATENCY_SIGMA_MS
 from services.acquisition.mocks.faults import FaultScript
+from services.acquisition.mocks.gloves import GloveCalibration
 from services.acquisition.mocks.pattern import pattern_streams
 from services.alignment.options import AlignmentOptions
 from services.pipelines import mock_takes

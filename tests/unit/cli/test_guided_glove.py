@@ -13,9 +13,9 @@ from dextouch.schemas import SaveTake, TakeName, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices import load_calibration
-from services.acquisition.devices.tactile_glove.driver import TactileGloveDecoder
-from services.acquisition.devices.tactile_glove.mock import GloveCalibration
+from services.acquisition.devices.tactile_glove import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
+from services.acquisition.mocks.gloves import GloveCalibration
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.recorder import Recorder
 from services.acquisition.station import LiveView

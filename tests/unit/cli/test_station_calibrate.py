@@ -23,7 +23,7 @@ from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition.devices import load_calibration
-from services.acquisition.devices.tactile_glove.mock import GloveCalibration
+from services.acquisition.mocks.gloves import GloveCalibration
 from services.alignment.station_calibration import record
 from services.cli import main as command_line
 from services.pipelines.calibrate.command import main

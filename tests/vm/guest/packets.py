@@ -3,9 +3,7 @@
 import numpy as np
 
 from dextouch.hands import NODES, NUM_KEYPOINTS
-from services.acquisition.devices.finger_tracker import driver as finger_tracker
-from services.acquisition.devices.pose_tracker import driver as pose_tracker
-from services.acquisition.devices.tactile_glove import driver as tactile_glove
+from services.acquisition.devices import finger_tracker, pose_tracker, tactile_glove
 from services.acquisition.drivers.base import (
     DATA_REPORT,
     DESCRIPTOR_REPORT,

@@ -7,8 +7,7 @@ import numpy as np
 
 from dextouch.errors import DeviceError
 from dextouch.streams import NO_DEVICE_TIME
-from services.acquisition.devices.station_camera.capture import StationCameraSettings
-from services.acquisition.devices.station_camera.driver import MAX_AHEAD_NS
+from services.acquisition.devices.station_camera import MAX_AHEAD_NS, StationCameraSettings
 from tests.vm.guest import kernel_devices
 from tests.vm.guest.conftest import (
     MAX_BACK_S,

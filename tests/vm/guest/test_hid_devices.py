@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from services.acquisition.devices.pose_tracker.driver import PoseTrackerSettings
+from services.acquisition.devices.pose_tracker import PoseTrackerSettings
 from tests.vm.guest import kernel_devices, packets
 from tests.vm.guest.conftest import (
     MAX_BACK_S,

@@ -12,8 +12,8 @@ import numpy as np
 
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.devices.tactile_glove.driver import TactileGloveSettings
-from services.acquisition.devices.tactile_glove.mock import GloveAnswers
+from services.acquisition.devices.tactile_glove import TactileGloveSettings
+from services.acquisition.mocks.gloves import GloveAnswers
 from services.acquisition.supervisor import DeviceSupervisor
 from tests.vm.guest import kernel_devices, packets
 from tests.vm.guest.conftest import (

@@ -5,7 +5,7 @@ from itertools import chain
 import numpy as np
 import pytest
 
-from services.acquisition.devices.finger_tracker.driver import FingerTrackerSettings
+from services.acquisition.devices.finger_tracker import FingerTrackerSettings
 from tests.vm.guest import kernel_devices, packets
 from tests.vm.guest.conftest import collect
 

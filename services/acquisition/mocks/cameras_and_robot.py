@@ -1,21 +1,21 @@
-"""A simulated camera on the station's own bus.
-
-A camera driver delivers images, not bytes, so this mock is a `CaptureLink`: images with the
-kernel's stamps, four buffers, an error when it is pulled out.
-"""
+"""Simulated cameras, behind a bridge and on the station's own bus, and a robot's state server."""
 
 import struct
+from collections.abc import Mapping
 
 import numpy as np
 
-from dextouch.errors import DeviceError
+from dextouch.errors import DeviceError, InvalidInputError
 from services.acquisition.clock import StationClock, Waiter
-from services.acquisition.devices.station_camera.capture import (
+from services.acquisition.devices import camera, robot_state
+from services.acquisition.devices.station_camera import (
     CapturedImage,
     CaptureLink,
+    StationCamera,
     StationCameraSettings,
 )
-from services.acquisition.devices.station_camera.driver import StationCamera
+from services.acquisition.drivers.images import ImageEncoder, ImageEncoding
+from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.mocks.ports import ReportPort
 from services.acquisition.mocks.replay import (
     MockDevice,
@@ -28,6 +28,43 @@ from services.acquisition.mocks.replay import (
 UNIT_HEADER = struct.Struct("<qHH")
 # With a virtual clock, time must not go on while an image is being encoded.
 LOCKSTEP_WAIT_S = 20.0
+
+
+class CameraSource(PacketSource):
+    """Packets of one camera.
+
+    Args:
+        stream: uint8 [n, h, w, 3].
+        encoding: of the images on the wire.
+    """
+
+    def __init__(self, stream: ReplayStream, *, encoding: ImageEncoding = "rgb8") -> None:
+        self.t_ns = stream.t_ns
+        self._images = stream.values
+        self._encoding: ImageEncoding = encoding
+        height_px, width_px = stream.descriptor.shape[:2]
+        self._encoder = ImageEncoder(
+            encoding, (height_px, width_px), rate_hz=stream.descriptor.nominal_rate_hz
+        )
+        self._last_sequence: int | None = None
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One packet."""
+        image = self._images[index]
+        header = camera.PAYLOAD_HEADER.pack(*image.shape[:2], camera.ENCODING_CODES[self._encoding])
+        body = image.tobytes() if self._encoding == "rgb8" else self._encoded(index, sequence)
+        packet = Packet(VERSION, SOURCES["none"], sequence, t_device_ns, header + body)
+        return [encode_packet(camera.MAGIC, packet)]
+
+    def _encoded(self, index: int, sequence: int) -> bytes:
+        # Packets that get lost were encoded too: a lost H.264 image tears its group.
+        first = sequence if self._last_sequence is None else self._last_sequence + 1
+        data = b""
+        for number in range(max(first, sequence - index), sequence + 1):
+            image = self._images[index - (sequence - number)]
+            data = self._encoder.encode(image, begins=False).item()
+        self._last_sequence = sequence
+        return data
 
 
 class VideoPort(ReportPort):
@@ -132,3 +169,30 @@ def video_camera(place: MockSlot, **settings: float | str) -> MockPair:
         max_encode_wait_s=LOCKSTEP_WAIT_S,
     )
     return MockPair(VideoDevice(place, VideoSource(place.stream), port), driver)
+
+
+class RobotStateSource(PacketSource):
+    """Packets of one robot.
+
+    Args:
+        streams: the six of `STREAM_SIZES`, all with the same times.
+
+    Raises:
+        InvalidInputError: one is missing, or their times differ.
+    """
+
+    def __init__(self, streams: Mapping[str, ReplayStream]) -> None:
+        missing = sorted(set(robot_state.STREAM_SIZES) - set(streams))
+        if missing:
+            raise InvalidInputError(f"robot state: streams {missing} are missing")
+        parts = [streams[name] for name in robot_state.STREAM_SIZES]
+        if any(not np.array_equal(part.t_ns, parts[0].t_ns) for part in parts):
+            raise InvalidInputError("robot state: the six streams have different times")
+        self.t_ns = parts[0].t_ns
+        self._numbers = np.concatenate([part.values for part in parts], axis=1).astype("<f8")
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One packet."""
+        payload = self._numbers[index].tobytes()
+        packet = Packet(VERSION, SOURCES["none"], sequence, t_device_ns, payload)
+        return [encode_packet(robot_state.MAGIC, packet)]

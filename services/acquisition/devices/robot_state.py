@@ -14,7 +14,7 @@ from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import DeviceKind, TcpSettings
 from services.acquisition.drivers.base import Decoder, Driver, Readings, check_packet
 from services.acquisition.drivers.packets import PacketDecoder
-from services.acquisition.transports.ports import tcp_transport
+from services.acquisition.transports import tcp_transport
 
 MAGIC = b"DXRS"
 NUM_JOINTS = 40

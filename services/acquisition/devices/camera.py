@@ -19,10 +19,14 @@ from dextouch.streams import (
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import CameraStream, DeviceKind, TcpSettings
 from services.acquisition.drivers.base import Driver, StreamDecoder, check_packet
-from services.acquisition.drivers.image_encoding import ImageEncoding, WholeGroups
-from services.acquisition.drivers.image_quality import ImageChecker, ImageQuality
+from services.acquisition.drivers.images import (
+    ImageChecker,
+    ImageEncoding,
+    ImageQuality,
+    WholeGroups,
+)
 from services.acquisition.drivers.packets import Packet, PacketDecoder
-from services.acquisition.transports.ports import tcp_transport
+from services.acquisition.transports import tcp_transport
 
 MAGIC = b"DXCI"
 # height and width in pixels, encoding, three bytes of padding; then the image

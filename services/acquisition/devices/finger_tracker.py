@@ -31,7 +31,7 @@ from services.acquisition.drivers.sdk_link import (
     BridgeDriver,
     BridgeHello,
 )
-from services.acquisition.transports.ports import Transport
+from services.acquisition.transports import Transport
 
 MAGIC = b"DXFT"
 DESCRIPTOR_MAGIC = b"DXFD"

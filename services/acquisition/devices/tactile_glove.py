@@ -33,7 +33,7 @@ from services.acquisition.drivers.packets import (
     PacketDecoder,
     encode_packet,
 )
-from services.acquisition.transports.ports import Transport
+from services.acquisition.transports import Transport
 
 COMMAND_MAGIC = b"DXTC"
 REPLY_MAGIC = b"DXTR"
@@ -379,5 +379,5 @@ KIND = DeviceKind(
     name="tactile_glove",
     settings=TactileGloveSettings,
     build=build,
-    mock="services.acquisition.devices.tactile_glove.mock:mock_glove",
+    mock="services.acquisition.mocks.gloves:mock_glove",
 )

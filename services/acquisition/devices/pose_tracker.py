@@ -44,6 +44,14 @@ MAX_TURN_RATE_RAD_PER_S = math.radians(2000.0)
 MIN_STEP_NS = round(0.5e9 / NOMINAL_RATE_HZ)
 
 Rows = Sequence[Sequence[float]]
+MAGIC = b"DXPT"
+# running state, three bytes of padding, x y z (m), qw qx qy qz
+PAYLOAD = struct.Struct("<B3x7f")
+POSE_MAGIC = b"DXPM"
+# device index, pose-valid flag, a byte of padding, tracking result, SDK's seconds, 3×4 matrix
+POSE_PAYLOAD = struct.Struct("<HBxid12f")
+MAX_SECONDS = 2**63 / 1e9
+OTHER_ROLES = ("tactile_", "keypoints_", "camera_", "joints_", "action", "object_poses")
 
 
 class TrackingState(IntEnum):
@@ -224,16 +232,6 @@ def check_rotation(R: Rows) -> None:
     determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
     if error > NORM_TOLERANCE or determinant < 0:
         raise PacketError(f"pose matrix: no rotation (R Rᵀ is off by {error:.1e})")
-
-
-MAGIC = b"DXPT"
-# running state, three bytes of padding, x y z (m), qw qx qy qz
-PAYLOAD = struct.Struct("<B3x7f")
-POSE_MAGIC = b"DXPM"
-# device index, pose-valid flag, a byte of padding, tracking result, SDK's seconds, 3×4 matrix
-POSE_PAYLOAD = struct.Struct("<HBxid12f")
-MAX_SECONDS = 2**63 / 1e9
-OTHER_ROLES = ("tactile_", "keypoints_", "camera_", "joints_", "action", "object_poses")
 
 
 class PoseTrackerDecoder(ReportDecoder):

@@ -1,25 +1,24 @@
-"""Ports of this host: serial lines, HID devices and stream sockets, as drivers read them."""
+"""Ways to a device: serial lines, HID and USB devices and stream sockets, as drivers read them."""
 
 import contextlib
+import errno
 import os
-import re
 import select
 import socket
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import structlog
 
 from dextouch.errors import DeviceError
-from dextouch.schemas import SharedLink
 
 if TYPE_CHECKING:
     import serial
-
+    from usb.backend import IBackend
+    from usb.core import Device, Interface
 
 logger = structlog.get_logger(__name__)
 
@@ -28,7 +27,7 @@ Handle = TypeVar("Handle")
 HidDevice = Any
 
 READ_TIMEOUT_S = 0.1
-MAX_REPORT_BYTES = 64
+REPORT_BYTES = 64
 CONNECT_TIMEOUT_S = 2.0
 # A device that takes nothing in must not hold up the station for ever.
 WRITE_TIMEOUT_S = 0.5
@@ -38,6 +37,12 @@ CLOSE_TIMEOUT_S = 1.0
 # More than a kernel buffer of a serial line holds: one read takes all that has come.
 SERIAL_READ_BYTES = 65_536
 READ_BYTES = 1 << 18
+# The number of the interface that sends the reports.
+INTERFACE = 0
+READ_TIMEOUT_MS = 100
+WRITE_TIMEOUT_MS = 500
+# HID 1.11, 7.2.2: SET_REPORT to an interface, an output report; for devices without an OUT endpoint
+SET_REPORT_TYPE, SET_REPORT_REQUEST, OUTPUT_REPORT = 0x21, 0x09, 0x0200
 
 
 @dataclass(frozen=True)
@@ -277,7 +282,7 @@ class HidTransport(HandleTransport[HidDevice]):
         return self._open_device()
 
     def _receive(self, handle: HidDevice) -> bytes:
-        return bytes(handle.read(MAX_REPORT_BYTES, round(READ_TIMEOUT_S * 1e3)))
+        return bytes(handle.read(REPORT_BYTES, round(READ_TIMEOUT_S * 1e3)))
 
     def _send(self, handle: HidDevice, data: bytes) -> None:
         written = handle.write(data)
@@ -345,48 +350,189 @@ def unix_transport(path: str) -> SocketTransport:
     return SocketTransport(connect, address=path)
 
 
-# What a device shares with others on its way to this computer: USB hub, network or program.
+@dataclass(frozen=True)
+class UsbAddress:
+    """Which device: its ids and, where several are alike, its serial number."""
 
-SYSFS = Path("/sys/class")
-# Kernel classes of the device files that transports open.
-CLASSES = ("tty", "video4linux", "hidraw")
-# A port of a hub in sysfs: bus, then ports from the root on, as in 1-2.4.
-_USB_PORT = re.compile(r"^\d+-\d+(?:\.\d+)*$")
-_LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1", "[::1]"})
+    vendor_id: int
+    product_id: int
+    serial_number: str | None = None
+
+    def __str__(self) -> str:
+        return f"{self.vendor_id:04x}:{self.product_id:04x}"
 
 
-def shared_link(info: TransportInfo, *, sysfs: Path = SYSFS) -> SharedLink | None:
-    """The hub, remote host or local program that a transport leads through.
+@dataclass(frozen=True)
+class _Opened:
+    device: "Device"
+    endpoint_in: int
+    endpoint_out: int | None
+    read_bytes: int
 
-    None where it is plugged into this computer directly, or where nothing is known.
+
+class UsbTransport(HandleTransport[_Opened]):
+    """One USB device with an interrupt endpoint; `read` gives one report, b"" means nothing yet.
+
+    Every opening searches for the device by its serial number, so that it is found again after
+    replugging, on any port. The kernel's HID driver is detached while the interface is open, and
+    reattached on closing.
 
     Args:
-        info: where the transport leads now.
-        sysfs: folder of the kernel's device classes.
+        address: of the device.
+        backend: of pyusb; a new context of libusb at every opening if None, since an older one
+            learns of what is plugged in only by udev, which does not speak inside containers.
     """
-    if info.kind == "socket":
-        return _of_socket(info.address)
-    hub = _usb_hub(info.address, sysfs) if info.address.startswith("/dev/") else None
-    return None if hub is None else SharedLink(kind="hub", name=hub)
+
+    def __init__(self, address: UsbAddress, *, backend: "IBackend | None" = None) -> None:
+        super().__init__(TransportInfo("usb", str(address), address.serial_number))
+        self._address = address
+        self._backend = backend
+        # Outlives the devices found in it: libusb wants them given back before its context ends.
+        self._context: IBackend | None = None
+        self._detached = False
+
+    def _connect(self) -> _Opened:
+        import usb.core
+
+        try:
+            self._context = self._backend or _new_context()
+            device = self._find()
+        except usb.core.NoBackendError as error:
+            raise DeviceError(f"{self.info}: libusb-1.0 is not installed ({error})") from error
+        try:
+            return self._take(device)
+        except (OSError, DeviceError):
+            self._give_back(device)
+            raise
+
+    def _receive(self, handle: _Opened) -> bytes:
+        import usb.core
+
+        try:
+            data = handle.device.read(handle.endpoint_in, handle.read_bytes, READ_TIMEOUT_MS)
+        except OSError as error:
+            # Not every backend has the class for it.
+            if isinstance(error, usb.core.USBTimeoutError) or error.errno == errno.ETIMEDOUT:
+                return b""
+            raise
+        return data.tobytes()
+
+    def _send(self, handle: _Opened, data: bytes) -> None:
+        if handle.endpoint_out is not None:
+            written = handle.device.write(handle.endpoint_out, data, WRITE_TIMEOUT_MS)
+        else:
+            written = handle.device.ctrl_transfer(
+                SET_REPORT_TYPE,
+                SET_REPORT_REQUEST,
+                OUTPUT_REPORT | data[0],
+                INTERFACE,
+                data,
+                WRITE_TIMEOUT_MS,
+            )
+        if written != len(data):
+            raise DeviceError(f"{self.info}: wrote {written} bytes, expected {len(data)}")
+
+    def _release(self, handle: _Opened) -> None:
+        """Release the interface; a device that is gone is only forgotten."""
+        self._give_back(handle.device)
+
+    def _give_back(self, device: "Device") -> None:
+        import usb.util
+
+        detached, self._detached = self._detached, False
+        with contextlib.suppress(OSError):  # it may be gone
+            usb.util.dispose_resources(device)
+            if detached:
+                device.attach_kernel_driver(INTERFACE)
+                usb.util.dispose_resources(device)
+
+    def _find(self) -> "Device":
+        """The one device of this address; handles of others are closed again."""
+        import usb.core
+        import usb.util
+
+        candidates = list(
+            usb.core.find(
+                find_all=True,
+                backend=self._context,
+                idVendor=self._address.vendor_id,
+                idProduct=self._address.product_id,
+            )
+        )
+        wanted = self._address.serial_number
+        numbers = [_serial_number(device) for device in candidates]
+        matching = [
+            device
+            for device, number in zip(candidates, numbers, strict=True)
+            if wanted is None or number == wanted
+        ]
+        for device in candidates:
+            if len(matching) != 1 or device is not matching[0]:
+                usb.util.dispose_resources(device)
+        if len(matching) == 1:
+            return matching[0]
+        present = ", ".join(number or "(unreadable)" for number in numbers) or "none"
+        if matching:
+            raise DeviceError(
+                f"{self.info}: {len(matching)} devices match; set serial_number to one of: "
+                f"{present}"
+            )
+        raise DeviceError(
+            f"{self.info}: device {wanted or 'of these ids'!r} is not plugged in; present: "
+            f"{present}",
+            serial_number=wanted,
+        )
+
+    def _take(self, device: "Device") -> _Opened:
+        import usb.core
+        import usb.util
+
+        with contextlib.suppress(NotImplementedError):  # a system without kernel drivers in the way
+            if device.is_kernel_driver_active(INTERFACE):
+                device.detach_kernel_driver(INTERFACE)
+                self._detached = True
+        try:
+            configuration = device.get_active_configuration()
+        except usb.core.USBError:
+            device.set_configuration()
+            configuration = device.get_active_configuration()
+        found = [i for i in configuration if i.bInterfaceNumber == INTERFACE]
+        ins = [end for i in found[:1] for end in _interrupt_endpoints(i, usb.util.ENDPOINT_IN)]
+        outs = [end for i in found[:1] for end in _interrupt_endpoints(i, usb.util.ENDPOINT_OUT)]
+        if not ins:
+            raise DeviceError(
+                f"{self.info}: interface {INTERFACE} has no interrupt endpoint to read; "
+                "another device or firmware?"
+            )
+        usb.util.claim_interface(device, INTERFACE)
+        endpoint_in, packet_bytes = ins[0]
+        # Less room than one transfer fills is an overflow error, so never ask for less.
+        read_bytes = max(REPORT_BYTES, packet_bytes)
+        endpoint_out = outs[0][0] if outs else None
+        return _Opened(device, endpoint_in, endpoint_out, read_bytes)
 
 
-def _of_socket(address: str) -> SharedLink | None:
-    if address.startswith("/"):
-        return SharedLink(kind="bridge", name=address)
-    host, separator, port = address.rpartition(":")
-    if not separator or not port.isdecimal():
+def _new_context() -> "IBackend | None":
+    """Another context of libusb, which looks at the bus now; None where there is no libusb."""
+    from usb.backend import libusb1
+
+    first = libusb1.get_backend()
+    return None if first is None else type(first)(first.lib)
+
+
+def _interrupt_endpoints(interface: "Interface", direction: int) -> Iterator[tuple[int, int]]:
+    """(address, packet size in bytes) of the interrupt endpoints in one direction."""
+    import usb.util
+
+    for endpoint in interface:
+        is_interrupt = usb.util.endpoint_type(endpoint.bmAttributes) == usb.util.ENDPOINT_TYPE_INTR
+        if is_interrupt and usb.util.endpoint_direction(endpoint.bEndpointAddress) == direction:
+            yield endpoint.bEndpointAddress, endpoint.wMaxPacketSize
+
+
+def _serial_number(device: "Device") -> str | None:
+    """The serial number, or None where the device has none or does not let us read it."""
+    try:
+        return device.serial_number
+    except (OSError, ValueError):  # no permission; no string descriptors
         return None
-    if host in _LOOPBACK:
-        return SharedLink(kind="bridge", name=address)
-    return SharedLink(kind="network", name=host)
-
-
-def _usb_hub(address: str, sysfs: Path) -> str | None:
-    """Path of the hub above a device file, such as 1-2; None for a port of the root hub."""
-    name = Path(address).resolve().name
-    for kind in CLASSES:
-        link = sysfs / kind / name / "device"
-        if link.exists():
-            ports = [part for part in link.resolve().parts if _USB_PORT.match(part)]
-            return ports[-1].rpartition(".")[0] or None if ports else None
-    return None

@@ -223,5 +223,5 @@ KIND = DeviceKind(
     name="justfloat_glove",
     settings=JustFloatGloveSettings,
     build=build,
-    mock="services.acquisition.devices.justfloat_glove.mock:mock_justfloat_glove",
+    mock="services.acquisition.mocks.gloves:mock_justfloat_glove",
 )

@@ -1,16 +1,18 @@
-"""Simulated glove of our own protocol, with its own offsets and gains, that answers requests."""
+"""Simulated gloves: our own, which answers commands, a Wuji glove, and one of bare float32s."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from dextouch.errors import ShapeError
 from dextouch.schemas import Matrix, matrix_rows
-from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, expand_taxels
+from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, expand_taxels, split_pads
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.tactile_glove.driver import (
+from services.acquisition.devices import wuji_glove
+from services.acquisition.devices.justfloat_glove import TAIL, JustFloatGloveDecoder
+from services.acquisition.devices.tactile_glove import (
     COMMAND_MAGIC,
     FULL_SCALE_COUNTS,
     MAGIC,
@@ -29,7 +31,12 @@ from services.acquisition.drivers.packets import (
     PacketDecoder,
     encode_packet,
 )
-from services.acquisition.mocks.faults import DeviceFaults, OurPacketEdits, Pinned
+from services.acquisition.mocks.faults import (
+    DeviceFaults,
+    OurPacketEdits,
+    PacketEdits,
+    PacketFields,
+)
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.mocks.replay import (
     MockDevice,
@@ -37,7 +44,9 @@ from services.acquisition.mocks.replay import (
     MockSlot,
     PacketSource,
     ReplayStream,
+    at_rate,
     device_rng,
+    serial_mock,
 )
 
 FIRMWARE = (1, 0, 0)
@@ -45,8 +54,13 @@ OFFSET_COUNTS = 120.0
 GAIN_COUNTS_PER_KPA = 40.0
 OFFSET_SPREAD_COUNTS = 10.0
 GAIN_SPREAD = 0.05
-# What pinned cells show.
-PINNED: dict[Pinned, float] = {"stuck": 1_000.0, "saturated": float(FULL_SCALE_COUNTS)}
+COUNTS_PER_KPA = 40.0
+NUM_VALUES = 401
+FULL_SCALE = 4095.0
+FULL_SCALE_KPA = 100.0
+# Which cells the real glove has is not public: the mock's grid is its own choice.
+_FINGER_ROWS = slice(0, 4)
+_PALM_ROWS, _PALM_COLUMNS = slice(6, 21), slice(8, 24)
 
 
 class GloveAnswers:
@@ -160,7 +174,7 @@ class TactileGloveSource(PacketSource):
         faults: whose dead and drifted raw cells are planted.
     """
 
-    edits = OurPacketEdits(PINNED)
+    edits = OurPacketEdits({"stuck": 1_000.0, "saturated": float(FULL_SCALE_COUNTS)})
 
     def __init__(
         self,
@@ -200,3 +214,134 @@ def _device_time_ns(device: MockDevice, clock: StationClock) -> int:
     since_ns = now_ns - ledger.t_true_ns[last]
     skew_ns = round(since_ns * device.faults.skew_ppm * 1e-6)
     return ledger.t_device_ns[last] + since_ns + skew_ns
+
+
+def mock_justfloat_glove(place: MockSlot) -> MockPair:
+    """A glove that sends bare float32s at the rate of the stream."""
+    source = JustFloatGloveSource(place.stream, dead_taxels=place.faults.dead_taxels)
+    decoder = JustFloatGloveDecoder(
+        place.side,
+        num_values=NUM_VALUES,
+        full_scale=FULL_SCALE,
+        rate_hz=place.stream.descriptor.nominal_rate_hz,
+    )
+    return serial_mock(place, source=source, decoder=decoder)
+
+
+class JustFloatPacketEdits(PacketEdits):
+    """Faults inside a packet that contains only numbers, without hand and version."""
+
+    def fields(self, data: bytes) -> PacketFields:
+        """All numbers."""
+        return PacketFields(np.frombuffer(data[: -len(TAIL)], "<f4").copy())
+
+    def packed(self, data: bytes, fields: PacketFields) -> bytes:
+        """A packet of these numbers."""
+        return data if fields.numbers is None else encode_justfloat(fields.numbers)
+
+
+class JustFloatGloveSource(PacketSource):
+    """Packets of one glove: the taxels' counts, then zeros in the slots that mean nothing.
+
+    Args:
+        stream: float32 [n, 320] in kPa.
+        dead_taxels: places in the packet that read zero.
+    """
+
+    edits = JustFloatPacketEdits({"stuck": 1_000.0, "saturated": FULL_SCALE})
+
+    def __init__(self, stream: ReplayStream, *, dead_taxels: Sequence[int] = ()) -> None:
+        # No device sends the negative zero that rounding leaves of noise.
+        counts = np.clip(np.rint(COUNTS_PER_KPA * stream.values), 0.0, FULL_SCALE) + 0.0
+        self.t_ns = stream.t_ns
+        self._values = np.zeros((len(counts), NUM_VALUES), dtype="<f4")
+        self._values[:, :NUM_TAXELS] = counts
+        self._values[:, list(dead_taxels)] = 0.0
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One packet; the device sends neither sequence number nor time."""
+        return [encode_justfloat(self._values[index])]
+
+
+def encode_justfloat(values: Float32[np.ndarray, " n"]) -> bytes:
+    """Bytes of one packet."""
+    return values.astype("<f4").tobytes() + TAIL
+
+
+def mock_wuji_glove(place: MockSlot) -> MockPair:
+    """A Wuji glove: wuji_glove.CRC-16, a number of 16 bits, milliseconds."""
+    source = WujiGloveSource(
+        at_rate(place.stream, wuji_glove.NOMINAL_RATE_HZ),
+        side=place.side,
+        dead_taxels=place.faults.dead_taxels,
+    )
+    return serial_mock(place, source=source, decoder=wuji_glove.WujiGloveDecoder(place.side))
+
+
+class WujiPacketEdits(PacketEdits):
+    """Faults inside a Wuji glove's packet, which tells its hand and no version."""
+
+    # A cell may be NaN.
+    marks_nan = True
+
+    def fields(self, data: bytes) -> PacketFields:
+        """Hand and cells of the grid, row by row."""
+        cells = np.frombuffer(data, "<f4", wuji_glove.NUM_CELLS, wuji_glove.HEAD.size).copy()
+        return PacketFields(cells, wuji_glove.HANDS[wuji_glove.HEAD.unpack_from(data)[2]])
+
+    def packed(self, data: bytes, fields: PacketFields) -> bytes:
+        """A packet of these cells and this hand."""
+        sequence, time_ms = wuji_glove.STAMPS.unpack_from(
+            data, wuji_glove.CRC_OFFSET - wuji_glove.STAMPS.size
+        )
+        hand = 0 if fields.side == "left" else 1
+        return encode_wuji(hand, sequence, time_ms, np.asarray(fields.numbers).tobytes())
+
+
+class WujiGloveSource(PacketSource):
+    """Packets of one glove.
+
+    Args:
+        stream: float32 [n, 320] in kPa.
+        side: which hand.
+        dead_taxels: cells of the grid, row by row, that read zero.
+    """
+
+    edits = WujiPacketEdits({"stuck": 0.25, "saturated": 1.0})
+
+    def __init__(
+        self,
+        stream: ReplayStream,
+        *,
+        side: Side,
+        dead_taxels: Sequence[int] = (),
+    ) -> None:
+        self.t_ns = stream.t_ns
+        self._hand = {name: number for number, name in wuji_glove.HANDS.items()}[side]
+        self._cells = grid_of(np.clip(stream.values / FULL_SCALE_KPA, 0.0, 1.0).astype(np.float32))
+        self._cells.reshape(len(self._cells), -1)[:, list(dead_taxels)] = 0.0
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One packet; sequence and milliseconds run over as the device's do."""
+        cells = self._cells[index].tobytes()
+        return [encode_wuji(self._hand, sequence, t_device_ns // wuji_glove.TICK_NS, cells)]
+
+
+def grid_of(taxels: Float32[np.ndarray, "n 320"]) -> Float32[np.ndarray, "n 24 32"]:
+    """Fingertips in the top rows, the palm below, NaN where the glove has no cell."""
+    grid = np.full((len(taxels), *wuji_glove.GRID), np.nan, dtype="<f4")
+    fingertips, palm = split_pads(taxels.reshape(-1, NUM_TAXELS))
+    for finger in range(5):
+        columns = slice(1 + 6 * finger, 5 + 6 * finger)
+        grid[:, _FINGER_ROWS, columns] = fingertips[:, finger]
+    grid[:, _PALM_ROWS, _PALM_COLUMNS] = palm
+    return grid
+
+
+def encode_wuji(hand: int, sequence: int, time_ms: int, cells: bytes) -> bytes:
+    """Bytes of one packet; `cells` are 768 float32s."""
+    packet = wuji_glove.HEAD.pack(wuji_glove.MARK, wuji_glove.PACKET_BYTES, hand) + cells
+    packet += wuji_glove.STAMPS.pack(
+        sequence % (1 << wuji_glove.SEQUENCE_BITS), time_ms % (1 << wuji_glove.TIME_BITS)
+    )
+    return packet + wuji_glove.CRC.pack(wuji_glove.crc16(packet[len(wuji_glove.MARK) :]))

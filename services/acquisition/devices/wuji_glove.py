@@ -159,5 +159,5 @@ KIND = DeviceKind(
     name="wuji_glove",
     settings=WujiGloveSettings,
     build=build,
-    mock="services.acquisition.devices.wuji_glove.mock:mock_wuji_glove",
+    mock="services.acquisition.mocks.gloves:mock_wuji_glove",
 )

@@ -1,1 +1,0 @@
-"""Cameras whose images come over a TCP bridge."""

@@ -1,1 +1,0 @@
-"""Tactile gloves that send bare float32s and a tail (VOFA's "justfloat") on a serial line."""

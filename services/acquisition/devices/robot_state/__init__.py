@@ -1,1 +1,0 @@
-"""A robot's state server on a TCP socket."""

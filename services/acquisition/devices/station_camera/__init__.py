@@ -1,1 +1,0 @@
-"""Cameras on the station's own bus, captured by V4L2."""

@@ -1,1 +1,0 @@
-"""Wuji's tactile glove on a serial line: 24 × 32 cells, no commands."""
