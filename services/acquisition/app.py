@@ -16,12 +16,7 @@ from services.acquisition.health.metrics import RecorderCollector, SpoolCollecto
 from services.acquisition.memory import keep_for_life
 from services.acquisition.recorder import Recorder
 from services.acquisition.retention import DeletedTakes, OperatorNames
-from services.acquisition.routes import (
-    live_router,
-    recorder_router,
-    station_router,
-    uploads_router,
-)
+from services.acquisition.routes import live_router, recorder_router, station_router, uploads_router
 from services.acquisition.settings import AcquisitionSettings, with_enrolment
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader, ids_in_store, recover_spool

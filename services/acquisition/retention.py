@@ -19,12 +19,7 @@ from pydantic import Field, ValidationError
 
 from dextouch.episodes import disk_errors, folder_bytes
 from dextouch.episodes.spool import LOG_FILE, SpoolReader
-from dextouch.errors import (
-    AccessDeniedError,
-    DexTouchError,
-    NotFoundError,
-    StorageError,
-)
+from dextouch.errors import AccessDeniedError, DexTouchError, NotFoundError, StorageError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
     MAX_CHECKED_TAKES,

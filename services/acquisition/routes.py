@@ -102,11 +102,7 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
     disk = DiskCheck(station.recorder.spool_root, station.supervisors, station.clock.now_ns())
     station.health.watch(disk)
     station.health.watch(lambda evaluation: judge_uploads(evaluation, uploader.refused))
-    router = APIRouter(
-        prefix="/v1",
-        tags=["station"],
-        dependencies=[Depends(RequireScope(SCOPE))],
-    )
+    router = APIRouter(prefix="/v1", tags=["station"], dependencies=[Depends(RequireScope(SCOPE))])
 
     @router.get("/health")
     async def health() -> StationHealth:
@@ -199,9 +195,7 @@ def live_router(station: Station) -> APIRouter:
         return CameraList(cameras=tuple(station.live.cameras(station.clock.now_ns())))
 
     @router.get(
-        "/cameras/{name}",
-        response_class=Response,
-        responses={200: {"content": {"image/jpeg": {}}}},
+        "/cameras/{name}", response_class=Response, responses={200: {"content": {"image/jpeg": {}}}}
     )
     async def camera(name: str) -> Response:
         """Newest image as JPEG."""

@@ -75,10 +75,7 @@ class Take:
             self._log = os.open(spool.path / LOG_FILE, os.O_RDONLY)
         # None once it has ended: it holds this take, and the two must not outlive it as a circle.
         self._flushes: PeriodicCall | None = PeriodicCall(
-            self._flush,
-            period_ns=self._flush_period_ns,
-            clock=clock,
-            name="flush-spool",
+            self._flush, period_ns=self._flush_period_ns, clock=clock, name="flush-spool"
         )
         self._flushes.start()
 

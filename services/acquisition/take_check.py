@@ -61,9 +61,7 @@ DeviceEvents = Mapping[str, Mapping[str, int]]
 
 
 def root_cause(
-    problems: Sequence[TakeProblem],
-    causes: Sequence[HealthCause],
-    simulated: Collection[str] = (),
+    problems: Sequence[TakeProblem], causes: Sequence[HealthCause], simulated: Collection[str] = ()
 ) -> TakeCause | None:
     """The cause of the gravest problem; None without problems.
 

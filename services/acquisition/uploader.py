@@ -292,11 +292,7 @@ class Uploader:
             content[name] = digest.content()
         known = spool.attributes
         status = store.finish(
-            recording_id,
-            num_batches,
-            success=known.success,
-            ledger=known.ledger,
-            content=content,
+            recording_id, num_batches, success=known.success, ledger=known.ledger, content=content
         )
         check_proof(status, content)
         logger.info("upload_take", recording_id=path.name, stored_as=recording_id)

@@ -26,11 +26,7 @@ from services.acquisition.drivers.base import (
     StreamDecoder,
     hand_name,
 )
-from services.acquisition.drivers.packets import (
-    DecoderStatistics,
-    FrameSearch,
-    SequenceCounter,
-)
+from services.acquisition.drivers.packets import DecoderStatistics, FrameSearch, SequenceCounter
 from services.acquisition.transports import Transport, TransportInfo
 
 __all__ = [

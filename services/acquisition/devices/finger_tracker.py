@@ -12,11 +12,7 @@ from dextouch.hands import CHAINS, FINGER_JOINTS, NO_KEYPOINT, NUM_KEYPOINTS, WR
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.kinds import (
-    DeviceKind,
-    TrackerSettings,
-    tracker_transport,
-)
+from services.acquisition.devices.kinds import DeviceKind, TrackerSettings, tracker_transport
 from services.acquisition.drivers.base import (
     DESCRIPTOR_REPORT,
     REPORT_BYTES,

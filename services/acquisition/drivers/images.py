@@ -27,10 +27,7 @@ from dextouch.episodes import (
 )
 from dextouch.errors import CorruptDataError, DeviceError, InvalidInputError, NotFoundError
 from dextouch.images import encode_jpeg
-from dextouch.streams import (
-    Sample,
-    encoded_values,
-)
+from dextouch.streams import Sample, encoded_values
 from services.acquisition.drivers.packets import DecoderStatistics
 
 CHECK_EVERY = 3

@@ -14,13 +14,7 @@ from dextouch.streams import RATE_ERROR, RATE_WARN, RESIDUAL_ERROR_S, RESIDUAL_W
 SEVERITY: tuple[HealthLevel, ...] = ("OK", "WARN", "ERROR", "STALE")
 NEVER = math.inf
 # How a limit is shown: the factor that makes a number of this unit.
-_SHOWN_AS: Final = {
-    "%": 100.0,
-    "mm": 1e3,
-    "ms": 1e3,
-    "min left": -1 / 60,
-    "days": 1 / 86_400,
-}
+_SHOWN_AS: Final = {"%": 100.0, "mm": 1e3, "ms": 1e3, "min left": -1 / 60, "days": 1 / 86_400}
 
 
 @dataclass(frozen=True)

@@ -132,10 +132,7 @@ class GloveCalibration:
 
 
 def mock_glove(
-    place: MockSlot,
-    *,
-    calibration: GloveCalibration | None = None,
-    worn_side: Side | None = None,
+    place: MockSlot, *, calibration: GloveCalibration | None = None, worn_side: Side | None = None
 ) -> MockPair:
     """Our own glove, which answers commands.
 
@@ -148,12 +145,7 @@ def mock_glove(
     unit_seed = place.seed if place.unit_seed is None else place.unit_seed
     glove = calibration or GloveCalibration.seeded(side, unit_seed)
     told: Side = worn_side or side
-    source = TactileGloveSource(
-        place.stream,
-        side=told,
-        calibration=glove,
-        faults=place.faults,
-    )
+    source = TactileGloveSource(place.stream, side=told, calibration=glove, faults=place.faults)
     # The device is made of its port, and tells its time to what answers there.
     answers = GloveAnswers(
         told, serial_number=name, device_time_ns=lambda: _device_time_ns(device, place.clock)
@@ -310,11 +302,7 @@ class WujiGloveSource(PacketSource):
     edits = WujiPacketEdits({"stuck": 0.25, "saturated": 1.0})
 
     def __init__(
-        self,
-        stream: ReplayStream,
-        *,
-        side: Side,
-        dead_taxels: Sequence[int] = (),
+        self, stream: ReplayStream, *, side: Side, dead_taxels: Sequence[int] = ()
     ) -> None:
         self.t_ns = stream.t_ns
         self._hand = {name: number for number, name in wuji_glove.HANDS.items()}[side]

@@ -263,11 +263,7 @@ class TrackedPoses(PacketSource):
     """
 
     def __init__(
-        self,
-        stream: ReplayStream,
-        *,
-        faults: DeviceFaults,
-        rng: np.random.Generator,
+        self, stream: ReplayStream, *, faults: DeviceFaults, rng: np.random.Generator
     ) -> None:
         self.t_ns = stream.t_ns
         self.source = pose_tracker.source_of(stream.descriptor.name)
