@@ -12,7 +12,7 @@ from dextouch.serving import create_service_app, serve
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.health import HealthCollector
-from services.acquisition.health.metrics import RecorderCollector, SpoolCollector
+from services.acquisition.health.metrics import RecorderCollector
 from services.acquisition.memory import keep_for_life
 from services.acquisition.recorder import Recorder
 from services.acquisition.retention import DeletedTakes, OperatorNames
@@ -116,8 +116,7 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
         # /metrics shows the station's health for as long as the application runs.
         collectors = (
             HealthCollector(station.health.report, station.health.raised),
-            RecorderCollector(station.recorder.status, uploads.counts),
-            SpoolCollector(uploads.retention),
+            RecorderCollector(station.recorder.status, uploads.counts, uploads.retention),
         )
         for collector in collectors:
             app.state.registry.register(collector)

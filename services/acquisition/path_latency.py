@@ -150,10 +150,6 @@ class PathWatch:
     Readers only append timestamps; only this thread waits for answers. With a virtual clock there
     are no requests: its time does not advance during an exchange, and the replies would change
     which packets of a take arrive together.
-
-    Args:
-        supervisors: of the station's devices.
-        clock: of the station.
     """
 
     def __init__(self, supervisors: Sequence[DeviceSupervisor], *, clock: StationClock) -> None:

@@ -84,14 +84,6 @@ class Recorder:
     or discarded. Actions that name their recording are idempotent; an action for another take than
     the current one is refused.
 
-    Args:
-        station: name of the station.
-        spool_root: folder of the takes.
-        drivers: whose streams are recorded.
-        clock: of the station.
-        calibration: matrices that travel with every recording.
-        options: how takes are kept.
-
     Attributes:
         take: the running or ended one, which reader threads append to; None before the first.
     """
@@ -354,9 +346,6 @@ class SessionCount:
     """The present session; counts survive a restart and the deletion of uploaded takes.
 
     A session that cannot be written is counted in memory: a take that is saved must stay saved.
-
-    Args:
-        spool_root: folder of the takes.
     """
 
     def __init__(self, spool_root: Path) -> None:

@@ -65,13 +65,7 @@ class Retention(FrozenModel):
 
 
 class SpoolRetention:
-    """Removes acknowledged takes, the oldest acknowledgement first, and measures the spool.
-
-    Args:
-        spool_root: folder of the takes.
-        limits: how long they stay.
-        now_s: seconds since 1970.
-    """
+    """Removes acknowledged takes, the oldest acknowledgement first, and measures the spool."""
 
     def __init__(
         self, spool_root: Path, limits: Retention, *, now_s: Callable[[], float] = time.time
@@ -165,14 +159,6 @@ def empty_removed(spool_root: Path) -> None:
         with disk_errors(f"empty {folder}"):
             for path in folder.iterdir():
                 shutil.rmtree(path)
-
-
-def sweep_safely(retention: SpoolRetention) -> None:
-    """Sweep, and log why it is not possible."""
-    try:
-        retention.sweep()
-    except StorageError as error:
-        logger.warning("fail_retention", error=error.message)
 
 
 @dataclass(frozen=True)

@@ -34,15 +34,12 @@ from services.acquisition.health import (
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader
 
-SCOPE = "station"
 Named = Annotated[TakeName | None, Body()]
 
 
 def recorder_router(station: Station) -> APIRouter:
     """State and actions of the recorder."""
-    router = APIRouter(
-        prefix="/v1/recorder", tags=["recorder"], dependencies=[Depends(RequireScope(SCOPE))]
-    )
+    router = _router("/v1/recorder", "recorder")
     recorder = station.recorder
 
     @router.get("")
@@ -102,7 +99,7 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
     disk = DiskCheck(station.recorder.spool_root, station.supervisors, station.clock.now_ns())
     station.health.watch(disk)
     station.health.watch(lambda evaluation: judge_uploads(evaluation, uploader.refused))
-    router = APIRouter(prefix="/v1", tags=["station"], dependencies=[Depends(RequireScope(SCOPE))])
+    router = _router("/v1")
 
     @router.get("/health")
     async def health() -> StationHealth:
@@ -141,9 +138,7 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
 
 def uploads_router(uploader: Uploader) -> APIRouter:
     """Saved takes on their way to the store."""
-    router = APIRouter(
-        prefix="/v1/uploads", tags=["station"], dependencies=[Depends(RequireScope(SCOPE))]
-    )
+    router = _router("/v1/uploads")
 
     @router.get("")
     async def uploads(refused: Annotated[bool, Query()] = False) -> list[UploadStatus]:  # noqa: FBT002 - a query's flag
@@ -165,9 +160,7 @@ def uploads_router(uploader: Uploader) -> APIRouter:
 
 def live_router(station: Station) -> APIRouter:
     """What a station shows at this moment: taxels, poses, cameras, and a tile of a wall."""
-    router = APIRouter(
-        prefix="/v1/live", tags=["station"], dependencies=[Depends(RequireScope(SCOPE))]
-    )
+    router = _router("/v1/live")
 
     @router.get("/overview", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
     async def overview() -> Response:
@@ -221,3 +214,8 @@ def station_overview(station: Station) -> StationOverview:
         disk_free_bytes=health.figures.get("disk_free_bytes"),
         cameras=tuple(station.live.cameras(station.clock.now_ns())),
     )
+
+
+def _router(prefix: str, tag: str = "station") -> APIRouter:
+    dependencies = [Depends(RequireScope("station"))]
+    return APIRouter(prefix=prefix, tags=[tag], dependencies=dependencies)

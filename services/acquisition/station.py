@@ -21,7 +21,6 @@ from services.acquisition.path_latency import PathWatch
 from services.acquisition.recorder import Recorder, TakeOptions
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.supervisor import DeviceSupervisor
-from services.acquisition.take_check import DeviceEvents
 
 CONNECT_TIMEOUT_S = 10.0
 # Of a quaternion that says where a body points.
@@ -81,7 +80,10 @@ class Station:
             clock=clock,
             calibration=calibration,
             options=TakeOptions(
-                safety or SpoolSafety(), self._device_events, self.health, self.paths.latencies
+                safety or SpoolSafety(),
+                lambda: {s.driver.name: s.events() for s in self.supervisors},
+                self.health,
+                self.paths.latencies,
             ),
         )
 
@@ -122,9 +124,6 @@ class Station:
         take = self.recorder.take
         is_read = all(supervisor.is_running for supervisor in self.supervisors)
         return is_read and self.health.is_running and (take is None or take.is_working())
-
-    def _device_events(self) -> DeviceEvents:
-        return {s.driver.name: s.events() for s in self.supervisors}
 
     def _accept(self, readings: Readings) -> None:
         take = self.recorder.take

@@ -222,10 +222,6 @@ def shared_link(info: TransportInfo, *, sysfs: Path = SYSFS) -> SharedLink | Non
     """The hub, remote host or local program that a transport leads through.
 
     None where it is plugged into this computer directly, or where nothing is known.
-
-    Args:
-        info: where the transport leads now.
-        sysfs: folder of the kernel's device classes.
     """
     if info.kind == "socket":
         return _of_socket(info.address)

@@ -49,12 +49,6 @@ class Take:
     The only lock that readers take is held for the write of one append: data is encoded before, and
     other threads wait for the disk. The thread that flushes has its own descriptor of the log and
     takes no lock; the disk's error, or a disk that is nearly full, ends the take.
-
-    Args:
-        spool: new, of this take.
-        watch: of its streams and devices.
-        clock: of the station.
-        safety: of the spool.
     """
 
     def __init__(

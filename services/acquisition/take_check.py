@@ -185,10 +185,6 @@ class TakeFindings:
     A finding counts as often as its level was raised or changed during the take, and once more if
     it was already raised when the take began. Findings that were not confirmed before the end are
     not included.
-
-    Args:
-        health: of the station; without one there are no findings.
-        t_host_ns: start of the take.
     """
 
     def __init__(self, health: HealthMonitor | None, t_host_ns: int) -> None:

@@ -61,9 +61,6 @@ class HandleTransport(ABC, Generic[Handle]):
     """Way to one device, over what a library opens: a port, a device, a socket, a camera.
 
     Every failure of the link is a DeviceError; an OSError of the library is one.
-
-    Args:
-        info: where it leads.
     """
 
     # What to look at where it cannot be opened.

@@ -42,7 +42,6 @@ from services.acquisition.retention import (
     SpoolRetention,
     acknowledgement,
     remove_take,
-    sweep_safely,
 )
 from services.acquisition.retention import spooled_takes as _spools
 
@@ -255,7 +254,10 @@ class Uploader:
             if self._deleted is not None and self._store is not None:
                 self._deleted.remove(self._store)
             self.upload_all()
-            sweep_safely(self.retention)
+            try:
+                self.retention.sweep()
+            except StorageError as error:
+                logger.warning("fail_retention", error=error.message)
             self._stopping.wait(max(self._period_s, self._retry_after_s))
 
     def _upload_traced(self, path: Path) -> bool:

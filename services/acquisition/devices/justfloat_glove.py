@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 from pydantic import Field
 
-from dextouch.errors import DeviceError, InvalidInputError
+from dextouch.errors import DeviceError
 from dextouch.streams import ClockCapabilities, Sample
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
@@ -31,16 +31,9 @@ _VALUE = np.dtype("<f4")
 
 
 class JustFloatFrames(PortionedSearch[bytes]):
-    """Finds the payloads of packets between tails.
-
-    Args:
-        num_values: float32s of a packet.
-        full_scale: the largest reading.
-    """
+    """Finds the payloads of packets between tails."""
 
     def __init__(self, num_values: int, full_scale: float) -> None:
-        if not 1 <= num_values <= MAX_VALUES:
-            raise InvalidInputError(f"num_values: got {num_values}, expected 1 … {MAX_VALUES}")
         super().__init__()
         self._payload = FLOAT_BYTES * num_values
         self._size = self._payload + len(TAIL)
@@ -201,7 +194,7 @@ class JustFloatGloveSettings(GloveSettings):
     """
 
     kind: Literal["justfloat_glove"] = "justfloat_glove"
-    num_values: int = Field(ge=1, le=4096)
+    num_values: int = Field(ge=1, le=MAX_VALUES)
     full_scale: float = Field(gt=0, le=1e30)
     rate_hz: float = Field(gt=0, le=10_000)
 

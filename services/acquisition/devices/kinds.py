@@ -133,10 +133,6 @@ class GloveSettings(SerialLineSettings):
 def serial_transport(settings: SerialLineSettings, *, device: str) -> SerialTransport:
     """The line to a device, not opened.
 
-    Args:
-        settings: where it is.
-        device: for messages.
-
     Raises:
         InvalidInputError: neither serial number nor port.
     """

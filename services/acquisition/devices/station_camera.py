@@ -129,10 +129,6 @@ class CapturedImage:
 class CaptureLink(HandleTransport[Handle]):
     """Base of transports to a camera, which gives images instead of bytes.
 
-    Args:
-        address: for messages.
-        serial_number: of the camera, for messages.
-
     Attributes:
         exposure_ns: what the opened camera states; None where it does not.
     """

@@ -91,10 +91,6 @@ class WujiGloveDecoder(StreamDecoder[WujiPacket]):
     """Decodes one glove's byte stream to float32 [768] of full scale, 0 … 1, row by row.
 
     Cells that the glove has not are NaN, as it sends them.
-
-    Args:
-        side: which glove it must be.
-        label: of a further glove of this hand.
     """
 
     cells = CellLayout(1.0, GRID)

@@ -80,12 +80,7 @@ class Decoder(ABC):
 
 
 class StreamDecoder(Decoder, Generic[Found]):
-    """Base of a decoder whose packets become samples of one stream.
-
-    Args:
-        descriptor: of the stream.
-        packets: finds the packets in the bytes.
-    """
+    """Base of a decoder whose packets become samples of one stream."""
 
     def __init__(self, descriptor: StreamDescriptor, packets: PortionedSearch[Found]) -> None:
         self.descriptors = (descriptor,)
@@ -291,12 +286,7 @@ class ReportReassembler:
 
 
 class ReportDecoder(StreamDecoder[Packet]):
-    """Base of the decoders of trackers by HID or USB, whose packets come in reports.
-
-    Args:
-        descriptor: of the stream.
-        packets: finds the packets in joined reports.
-    """
+    """Base of the decoders of trackers by HID or USB, whose packets come in reports."""
 
     def __init__(self, descriptor: StreamDescriptor, packets: PacketDecoder) -> None:
         super().__init__(descriptor, packets)

@@ -25,7 +25,7 @@ from dextouch.episodes import (
     first_gap,
     is_keyframe,
 )
-from dextouch.errors import CorruptDataError, DeviceError, InvalidInputError, NotFoundError
+from dextouch.errors import CorruptDataError, DeviceError, NotFoundError
 from dextouch.images import encode_jpeg
 from dextouch.streams import Sample, encoded_values
 from services.acquisition.drivers.packets import DecoderStatistics
@@ -118,21 +118,10 @@ class SessionMedian:
 
 
 class ImageChecker:
-    """Checks the images of one camera in order of arrival; used by one thread.
+    """Checks the images of one camera in order of arrival; used by one thread."""
 
-    Args:
-        period_ns: nominal distance of two images.
-        check_every: of how many images one has its sharpness and exposure checked.
-    """
-
-    def __init__(self, *, period_ns: int, check_every: int = CHECK_EVERY) -> None:
-        if period_ns <= 0 or check_every < 1:
-            raise InvalidInputError(
-                f"image checker: got period {period_ns} ns and every {check_every}, expected a "
-                "positive period and at least 1"
-            )
+    def __init__(self, *, period_ns: int) -> None:
         self._period_ns = period_ns
-        self._check_every = check_every
         self._found = ImageQuality()
         self._checksum: int | None = None
         self._num_equal = 0
@@ -146,15 +135,10 @@ class ImageChecker:
         return replace(self._found)
 
     def check(self, image: UInt8[np.ndarray, "h w 3"], t_ns: int | None = None) -> None:
-        """Look at the next image.
-
-        Args:
-            image: RGB.
-            t_ns: the driver's stamp, if it gives one; must grow.
-        """
+        """Look at the next image (RGB); the driver's stamps, if it gives any, must grow."""
         step = max(1, min(image.shape[:2]) // _CHECKSUM_ROWS)
         self.note(image[::step, ::step].tobytes(), t_ns)
-        if (self._found.num_images - 1) % self._check_every == 0:
+        if (self._found.num_images - 1) % CHECK_EVERY == 0:
             self.look(image)
 
     def note(self, data: bytes, t_ns: int | None = None) -> None:
@@ -313,10 +297,7 @@ class EncodingQueue:
         return True
 
     def collect(self, wait_s: float = 0.0) -> list[Sample]:
-        """Samples that are ready, in order.
-
-        Args:
-            wait_s: how long to wait for those that are not.
+        """Samples that are ready, in order, after waiting so long for those that are not.
 
         Raises:
             DexTouchError: an image could not be encoded.

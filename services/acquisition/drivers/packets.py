@@ -8,8 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from dextouch.errors import InvalidInputError
-
 Found = TypeVar("Found")
 
 # Packets that overtake each other do so within a few; a restarted device jumps further.
@@ -254,19 +252,9 @@ class Packet:
 
 def encode_packet(magic: bytes, packet: Packet) -> bytes:
     """Bytes of a packet (what a device sends)."""
-    if len(magic) != MAGIC_SIZE:
-        raise InvalidInputError(f"magic: got {magic!r}, expected {MAGIC_SIZE} bytes")
-    body = (
-        HEADER.pack(
-            magic,
-            packet.version,
-            packet.source,
-            len(packet.payload),
-            packet.sequence % SEQUENCE_MODULUS,
-            packet.t_device_ns,
-        )
-        + packet.payload
-    )
+    size, sequence = len(packet.payload), packet.sequence % SEQUENCE_MODULUS
+    head = HEADER.pack(magic, packet.version, packet.source, size, sequence, packet.t_device_ns)
+    body = head + packet.payload
     return body + CRC.pack(zlib.crc32(body))
 
 
@@ -290,14 +278,10 @@ class PacketDecoder(FrameSearch[Packet]):
         others: Mapping[bytes, tuple[int, int]] | None = None,
     ) -> None:
         self._sizes = {**(others or {}), magic: (min_payload, max_payload)}
-        # One search finds every kind.
+        # One search finds every kind, by the start that their magics share.
         start = magic
         while not all(other.startswith(start) for other in self._sizes):
             start = start[:-1]
-        if not start:
-            raise InvalidInputError(
-                f"magics {list(self._sizes)}: got no common start, expected one byte or more"
-            )
         super().__init__(start, sequence_bits=SEQUENCE_BITS)
         self._magic = magic
 

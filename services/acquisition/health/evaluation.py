@@ -41,12 +41,7 @@ NO_SAMPLES = Block(*(np.empty(0, dtype=np.int64) for _ in range(4)))
 
 
 class CountWindow:
-    """Counters that only grow, and by how much they grew within the last 10 s.
-
-    Args:
-        count: the counters at this moment, by name.
-        now_ns: this moment.
-    """
+    """Counters that only grow, and by how much they grew within the last 10 s."""
 
     def __init__(self, count: Callable[[], Mapping[str, int]], now_ns: int = 0) -> None:
         self._count = count

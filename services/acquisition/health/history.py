@@ -149,12 +149,7 @@ class StreamMeter:
 
 
 class HealthHistory:
-    """The newest rows of the station and its streams, and the newest takes; for any thread.
-
-    Args:
-        streams: names of the streams.
-        num_rows: how many are kept.
-    """
+    """The newest rows of the station and its streams, and the newest takes; for any thread."""
 
     def __init__(self, streams: Sequence[str], num_rows: int = NUM_ROWS) -> None:
         self.streams = tuple(streams)
@@ -230,13 +225,7 @@ class HealthHistory:
 def history_facts(
     now_ns: int, takes: tuple[TakeSpan, ...], nominal_rate_hz: Mapping[str, float]
 ) -> dict[str, object]:
-    """What a history tells besides its rows (`dextouch.schemas.HealthHistory`).
-
-    Args:
-        now_ns: the station's clock.
-        takes: of the time of the rows.
-        nominal_rate_hz: of the streams that are told.
-    """
+    """What a history tells besides its rows (`dextouch.schemas.HealthHistory`)."""
     return {
         "now_ns": now_ns,
         "now_unix_s": time.time(),

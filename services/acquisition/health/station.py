@@ -249,11 +249,7 @@ def _cpu_times(stat: Path = Path("/proc/stat")) -> tuple[int, int] | None:
 
 
 class HostClockCheck:
-    """Whether the computer slept, or its wall clock was set, since the last evaluations.
-
-    Args:
-        clock: of the station.
-    """
+    """Whether the computer slept, or its wall clock was set, since the last evaluations."""
 
     def __init__(self, clock: StationClock) -> None:
         self._watch = HostWatch(clock)

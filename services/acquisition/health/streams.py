@@ -156,11 +156,7 @@ class LinkCheck:
 
 
 class TrackingCheck:
-    """Checks the packets that a tracker's decoder dropped: occluded, jumped, stale.
-
-    Args:
-        count: the counters of the device.
-    """
+    """Checks the packets that a tracker's decoder dropped: occluded, jumped, stale."""
 
     def __init__(self, count: Callable[[], Mapping[str, int]]) -> None:
         self._counts = CountWindow(count)

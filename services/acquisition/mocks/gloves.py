@@ -64,13 +64,7 @@ _PALM_ROWS, _PALM_COLUMNS = slice(6, 21), slice(8, 24)
 
 
 class GloveAnswers:
-    """Replies of a mock glove to the requests of the host.
-
-    Args:
-        side: which hand it says it is.
-        serial_number: that it says it has.
-        device_time_ns: gives what the glove's clock shows now.
-    """
+    """Replies of a mock glove to the requests of the host."""
 
     def __init__(
         self, side: Side, *, serial_number: str, device_time_ns: Callable[[], int]

@@ -144,11 +144,7 @@ def _images(turn_rad: np.ndarray) -> UInt8[np.ndarray, "n 64 64 3"]:
 
 
 def practice_streams(seed: int = 0) -> list[ReplayStream]:
-    """All human streams, with a board before the head camera and gloves at rest.
-
-    Args:
-        seed: of the image noise.
-    """
+    """All human streams, with a board before the head camera and gloves at rest."""
     images = board_images(seed)
     board = ReplayStream(
         StreamDescriptor(

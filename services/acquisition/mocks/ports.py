@@ -325,12 +325,7 @@ class HidPort(ReportPort):
 
 
 class SocketPort(MockPort):
-    """A device behind a socket: every connection of the host is a new pair.
-
-    Args:
-        name: of the device.
-        on_open: called when the host has connected.
-    """
+    """A device behind a socket: every connection of the host is a new pair."""
 
     def __init__(self, name: str, on_open: Callable[[], None] | None = None) -> None:
         super().__init__()

@@ -127,13 +127,7 @@ class _Event(NamedTuple):
 
 
 class MockDevice:
-    """Plays a packet source through a port, disturbed by its faults, keeping a ledger.
-
-    Args:
-        place: its name, faults and seed.
-        source: what it says.
-        port: where it says it.
-    """
+    """Plays a packet source through a port, disturbed by its faults, keeping a ledger."""
 
     def __init__(self, place: MockSlot, source: PacketSource, port: MockPort) -> None:
         faults = place.faults
@@ -328,14 +322,7 @@ def serial_mock(
     decoder: Decoder,
     calibration: Mapping[str, Matrix] | None = None,
 ) -> MockPair:
-    """A simulated device on a pseudo terminal, read by the real serial transport.
-
-    Args:
-        place: where it stands.
-        source: what it sends.
-        decoder: of its driver.
-        calibration: what a calibrated station knows of it.
-    """
+    """A simulated device on a pseudo terminal, read by the real serial transport."""
     port = PtyPort(place.name)
     driver = Driver(place.name, transport=port.transport, decoder=decoder, clock=place.clock)
     return MockPair(MockDevice(place, source, port), driver, calibration or {})

@@ -4,7 +4,7 @@ import struct
 import numpy as np
 import pytest
 
-from dextouch.errors import DeviceError, InvalidInputError
+from dextouch.errors import DeviceError
 from services.acquisition.devices.justfloat_glove import (
     TAIL,
     JustFloatGloveDecoder,
@@ -187,8 +187,3 @@ def test_readings_are_the_plain_check():
         smallest = np.finfo(np.float32).tiny
         plain = pattern == 0 or bool(smallest <= value[0] <= np.float32(4095.0))
         assert are_readings(value, bits_of(4095.0)) == plain, hex(pattern)
-
-
-def test_packets_without_a_number_are_refused():
-    with pytest.raises(InvalidInputError, match="num_values"):
-        justfloat(0)

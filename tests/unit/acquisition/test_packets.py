@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dextouch.errors import DeviceError, InvalidInputError
+from dextouch.errors import DeviceError
 from services.acquisition.devices.tactile_glove import (
     MAGIC,
     PAYLOAD_BYTES,
@@ -216,11 +216,6 @@ def test_foreign_glove_is_refused(rng, version, source, words):
     data = glove_packet(0, rng, version=version, source=source)
     with pytest.raises(DeviceError, match=words):
         TactileGloveDecoder("left").feed(data)
-
-
-def test_magic_must_have_four_bytes():
-    with pytest.raises(InvalidInputError, match="4 bytes"):
-        encode_packet(b"DX", Packet(1, 0, 0, 0, b""))
 
 
 def test_reset_forgets_half_a_packet(rng):

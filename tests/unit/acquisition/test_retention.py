@@ -6,8 +6,9 @@ import shutil
 import pytest
 from prometheus_client import CollectorRegistry
 
+from dextouch.schemas import RecorderStatus
 from services.acquisition import retention as retention_module
-from services.acquisition.health.metrics import SpoolCollector
+from services.acquisition.health.metrics import RecorderCollector
 from services.acquisition.retention import Retention, SpoolRetention, spooled_takes
 
 DAY_S = 86_400
@@ -104,7 +105,9 @@ def test_metrics_show_the_spools_use_and_the_limits(tmp_path):
     take(tmp_path, "b", num_bytes=2 * MEGABYTE)
     registry = CollectorRegistry()
     limits = Retention(keep_uploaded_days=2, keep_uploaded_gb=5)
-    registry.register(SpoolCollector(SpoolRetention(tmp_path, limits)))
+    status = RecorderStatus(state="idle", actions=("arm",), problems=())
+    retention = SpoolRetention(tmp_path, limits)
+    registry.register(RecorderCollector(lambda: status, dict, retention))
     for state, num_bytes in (("uploaded", 3e6), ("waiting", 2e6), ("refused", 0)):
         assert registry.get_sample_value("dextouch_spool_bytes", {"state": state}) == num_bytes
     assert registry.get_sample_value("dextouch_spool_keep_seconds") == 172_800

@@ -262,8 +262,7 @@ class UsbPort(MockPort):
 def usb_trackers():
     """Mock trackers that are made meanwhile are on USB instead of HID."""
     with pytest.MonkeyPatch.context() as patch:
-        for family in ("finger_tracker", "pose_tracker"):
-            patch.setattr(f"services.acquisition.devices.{family}.mock.HidPort", UsbPort)
+        patch.setattr("services.acquisition.mocks.trackers.HidPort", UsbPort)
         yield
 
 
