@@ -9,10 +9,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from dextouch.command_line import progress, write_result
+from dextouch.data_folder import is_system_file
 from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader, is_rejected
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
-from dextouch.system_files import is_system_file
 from services.pipelines.parsers import JOINT_FORMATS, export_parser, import_parser
 
 Reader = EpisodeReader | RecordingReader

@@ -1,11 +1,21 @@
-"""Default data folder of all commands: `data`, or the folder named by DEXTOUCH_DATA."""
+"""Default data folder of all commands, and files that operating systems leave in folders."""
 
 import os
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from dextouch.errors import InvalidInputError
 
 DATA_VARIABLE = "DEXTOUCH_DATA"
+# macOS, Windows, Linux desktops and network drives; compared in lower case.
+_NAMES = {
+    ".ds_store", ".localized", ".apdisk", ".spotlight-v100", ".trashes", ".fseventsd",
+    ".temporaryitems", ".documentrevisions-v100", "__macosx", "icon\r", "thumbs.db", "ehthumbs.db",
+    "ehthumbs_vista.db", "desktop.ini", "$recycle.bin", "system volume information", ".directory",
+    "lost+found", "@eadir",
+}  # fmt: skip
+# The other half of a file on a drive of another system (macOS), a file that was removed while it
+# was open (NFS), and the trash of a Linux desktop.
+_PREFIXES = ("._", ".nfs", ".trash-", ".fuse_hidden")
 
 
 def data_folder() -> Path:
@@ -36,3 +46,11 @@ def default_enrolment() -> Path:
 def default_spool() -> Path:
     """Where a station keeps its takes until they are uploaded."""
     return data_folder() / "spool"
+
+
+def is_system_file(path: PurePath | str) -> bool:
+    """Whether a relative path is, or lies in, what an operating system left: no data, no damage."""
+    return any(
+        part.lower() in _NAMES or part.lower().startswith(_PREFIXES)
+        for part in PurePath(path).parts
+    )

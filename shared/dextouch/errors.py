@@ -1,27 +1,4 @@
-"""Exception hierarchy of DexTouch: one tree, one class per decision that a caller can take.
-
-```
-DexTouchError
-├── InvalidInputError          invalid input from the caller: correct it and retry
-│   ├── ShapeError             an array has the wrong shape or kind of number
-│   ├── NonFiniteError         NaN or infinity where a finite number is needed
-│   ├── DegenerateRotationError  numbers that do not describe a rotation
-│   ├── UnknownNameError       a name that is not among the valid ones (which are listed)
-│   ├── ClockFitError          stamps to which no clock can be fitted
-│   └── PacketError            bytes that are not a valid packet of their kind
-├── NotFoundError              the requested item does not exist
-├── ConflictError              the item is in another state than the request assumes
-│   └── EndedError             a rollout is over: start a new one or branch from its end
-├── LimitExceededError         larger, longer or more than this installation allows
-├── UnavailableError           a service, model or world is not ready: try again later
-├── DeviceError                a device is disconnected, silent or speaks another protocol
-│   └── StaleDataError         the newest sample is older than the caller allows
-├── StorageError               bytes on disk are damaged, foreign or cannot be written
-│   ├── CorruptDataError       a checksum mismatch or an invalid structure
-│   └── StorageFullError       no space left on the device: free some
-└── AccessDeniedError          no key, or a key without the needed scope
-```
-"""
+"""Exceptions of DexTouch: one tree, one class for each decision that a caller can take."""
 
 
 class DexTouchError(Exception):
@@ -46,7 +23,7 @@ def _restored(kind: type[DexTouchError], arguments: tuple[object, ...]) -> DexTo
 
 
 class InvalidInputError(DexTouchError):
-    """Input from the caller is invalid."""
+    """Input from the caller is invalid: correct it and retry."""
 
 
 class ShapeError(InvalidInputError):
@@ -62,7 +39,7 @@ class DegenerateRotationError(InvalidInputError):
 
 
 class UnknownNameError(InvalidInputError):
-    """A name that is not among the valid ones."""
+    """A name that is not among the valid ones, which are listed."""
 
     def __init__(self, kind: str, name: str, valid: list[str]) -> None:
         listed = ", ".join(sorted(valid)) or "none"
@@ -86,7 +63,7 @@ class ConflictError(DexTouchError):
 
 
 class EndedError(ConflictError):
-    """A rollout is over: its world cannot continue it, for the given `reason`."""
+    """A rollout is over for this `reason`: start a new one or branch from its end."""
 
     def __init__(self, message: str, *, reason: str, **details: object) -> None:
         super().__init__(message, reason=reason, **details)
@@ -102,7 +79,7 @@ class LimitExceededError(DexTouchError):
 
 
 class UnavailableError(DexTouchError):
-    """A service, model or world is not ready."""
+    """A service, model or world is not ready: try again later."""
 
 
 class DeviceError(DexTouchError):
@@ -122,7 +99,7 @@ class CorruptDataError(StorageError):
 
 
 class StorageFullError(StorageError):
-    """No space left on the device."""
+    """No space left on the device: free some."""
 
 
 class AccessDeniedError(DexTouchError):

@@ -13,7 +13,7 @@ import numpy as np
 import zarr
 from playwright.sync_api import expect
 
-from dextouch.tactile.heatmap import colour, hand_canvas
+from dextouch.tactile.layout import colour, hand_canvas
 
 DEXTOUCH = (sys.executable, "-m", "services.cli.main")
 START_LIMIT_S = 300

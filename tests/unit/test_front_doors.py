@@ -120,7 +120,7 @@ def test_promised_modules_are_public():
         "from dextouch.streams import Sample, batch",
         "import dextouch.streams.batch",
         "import dextouch.streams.batch as batch",
-        "def late():\n    from dextouch.clocks.steps import find_steps",
+        "def late():\n    from dextouch.clocks.clock_model import find_steps",
         "from dextouch.bridges.lerobot.frames import frames_of",
         "from dextouch.hands.hand_files.loading import load_hand",
         "from dextouch.episodes.care.repair import repair_group",

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
-from dextouch.geometry import interpolation, rotations, transforms
+from dextouch.geometry import rotations, transforms
 
 vectors = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)
 
@@ -83,16 +83,16 @@ def test_tiny_and_huge_columns_survive():
 
 def test_a_quarter_of_the_way_is_three_parts_of_the_earlier_sample():
     t_ns, at_ns = np.array([0, 100, 200]), np.array([25, 100, 150])
-    left, weight, valid = interpolation.bracket(t_ns, at_ns, max_gap_ns=100)
+    left, weight, valid = transforms.bracket(t_ns, at_ns, max_gap_ns=100)
     assert valid.all()
-    values = interpolation.interpolate_linear(np.array([0.0, 8.0, 10.0]), left, weight)
+    values = transforms.interpolate_linear(np.array([0.0, 8.0, 10.0]), left, weight)
     np.testing.assert_allclose(values, [2.0, 8.0, 9.0])
 
 
 def test_the_nearest_sample_of_two_equally_near_ones_is_the_earlier():
     t_ns = np.array([0, 10, 20])
     at_ns = np.array([-3, 4, 5, 6, 15, 16, 99])
-    assert interpolation.nearest_index(t_ns, at_ns).tolist() == [0, 0, 0, 1, 1, 2, 2]
+    assert transforms.nearest_index(t_ns, at_ns).tolist() == [0, 0, 0, 1, 1, 2, 2]
 
 
 def test_a_pinhole_camera_sees_its_field_of_view_edge_to_edge():
@@ -134,8 +134,8 @@ def test_interpolated_poses_follow_a_screw(seed):
         rotations.rotation_from_vector(t_ns[:, None] * 1e-9 * axis * 4), t_ns[:, None] * 1e-9 * axis
     )
     at_ns = rng.integers(t_ns[0], t_ns[-1], size=50)
-    left, weight, valid = interpolation.bracket(t_ns, at_ns, max_gap_ns=20_000_000)
-    got = interpolation.interpolate_poses(Ts, left, weight)
+    left, weight, valid = transforms.bracket(t_ns, at_ns, max_gap_ns=20_000_000)
+    got = transforms.interpolate_poses(Ts, left, weight)
     expected = transforms.transform(
         rotations.rotation_from_vector(at_ns[:, None] * 1e-9 * axis * 4),
         at_ns[:, None] * 1e-9 * axis,
@@ -146,12 +146,10 @@ def test_interpolated_poses_follow_a_screw(seed):
 
 def test_gaps_and_outside_are_marked_not_filled():
     t_ns = np.array([0, 10, 100, 110])
-    _, _, valid = interpolation.bracket(
-        t_ns, np.array([-1, 5, 10, 50, 100, 110, 111]), max_gap_ns=20
-    )
+    _, _, valid = transforms.bracket(t_ns, np.array([-1, 5, 10, 50, 100, 110, 111]), max_gap_ns=20)
     assert valid.tolist() == [False, True, True, False, True, True, False]
     with pytest.raises(InvalidInputError):
-        interpolation.bracket(np.array([0, 0]), np.array([0]), max_gap_ns=1)
+        transforms.bracket(np.array([0, 0]), np.array([0]), max_gap_ns=1)
 
 
 def test_the_error_of_transforms_that_are_not_rigid():

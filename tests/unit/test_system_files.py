@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from dextouch.data_folder import is_system_file
 from dextouch.episodes import EpisodeStore
-from dextouch.system_files import is_system_file
 from services.alignment.station_calibration.boards import photo_paths
 from services.cli import main
 from tests.unit.bridges.takes import write_episode, write_recording

@@ -5,7 +5,7 @@ import pytest
 
 from dextouch.errors import ShapeError, UnknownNameError
 from dextouch.streams import StreamDescriptor
-from dextouch.tactile import contact, heatmap, layout
+from dextouch.tactile import layout
 from services.acquisition.mocks.gloves import GloveCalibration, TactileGloveSource
 from services.acquisition.mocks.replay import ReplayStream
 
@@ -133,15 +133,15 @@ def test_bad_input_is_named():
 
 
 def test_contact_threshold_is_two_kilopascal():
-    assert contact.in_contact(np.array([1.99, 2.0, np.nan])).tolist() == [False, True, False]
+    assert layout.in_contact(np.array([1.99, 2.0, np.nan])).tolist() == [False, True, False]
 
 
 def test_hand_canvas_holds_every_taxel_once_and_mirrors():
     taxels = np.arange(1, 321, dtype=np.float32)
-    right = heatmap.hand_canvas(taxels, side="right")
+    right = layout.hand_canvas(taxels, side="right")
     assert sorted(right[np.isfinite(right)].tolist()) == taxels.tolist()
-    left = heatmap.hand_canvas(taxels, side="left")
+    left = layout.hand_canvas(taxels, side="left")
     np.testing.assert_array_equal(left, right[:, ::-1])
-    rgb = heatmap.colour(right)
+    rgb = layout.colour(right)
     assert rgb.shape == (28, 26, 3)
     assert (rgb[np.isnan(right)] == rgb[0, 0]).all()

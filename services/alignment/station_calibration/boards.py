@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from dextouch.command_line import progress
+from dextouch.data_folder import is_system_file
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.geometry import apply, invert, transform
 from dextouch.geometry.rotations import rotation_from_vector, vector_from_rotation
-from dextouch.system_files import is_system_file
 from services.alignment.calibration.intrinsics import (
     DICTIONARIES,
     CharucoBoard,

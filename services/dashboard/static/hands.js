@@ -1,5 +1,5 @@
 // Pressures of one hand → a canvas in hand layout. Layout and colours come from the server, which
-// takes them from dextouch.tactile.heatmap, so that report and page show the same picture.
+// takes them from dextouch.tactile.layout, so that report and page show the same picture.
 
 import { beforeNextFrame, cleared, css } from "./canvas.js";
 import { setText } from "./dom.js";

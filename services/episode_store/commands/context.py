@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dextouch.data_folder import is_system_file
 from dextouch.episodes import KINDS, EpisodeStore, Kind, check_id, local_folder
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.system_files import is_system_file
 
 EXIT_DAMAGED = 1
 _SIZES = ("bytes", "kB", "MB", "GB", "TB")

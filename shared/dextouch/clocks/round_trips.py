@@ -10,7 +10,7 @@ delays may differ; sigma accounts for it.
 import math
 from dataclasses import dataclass
 
-from dextouch.clocks.lower_hull import LowerHull
+from dextouch.clocks.envelopes import LowerHull
 from dextouch.errors import ClockFitError, InvalidInputError
 
 WINDOW_S = 600.0

@@ -10,11 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+from dextouch.data_folder import is_system_file
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import COMMIT_FILE, KINDS, Kind, decode_commit
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts
 from dextouch.errors import ConflictError, StorageError, UnavailableError
-from dextouch.system_files import is_system_file
 
 CLAIM_FILE = "claim"
 # A hash that no content has, so that nothing is written while a group is deleted.

@@ -10,6 +10,7 @@ from types import TracebackType
 
 import numpy as np
 
+from dextouch.data_folder import is_system_file
 from dextouch.episodes.files import (
     disk_errors,
     is_folder_at,
@@ -46,7 +47,6 @@ from dextouch.streams import (
     NO_SEQUENCE,
     StreamDescriptor,
 )
-from dextouch.system_files import is_system_file
 
 # A stage: the folder in which a group is written, and its commit to the final place.
 #

@@ -21,6 +21,7 @@ WRIST_RIGHT = slice(9, 18)
 JOINTS_LEFT = slice(18, 38)
 JOINTS_RIGHT = slice(38, 58)
 CAMERA_HEAD = slice(58, 67)
+PARTS = (WRIST_LEFT, WRIST_RIGHT, JOINTS_LEFT, JOINTS_RIGHT, CAMERA_HEAD)
 POSE_SLICES = (WRIST_LEFT, WRIST_RIGHT, CAMERA_HEAD)
 # All pose columns: converting the three parts together takes half the time.
 _POSE_COLUMNS = np.concatenate([np.arange(part.start, part.stop) for part in POSE_SLICES])
@@ -146,13 +147,7 @@ def unpack_action(actions: np.ndarray) -> ActionParts:
     actions = np.asarray(actions)
     if actions.shape[-1:] != (ACTION_DIM,):
         raise ShapeError(f"actions: got shape {actions.shape}, expected [..., {ACTION_DIM}]")
-    return ActionParts(
-        actions[..., WRIST_LEFT],
-        actions[..., WRIST_RIGHT],
-        actions[..., JOINTS_LEFT],
-        actions[..., JOINTS_RIGHT],
-        actions[..., CAMERA_HEAD],
-    )
+    return ActionParts(*(actions[..., part] for part in PARTS))
 
 
 def actions_from_poses(

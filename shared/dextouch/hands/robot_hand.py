@@ -221,13 +221,9 @@ def chain_points_of_both_m(joints_rad: np.ndarray) -> Float64[np.ndarray, "time 
 @cache
 def _both_hands() -> _Chains:
     hands = [_Chains.of(_wuji_hand_2()[side]) for side in SIDES]
-    return _Chains(
-        np.stack([hand.is_joint for hand in hands]),
-        np.stack([hand.offsets for hand in hands]),
-        np.stack([hand.axes for hand in hands]),
-        np.stack([hand.tips_m for hand in hands]),
-        hands[0].points,
-    )
+    names = ("is_joint", "offsets", "axes", "tips_m")
+    stacked = (np.stack([getattr(hand, name) for hand in hands]) for name in names)
+    return _Chains(*stacked, hands[0].points)
 
 
 @cache

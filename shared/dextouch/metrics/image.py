@@ -1,4 +1,4 @@
-"""PSNR (dB) and SSIM of predicted 8-bit colour images.
+"""PSNR (dB) and SSIM of predicted 8-bit colour images, and the check of arrays to compare.
 
 Both are averaged over images, so the value of a clip is the mean over its images.
 """
@@ -6,15 +6,41 @@ Both are averaged over images, so the value of a clip is the mean over its image
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import ShapeError
-from dextouch.metrics.checks import checked_pair
+from dextouch.errors import NonFiniteError, ShapeError
 
 PEAK = 255.0
 # Cap for exact images, whose PSNR is infinite, so that means stay finite.
 MAX_PSNR_DB = 100.0
 SSIM_WINDOW_PX = 11
 _SSIM_SIGMA_PX = 1.5
-_C1, _C2 = (0.01 * PEAK) ** 2, (0.03 * PEAK) ** 2
+
+
+def checked_pair(
+    first: np.ndarray, second: np.ndarray, *, what: str, tail: tuple[int | None, ...]
+) -> tuple[Float64[np.ndarray, "..."], Float64[np.ndarray, "..."]]:
+    """Validate two arrays of equal shape and return them as float64.
+
+    `tail` are the expected last axes; None stands for any length of at least one.
+    """
+    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    if a.shape != b.shape:
+        raise ShapeError(f"{what}: got shapes {a.shape} and {b.shape}, expected the same shape")
+    fits = a.ndim >= len(tail) and all(
+        want is None or got == want
+        for got, want in zip(a.shape[a.ndim - len(tail) :], tail, strict=True)
+    )
+    if not fits or a.size == 0:
+        expected = ", ".join("n" if n is None else str(n) for n in tail)
+        raise ShapeError(f"{what}: got shape {a.shape}, expected [..., {expected}] and not empty")
+    for side, values in (("first", a), ("second", b)):
+        num_bad = int(np.count_nonzero(~np.isfinite(values)))
+        if num_bad:
+            raise NonFiniteError(
+                f"{what}: {num_bad} values of the {side} array are NaN or infinite; "
+                "leave them out before comparing",
+                num_bad=num_bad,
+            )
+    return a, b
 
 
 def psnr(*, predicted: np.ndarray, true: np.ndarray) -> float:
@@ -60,15 +86,25 @@ def ssim(*, predicted: np.ndarray, true: np.ndarray) -> float:
             f"{SSIM_WINDOW_PX} by {SSIM_WINDOW_PX}"
         )
     mean_a, mean_b = _smooth(a), _smooth(b)
-    variance_a = _smooth(a * a) - mean_a**2
-    variance_b = _smooth(b * b) - mean_b**2
+    variances = _smooth(a * a) - mean_a**2 + (_smooth(b * b) - mean_b**2)
     covariance = _smooth(a * b) - mean_a * mean_b
-    return float(
-        np.mean(
-            (2 * mean_a * mean_b + _C1)
-            * (2 * covariance + _C2)
-            / ((mean_a**2 + mean_b**2 + _C1) * (variance_a + variance_b + _C2))
-        )
+    return float(np.mean(similarity((mean_a, mean_b), variances, covariance, peak=PEAK)))
+
+
+def similarity(
+    means: tuple[np.ndarray, np.ndarray],
+    variances: np.ndarray,
+    covariance: np.ndarray,
+    *,
+    peak: float,
+) -> Float64[np.ndarray, "..."]:
+    """Structural similarity of windows from their means, sums of variances, and covariances."""
+    mean_a, mean_b = means
+    c1, c2 = (0.01 * peak) ** 2, (0.03 * peak) ** 2
+    return (
+        (2 * mean_a * mean_b + c1)
+        * (2 * covariance + c2)
+        / ((mean_a**2 + mean_b**2 + c1) * (variances + c2))
     )
 
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from dextouch.errors import UnknownNameError
-from dextouch.metrics.checks import checked_pair
+from dextouch.metrics.image import checked_pair
 
 TIE_RULES = ("paper", "simpler")
 # Two points always lie on a line, and two ranks always agree or are reversed: every correlation

@@ -1,13 +1,12 @@
 """Tactile errors (kPa) and contact agreement of predicted taxel pressures [..., 320].
 
 Everything pools over all given samples, hands and taxels (micro average). Contact is pressure of
-at least 2 kPa (`dextouch.tactile.contact`). Exclude invalid hands before calling: NaN is refused.
+at least 2 kPa (`dextouch.tactile.layout`). Exclude invalid hands before calling: NaN is refused.
 """
 
 import numpy as np
 
-from dextouch.metrics.checks import checked_pair
-from dextouch.metrics.image import decibels
+from dextouch.metrics.image import checked_pair, decibels, similarity
 from dextouch.tactile import in_contact
 from dextouch.tactile.layout import NUM_TAXELS, split_pads
 
@@ -64,12 +63,8 @@ def _pad_similarity(a: np.ndarray, b: np.ndarray, peak: float) -> np.ndarray:
     windows_b = np.lib.stride_tricks.sliding_window_view(b, size, axis=(-2, -1))
     mean_a, mean_b = windows_a.mean((-2, -1)), windows_b.mean((-2, -1))
     covariance = (windows_a * windows_b).mean((-2, -1)) - mean_a * mean_b
-    c1, c2 = (0.01 * peak) ** 2, (0.03 * peak) ** 2
-    return np.asarray(
-        (2 * mean_a * mean_b + c1)
-        * (2 * covariance + c2)
-        / ((mean_a**2 + mean_b**2 + c1) * (windows_a.var((-2, -1)) + windows_b.var((-2, -1)) + c2))
-    )
+    variances = windows_a.var((-2, -1)) + windows_b.var((-2, -1))
+    return similarity((mean_a, mean_b), variances, covariance, peak=peak)
 
 
 def contact_mae(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:

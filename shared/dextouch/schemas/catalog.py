@@ -7,8 +7,8 @@ from pydantic import AwareDatetime, Field
 
 from dextouch.free_text import FreeLines, FreeText
 from dextouch.frozen_model import FrozenModel
+from dextouch.schemas.common import Domain, Origin, StoreId
 from dextouch.schemas.episodes import LineageEntry
-from dextouch.schemas.fields import Domain, Origin, StoreId
 
 ItemKind = Literal["episode", "recording"]
 Verdict = Literal["accepted", "rejected"]
@@ -210,9 +210,6 @@ class HoursByField(FrozenModel):
     """Hours of episodes by the values of one field, in their order."""
 
     rows: tuple[HoursOf, ...]
-
-
-# Schemas for playing recordings and episodes: their streams, extents and gaps.
 
 
 class PlayedStream(FrozenModel):

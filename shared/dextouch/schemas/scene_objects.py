@@ -7,7 +7,7 @@ from pydantic import Field, FiniteFloat, ValidationError, field_validator, model
 
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas.fields import Box, StoreId
+from dextouch.schemas.common import Box, StoreId
 
 # Position x y z (m), then the quaternion w x y z.
 Pose = tuple[

@@ -8,10 +8,10 @@ from .batch import encode_samples as encode_samples
 from .batch import frame_body as frame_body
 from .batch import read_batch as read_batch
 from .batch import sample_ends as sample_ends
-from .openpi import pack_openpi as pack_openpi
-from .openpi import unpack_openpi as unpack_openpi
 from .packing import pack as pack
+from .packing import pack_openpi as pack_openpi
 from .packing import unpack as unpack
+from .packing import unpack_openpi as unpack_openpi
 from .samples import ENCODED_UNITS as ENCODED_UNITS
 from .samples import H264_UNIT as H264_UNIT
 from .samples import HEAD_CAMERA as HEAD_CAMERA

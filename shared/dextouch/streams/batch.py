@@ -14,12 +14,7 @@ from itertools import chain
 import google_crc32c
 import numpy as np
 
-from dextouch.errors import (
-    CorruptDataError,
-    InvalidInputError,
-    LimitExceededError,
-    PacketError,
-)
+from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError, PacketError
 from dextouch.streams.samples import (
     ENCODED_UNITS,
     SampleBatch,
@@ -213,20 +208,21 @@ def read_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> Enc
             f"batch {number} of {descriptor.name!r}: got wire version {version}, expected "
             f"{VERSION}; use a station and a store of the same release"
         )
-    return _read(data, descriptor, number)
-
-
-def _read(data: bytes, descriptor: StreamDescriptor, number: int) -> EncodedBatch:
     _, _, name_bytes, got_number, num_samples, length, crc = _HEADER.unpack_from(data)
     place = _HEADER.size + name_bytes + _CRC.size
-    name = data[_HEADER.size : place - _CRC.size]
-    if len(data) < place or data[place - _CRC.size : place] != _CRC.pack(
-        google_crc32c.value(data[: place - _CRC.size])
-    ):
+    header, body = data[: place - _CRC.size], data[place:]
+    if data[len(header) : place] != _CRC.pack(google_crc32c.value(header)):
         raise PacketError("batch: its header was damaged in transit, send it again")
-    body = data[place:]
-    _check_body(body, length, crc)
-    _check_identity(descriptor, name.decode(errors="replace"), got_number, number)
+    if len(body) != length:
+        raise PacketError(f"batch: got {len(body)} bytes after the header, expected {length}")
+    if google_crc32c.value(body) != crc:
+        raise PacketError("batch: checksum mismatch; it was damaged in transit, send it again")
+    name = header[_HEADER.size :].decode(errors="replace")
+    if (name, got_number) != (descriptor.name, number):
+        raise InvalidInputError(
+            f"batch of {descriptor.name!r}: bytes are batch {got_number!r} of stream {name!r}, "
+            f"expected batch {number} of {descriptor.name!r}"
+        )
     _check_count(descriptor.name, num_samples)
     try:
         batch = decode_body(descriptor, body, num_samples)
@@ -234,23 +230,6 @@ def _read(data: bytes, descriptor: StreamDescriptor, number: int) -> EncodedBatc
         raise InvalidInputError(error.message) from error
     check_batch(descriptor, batch)
     return _encoded(descriptor, body, crc, batch)
-
-
-def _check_body(body: bytes, length: int, crc32c: int) -> None:
-    if len(body) != length:
-        raise PacketError(f"batch: got {len(body)} bytes after the header, expected {length}")
-    if google_crc32c.value(body) != crc32c:
-        raise PacketError("batch: checksum mismatch; it was damaged in transit, send it again")
-
-
-def _check_identity(
-    descriptor: StreamDescriptor, got_name: str, got_number: int, number: int
-) -> None:
-    if (got_name, got_number) != (descriptor.name, number):
-        raise InvalidInputError(
-            f"batch of {descriptor.name!r}: bytes are batch {got_number!r} of stream {got_name!r}, "
-            f"expected batch {number} of {descriptor.name!r}"
-        )
 
 
 def _check_count(what: str, count: int) -> None:

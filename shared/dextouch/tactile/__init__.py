@@ -1,7 +1,13 @@
 """Tactile sensing of a hand: taxel layout, contact threshold, pad forces and heat maps."""
 
-from dextouch.tactile.contact import CONTACT_THRESHOLD_KPA, PADS, in_contact, pad_forces_n
-from dextouch.tactile.heatmap import colour, hand_canvas
+from dextouch.tactile.layout import (
+    CONTACT_THRESHOLD_KPA,
+    PADS,
+    colour,
+    hand_canvas,
+    in_contact,
+    pad_forces_n,
+)
 
 __all__ = [
     "CONTACT_THRESHOLD_KPA",

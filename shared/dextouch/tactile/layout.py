@@ -1,36 +1,43 @@
-"""Layout of a glove's 320 taxels on the hand, and their mapping to its 360 raw cells.
+"""Taxels of a glove: their layout on the hand, contact, forces of pads, and heat maps.
 
-Anatomical order, the same for both hands: thumb, index, middle, ring and little fingertip, 4×4
-each, then the palm, 15×16. Inside every pad axis 0 runs from distal to proximal and axis 1 from
-radial (thumb side) to ulnar, so that a left and a right hand doing the same thing give the same
-numbers.
+Anatomical order of the 320 taxels, the same for both hands: thumb, index, middle, ring and little
+fingertip, 4×4 each, then the palm, 15×16. Inside every pad axis 0 runs from distal to proximal and
+axis 1 from radial (thumb side) to ulnar, so that a left and a right hand doing the same thing give
+the same numbers.
 """
 
 from functools import cache
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from dextouch.errors import ShapeError, UnknownNameError
+from dextouch.errors import NonFiniteError, ShapeError, UnknownNameError
 
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 FINGERS = ("thumb", "index", "middle", "ring", "little")
-
 NUM_RAW_TAXELS = 360
 NUM_FINGERTIPS = 5
 TIP_SHAPE = (4, 4)
 PALM_SHAPE = (15, 16)
 NUM_TIP_TAXELS = NUM_FINGERTIPS * TIP_SHAPE[0] * TIP_SHAPE[1]
 NUM_TAXELS = NUM_TIP_TAXELS + PALM_SHAPE[0] * PALM_SHAPE[1]
-
 TIP_PITCH_M = 0.004
 PALM_PITCH_M = (0.006, 0.005)
 TIP_TAXEL_AREA_M2 = TIP_PITCH_M**2
 PALM_TAXEL_AREA_M2 = PALM_PITCH_M[0] * PALM_PITCH_M[1]
-
 _SCAN_SHAPE = (18, 20)
+CONTACT_THRESHOLD_KPA = 2.0
+PADS: Final = (*FINGERS, "palm")
+_PASCAL_PER_KPA: Final = 1000.0
+# Top-left cell of each pad for a right hand seen from its palm: fingers up, thumb to the right.
+_CANVAS_SHAPE = (28, 26)
+_PALM_ORIGIN = (13, 0)
+_TIP_ORIGINS = ((8, 21), (3, 13), (0, 9), (2, 5), (5, 0))
+# Colour map: dark blue, violet, orange, pale yellow.
+_RAMP = np.array([(13, 17, 40), (92, 32, 110), (226, 92, 44), (255, 240, 170)], dtype=np.float64)
+_EMPTY = np.array((247, 247, 245), dtype=np.uint8)
 
 
 def taxel_areas_m2() -> np.ndarray:
@@ -116,3 +123,53 @@ def join_pads(fingertips: np.ndarray, palm: np.ndarray) -> np.ndarray:
         ],
         axis=-1,
     )
+
+
+def in_contact(tactile_kpa: np.ndarray) -> Bool[np.ndarray, "..."]:
+    """Mask of taxels in contact: pressure of at least 2 kPa. NaN is not contact."""
+    return np.asarray(tactile_kpa) >= CONTACT_THRESHOLD_KPA
+
+
+def pad_forces_n(tactile_kpa: np.ndarray) -> Float64[np.ndarray, "time 6"]:
+    """Normal force (N) on thumb … little fingertip and palm: pressure times area.
+
+    Only taxels in contact count (`in_contact`), so that noise of the others does not add up.
+
+    Args:
+        tactile_kpa: [T, 320], anatomical order.
+
+    Raises:
+        ShapeError: not [T, 320].
+        NonFiniteError: NaN or infinity; a taxel that was not measured is zero.
+    """
+    kpa = np.asarray(tactile_kpa, dtype=np.float64)
+    if kpa.ndim != 2 or kpa.shape[1] != NUM_TAXELS:
+        raise ShapeError(f"pad forces: got shape {kpa.shape}, expected [T, {NUM_TAXELS}]")
+    if not np.isfinite(kpa).all():
+        raise NonFiniteError("pad forces: taxels hold NaN or infinity; set unmeasured ones to zero")
+    forces = np.where(in_contact(kpa), kpa, 0.0) * taxel_areas_m2() * _PASCAL_PER_KPA
+    tips, palm = split_pads(forces)
+    return np.concatenate([tips.sum(axis=(2, 3)), palm.sum(axis=(1, 2))[:, None]], axis=1)
+
+
+def hand_canvas(taxels: np.ndarray, *, side: Side) -> Float32[np.ndarray, "28 26"]:
+    """Taxels [320] laid out as a hand on a 28×26 grid; cells without a taxel are NaN."""
+    tips, palm = split_pads(np.asarray(taxels, dtype=np.float32))
+    canvas = np.full(_CANVAS_SHAPE, np.nan, dtype=np.float32)
+    # Radial is on the right of a right palm, while arrays run from radial to ulnar.
+    row, column = _PALM_ORIGIN
+    canvas[row : row + PALM_SHAPE[0], column : column + PALM_SHAPE[1]] = palm[:, ::-1]
+    for tip, (row, column) in zip(tips, _TIP_ORIGINS, strict=True):
+        canvas[row : row + 4, column : column + 4] = tip[:, ::-1]
+    return canvas if side == "right" else canvas[:, ::-1]
+
+
+def colour(values_kpa: np.ndarray, *, full_scale_kpa: float = 40.0) -> UInt8[np.ndarray, "*s 3"]:
+    """Map pressures to RGB on a square-root scale, which shows light touch; NaN is background."""
+    values = np.asarray(values_kpa, dtype=np.float64)
+    level = np.sqrt(np.clip(np.nan_to_num(values) / full_scale_kpa, 0.0, 1.0)) * (len(_RAMP) - 1)
+    left = np.minimum(level.astype(int), len(_RAMP) - 2)
+    weight = (level - left)[..., None]
+    rgb = ((1 - weight) * _RAMP[left] + weight * _RAMP[left + 1]).astype(np.uint8)
+    rgb[np.isnan(values)] = _EMPTY
+    return rgb

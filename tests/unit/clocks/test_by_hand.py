@@ -7,10 +7,9 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from dextouch.clocks import OnlineClock, fit_clock
-from dextouch.clocks.clock_model import ClockModel, ClockSegment
-from dextouch.clocks.lower_hull import LowerHull
-from dextouch.clocks.online_clock import DeviceCounter
-from dextouch.clocks.steps import find_steps, find_wrong_stamps
+from dextouch.clocks.clock_model import ClockModel, ClockSegment, find_steps, find_wrong_stamps
+from dextouch.clocks.envelopes import LowerHull
+from dextouch.clocks.online_clocks import DeviceCounter
 from dextouch.errors import ClockFitError, InvalidInputError
 from dextouch.streams import ClockCapabilities, SampleBatch, StreamDescriptor
 from services.alignment.synchronization.stream_clock import time_stream

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dextouch.clocks import OnlineClock, find_lost_samples, fit_clock, unwrap_counter
-from dextouch.clocks.lower_hull import MAX_VERTICES, LowerHull
+from dextouch.clocks.envelopes import MAX_VERTICES, LowerHull
 from dextouch.errors import ClockFitError, InvalidInputError, ShapeError
 from dextouch.streams import ClockCapabilities, StreamDescriptor
 

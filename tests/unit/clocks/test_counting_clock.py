@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.clocks import CountingClock, date_by_counting
-from dextouch.clocks.counting_clock import LOOK_AHEAD
+from dextouch.clocks.online_clocks import LOOK_AHEAD
 from dextouch.errors import InvalidInputError
 
 PERIOD_NS = 10_000_000

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.clocks import OnlineClock
-from dextouch.clocks.running_envelope import LEARNED_DISTANCES, MAX_ODD, Rhythm
+from dextouch.clocks.envelopes import LEARNED_DISTANCES, MAX_ODD, Rhythm
 
 PERIOD_NS = 16_666_667
 LATE_NS = 500_000

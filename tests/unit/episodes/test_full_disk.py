@@ -47,7 +47,7 @@ from pathlib import Path
 import numpy as np
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import StorageFullError
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas.episodes import RecordingAttributes
 
 disk = Path(sys.argv[1])
 store = EpisodeStore(disk / "store")

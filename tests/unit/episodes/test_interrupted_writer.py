@@ -42,7 +42,7 @@ import signal
 import sys
 import numpy as np
 from dextouch.episodes import EpisodeStore
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas.episodes import RecordingAttributes
 
 # A shell that starts the tests in the background has them ignore it.
 signal.signal(signal.SIGINT, signal.default_int_handler)

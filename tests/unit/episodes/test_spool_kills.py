@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from dextouch.episodes.spool import SpoolWriter
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas.episodes import RecordingAttributes
 from dextouch.streams.samples import SampleBatch
 
 attributes = RecordingAttributes.model_validate_json(sys.argv[2])

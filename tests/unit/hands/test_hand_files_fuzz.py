@@ -14,7 +14,7 @@ from dextouch.errors import (
     StorageError,
     UnknownNameError,
 )
-from dextouch.hands.hand_files import elements, load_hand
+from dextouch.hands.hand_files import load_hand, models
 from tests.unit.hands.hand_texts import FINGER_MAPPING as FINGER
 from tests.unit.hands.hand_texts import FINGER_MJCF as MJCF
 from tests.unit.hands.hand_texts import documented_mappings, four_finger_urdf, write_hand
@@ -59,7 +59,7 @@ def test_document_types_are_refused(doctype, encoding, tmp_path):
     ],
 )
 def test_files_that_are_no_model_are_refused(model, error, message, tmp_path, monkeypatch):
-    monkeypatch.setattr(elements, "MAX_ELEMENTS", 500)
+    monkeypatch.setattr(models, "MAX_ELEMENTS", 500)
     refused(tmp_path, model, FINGER, message, error)
 
 

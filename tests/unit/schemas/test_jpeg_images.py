@@ -8,7 +8,7 @@ from PIL import Image
 
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError
 from dextouch.schemas import ReturnSelector, decode_answer
-from dextouch.schemas.jpeg_images import decode_images, encode_images
+from dextouch.schemas.observations import decode_images, encode_images
 from dextouch.streams import unpack
 from tests.unit.schemas.test_rollout_codec import INFO, encode_answer
 from tests.unit.worlds.fakes import observation

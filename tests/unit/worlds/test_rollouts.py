@@ -17,7 +17,7 @@ from dextouch.errors import (
     StorageError,
     UnknownNameError,
 )
-from dextouch.schemas import MAX_SEED, ReturnSelector, RolloutStart, jpeg_images
+from dextouch.schemas import MAX_SEED, ReturnSelector, RolloutStart, observations
 from dextouch.serving.state import MemoryState
 from dextouch.worlds import records
 from dextouch.worlds.records import watch_id_of
@@ -247,13 +247,13 @@ async def test_a_record_of_another_version_is_refused():
 
 async def test_many_jpeg_images_are_encoded_beside_the_event_loop(monkeypatch):
     threads = []
-    encode = jpeg_images.encode_jpeg
+    encode = observations.encode_jpeg
 
     def noted(image):
         threads.append(threading.get_ident())
         return encode(image)
 
-    monkeypatch.setattr(jpeg_images, "encode_jpeg", noted)
+    monkeypatch.setattr(observations, "encode_jpeg", noted)
     made = service()
     rollout_id = await begin(made)
     selector = ReturnSelector(images="jpeg")

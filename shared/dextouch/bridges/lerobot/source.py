@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.video import VideoSpan
+from dextouch.data_folder import is_system_file
 from dextouch.episodes import disk_errors
 from dextouch.errors import (
     CorruptDataError,
@@ -22,7 +23,6 @@ from dextouch.errors import (
     NotFoundError,
 )
 from dextouch.schemas import first_problems
-from dextouch.system_files import is_system_file
 
 MAX_INFO_BYTES: Final = 1 << 24
 MAX_SIDECAR_BYTES: Final = 1 << 22

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from dextouch.data_folder import is_system_file
 from dextouch.episodes.care.deletion_records import take_start
 from dextouch.episodes.files import disk_errors, try_lock
 from dextouch.episodes.format import (
@@ -32,7 +33,6 @@ from dextouch.episodes.trash import HOMES, REMARK_FILES, REVIEW_FILE, TRASH
 from dextouch.episodes.writer import STAGING
 from dextouch.errors import NotFoundError, StorageError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
-from dextouch.system_files import is_system_file
 
 # Full inspection of a store: all damage by item, array and storage chunk, foreign files, stages.
 #

@@ -1,28 +1,296 @@
-"""Reader of bodies with their joints and sites from MJCF.
+"""Links and joints of hand models in URDF and MJCF, read from XML with source locations.
 
-https://mujoco.readthedocs.io/en/stable/XMLreference.html. A body may have several joints, each with
-its own anchor; `frame` elements transform their children.
+The reader is built on expat: a document type declaration, and with it every entity, is refused;
+depth and number of elements are limited. Of URDF (https://wiki.ros.org/urdf/XML) defaults follow
+the format: origin zero, axis x, lower and upper limit zero. Of MJCF
+(https://mujoco.readthedocs.io/en/stable/XMLreference.html) a body may have several joints, each
+with its own anchor; `frame` elements transform their children.
 """
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Final, NamedTuple
+from xml.parsers import expat
 
 import numpy as np
 
-from dextouch.errors import DegenerateRotationError, UnknownNameError
+from dextouch.errors import (
+    DegenerateRotationError,
+    InvalidInputError,
+    LimitExceededError,
+    NotFoundError,
+    StorageError,
+    UnknownNameError,
+)
 from dextouch.geometry import apply, transform
 from dextouch.geometry.rotations import rotation_from_quaternion, rotation_from_vector
-from dextouch.hands.hand_files.elements import Element
-from dextouch.hands.hand_files.urdf import Joint, Link, unit_axis, vector3
+from dextouch.hands.robot_hand import Vector3
 
+MAX_BYTES: Final = 8 * 2**20
+MAX_DEPTH: Final = 100
+MAX_ELEMENTS: Final = 20_000
+# Far above any length, angle or direction, yet sums and products stay finite.
+MAX_NUMBER: Final = 1e6
+# float() also accepts "nan", "inf", "1_0" and digits of other scripts.
+_NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_TYPES: Final = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 WORLD: Final = "world"
 MAIN_CLASS: Final = "main"
 ORIENTATIONS: Final = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 # Elements that import bodies from elsewhere: the file must contain the whole model.
 _FOREIGN: Final = ("include", "attach", "replicate", "composite", "flexcomp")
 _TINY: Final = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Element:
+    """One XML element; what it lacks or holds wrongly raises InvalidInputError with its place."""
+
+    tag: str
+    attributes: dict[str, str]
+    source: str
+    children: list["Element"] = field(default_factory=list, repr=False)
+
+    def __str__(self) -> str:
+        name = self.attributes.get("name")
+        return f"{self.source}: <{self.tag}{f' name={name!r}' if name else ''}>"
+
+    def refusal(self, message: str) -> InvalidInputError:
+        """An error about this element, to be raised."""
+        return InvalidInputError(f"{self}: {message}", element=self.tag)
+
+    def each(self, *tags: str) -> Iterator["Element"]:
+        """Iterate over children with these tags."""
+        return (child for child in self.children if child.tag in tags)
+
+    def child(self, tag: str) -> "Element | None":
+        """The only child with that tag, or None."""
+        found = list(self.each(tag))
+        if len(found) > 1:
+            raise self.refusal(f"got {len(found)} <{tag}>, expected at most one")
+        return found[0] if found else None
+
+    def text(self, name: str) -> str:
+        """A required attribute, not empty."""
+        value = self.attributes.get(name)
+        if not value:
+            raise self.refusal(f"got no {name!r}, expected one; name it in the model")
+        return value
+
+    def choice(self, name: str, *valid: str) -> str:
+        """An attribute with a fixed set of values; the first one is the default."""
+        value = self.attributes.get(name, valid[0])
+        if value not in valid:
+            raise UnknownNameError(f"value of {name!r} in {self}:", value, list(valid))
+        return value
+
+    def numbers(self, name: str, *defaults: float) -> tuple[float, ...]:
+        """An attribute of as many finite numbers as there are defaults."""
+        text = self.attributes.get(name)
+        if text is None:
+            return defaults
+        words = text.split()
+        if len(words) == len(defaults) and all(_NUMBER.fullmatch(word) for word in words):
+            values = tuple(float(word) for word in words)
+            if all(abs(value) <= MAX_NUMBER for value in values):
+                return values
+        raise self.refusal(
+            f"got {name}={text[:80]!r}, expected {len(defaults)} finite numbers of at most "
+            f"{MAX_NUMBER:g}"
+        )
+
+
+def read_elements(path: Path) -> Element:
+    """Read an XML file of at most 8 MiB, 100 levels and 20 000 elements; returns the root."""
+    parser = expat.ParserCreate()
+    document = Element("", {}, path.name)
+    ancestors = [document]
+    count = 0
+
+    def line() -> str:
+        return f"{path.name} line {parser.CurrentLineNumber}"
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal count
+        count += 1
+        if len(ancestors) > MAX_DEPTH or count > MAX_ELEMENTS:
+            raise LimitExceededError(
+                f"{line()}: got more than {MAX_DEPTH} nested or {MAX_ELEMENTS} XML elements"
+            )
+        ancestors[-1].children.append(Element(tag, attributes, line()))
+        ancestors.append(ancestors[-1].children[-1])
+
+    def doctype(*_: object) -> None:
+        raise InvalidInputError(
+            f"{line()}: got a document type; entities are never read, remove the declaration"
+        )
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = lambda _: ancestors.pop()
+    parser.StartDoctypeDeclHandler = doctype
+    try:
+        parser.Parse(read_bounded(path, MAX_BYTES), True)  # noqa: FBT003 - takes no keywords
+    except expat.ExpatError as error:
+        raise InvalidInputError(
+            f"{path.name} line {error.lineno}: got invalid XML "
+            f"({expat.ErrorString(error.code)}); is the file complete?"
+        ) from error
+    except (ValueError, LookupError) as error:
+        raise InvalidInputError(f"{path.name}: got an unknown text encoding: {error}") from error
+    return document.children[0]
+
+
+def read_bounded(path: Path, max_bytes: int) -> bytes:
+    """Read a regular file of limited size."""
+    try:
+        if not path.exists():
+            raise NotFoundError(f"{path}: no such file")
+        if not path.is_file():
+            raise InvalidInputError(f"{path}: got a folder or device, expected a regular file")
+        with path.open("rb") as file:
+            data = file.read(max_bytes + 1)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be read: {error.strerror}") from error
+    if len(data) > max_bytes:
+        raise LimitExceededError(
+            f"{path}: got more than {max_bytes} bytes, expected a hand's description of at most "
+            "that; meshes belong into files of their own"
+        )
+    return data
+
+
+def vector3(values: np.ndarray) -> Vector3:
+    """An array of three numbers as a tuple."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def unit_axis(axis: np.ndarray, joint: Element) -> Vector3:
+    """The direction of a joint's axis, which must not be zero."""
+    length = float(np.linalg.norm(axis))
+    if length < 1e-9:
+        raise joint.refusal(f"got axis {axis.tolist()}, expected a direction")
+    return vector3(axis / length)
+
+
+class Joint(NamedTuple):
+    """A joint in the frame of its link.
+
+    Attributes:
+        name: in the model.
+        where: prefix of error messages.
+        anchor_m: a point of its axis in the link's frame.
+        axis: unit vector in the link's frame.
+        limits_rad: lower and upper limit; None if it is not a limited hinge.
+        zero_rad: joint angle of the file's reference pose.
+        refusal: why a finger cannot contain this joint; None if it can.
+    """
+
+    name: str
+    where: str
+    anchor_m: Vector3 = (0.0, 0.0, 0.0)
+    axis: Vector3 = (0.0, 0.0, 1.0)
+    limits_rad: tuple[float, float] | None = None
+    zero_rad: float = 0.0
+    refusal: str | None = None
+
+
+class Link(NamedTuple):
+    """A link: T_parent_link [4, 4] in the reference pose, and its joints in order."""
+
+    T_parent_link: np.ndarray
+    joints: tuple[Joint, ...] = ()
+
+
+class UrdfModel:
+    """The links of a URDF, which must be a tree without unprocessed xacro.
+
+    Links are read when asked for, so that only those of fingers must be valid.
+    """
+
+    def __init__(self, root: Element) -> None:
+        self.source = root.source.rpartition(" line ")[0]
+        self.parents: dict[str, str | None] = {}
+        self._joints: dict[str, Element] = {}
+        for child in root.children:
+            if child.tag.startswith("xacro:"):
+                raise child.refusal("got xacro; run it first and load the URDF that it prints")
+        for link in root.each("link"):
+            if link.text("name") in self.parents:
+                raise link.refusal("got this link twice; names must differ")
+            self.parents[link.text("name")] = None
+        names: set[str] = set()
+        for joint in root.each("joint"):
+            if joint.text("name") in names:
+                raise joint.refusal("got this joint twice; names must differ")
+            names.add(joint.text("name"))
+            parent, child_name = self._end(joint, "parent"), self._end(joint, "child")
+            if child_name in self._joints:
+                raise joint.refusal(
+                    f"got link {child_name!r} as child, but joint "
+                    f"{self._joints[child_name].text('name')!r} already moves it; expected a tree"
+                )
+            self.parents[child_name] = parent
+            self._joints[child_name] = joint
+
+    def _end(self, joint: Element, tag: str) -> str:
+        end = joint.child(tag)
+        if end is None:
+            raise joint.refusal(f"got no <{tag}>, expected one")
+        if end.text("link") not in self.parents:
+            raise joint.refusal(
+                f"got {tag} link {end.text('link')!r}, which the file does not have"
+            )
+        return end.text("link")
+
+    def link(self, name: str) -> Link:
+        """A link with the joint that moves it."""
+        element = self._joints.get(name)
+        if element is None:
+            return Link(np.eye(4))
+        T_parent_link = _origin(element)
+        element.text("type")
+        kind = element.choice("type", *_TYPES)
+        if kind == "fixed":
+            return Link(T_parent_link)
+        joint = Joint(element.text("name"), str(element))
+        if element.child("mimic") is not None:
+            joint = joint._replace(refusal="it mimics another joint")
+        elif kind != "revolute":
+            joint = joint._replace(refusal=f"its type is {kind!r}")
+        else:
+            joint = joint._replace(axis=_axis(element), limits_rad=_limits(element))
+        return Link(T_parent_link, (joint,))
+
+    def site(self, name: str, where: str) -> tuple[str, np.ndarray]:
+        """URDF has no sites."""
+        raise UnknownNameError(f"site in {where}:", name, [])
+
+
+def _origin(joint: Element) -> np.ndarray:
+    origin = joint.child("origin")
+    if origin is None:
+        return np.eye(4)
+    turns = np.diag(origin.numbers("rpy", 0.0, 0.0, 0.0))
+    # Extrinsic rotations: about x, then y, then z.
+    R_x, R_y, R_z = rotation_from_vector(turns)
+    return transform(R_z @ R_y @ R_x, np.array(origin.numbers("xyz", 0.0, 0.0, 0.0)))
+
+
+def _axis(joint: Element) -> Vector3:
+    element = joint.child("axis")
+    axis = (1.0, 0.0, 0.0) if element is None else element.numbers("xyz", 1.0, 0.0, 0.0)
+    return unit_axis(np.array(axis), joint)
+
+
+def _limits(joint: Element) -> tuple[float, float] | None:
+    limit = joint.child("limit")
+    if limit is None:
+        return None
+    return limit.numbers("lower", 0.0)[0], limit.numbers("upper", 0.0)[0]
 
 
 class _ElementLocation(NamedTuple):

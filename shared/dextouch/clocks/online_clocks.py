@@ -1,0 +1,456 @@
+"""Host times of samples as they arrive, by device time or by counting, and unwrapped counters.
+
+The clock of a steady device without stamps is its sample count. Whether a sample is late, or the
+one before it was lost, is decided from the following samples: the promptest of the next ten has
+hardly been delayed.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Int64
+
+from dextouch.clocks.envelopes import MIN_SLOPE_SPAN_S, RunningEnvelope
+from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.streams import StreamDescriptor
+
+# Stamps coarser than this share of the sample period are less accurate than counting samples.
+COARSE_SHARE = 0.25
+ABSENT = -1
+# A nominal rate can be off by percents, a crystal by tens of ppm: counted samples need a slope
+# earlier than stamped ones.
+COUNTED_SLOPE_SPAN_S = 0.5
+Source = Literal["device", "sequence", "arrival"]
+LOOK_AHEAD = 10
+# A sample counts as lost where everything behind is later by nearly a period: delays are common,
+# losses are rare.
+LOST_SHARE = 0.75
+# While a queue drains, the look-ahead may be extended by this factor.
+MAX_WAIT = 6
+# A device whose samples are counted must be a steady one. Beyond these its nominal rate is wrong
+# or it samples when it likes, and its arrivals say more.
+MAX_STEADY_SKEW_PPM = 20_000.0
+MAX_STEADY_LOSS = 0.1
+MAX_STEPS_PER_SAMPLE = 0.001
+
+
+class TickCounter:
+    """Unwraps a counter whose ticks are not whole nanoseconds (48 MHz).
+
+    Args:
+        bits: width of the counter.
+        ticks_per_s: its rate.
+    """
+
+    def __init__(self, bits: int, ticks_per_s: int) -> None:
+        if not 8 <= bits <= 62 or ticks_per_s < 1:
+            raise InvalidInputError(
+                f"tick counter: got {bits} bits at {ticks_per_s} ticks a second, expected 8 … 62 "
+                "bits and at least 1 tick a second"
+            )
+        self._modulus = 2**bits
+        self._ticks_per_s = ticks_per_s
+        self._last: tuple[int, int] | None = None
+
+    def to_ns(self, count: int, t_host_ns: int) -> int:
+        """Exact, unwrapped device time in ns of a count that arrived at a host time.
+
+        Raises:
+            InvalidInputError: a count outside the counter's range.
+        """
+        if not 0 <= count < self._modulus:
+            raise InvalidInputError(
+                f"tick counter: got a count of {count}, expected 0 … {self._modulus - 1}"
+            )
+        straight = count
+        if self._last is not None:
+            waited_ticks = (t_host_ns - self._last[1]) * self._ticks_per_s // 10**9
+            straight = nearest_congruent(count, self._last[0] + waited_ticks, self._modulus)
+        self._last = (straight, t_host_ns)
+        return straight * 10**9 // self._ticks_per_s
+
+
+def nearest_congruent(count: int, expected: int, modulus: int) -> int:
+    """The number nearest to `expected` that is congruent to `count` modulo `modulus`."""
+    half = modulus // 2
+    return expected + (count - expected + half) % modulus - half
+
+
+def prefers_sequence(tick_ns: int, period_ns: int) -> bool:
+    """Whether stamps are so coarse that sequence numbers are the better clock."""
+    return tick_ns > COARSE_SHARE * period_ns
+
+
+@dataclass(frozen=True)
+class SequenceReport:
+    """Lost samples of a stream.
+
+    `num_missing_before[i]` samples are missing between sample i-1 and i (0 for the first, at a
+    duplicate and at a restart); `restart_indices` are samples whose number went back or stood.
+    """
+
+    num_missing_before: Int64[np.ndarray, " n"]
+    restart_indices: Int64[np.ndarray, " r"]
+
+    @property
+    def num_missing(self) -> int:
+        """Total number of lost samples."""
+        return int(self.num_missing_before.sum())
+
+
+def unwrap_counter(
+    raw: np.ndarray, *, modulus: int, hint: np.ndarray | None = None
+) -> Int64[np.ndarray, " n"]:
+    """Unwrap a counter that wraps at `modulus`.
+
+    Args:
+        raw: integer counts [n], each in 0 … modulus - 1.
+        modulus: count at which the counter starts again from zero, 2 … 2**62.
+        hint: another clock in the same unit [n] (arrival times). It gives the number of wraps in a
+            gap longer than a wrap; without it a step of more than half a modulus counts as one
+            wrap, a smaller step back as a step back.
+
+    Raises:
+        ShapeError: not one axis of integers, or a hint of another length.
+        InvalidInputError: a count outside 0 … modulus - 1, or an invalid modulus.
+    """
+    counts = np.asarray(raw)
+    if counts.ndim != 1 or not np.issubdtype(counts.dtype, np.integer):
+        raise ShapeError(f"counter: got {counts.dtype} {counts.shape}, expected integers [n]")
+    if not 2 <= modulus <= 2**62:
+        raise InvalidInputError(f"counter: got modulus {modulus}, expected 2 … 2**62")
+    if counts.size and (int(counts.min()) < 0 or int(counts.max()) >= modulus):
+        raise InvalidInputError(
+            f"counter: got counts {counts.min()} … {counts.max()}, expected 0 … {modulus - 1}"
+        )
+    straight = counts.astype(np.int64)
+    steps: Int64[np.ndarray, " m"] = np.diff(straight)
+    expected = np.zeros_like(steps) if hint is None else np.diff(np.asarray(hint, dtype=np.int64))
+    if expected.shape != steps.shape:
+        raise ShapeError(f"counter: got {counts.size} counts and a hint of another length")
+    half = modulus // 2
+    # The congruent step nearest to the expected one.
+    steps = expected + np.mod(steps - expected + half, modulus) - half
+    return np.concatenate([straight[:1], straight[:1] + np.cumsum(steps)]).astype(np.int64)
+
+
+def find_lost_samples(sequence: np.ndarray, *, bits: int = 64) -> SequenceReport:
+    """Gaps and restarts in a stream's sequence numbers.
+
+    Args:
+        sequence: numbers [n] as the device sent them.
+        bits: width of the device's counter, 8 … 64 (64 never wraps in practice).
+    """
+    if not 8 <= bits <= 64:
+        raise InvalidInputError(f"sequence: got a counter of {bits} bits, expected 8 … 64")
+    numbers = np.asarray(sequence, dtype=np.int64)
+    straight = numbers if bits > 62 else unwrap_counter(numbers, modulus=2**bits)
+    steps = np.diff(straight, prepend=straight[:1] - 1)
+    return SequenceReport(np.maximum(steps - 1, 0), np.flatnonzero(steps <= 0).astype(np.int64))
+
+
+class OnlineClock:
+    """Running estimate of the time at which each sample left its device, on the host's clock.
+
+    The line under the (device time, apparent offset) points of the last minute, as in `fit_clock`,
+    but causal (`RunningEnvelope`). Without device time, or where it is very coarse, the sequence
+    number times the nominal period is the device's clock; without either, the arrival itself is
+    returned (`CountingClock` is more accurate for such samples, with a delay).
+
+    Args:
+        descriptor: the stream's descriptor; needed for wrapping or coarse stamps and for streams
+            that have only a sequence number.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor | None = None) -> None:
+        self._counter = DeviceCounter(descriptor)
+        self._envelope = RunningEnvelope()
+        self._last_ns: int | None = None
+        # Device time of the first sample, and its arrival minus that.
+        self._start: tuple[int, int] | None = None
+
+    @property
+    def source(self) -> Source | None:
+        """Source of the clock: device, sequence or arrival; None before the first sample."""
+        return self._counter.source
+
+    @property
+    def num_steps(self) -> int:
+        """Steps and restarts of the device's clock found so far."""
+        return self._envelope.num_steps
+
+    @property
+    def skew_ppm(self) -> float:
+        """How much faster the host's clock runs than the device's, present estimate."""
+        return self._envelope.slope_ns_per_s * 1e-3
+
+    @property
+    def spread_ns(self) -> float:
+        """Recent mean of the path delay above its minimum."""
+        return self._envelope.spread_ns
+
+    def update(
+        self, *, t_host_ns: int, t_device_ns: int | None = None, sequence: int | None = None
+    ) -> int:
+        """Corrected host time of one sample, strictly increasing.
+
+        Args:
+            t_host_ns: arrival on the host's monotonic clock.
+            t_device_ns: the device's raw stamp (wrapping as in the descriptor); None or -1 if the
+                device has none.
+            sequence: the device's sequence number; None or -1 likewise.
+
+        Raises:
+            InvalidInputError: a stamp or number that earlier samples had is missing.
+        """
+        device_ns = self._counter.straighten(t_host_ns, t_device_ns, sequence)
+        estimate_ns = t_host_ns if device_ns is None else self._estimate(device_ns, t_host_ns)
+        if self._last_ns is not None and estimate_ns <= self._last_ns:
+            estimate_ns = self._last_ns + 1
+        self._last_ns = estimate_ns
+        return estimate_ns
+
+    def _estimate(self, device_ns: int, t_host_ns: int) -> int:
+        if self._start is None:
+            self._start = device_ns, t_host_ns - device_ns
+            counted = self._counter.source == "sequence"
+            self._envelope = RunningEnvelope(
+                resolution_ns=self._counter.resolution_ns,
+                min_slope_span_s=COUNTED_SLOPE_SPAN_S if counted else MIN_SLOPE_SPAN_S,
+                is_counted=counted,
+            )
+        start_ns, reference_ns = self._start
+        since_ns, ahead_ns = device_ns - start_ns, t_host_ns - device_ns - reference_ns
+        now_s = (since_ns + ahead_ns) * 1e-9
+        offset_ns = self._envelope.add(since_ns * 1e-9, float(ahead_ns), now_s)
+        # Stamps are truncated to whole ticks: on average the sample is half a tick later. The line
+        # does not show it, since it is determined by the stamps with the smallest truncation.
+        return device_ns + reference_ns + round(offset_ns) + self._counter.resolution_ns // 2
+
+
+class DeviceCounter:
+    """Continuous device time from stamps, or else from sequence numbers times the period.
+
+    The first sample decides: stamps if present, unless they are coarser than a quarter of the
+    period and samples are numbered. Device time is truncated to multiples of `resolution_ns`.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor | None) -> None:
+        self._descriptor = descriptor
+        self._period_ns = 0 if descriptor is None else descriptor.period_ns()
+        self.resolution_ns = 0
+        self._modulus_ns: int | None = None
+        self._last: tuple[int, int] | None = None
+        self.source: Source | None = None
+
+    def straighten(
+        self, t_host_ns: int, t_device_ns: int | None, sequence: int | None
+    ) -> int | None:
+        """Device time of one sample, in ns; None if the device provides no counter."""
+        t_device_ns = None if t_device_ns == ABSENT else t_device_ns
+        sequence = None if sequence == ABSENT else sequence
+        if self.source is None:
+            self._choose(has_time=t_device_ns is not None, has_sequence=sequence is not None)
+        if self.source == "arrival":
+            return None
+        count_ns = t_device_ns
+        if self.source == "sequence":
+            count_ns = None if sequence is None else sequence * self._period_ns
+        if count_ns is None:
+            raise InvalidInputError(
+                f"online clock: a sample at {t_host_ns} ns came without its {self.source} stamp, "
+                "which earlier samples had; expected the same fields in every sample of a stream"
+            )
+        if self._modulus_ns is not None and self._last is not None:
+            expected_ns = self._last[0] + t_host_ns - self._last[1]
+            count_ns = nearest_congruent(count_ns, expected_ns, self._modulus_ns)
+        self._last = (count_ns, t_host_ns)
+        return count_ns
+
+    def _choose(self, *, has_time: bool, has_sequence: bool) -> None:
+        if self._descriptor is None:
+            self.source = "device" if has_time else "arrival"
+            return
+        device = self._descriptor.capabilities
+        if has_time and not (has_sequence and prefers_sequence(device.tick_ns, self._period_ns)):
+            self.source = "device"
+            self.resolution_ns = device.tick_ns
+            bits, unit_ns = device.device_time_bits, device.tick_ns
+        elif has_sequence:
+            self.source = "sequence"
+            bits, unit_ns = device.sequence_bits, self._period_ns
+        else:
+            self.source = "arrival"
+            return
+        # A wider counter never wraps.
+        self._modulus_ns = 2**bits * unit_ns if bits <= 62 else None
+
+
+class CountedSample(NamedTuple):
+    """A counted sample.
+
+    Attributes:
+        number: inferred sample number, 0 for the first.
+        t_host_ns: time at which it left the device, on the host's clock.
+    """
+
+    number: int
+    t_host_ns: int
+
+
+class CountingClock:
+    """Estimates the times of samples of a steady device without stamps and sequence numbers.
+
+    Times are available ten samples later, or once a queue has drained.
+
+    Args:
+        period_ns: nominal sample period, accurate within a few percent.
+
+    Attributes:
+        num_lost: lost samples, up to the last final time.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        if period_ns < 1:
+            raise InvalidInputError(
+                f"counting clock: got a period of {period_ns} ns, expected at least 1"
+            )
+        self._period_ns = period_ns
+        self._waiting: deque[int] = deque()
+        self._envelope = RunningEnvelope(min_slope_span_s=COUNTED_SLOPE_SPAN_S, is_counted=True)
+        self._start_ns: int | None = None
+        self._index = -1
+        self.num_lost = 0
+        self._last_final_ns: int | None = None
+
+    @property
+    def num_steps(self) -> int:
+        """Number of device restarts and of corrected miscounts."""
+        return self._envelope.num_steps
+
+    @property
+    def skew_ppm(self) -> float:
+        """Relative excess of the sample period over the nominal one, in ppm."""
+        return self._envelope.slope_ns_per_s * 1e-3
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether the device is so steady that counting is more accurate than arrival times."""
+        num_arrived = self._index + 1 - self.num_lost
+        return (
+            abs(self.skew_ppm) <= MAX_STEADY_SKEW_PPM
+            and self.num_lost <= MAX_STEADY_LOSS * num_arrived
+            and self.num_steps <= MAX_STEPS_PER_SAMPLE * num_arrived
+        )
+
+    def advance(self, t_host_ns: int) -> tuple[CountedSample, ...]:
+        """Add one arrival on the host's monotonic clock; returns the samples decided by it.
+
+        Raises:
+            InvalidInputError: it precedes the last arrival.
+        """
+        if self._waiting and t_host_ns < self._waiting[-1]:
+            raise InvalidInputError(
+                f"counting clock: got an arrival at {t_host_ns} ns after one at "
+                f"{self._waiting[-1]} ns, expected the order of arrival"
+            )
+        if self._start_ns is None:
+            self._start_ns = t_host_ns
+        self._waiting.append(t_host_ns)
+        final: list[CountedSample] = []
+        while len(self._waiting) > LOOK_AHEAD and (sample := self._decide()) is not None:
+            final.append(sample)
+        return tuple(final)
+
+    def flush(self) -> tuple[CountedSample, ...]:
+        """Final times of the pending samples, with less than the full look-ahead."""
+        decided = (self._decide(is_last_chance=True) for _ in range(len(self._waiting)))
+        return tuple(sample for sample in decided if sample is not None)
+
+    def _lateness_ns(self, count: int) -> list[float]:
+        """Delay of the first pending samples if none were lost."""
+        start_ns = self._start_ns if self._start_ns is not None else 0
+        period_ns = self._period_ns * (1 + self._envelope.slope_ns_per_s * 1e-9)
+        x_ns = (self._index + 1) * self._period_ns
+        origin_ns = start_ns + x_ns + round(self._envelope.at(x_ns * 1e-9))
+        return [self._waiting[k] - origin_ns - k * period_ns for k in range(count)]
+
+    def _num_lost_before(self, *, is_last_chance: bool) -> int | None:
+        """Number of samples lost before the oldest pending one; None while undecided."""
+        if self._index < 0:
+            return 0
+        threshold_ns = LOST_SHARE * self._period_ns
+        if self._lateness_ns(1)[0] < threshold_ns:
+            return 0
+        late_ns = self._lateness_ns(len(self._waiting))
+        least_ns = min(late_ns)
+        if least_ns < threshold_ns:
+            return 0
+        # A queue that is still draining: the following samples are delayed less.
+        draining = late_ns[-1] <= least_ns
+        if draining and not is_last_chance and len(late_ns) < MAX_WAIT * LOOK_AHEAD:
+            return None
+        return int(least_ns / self._period_ns + 1.0 - LOST_SHARE)
+
+    def _decide(self, *, is_last_chance: bool = False) -> CountedSample | None:
+        num_lost = self._num_lost_before(is_last_chance=is_last_chance)
+        if num_lost is None or self._start_ns is None:
+            return None
+        self.num_lost += num_lost
+        self._index += 1 + num_lost
+        since_ns = self._waiting.popleft() - self._start_ns
+        x_ns = self._index * self._period_ns
+        offset_ns = self._envelope.add(x_ns * 1e-9, float(since_ns - x_ns), since_ns * 1e-9)
+        final_ns = self._start_ns + x_ns + round(offset_ns)
+        if self._last_final_ns is not None:
+            final_ns = max(final_ns, self._last_final_ns + 1)
+        self._last_final_ns = final_ns
+        return CountedSample(self._index, final_ns)
+
+
+@dataclass(frozen=True)
+class CountedTake:
+    """Estimated times of a whole take without stamps.
+
+    Attributes:
+        number: inferred sample numbers, 0 for the first.
+        t_host_ns: times at which samples left the device, on the host's clock, strictly increasing.
+        skew_ppm: relative excess of the sample period over the nominal one, at the end.
+        num_lost: number of lost samples.
+        num_steps: number of device restarts and of corrected miscounts.
+        is_steady: whether these times are more accurate than the arrivals.
+    """
+
+    number: Int64[np.ndarray, " n"]
+    t_host_ns: Int64[np.ndarray, " n"]
+    skew_ppm: float
+    num_lost: int
+    num_steps: int
+    is_steady: bool
+
+
+def date_by_counting(t_host_ns: np.ndarray, *, period_ns: int) -> CountedTake:
+    """Estimate the sample times of a steady device from its arrivals alone.
+
+    Args:
+        t_host_ns: arrivals [n] in order, int64.
+        period_ns: nominal sample period, accurate within a few percent.
+
+    Raises:
+        InvalidInputError: arrivals out of order.
+    """
+    clock = CountingClock(period_ns)
+    counted: list[CountedSample] = []
+    for arrival_ns in np.asarray(t_host_ns, dtype=np.int64).tolist():
+        counted.extend(clock.advance(arrival_ns))
+    counted.extend(clock.flush())
+    return CountedTake(
+        number=np.array([sample.number for sample in counted], dtype=np.int64),
+        t_host_ns=np.array([sample.t_host_ns for sample in counted], dtype=np.int64),
+        skew_ppm=clock.skew_ppm,
+        num_lost=clock.num_lost,
+        num_steps=clock.num_steps,
+        is_steady=clock.is_steady,
+    )
