@@ -167,13 +167,6 @@ class _Trial:
         return self._num >= MIN_TRIAL_SAMPLES and self._least_ns > near_ns
 
 
-class _Odd(NamedTuple):
-    """Two stamps at an irregular distance: device time of the later one, distance."""
-
-    x_s: float
-    distance_s: float
-
-
 class RunningEnvelope:
     """Lower envelope of apparent offsets with step detection; O(vertices) time and memory.
 
@@ -214,7 +207,6 @@ class RunningEnvelope:
         self._slope_span_s = 0.0
         self._last_x_s = 0.0
         self._rhythm = Rhythm()
-        self._odd: _Odd | None = None
         self._broken_x_s = -math.inf
         self._start(LowerHull())
 
@@ -229,7 +221,7 @@ class RunningEnvelope:
         else:
             distance_s = x_s - self._last_x_s
             if self._rhythm.is_odd(distance_s):
-                self._odd = _Odd(x_s, distance_s)
+                self._odd = x_s, distance_s
             if not self._rhythm.is_kept(distance_s):
                 self._broken_x_s = x_s
             self._rhythm.add(distance_s)
@@ -246,7 +238,8 @@ class RunningEnvelope:
         self._pending_since: tuple[float, float] = (0.0, 0.0)
         self._pending = LowerHull()
         self._trial: _Trial | None = None
-        self._odd = None
+        # The newest stamp at an irregular distance from the one before, and that distance.
+        self._odd = -math.inf, 0.0
 
     def _is_pending(self, line: Line, x_s: float, y_ns: float, now_s: float) -> bool:
         """Step detection; returns whether the point is pending and must not affect the line."""
@@ -273,12 +266,12 @@ class RunningEnvelope:
 
     def _confirm(self, line: Line) -> None:
         """Confirm that the pending points lie above the line because of a step."""
-        odd, pending = self._odd, self._pending
-        if odd is None or odd.x_s < self._pending_since[0]:
+        (odd_x_s, distance_s), pending = self._odd, self._pending
+        if odd_x_s < self._pending_since[0]:
             self._start(pending)
             return
         lowest = pending.line_of_slope(line.slope_ns_per_s)
-        step_s = self._step_s(line, odd.distance_s, (lowest.x_at_s, lowest.y_at_ns))
+        step_s = self._step_s(line, distance_s, (lowest.x_at_s, lowest.y_at_ns))
         self._start_after(step_s, _Trial(pending))
 
     def _step_s(self, line: Line, distance_s: float, point: tuple[float, float]) -> float | None:

@@ -222,8 +222,10 @@ def chain_points_of_both_m(joints_rad: np.ndarray) -> Float64[np.ndarray, "time 
 def _both_hands() -> _Chains:
     hands = [_Chains.of(_wuji_hand_2()[side]) for side in SIDES]
     names = ("is_joint", "offsets", "axes", "tips_m")
-    stacked = (np.stack([getattr(hand, name) for hand in hands]) for name in names)
-    return _Chains(*stacked, hands[0].points)
+    is_joint, offsets, axes, tips_m = (
+        np.stack([getattr(hand, name) for hand in hands]) for name in names
+    )
+    return _Chains(is_joint, offsets, axes, tips_m, hands[0].points)
 
 
 @cache

@@ -22,6 +22,8 @@ _QUALITY: Final = {
     "imagined_success_spread": "success_spread",
     "imagined_size_deviation": "size_deviation",
 }
+# Of these, the world's own estimates after a chunk.
+_ESTIMATES: Final = ("success_probability", "success_spread", "size_deviation")
 
 
 def _is_none(value: object) -> bool:
@@ -146,22 +148,13 @@ class RolloutDoubt(FrozenModel):
         reason, step = self.reason, self.step
         if reason is None and doubt is not None and doubt.outside:
             reason, step = doubt.reason, last_step
-        return RolloutDoubt(
-            reason=reason,
-            step=step,
-            success_probability=None if doubt is None else doubt.success_probability,
-            success_spread=None if doubt is None else doubt.success_spread,
-            size_deviation=None if doubt is None else doubt.size_deviation,
-        )
+        newest = {name: getattr(doubt, name, None) for name in _ESTIMATES}
+        return RolloutDoubt(reason=reason, step=step, **newest)
 
     def to_quality(self) -> dict[str, float]:
         """The known numbers as quality figures of an episode; the reason's text is lost."""
-        known = {name: getattr(self, name) for name in _QUALITY.values()}
-        return {
-            figure: float(known[name])
-            for figure, name in _QUALITY.items()
-            if known[name] is not None
-        }
+        known = {figure: getattr(self, name) for figure, name in _QUALITY.items()}
+        return {figure: float(value) for figure, value in known.items() if value is not None}
 
     @staticmethod
     def from_quality(quality: Mapping[str, float]) -> "RolloutDoubt":

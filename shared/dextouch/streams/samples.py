@@ -117,19 +117,12 @@ class SampleBatch:
     @staticmethod
     def from_samples(samples: Sequence[Sample]) -> "SampleBatch":
         """Stack samples of one stream; the values of a single one are shared, not copied."""
-        if len(samples) == 1:
-            (sample,) = samples
-            return SampleBatch(
-                np.array([sample.t_host_ns], dtype=np.int64),
-                np.array([sample.t_device_ns], dtype=np.int64),
-                np.array([sample.sequence], dtype=np.int64),
-                sample.values[np.newaxis],
-            )
+        values = [s.values for s in samples]
         return SampleBatch(
             np.array([s.t_host_ns for s in samples], dtype=np.int64),
             np.array([s.t_device_ns for s in samples], dtype=np.int64),
             np.array([s.sequence for s in samples], dtype=np.int64),
-            np.stack([s.values for s in samples]),
+            values[0][np.newaxis] if len(values) == 1 else np.stack(values),
         )
 
 

@@ -1,20 +1,5 @@
 """Tactile sensing of a hand: taxel layout, contact threshold, pad forces and heat maps."""
 
-from dextouch.tactile.layout import (
-    CONTACT_THRESHOLD_KPA,
-    PADS,
-    colour,
-    hand_canvas,
-    in_contact,
-    pad_forces_n,
-)
+import lazy_loader
 
-__all__ = [
-    "CONTACT_THRESHOLD_KPA",
-    "PADS",
-    "colour",
-    "hand_canvas",
-    "in_contact",
-    "layout",
-    "pad_forces_n",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

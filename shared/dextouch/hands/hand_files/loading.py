@@ -335,11 +335,9 @@ def _check_mapping(hand: HandModel, where: str) -> None:
     # Knuckle, PIP, DIP and tip [4, 3] by chain, with all joints at mid-range.
     points_m = hand.chain_points_m(0.5 * (hand.lower_rad + hand.upper_rad)[None])[0]
     across_m = {f.chain: float(points_m[k, 0, 0]) for k, f in enumerate(hand.fingers)}
-    falling_m = [across_m[chain] for chain in CHAINS[1:] if chain in across_m]
-    if any(near <= far for near, far in pairwise(falling_m)):
-        listed = ", ".join(
-            f"{chain} {1e3 * across_m[chain]:.1f} mm" for chain in CHAINS[1:] if chain in across_m
-        )
+    falling_m = {chain: across_m[chain] for chain in CHAINS[1:] if chain in across_m}
+    if any(near <= far for near, far in pairwise(falling_m.values())):
+        listed = ", ".join(f"{chain} {1e3 * x_m:.1f} mm" for chain, x_m in falling_m.items())
         raise InvalidInputError(
             f"{where}: got knuckles along thumb_side at {listed}, expected them to fall "
             "from index to little; check thumb_side, fingers_along and the fingers' chains"
