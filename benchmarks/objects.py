@@ -22,8 +22,7 @@ from dextouch.geometry import invert, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from dextouch.schemas import SceneObjects
 from dextouch.streams import HEAD_CAMERA
-from services.alignment.marker_poses import CameraLens, MarkerTracker
-from services.alignment.marker_sheet import cells_of_markers
+from services.alignment.markers import MarkerTracker, cells_of_markers
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.markers import Markers, marked_objects
 from services.twin.settings import TwinSettings
@@ -175,7 +174,7 @@ def _seen(images: Images, look: str, seed: int) -> Images:
 
 def _ours(take: _Take, images: Images) -> dict[str, Poses]:
     (listed,) = take.objects.tasks.values()
-    tracker = MarkerTracker(listed, take.objects.dictionary, CameraLens(take.K, np.zeros(5)))
+    tracker = MarkerTracker(listed, take.objects.dictionary, take.K, np.zeros(5))
     period_ns = round(1e9 * STRIDE / MODEL_RATE_HZ)
     for index, image in enumerate(images):
         tracker.add(index * period_ns, image, take.Ts_world_camera[index])

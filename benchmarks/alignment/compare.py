@@ -19,14 +19,14 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.schemas import ClockReport, EpisodeAttributes, StoredAnchor
 from dextouch.streams import StreamDescriptor
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
+from services.alignment.synchronization import STAGE_BEGINS
 from services.alignment.synchronization.grid_actions import (
     REQUIRED,
     GriddedStreams,
     make_actions,
     place_streams,
 )
-from services.alignment.synchronization.progress import STAGE_BEGINS
 from services.alignment.synchronization.recorded_streams import (
     Block,
     DatedStream,

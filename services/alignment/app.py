@@ -19,8 +19,7 @@ from dextouch.serving import (
     serve,
     takes,
 )
-from services.alignment.job_runner import JobRunner
-from services.alignment.new_recordings import NewRecordings
+from services.alignment.job_runner import JobRunner, NewRecordings
 from services.alignment.schemas import (
     ENDED,
     MAX_BATCH,

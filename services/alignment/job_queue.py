@@ -25,7 +25,7 @@ from dextouch.errors import (
     UnavailableError,
 )
 from services.alignment.schemas import ENDED, AlignmentJob, AlignmentList, JobState
-from services.alignment.synchronization.progress import Progress
+from services.alignment.synchronization import Progress
 
 logger = structlog.get_logger(__name__)
 

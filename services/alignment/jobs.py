@@ -24,14 +24,14 @@ from dextouch.errors import (
 )
 from dextouch.schemas import Problem, error_from_problem, json_ready, problem_from_error
 from dextouch.serving import Answer, ChildProcess, configure_logging, serve_parent
-from services.alignment.options import AlignmentOptions
-from services.alignment.report import AlignmentReport, report_of
+from services.alignment.schemas import AlignmentReport, report_of
+from services.alignment.settings import AlignmentOptions
+from services.alignment.synchronization import OnProgress, Progress, progress_within
 from services.alignment.synchronization.episode_builder import (
     BuiltEpisode,
     build_episode,
     check_complete,
 )
-from services.alignment.synchronization.progress import OnProgress, Progress, progress_within
 
 logger = structlog.get_logger(__name__)
 

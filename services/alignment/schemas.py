@@ -1,23 +1,35 @@
-"""Request and response bodies of the alignment service, and the states of an alignment job."""
+"""Bodies of the alignment service: requests, jobs with their states, and reports on episodes."""
 
+import re
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from http import HTTPStatus
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import AwareDatetime, Field, FiniteFloat, model_validator
 
+from dextouch.episodes import EpisodeReader
 from dextouch.errors import DexTouchError, UnavailableError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import Problem, StoreId, problem_from_error
-from services.alignment.options import AlignmentOptions
-from services.alignment.report import AlignmentReport
-from services.alignment.synchronization.progress import Progress, Stage
+from dextouch.schemas import ClockReport, Domain, Matrix, Problem, StoreId, problem_from_error
+from services.alignment.calibration.tactile_tare import REASONS
+from services.alignment.settings import AlignmentOptions
+from services.alignment.synchronization import Progress, Stage
+from services.alignment.synchronization.resampling import RefusedPart, refused_parts
 
 MAX_BATCH = 1000
 JobState = Literal["waiting", "running", "done", "failed", "cancelled"]
 # Progress below this share is too little to estimate the remaining time from.
 MIN_ETA_SHARE = 0.05
 ENDED: frozenset[JobState] = frozenset({"done", "failed", "cancelled"})
+EXPECTED_STREAMS = (
+    "tactile_left",
+    "tactile_right",
+    "camera_head",
+    "camera_wrist_left",
+    "camera_wrist_right",
+)
 
 
 class AlignmentRequest(FrozenModel):
@@ -41,6 +53,33 @@ class AlignmentRequest(FrozenModel):
         if self.recording_id is not None:
             return (self.recording_id,)
         return tuple(dict.fromkeys(self.recording_ids or ()))
+
+
+class AlignmentReport(FrozenModel):
+    """Report of one aligned recording.
+
+    `created` is False where the same recording had been aligned with the same options before.
+    `duration_s` is that of the model grid. `absent` lists streams that an episode may have and this
+    one has not; `refused_parts` the stretches of the recording that are not in the episode, and
+    why; `retargeting` figures of each hand: tip error (mean and 95th percentile, mm) and the share
+    of steps by status. `refused_taxels` names, by stream and reason, taxels (anatomical order) that
+    are zero because they were not measured.
+    """
+
+    recording_id: str
+    episode_id: str
+    created: bool
+    domain: Domain
+    num_steps: int
+    duration_s: float = Field(default=0.0, ge=0)
+    streams: dict[str, int]
+    absent: tuple[str, ...]
+    clocks: tuple[ClockReport, ...]
+    quality: dict[str, FiniteFloat]
+    retargeting: dict[str, dict[str, FiniteFloat]] = Field(default={})
+    refused_parts: tuple[RefusedPart, ...] = ()
+    refused_taxels: dict[str, dict[str, tuple[int, ...]]] = Field(default={})
+    content_sha256: str
 
 
 class AlignmentJob(FrozenModel):
@@ -153,6 +192,47 @@ class AlignmentList(FrozenModel):
     alignments: tuple[AlignmentJob, ...]
     num_matching: int = Field(ge=0)
     next_after: str | None = None
+
+
+def report_of(episode: EpisodeReader, *, recording_id: str, created: bool) -> AlignmentReport:
+    """The report of an episode that alignment wrote."""
+    attributes = episode.attributes
+    return AlignmentReport(
+        recording_id=recording_id,
+        episode_id=attributes.episode_id,
+        created=created,
+        domain=attributes.domain,
+        num_steps=episode.num_steps,
+        duration_s=episode.num_steps / attributes.model_rate_hz,
+        streams={name: episode.num_samples(name) for name in episode.streams},
+        absent=tuple(name for name in EXPECTED_STREAMS if name not in episode.streams),
+        clocks=attributes.clocks,
+        quality=attributes.quality,
+        retargeting=_retargeting_figures(attributes.quality),
+        refused_parts=refused_parts(attributes.calibration),
+        refused_taxels=_refused_taxels(attributes.calibration),
+        content_sha256=episode.content_sha256,
+    )
+
+
+def _retargeting_figures(quality: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """By side; empty where nothing was retargeted."""
+    found: dict[str, dict[str, float]] = {}
+    for name, value in quality.items():
+        if match := re.fullmatch(r"retargeting_(left|right)_(.+)", name):
+            found.setdefault(match[1], {})[match[2]] = value
+    return found
+
+
+def _refused_taxels(calibration: Mapping[str, Matrix]) -> dict[str, dict[str, tuple[int, ...]]]:
+    """By stream and reason."""
+    found: dict[str, dict[str, tuple[int, ...]]] = {}
+    for name in ("tactile_left", "tactile_right"):
+        states = np.array(calibration.get(f"{name}_refused_taxels", ()), dtype=np.int64).ravel()
+        for code in np.unique(states[states > 0]).tolist():
+            taxels = tuple(np.flatnonzero(states == code).tolist())
+            found.setdefault(name, {})[REASONS[code]] = taxels
+    return found
 
 
 def _now() -> datetime:

@@ -81,7 +81,7 @@ COMMANDS = {
     "align": Command(
         "convert recordings to synchronized episodes",
         "alignment.command_line:main",
-        "alignment.parser:default_parser",
+        "alignment.settings:default_parser",
     ),
     "align serve": Command("serve alignment over HTTP", "alignment.app:main", "alignment"),
     "train": Command("train the world model, its judge of success, or a policy"),

@@ -32,8 +32,8 @@ from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PLAYED_KINDS, ReplayStream
-from services.alignment.options import AlignmentOptions
 from services.alignment.retargeting import warm_up
+from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization.episode_builder import build_episode
 from services.alignment.synchronization.recorded_streams import EpisodeStream
 from services.episode_store.committing import commit_spool

@@ -143,7 +143,7 @@ def stage_of(task: str, domain: Domain) -> Stage:
 def marked_stage(task: str, domain: Domain) -> tuple[Stage, SceneObjects]:
     """A stage with markers on its objects and a camera that can read them, and their places."""
     # Needs OpenCV, which recording without a station does not.
-    from services.alignment.marker_sheet import cells_of_markers
+    from services.alignment.markers import cells_of_markers
 
     px = _MARKED_IMAGE_PX
     stage = Stage(task, domain, TwinSettings(image_height_px=px, image_width_px=px))

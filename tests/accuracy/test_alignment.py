@@ -19,8 +19,8 @@ from dextouch.schemas import EpisodeAttributes, RecordingAttributes, StoredAncho
 from dextouch.streams import ClockCapabilities, StreamDescriptor
 from dextouch.tactile.layout import expand_taxels
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
 from services.alignment.recording_error import compare_with_truth
+from services.alignment.settings import AlignmentOptions
 from services.twin.hands import HumanHand
 
 DURATION_S = 80 / 15

@@ -15,7 +15,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.episodes.format import decode_commit, encode_commit, group_metadata, sha256_hex
 from dextouch.episodes.spool import SpoolReader
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
 from services.episode_store.catalog import SETTLED_NS, Catalog
 from services.episode_store.committing import commit_spool
 from services.episode_store.filters import EpisodeFilter

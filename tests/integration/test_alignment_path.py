@@ -12,8 +12,8 @@ from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.replay import ReplayStream
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
 from services.alignment.recording_error import compare_with_truth
+from services.alignment.settings import AlignmentOptions
 from tests.accuracy.test_alignment import K_HEAD, write_truth
 
 

@@ -7,7 +7,7 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.streams import SampleBatch, StreamDescriptor, encode_batch
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings
 from services.pipelines.servers import served

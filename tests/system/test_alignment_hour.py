@@ -13,7 +13,7 @@ from tests.system.long_take import write_long_take
 CHILD = """
 import json, sys, threading, time
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
 from services.alignment.retargeting import warm_up
 from dextouch.episodes import EpisodeStore
 

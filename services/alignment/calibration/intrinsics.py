@@ -217,11 +217,7 @@ def _solved(found: FoundBoards) -> tuple[CameraCalibration, float]:
     import cv2
 
     rms_px, K, distortion, turns, _, sigma, _, by_photo = cv2.calibrateCameraExtended(
-        list(found.points_board),
-        list(found.pixels_px),
-        found.image_size_px,
-        np.eye(3),
-        np.zeros(5),
+        list(found.points_board), list(found.pixels_px), found.image_size_px, np.eye(3), np.zeros(5)
     )
     sigma, K = np.asarray(sigma, dtype=np.float64).ravel(), np.asarray(K, dtype=np.float64)
     normals = rotation_from_vector(np.array(turns, dtype=np.float64).reshape(-1, 3))[:, :, 2]

@@ -349,9 +349,7 @@ def right_jacobian_inverse(vectors_rad: np.ndarray) -> Float64[np.ndarray, "*bat
     small = angle < SERIES_ANGLE_RAD
     safe = np.where(small, 1.0, angle)
     factor = np.where(
-        small,
-        1 / 12 + angle**2 / 720,
-        1 / safe**2 - (1 + np.cos(safe)) / (2 * safe * np.sin(safe)),
+        small, 1 / 12 + angle**2 / 720, 1 / safe**2 - (1 + np.cos(safe)) / (2 * safe * np.sin(safe))
     )
     crossed = hat(vectors_rad)
     return np.eye(3) + 0.5 * crossed + factor * (crossed @ crossed)

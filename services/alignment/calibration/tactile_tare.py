@@ -1,4 +1,4 @@
-"""Tare of a glove, and detection of dead, stuck and saturated taxels in takes with contact.
+"""Tare of a glove, detection of faulty taxels, and conversion of raw counts to pressures in kPa.
 
 The tare is the reading and noise of each cell without contact. A taxel is only called faulty on
 evidence: its neighbours (or the others under the same known pressure) moved, and it did not. Where
@@ -53,6 +53,18 @@ MIN_EVIDENCE = 30
 MIN_SILENT = 0.95
 MIN_OWN_MOVES = 10
 BLOCK = 600
+
+# Why a taxel of a take is not measured: what the calibration says, or that it has no reading.
+REASONS = (*STATES, "absent")
+ABSENT = len(STATES)
+# A cell that never moves is dead if it rests further than this from its tare.
+DEAD_OFFSET_KPA = 1.0
+MIN_SAMPLES_TO_JUDGE = 30
+# A cell without a reading in more samples than this is refused; else those samples are left out.
+MAX_MISSING = 0.1
+NO_CELL = -1
+
+Record = Mapping[str, Sequence[Sequence[float]]]
 
 
 @dataclass(frozen=True)
@@ -154,10 +166,7 @@ def checked_counts(counts: np.ndarray, *, what: str) -> Float64[np.ndarray, "tim
 
 
 def classify_taxels(
-    takes: Sequence[np.ndarray],
-    tare: TaxelTare,
-    *,
-    full_scale_counts: float = FULL_SCALE_COUNTS,
+    takes: Sequence[np.ndarray], tare: TaxelTare, *, full_scale_counts: float = FULL_SCALE_COUNTS
 ) -> UInt8[np.ndarray, "320"]:
     """State of each taxel (index into `STATES`, anatomical order) from takes with contact.
 
@@ -242,21 +251,6 @@ def _least_neighbour(moved: Float64[np.ndarray, "time 320"]) -> Float64[np.ndarr
     around.sort(axis=2)
     rank = np.floor(STILL_NEIGHBOURS * _NUM_NEIGHBOURS).astype(np.int64)
     return np.take_along_axis(around, rank[None, :, None], axis=2)[..., 0]
-
-
-# Conversion of a glove's raw counts to pressures in kPa, and detection of unusable taxels.
-
-# Why a taxel of a take is not measured: what the calibration says, or that it has no reading.
-REASONS = (*STATES, "absent")
-ABSENT = len(STATES)
-# A cell that never moves is dead if it rests further than this from its tare.
-DEAD_OFFSET_KPA = 1.0
-MIN_SAMPLES_TO_JUDGE = 30
-# A cell without a reading in more samples than this is refused; else those samples are left out.
-MAX_MISSING = 0.1
-NO_CELL = -1
-
-Record = Mapping[str, Sequence[Sequence[float]]]
 
 
 @dataclass(frozen=True)

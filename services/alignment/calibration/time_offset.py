@@ -48,10 +48,7 @@ class TimeOffset:
 
 
 def estimate_time_offset(
-    t_a_ns: np.ndarray,
-    signal_a: np.ndarray,
-    t_b_ns: np.ndarray,
-    signal_b: np.ndarray,
+    t_a_ns: np.ndarray, signal_a: np.ndarray, t_b_ns: np.ndarray, signal_b: np.ndarray
 ) -> TimeOffset:
     """Estimate the offset between two streams that measured the same motion.
 
@@ -171,10 +168,7 @@ def _low_passed(
 
 
 def _coarse(
-    grid_a: np.ndarray,
-    a: np.ndarray,
-    stream_b: tuple[np.ndarray, np.ndarray],
-    step_s: float,
+    grid_a: np.ndarray, a: np.ndarray, stream_b: tuple[np.ndarray, np.ndarray], step_s: float
 ) -> float:
     """The offset of highest correlation on the grid, if it is the only high one."""
     grid_b, b = stream_b

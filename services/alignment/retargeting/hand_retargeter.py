@@ -9,11 +9,7 @@ from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.hands.robot_hand import HandModel, RobotHand
 from services.alignment.retargeting.hand_checks import checked_keypoints
-from services.alignment.retargeting.hand_profile import (
-    HandProfile,
-    measure_profile,
-    person_arrays,
-)
+from services.alignment.retargeting.hand_profile import HandProfile, measure_profile, person_arrays
 from services.alignment.retargeting.solver.arrays import (
     IMPLAUSIBLE,
     NOMINAL_PERIOD_S,

@@ -1,4 +1,4 @@
-"""Offset of the robot's wrist that puts its contact points where the human's were.
+"""Transfer of a tracked hand to the robot so that it touches where the person did.
 
 A robot hand is larger than a human one and has different proportions. With a copied wrist pose its
 fingertips and palm are centimetres away from those of the human, and so is its grasp. The wrist is
@@ -6,8 +6,12 @@ therefore shifted, in wrist axes, until the points in contact match the human's:
 
     T_world_robot = T_world_human @ T_human_robot,  T_human_robot = (identity rotation, offset)
 
-The orientation is unchanged. Neither task nor object is used, only both hands and, with a glove,
-its touch.
+The orientation is unchanged. The shifted hand has the person's posture, but around an object its
+fingertips still miss the human contact points. The solver closes pinches; with an object in
+between, only touch shows which fingertips matter. Those are moved to the human positions, each
+finger by its own four joints, near the retargeted angles; fingers without contact are unchanged.
+Neither task nor object is used, only both hands and, with a glove, its touch; without touch only a
+constant shift remains.
 """
 
 from dataclasses import dataclass
@@ -23,6 +27,20 @@ from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
 _TIPS = [NODE_INDEX[chain, "tip"] for chain in CHAINS]
 _PALM = [NODE_INDEX[WRIST, WRIST], *(NODE_INDEX[chain, "proximal"] for chain in CHAINS[1:])]
 NUM_PADS = 6
+# Time constant: a contact has the weight exp(-|Δt| / reach) at other times, so that an approach has
+# the offset of the grasp that follows, and fingertips move smoothly.
+REACH_S: Final = 0.3
+# Weight of the constant offset relative to touch (force × time). Far from any contact, and without
+# contact, only the constant offset counts.
+ANCHOR_N_S: Final = 0.005
+# Force (times its weight) at which a fingertip is moved half of the distance.
+HALF_FORCE_N: Final = 0.1
+# Weight of the deviation from the retargeted angles.
+STAY_M2_RAD2: Final = 1e-5
+# A few steps converge to micrometres; unreachable positions take more.
+_ITERATIONS: Final = 15
+# Smaller shares would move a fingertip by micrometres only: these fingers are unchanged.
+_NO_SHARE: Final = 1e-3
 
 
 @dataclass(frozen=True)
@@ -43,26 +61,6 @@ class MatchedPoints:
     def offset_m(self) -> Float64[np.ndarray, "time 6 3"]:
         """Wrist offset that makes each point match; zero where not tracked."""
         return np.where(self.seen[..., None], self.human_m - self.robot_m, 0.0)
-
-
-@dataclass(frozen=True)
-class WristTransferOptions:
-    """Influence of touch on the offset.
-
-    Args:
-        reach_s: time constant: a contact has the weight exp(-|Δt| / reach) at other times, so an
-            approach uses the offset of the grasp that follows.
-        anchor_n_s: weight of the constant offset relative to touch (force × time). Far from any
-            contact, and without contact, only the constant offset counts.
-    """
-
-    reach_s: float = 0.3
-    anchor_n_s: float = 0.005
-
-    def __post_init__(self) -> None:
-        for name, value in (("reach_s", self.reach_s), ("anchor_n_s", self.anchor_n_s)):
-            if not 0 < value < np.inf:
-                raise InvalidInputError(f"wrist transfer: got {name} {value}, expected > 0")
 
 
 def matched_points(
@@ -121,10 +119,7 @@ def constant_offset_m(points: MatchedPoints) -> Float64[np.ndarray, "3"]:
 
 
 def touch_offsets_m(
-    points: MatchedPoints,
-    pad_forces_n: np.ndarray,
-    t_s: np.ndarray,
-    options: WristTransferOptions | None = None,
+    points: MatchedPoints, pad_forces_n: np.ndarray, t_s: np.ndarray
 ) -> Float64[np.ndarray, "time 3"]:
     """Offset for every sample: mean over points in contact, weighted by force and time difference.
 
@@ -138,14 +133,12 @@ def touch_offsets_m(
         pad_forces_n: [T, 6] forces on thumb … little fingertip and palm, 0 or more
             (`dextouch.tactile.pad_forces_n`).
         t_s: [T] increasing times with any origin.
-        options: default: `WristTransferOptions()`.
 
     Raises:
         ShapeError: shapes that do not fit.
         NonFiniteError: forces or times that are not finite.
         InvalidInputError: times that do not increase, or a negative force.
     """
-    options = options or WristTransferOptions()
     forces, times = _checked(len(points.seen), pad_forces_n, t_s)
     # Samples are weighted by their duration, so that the result does not depend on the rate.
     lasts_s = np.gradient(times) if len(times) > 1 else np.ones(1)
@@ -153,10 +146,10 @@ def touch_offsets_m(
     moments = np.concatenate(
         [(weight[..., None] * points.offset_m).sum(axis=1), weight.sum(axis=1, keepdims=True)], 1
     )
-    pooled = _decaying_sums(moments, times, options.reach_s)
-    anchor = options.anchor_n_s
-    offset = pooled[:, :3] + anchor * constant_offset_m(points)
-    return np.asarray(offset / (pooled[:, 3:] + anchor))
+    before, after = _decaying(moments, times, np.add)
+    pooled = before + after - moments
+    offset = pooled[:, :3] + ANCHOR_N_S * constant_offset_m(points)
+    return np.asarray(offset / (pooled[:, 3:] + ANCHOR_N_S))
 
 
 def _checked(
@@ -177,17 +170,17 @@ def _checked(
     return forces, times
 
 
-def _decaying_sums(
-    values: Float64[np.ndarray, "time 4"], t_s: np.ndarray, reach_s: float
-) -> Float64[np.ndarray, "time 4"]:
-    """Σ_s exp(-|t - s| / reach) values(s) at every t, in linear time."""
-    keep = np.exp(-np.diff(t_s) / reach_s)
+def _decaying(
+    values: Float64[np.ndarray, "time n"], t_s: np.ndarray, combine: np.ufunc
+) -> tuple[Float64[np.ndarray, "time n"], Float64[np.ndarray, "time n"]]:
+    """Values combined with exp(-|t - s| / reach) of those before, and of those after; O(n)."""
+    keep = np.exp(-np.diff(t_s) / REACH_S)
     before, after = values.copy(), values.copy()
     for index, factor in enumerate(keep, start=1):
-        before[index] += factor * before[index - 1]
+        before[index] = combine(before[index], factor * before[index - 1])
     for index in range(len(keep) - 1, -1, -1):
-        after[index] += keep[index] * after[index + 1]
-    return before + after - values
+        after[index] = combine(after[index], keep[index] * after[index + 1])
+    return before, after
 
 
 def shifted_wrist(
@@ -198,54 +191,11 @@ def shifted_wrist(
     Args:
         Ts_world_human: [T, 4, 4].
         offset_m: [3] or [T, 3].
-
-    Raises:
-        ShapeError: other shapes.
     """
     Ts = np.array(Ts_world_human, dtype=np.float64)
-    offsets = np.asarray(offset_m, dtype=np.float64)
-    if Ts.shape[1:] != (4, 4) or offsets.shape not in {(3,), (len(Ts), 3)}:
-        raise ShapeError(
-            f"wrist transfer: got poses {Ts.shape} and offsets {offsets.shape}, expected "
-            "[T, 4, 4] and [3] or [T, 3]"
-        )
-    shift_world = Ts[:, :3, :3] @ np.broadcast_to(offsets, (len(Ts), 3))[..., None]
+    shift_world = Ts[:, :3, :3] @ np.broadcast_to(offset_m, (len(Ts), 3))[..., None]
     Ts[:, :3, 3] += shift_world[..., 0]
     return Ts
-
-
-# Correction of retargeted joint angles that moves fingertips in contact to the human positions.
-#
-# Retargeting by bone directions gives the same posture, but on a larger hand: around an object its
-# fingertips miss the human contact points. The solver closes pinches; with an object in between,
-# only touch shows which fingertips matter. Those are moved to the human positions, each finger by
-# its own four joints, near the retargeted angles. Fingers without contact are unchanged.
-
-# A few steps converge to micrometres; unreachable positions take more.
-_ITERATIONS: Final = 15
-# Smaller shares would move a fingertip by micrometres only: these fingers are unchanged.
-_NO_SHARE: Final = 1e-3
-
-
-@dataclass(frozen=True)
-class TouchAnchorOptions:
-    """Influence of touch on fingertips.
-
-    Args:
-        reach_s: time constant: a contact has the weight exp(-|Δt| / reach) at other times, so that
-            the correction is smooth.
-        half_force_n: force (times that weight) at which a fingertip is moved half of the distance.
-        stay_m2_rad2: weight of the deviation from the retargeted angles.
-    """
-
-    reach_s: float = 0.3
-    half_force_n: float = 0.1
-    stay_m2_rad2: float = 1e-5
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 < value < np.inf:
-                raise InvalidInputError(f"touch anchor: got {name} {value}, expected > 0")
 
 
 def anchored_joints(
@@ -254,7 +204,6 @@ def anchored_joints(
     points: MatchedPoints,
     offset_m: np.ndarray,
     shares: np.ndarray,
-    options: TouchAnchorOptions | None = None,
 ) -> Float64[np.ndarray, "time 20"]:
     """Joint angles, inside the limits, that move fingertips in contact to the human positions.
 
@@ -264,66 +213,28 @@ def anchored_joints(
         points: points of both hands at these angles (`matched_points`).
         offset_m: [T, 3], offset of the robot's wrist in the human wrist frame (`touch_offsets_m`).
         shares: [T, 5], share of the distance that each fingertip is moved (`touch_shares`).
-        options: default: `TouchAnchorOptions()`.
-
-    Raises:
-        ShapeError: lengths that differ.
     """
-    options = options or TouchAnchorOptions()
     joints = np.array(joints_rad, dtype=np.float64)
-    shapes = (joints.shape, np.shape(offset_m), np.shape(shares))
-    num = len(points.seen)
-    if shapes != ((num, NUM_JOINTS), (num, 3), (num, NUM_FINGERS)):
-        raise ShapeError(
-            f"touch anchor: got joints, offsets, shares {shapes}, expected [{num}, {NUM_JOINTS}], "
-            f"[{num}, 3], [{num}, {NUM_FINGERS}]"
-        )
     share = np.where(points.seen[:, :NUM_FINGERS], shares, 0.0)
     rows = np.flatnonzero((share > _NO_SHARE).any(axis=1))
     if rows.size:
         way = (points.offset_m[:, :NUM_FINGERS] - offset_m[:, None])[rows]
         moving = share[rows] > _NO_SHARE
         way = np.where(moving[..., None], way * share[rows][..., None], 0.0)
-        moved = _led(hand, joints[rows], way, options.stay_m2_rad2)
+        moved = _led(hand, joints[rows], way)
         keep = np.repeat(~moving, NUM_JOINTS // NUM_FINGERS, axis=1)
         joints[rows] = np.where(keep, joints[rows], moved)
     return joints
 
 
-def touch_shares(
-    pad_forces_n: np.ndarray, t_s: np.ndarray, options: TouchAnchorOptions | None = None
-) -> Float64[np.ndarray, "time 5"]:
+def touch_shares(pad_forces_n: np.ndarray, t_s: np.ndarray) -> Float64[np.ndarray, "time 5"]:
     """Share of the distance to the human position that each fingertip is moved.
 
-    It is 0 without contact and near 1 with contact.
-
-    Args:
-        pad_forces_n: [T, 6], thumb … little fingertip and palm, 0 or more.
-        t_s: [T] increasing times.
-        options: default: `TouchAnchorOptions()`.
-
-    Raises:
-        ShapeError: lengths that differ.
-        InvalidInputError: times that do not increase, or forces that are negative or not finite.
+    It is 0 without contact and near 1 with contact. Arguments and errors as `touch_offsets_m`.
     """
-    options = options or TouchAnchorOptions()
-    forces, times = np.asarray(pad_forces_n, dtype=np.float64), np.asarray(t_s, dtype=np.float64)
-    if forces.ndim != 2 or forces.shape != (len(times), NUM_FINGERS + 1):
-        raise ShapeError(
-            f"touch anchor: got forces {forces.shape} and times {times.shape}, expected [T, "
-            f"{NUM_FINGERS + 1}] and [T]"
-        )
-    if not ((np.diff(times) > 0).all() and (forces >= 0).all() and np.isfinite(forces).all()):
-        raise InvalidInputError(
-            "touch anchor: expected increasing times and finite forces ≥ 0; sort and calibrate them"
-        )
-    near = forces[:, :NUM_FINGERS].copy()
-    keep = np.exp(-np.diff(times) / options.reach_s)
-    for index, factor in enumerate(keep, start=1):
-        near[index] = np.maximum(near[index], factor * near[index - 1])
-    for index in range(len(keep) - 1, -1, -1):
-        near[index] = np.maximum(near[index], keep[index] * near[index + 1])
-    return near / (near + options.half_force_n)
+    forces, times = _checked(len(t_s), pad_forces_n, t_s)
+    near = np.maximum(*_decaying(forces[:, :NUM_FINGERS], times, np.maximum))
+    return near / (near + HALF_FORCE_N)
 
 
 def fingertip_jacobians(
@@ -337,12 +248,9 @@ def fingertip_jacobians(
     return tips, np.swapaxes(moves, -1, -2)
 
 
-def _led(
-    hand: RobotHand, joints_rad: np.ndarray, way_m: np.ndarray, stay: float
-) -> Float64[np.ndarray, "time 20"]:
+def _led(hand: RobotHand, first: np.ndarray, way_m: np.ndarray) -> Float64[np.ndarray, "time 20"]:
     """Gauss–Newton on |tip - goal|² + stay · |q - q0|² for each finger, cut at the limits."""
-    first = joints_rad
-    goal = hand.fingertips_m(first) + way_m
+    goal, stay = hand.fingertips_m(first) + way_m, STAY_M2_RAD2
     joints = first
     for _ in range(_ITERATIONS):
         tips, jacobian = fingertip_jacobians(hand, joints)
@@ -355,22 +263,6 @@ def _led(
     return joints
 
 
-# Transfer of a tracked hand to the robot so that it touches where the person did.
-#
-# Retargeting gives the person's posture on a larger hand. Where touch was recorded, the robot's
-# wrist is shifted (`wrist_transfer`) and its touching fingertips are moved (`touch_anchor`), so
-# that the points in contact coincide. Without touch only a constant shift remains.
-
-
-@dataclass(frozen=True)
-class TransferredHand:
-    """Reached poses of the robot's hand; `offset_m` is the shift of the wrist in its own axes."""
-
-    Ts_world_wrist: Float64[np.ndarray, "time 4 4"]
-    joints_rad: Float64[np.ndarray, "time 20"]
-    offset_m: Float64[np.ndarray, "time 3"]
-
-
 def transfer_by_touch(
     hand: RobotHand,
     Ts_world_human: Float64[np.ndarray, "time 4 4"],
@@ -379,7 +271,9 @@ def transfer_by_touch(
     keypoints_m: Float64[np.ndarray, "time 25 3"],
     pad_forces_n: Float64[np.ndarray, "time 6"],
     t_s: Float64[np.ndarray, " time"],
-) -> TransferredHand:
+) -> tuple[
+    Float64[np.ndarray, "time 4 4"], Float64[np.ndarray, "time 20"], Float64[np.ndarray, "time 3"]
+]:
     """Shift the wrist and move touching fingertips to the person's positions.
 
     Args:
@@ -390,6 +284,10 @@ def transfer_by_touch(
         pad_forces_n: forces on thumb … little fingertip and palm; zeros without a glove.
         t_s: increasing times with any origin.
 
+    Returns:
+        T_world_robot of the wrist and joint angles of the robot, and the shift (m) of its wrist in
+        the wrist's own axes.
+
     Raises:
         ShapeError: lengths that differ.
         InvalidInputError: no fingertip and no palm was ever tracked.
@@ -398,4 +296,4 @@ def transfer_by_touch(
     offset_m = touch_offsets_m(points, pad_forces_n, t_s)
     shares = touch_shares(pad_forces_n, t_s)
     joints = anchored_joints(hand, joints_rad, points, offset_m, shares)
-    return TransferredHand(shifted_wrist(Ts_world_human, offset_m), joints, offset_m)
+    return shifted_wrist(Ts_world_human, offset_m), joints, offset_m

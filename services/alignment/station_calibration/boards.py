@@ -37,6 +37,29 @@ _SIZES = {
     "chessboard": re.compile(rf"(\d+)x(\d+){_LENGTH}"),
     "charuco": re.compile(rf"(\d+)x(\d+){_LENGTH}{_LENGTH}(?::(\w+))?"),
 }
+# With fewer views than this the focal length scatters by more than 0.3 % (docs/calibration.md).
+ENOUGH_VIEWS = 25
+# Three of these sigmas are 0.3 % of the focal length.
+MAX_FOCAL_SIGMA = 0.001
+VIEWS_PER_REGION = 2
+VIEWS_PER_TILT = 2
+# Distortion is largest at the rim: corners must come within this part of every edge.
+RIM = 0.15
+EDGES = ("left", "upper", "right", "lower")
+MIN_TILT_RAD = np.deg2rad(15.0)
+MIN_SIZE_RATIO = 1.5
+ENOUGH_HAND_EYE_VIEWS = 20
+ENOUGH_TURN_RAD = np.deg2rad(15.0)
+REGIONS = np.array(
+    [[f"{y} {x}" for x in ("left", "centre", "right")] for y in ("upper", "middle", "lower")]
+)
+# Directions of the board's normal, right and down, in which an edge is nearer to the camera.
+TILTS = {
+    "its left edge nearer": (1.0, 0.0),
+    "its right edge nearer": (-1.0, 0.0),
+    "its upper edge nearer": (0.0, 1.0),
+    "its lower edge nearer": (0.0, -1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -239,31 +262,6 @@ def _dark_first(photo: np.ndarray, pixels: np.ndarray, board: Chessboard) -> np.
     ends = [grid[:2, :2].mean(axis=(0, 1)), grid[-2:, -2:].mean(axis=(0, 1))]
     first, last = (photo[round(float(y)), round(float(x))] for x, y in ends)
     return pixels if first < last else pixels[::-1].copy()
-
-
-# With fewer views than this the focal length scatters by more than 0.3 % (docs/calibration.md).
-ENOUGH_VIEWS = 25
-# Three of these sigmas are 0.3 % of the focal length.
-MAX_FOCAL_SIGMA = 0.001
-VIEWS_PER_REGION = 2
-VIEWS_PER_TILT = 2
-# Distortion is largest at the rim: corners must come within this part of every edge.
-RIM = 0.15
-EDGES = ("left", "upper", "right", "lower")
-MIN_TILT_RAD = np.deg2rad(15.0)
-MIN_SIZE_RATIO = 1.5
-ENOUGH_HAND_EYE_VIEWS = 20
-ENOUGH_TURN_RAD = np.deg2rad(15.0)
-REGIONS = np.array(
-    [[f"{y} {x}" for x in ("left", "centre", "right")] for y in ("upper", "middle", "lower")]
-)
-# Directions of the board's normal, right and down, in which an edge is nearer to the camera.
-TILTS = {
-    "its left edge nearer": (1.0, 0.0),
-    "its right edge nearer": (-1.0, 0.0),
-    "its upper edge nearer": (0.0, 1.0),
-    "its lower edge nearer": (0.0, -1.0),
-}
 
 
 @dataclass(frozen=True)

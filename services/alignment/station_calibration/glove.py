@@ -1,25 +1,337 @@
-"""Calibration of a glove: tare, gain and fault map of the taxels, from takes."""
+"""Calibration of a glove: tare, gain and fault map of the taxels, from takes.
+
+Takes are named ones, or those that a running station records now.
+"""
 
 import argparse
-from collections.abc import Sequence
+import csv
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from itertools import count
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from dextouch.clients import HttpLink, Reply
 from dextouch.command_line import progress
-from dextouch.errors import InvalidInputError
-from services.alignment.calibration.tactile_gain import TaxelGain, calibrate_glove
+from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
+from dextouch.streams import SampleBatch
+from services.alignment.calibration.tactile_gain import (
+    TaxelGain,
+    TaxelPress,
+    calibrate_glove,
+    fit_gain,
+    pad_taxels,
+)
 from services.alignment.calibration.tactile_tare import OK, STATES, TaxelTare, measure_tare
 from services.alignment.station_calibration.camera_views import glove_picture
-from services.alignment.station_calibration.glove_takes import (
-    Guide,
-    PressRow,
-    Say,
-    press_of,
-    read_presses,
-    read_take,
-    record_takes,
+from services.alignment.station_calibration.record import (
+    MATRICES_FILE,
+    read_rows,
+    read_stream,
+    write_entry,
+    write_picture,
 )
-from services.alignment.station_calibration.record import MATRICES_FILE, write_entry, write_picture
+
+STANDARD_GRAVITY_M_S2 = 9.80665
+REST_S, PRESS_S, TICK_S = 10.0, 5.0, 0.1
+# Timeout of an upload.
+UPLOAD_S = 120.0
+TASK = "calibrate-glove"
+COLUMNS = ("take", "pressure_kpa", "sigma_kpa", "pads")
+EXPECTED = (
+    "CSV with the columns take and pressure_kpa, or mass_kg and area_cm2; optional are sigma_kpa, "
+    "pads, start_s, stop_s"
+)
+PRESS_HELP = "30, or 30 palm, or 30 thumb+index (kPa), or 2kg/90cm2 palm (a weight)"
+NEXT = "Next pressure (Enter alone: no more; drop: forget the last): "
+# Groups are named as the columns of the list of presses.
+_PRESS = re.compile(
+    r"(?:(?P<pressure_kpa>[0-9.]+)(?: ?kpa)?"
+    r"|(?P<mass_kg>[0-9.]+) ?kg ?/ ?(?P<area_cm2>[0-9.]+) ?cm2)(?: +(?P<pads>[a-z+]+))?"
+)
+
+Found = TypeVar("Found")
+Say = Callable[[str], None]
+
+
+class PressRow(BaseModel):
+    """One row of the list of presses, by default of the whole take.
+
+    Instead of `pressure_kpa`, a weight may be given by `mass_kg` and `area_cm2`.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    take: str
+    pressure_kpa: float = Field(gt=0)
+    sigma_kpa: float | None = Field(default=None, ge=0)
+    pads: str = "all"
+    start_s: float = 0.0
+    stop_s: float = math.inf
+
+    @model_validator(mode="before")
+    @classmethod
+    def _pressure_of_weight(cls, given: dict[str, Any]) -> dict[str, Any]:
+        weight = {"mass_kg", "area_cm2"}
+        if not weight & given.keys():
+            return given
+        if "pressure_kpa" in given:
+            raise ValueError("got pressure_kpa and a weight, expected one of the two")
+        mass_kg, area_cm2 = float(given.get("mass_kg", 0)), float(given.get("area_cm2", 0))
+        if not (mass_kg > 0 and area_cm2 > 0):
+            raise ValueError("expected mass_kg and area_cm2, both above 0")
+        pressure_kpa = mass_kg * STANDARD_GRAVITY_M_S2 / (area_cm2 * 1e-4) / 1e3
+        return {n: v for n, v in given.items() if n not in weight} | {"pressure_kpa": pressure_kpa}
+
+    def known_to(self, relative_sigma: float) -> "PressRow":
+        """The row with a sigma; without one of its own, a share of the pressure."""
+        if self.sigma_kpa is not None:
+            return self
+        return self.model_copy(update={"sigma_kpa": relative_sigma * self.pressure_kpa})
+
+
+def read_presses(path: Path, relative_sigma: float) -> list[PressRow]:
+    """Read the list of presses; takes beside the file may be named by their folder alone."""
+    rows = []
+    for row in read_rows(path, PressRow, "press", EXPECTED):
+        beside = path.parent / row.take
+        take = str(beside) if beside.is_dir() else row.take
+        rows.append(row.known_to(relative_sigma).model_copy(update={"take": take}))
+    return rows
+
+
+def write_presses(path: Path, rows: Sequence[PressRow]) -> None:
+    """Write the list for `read_presses`, so that a calibration can be repeated."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerows([COLUMNS, *([getattr(row, name) for name in COLUMNS] for row in rows)])
+
+
+def parse_press(words: str, relative_sigma: float) -> PressRow:
+    """Parse a pressure typed by the operator (`PRESS_HELP`), before its take."""
+    matched = _PRESS.fullmatch(words.strip().lower())
+    groups = matched.groupdict() if matched else {}
+    given = {name: text for name, text in groups.items() if text}
+    try:
+        row = PressRow.model_validate({"take": ""} | given)
+    except ValidationError as error:
+        raise InvalidInputError(
+            f"pressure: got {words!r}, expected {PRESS_HELP}, above 0"
+        ) from error
+    pad_taxels(row.pads)
+    return row.known_to(relative_sigma)
+
+
+def read_take(take: str, options: argparse.Namespace) -> SampleBatch:
+    """Raw counts of one glove from a spool folder, or from a recording of the store."""
+    taken = read_stream(take, f"tactile_{options.side}", options.store)
+    if taken.descriptor.unit != "counts":
+        raise InvalidInputError(
+            f"take {take!r}: {taken.descriptor.name} is in {taken.descriptor.unit}, expected raw "
+            "counts"
+        )
+    return taken.batch
+
+
+def press_of(row: PressRow, options: argparse.Namespace) -> TaxelPress:
+    """The readings of one press."""
+    batch = read_take(row.take, options)
+    t_s = (batch.t_host_ns - batch.t_host_ns[:1]) * 1e-9
+    counts = batch.values[(t_s >= row.start_s) & (t_s < row.stop_s)]
+    return TaxelPress(row.pressure_kpa, row.sigma_kpa or 0.0, counts, pad_taxels(row.pads))
+
+
+class Guide:
+    """Leads an operator, who lays the glove down and presses it while a station records takes.
+
+    An invalid take is explained and repeated.
+
+    Args:
+        options: of the command.
+        request: sends a request to the station, as `HttpLink.request`.
+        ask: puts a question to the operator.
+        say: tells the operator something.
+        wait: sleeps.
+    """
+
+    def __init__(
+        self,
+        options: argparse.Namespace,
+        request: Callable[..., Reply],
+        *,
+        ask: Callable[[str], str] = input,
+        say: Say = print,
+        wait: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._options, self._request, self._ask, self._wait = options, request, ask, wait
+        self.say = say
+        started = f"calibration-glove-{options.side}-{datetime.now(UTC):%Y%m%d-%H%M%S}"
+        self._names = (f"{started}-{number}" for number in count(1))
+
+    def rest(self) -> tuple[str, TaxelTare]:
+        """Record a rest take with a valid tare."""
+        side = self._options.side
+        while True:
+            self._answer(
+                f"Lay the {side} glove down, untouched, and let it rest for a minute. "
+                f"Enter records {REST_S:g} s: "
+            )
+            try:
+                return self.record(
+                    next(self._names),
+                    f"{side} glove at rest, untouched",
+                    REST_S,
+                    lambda take: measure_tare(read_take(take, self._options).values, side=side),
+                )
+            except InvalidInputError as error:
+                self.say(f"Once more: {error.message}")
+
+    def presses(self, tare: TaxelTare) -> list[PressRow]:
+        """Record presses until the operator is done."""
+        self.say(
+            f"Now two to four known pressures, the highest as high as work needs: {PRESS_HELP}."
+        )
+        known: list[tuple[PressRow, TaxelPress]] = []
+        while words := self._answer(NEXT).strip():
+            if words == "drop":
+                known = known[:-1]
+                self.say(f"{len(known)} presses are left")
+                continue
+            try:
+                wanted = parse_press(words, self._options.pressure_sigma)
+            except (InvalidInputError, UnknownNameError) as error:
+                self.say(error.message)
+                continue
+            try:
+                known.append(self._press(wanted, tare))
+            except InvalidInputError as error:
+                self.say(f"Not used: {error.message}")
+                continue
+            self.say(self._known_so_far(tare, [press for _, press in known]))
+        return [row for row, _ in known]
+
+    def _press(self, wanted: PressRow, tare: TaxelTare) -> tuple[PressRow, TaxelPress]:
+        """Record a press that determines a gain on its own."""
+        target = f"{wanted.pressure_kpa:.4g} kPa on {wanted.pads}"
+        self._answer(f"Put {target}. Enter records {PRESS_S:g} s, once it holds still: ")
+
+        def check(take: str) -> tuple[PressRow, TaxelPress]:
+            row = wanted.model_copy(update={"take": take})
+            press = press_of(row, self._options)
+            fit_gain(tare, [press], full_scale_counts=self._options.full_scale)
+            return row, press
+
+        return self.record(next(self._names), f"{target}, held still", PRESS_S, check)[1]
+
+    def _known_so_far(self, tare: TaxelTare, presses: list[TaxelPress]) -> str:
+        try:
+            found = calibrate_glove(
+                tare, presses, full_scale_counts=self._options.full_scale
+            ).num_by_state()
+        except InvalidInputError as error:
+            return f"{len(presses)} presses, not enough yet: {error.message}"
+        others = ", ".join(f"{n} {state}" for state, n in found.items() if state != "ok")
+        return (
+            f"{len(presses)} presses: {found['ok']} of 320 taxels known"
+            f"{f' ({others})' if others else ''}; more pressures show bends"
+        )
+
+    def _answer(self, question: str) -> str:
+        try:
+            return self._ask(question)
+        except EOFError as error:
+            raise InvalidInputError(
+                "calibrate glove --url: nobody answers; run it at a terminal, or name takes with "
+                "--rest and --presses"
+            ) from error
+
+    def record(
+        self, name: str, words: str, seconds: float, check: Callable[[str], Found]
+    ) -> tuple[str, Found]:
+        """Record a valid take; interrupted and invalid ones are discarded.
+
+        Args:
+            name: id of the take.
+            words: description for the operator, also the take's instruction.
+            seconds: duration.
+            check: raises an error for an invalid take. If takes are only in the store, it runs
+                after the take is saved.
+
+        Returns:
+            The take's folder in the spool, or its id in the store; and the result of the check.
+
+        Raises:
+            ConflictError: the recorder is busy with another take; save or discard that.
+        """
+        self._act("arm", {"task": TASK, "instruction": words})
+        self._act("record", {"recording_id": name})
+        take, found = str((self._options.spool / name).resolve()), None
+        with ExitStack() as undo:
+            undo.callback(self._act, "discard", {"recording_id": name})
+            num_ticks = round(seconds / TICK_S)
+            for _ in progress(range(num_ticks), words, num_ticks):
+                self._wait(TICK_S)
+            self._act("stop", {"recording_id": name})
+            if Path(take).is_dir():
+                found = check(take)
+            undo.pop_all()
+        # Other devices may be absent; the presence of the glove shows in its readings.
+        self._act("save", {"recording_id": name, "accept_incomplete": True})
+        if found is None:
+            take = self._await_upload(name)
+            found = check(take)
+        return take, found
+
+    def _act(self, action: str, body: dict[str, object]) -> None:
+        self._request("POST", f"/v1/recorder/{action}", body=json.dumps(body).encode())
+
+    def _await_upload(self, name: str) -> str:
+        """Wait for the upload and return the take's id in the store."""
+        if self._options.store is None:
+            raise NotFoundError(
+                f"take {name!r}: not in {self._options.spool.resolve()}; name the station's spool "
+                "with --spool, or on another machine its store with --store URL"
+            )
+        num_tries = round(UPLOAD_S)
+        for _ in progress(range(num_tries), "waiting for the upload", num_tries):
+            uploads = json.loads(self._request("GET", "/v1/uploads").body)
+            for take in uploads:
+                if take["recording_id"] == name and take["uploaded"]:
+                    return str(take.get("stored_as") or name)
+            self._wait(1.0)
+        raise NotFoundError(
+            f"take {name!r}: the station did not upload it within {UPLOAD_S:g} s; look at its "
+            "uploads, then calibrate with --rest and --presses"
+        )
+
+
+def record_takes(
+    options: argparse.Namespace, guide: Guide | None = None
+) -> tuple[str, list[PressRow]]:
+    """Lead an operator through rest and presses; returns the rest take and valid presses.
+
+    The list of presses is stored in the folder, so that the calibration can be repeated from the
+    same takes.
+    """
+    guide = guide or Guide(options, HttpLink(options.url, api_key=options.key).request)
+    rest, tare = guide.rest()
+    rows = guide.presses(tare)
+    again = f"dextouch station calibrate glove --side {options.side} --rest {rest}"
+    if rows:
+        path = options.to / f"presses_{options.side}.csv"
+        write_presses(path, rows)
+        again += f" --presses {path}"
+    guide.say(f"The same takes again: {again} --to {options.to}")
+    return rest, rows
 
 
 def calibrate(

@@ -84,7 +84,7 @@ def _is_companion(name: str, matrices: Mapping[str, Matrix]) -> bool:
     return camera != name and f"K_{camera}" in matrices
 
 
-def _entry_of(name: str) -> str:
+def entry_of(name: str) -> str:
     """The entry that a matrix belongs to: its name without the unit."""
     for unit in ("_counts_per_kpa", "_counts", "_ns"):
         name = name.removesuffix(unit)
@@ -93,7 +93,7 @@ def _entry_of(name: str) -> str:
 
 def _judge(name: str, matrices: Mapping[str, Matrix], now: datetime) -> Finding:
     reasons, made_at, age_days = [], None, None
-    stamp = matrices.get(f"{_entry_of(name)}_calibrated_at_unix_s")
+    stamp = matrices.get(f"{entry_of(name)}_calibrated_at_unix_s")
     if stamp is None:
         reasons.append(f"age unknown; {_where_from(name)}")
     else:
@@ -126,7 +126,7 @@ def _where_from(name: str) -> str:
 
 def _sigma(name: str, matrices: Mapping[str, Matrix]) -> Sigma:
     """Description of the sigma, and problems with it."""
-    prefix = f"{_entry_of(name)}_sigma_"
+    prefix = f"{entry_of(name)}_sigma_"
     found = {
         key.removeprefix(prefix): np.array(m)
         for key, m in matrices.items()
@@ -146,7 +146,7 @@ def _sigma(name: str, matrices: Mapping[str, Matrix]) -> Sigma:
         wrong = f"expected {max_deg:g}° and {max_mm:g} mm; add views, turned further"
         return f"{deg:.3f}°, {mm:.2f} mm", [("WARN", wrong)] * (not good)
     if "counts_per_kpa" in found:
-        state = matrices.get(f"{_entry_of(name).removesuffix('_gain')}_taxel_state", ())
+        state = matrices.get(f"{entry_of(name).removesuffix('_gain')}_taxel_state", ())
         return _gain_sigma(matrix, found["counts_per_kpa"], int(np.count_nonzero(state)))
     if "ns" in found:
         words = f"{found['ns'].max() * 1e-6:.2f} ms"

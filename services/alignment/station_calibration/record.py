@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
@@ -36,6 +36,8 @@ from services.alignment.synchronization.stream_clock import time_stream
 MATRICES_FILE = "calibration.json"
 DETAILS_FILE = "calibration_details.json"
 PICTURES = "pictures"
+# Tracker of each camera, by the stream names of recordings.
+TRACKERS: Final = {"head": "head", "wrist_left": "left", "wrist_right": "right"}
 
 Named = TypeVar("Named")
 _MATRICES = TypeAdapter(dict[str, Matrix]).validate_json

@@ -9,13 +9,18 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Literal
 
 import numpy as np
 import structlog
+from pydantic import AwareDatetime, Field
 
 from dextouch.clients import HttpLink
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
+from dextouch.free_text import FreeText
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import StationHealth
+from services.alignment.calibration.tactile_tare import FULL_SCALE_COUNTS
 from services.alignment.station_calibration import glove
 from services.alignment.station_calibration.boards import (
     ENOUGH_VIEWS,
@@ -28,20 +33,71 @@ from services.alignment.station_calibration.camera_views import (
     calibrate_photos,
     station_arrivals,
 )
-from services.alignment.station_calibration.glove_takes import Guide
-from services.alignment.station_calibration.schemas import (
-    ENDED,
-    CameraRunView,
-    RunRequest,
-    RunStatus,
-)
+from services.alignment.station_calibration.glove import Guide
 
 logger = structlog.get_logger(__name__)
 
 MAX_LINES = 40
-FULL_SCALE_COUNTS = 65535.0
 PRESSURE_SIGMA = 0.02
 PRACTICE = "practice"
+
+RunState = Literal["running", "asking", "done", "failed", "cancelled"]
+ENDED: frozenset[RunState] = frozenset({"done", "failed", "cancelled"})
+Outline = tuple[tuple[float, float], ...]
+
+
+class RunRequest(FrozenModel):
+    """A guided run: intrinsics of a camera with a board, or tare and gain of a glove."""
+
+    kind: Literal["camera", "glove"]
+    subject: Literal["head", "wrist_left", "wrist_right", "left", "right"]
+    board: FreeText = Field(default="", max_length=64)
+
+
+class Answer(FrozenModel):
+    """What the operator answers to the question of a run."""
+
+    text: FreeText = Field(max_length=200)
+
+
+class CameraRunView(FrozenModel):
+    """Live view of a camera run: the newest image and what was seen in it, in its pixels.
+
+    `corners_px` are those of the newest image, `outlines_px` those of the boards that were kept.
+    `focal_sigma` is the standard deviation of the focal length that the views give, as a share of
+    it, None where they give none; the run goes on until it is `focal_sigma_wanted`.
+    """
+
+    image_index: int
+    width_px: int
+    height_px: int
+    corners_px: Outline = ()
+    outlines_px: tuple[Outline, ...] = ()
+    views_by_region: tuple[tuple[int, ...], ...] = ()
+    num_views: int = 0
+    num_wanted: int
+    focal_sigma: float | None = None
+    focal_sigma_wanted: float
+    todo: tuple[str, ...] = ()
+    hint: str = ""
+
+
+class RunStatus(FrozenModel):
+    """State of a guided run; `lines` is what it said, `question` what it waits for.
+
+    `facts` are the results as in `calibration_details.json`.
+    """
+
+    run_id: str
+    request: RunRequest
+    state: RunState
+    started_at: AwareDatetime
+    question: str = ""
+    lines: tuple[str, ...] = ()
+    busy_s: float = 0.0
+    camera: CameraRunView | None = None
+    facts: dict[str, object] = Field(default_factory=dict)
+    problem: str = ""
 
 
 class _CancelledError(Exception):
@@ -198,13 +254,9 @@ class GuidedRun:
             camera=camera, board=self._request.board, to=folder, photos=photos, check=False
         )
         session = Session(options, photos, say=self._say)
-        path = f"/v1/live/cameras/camera_{camera}"
         with closing(self._place.link()) as link:
-
-            def newest() -> bytes:
-                return link.request("GET", path, accept="image/jpeg").body
-
-            for index, (name, data) in enumerate(station_arrivals(newest, wait=self._wait)):
+            images = station_arrivals(link, camera, wait=self._wait)
+            for index, (name, data) in enumerate(images):
                 session.add(name, data)
                 self.image = data
                 self._set(camera=_camera_view(index, session))
@@ -238,13 +290,13 @@ def _camera_view(index: int, session: Session) -> CameraRunView:
     )
 
 
-def _outline(view: BoardView) -> tuple[tuple[float, float], ...]:
+def _outline(view: BoardView) -> Outline:
     """The four corners that are outermost on the board, in turn."""
     x, y = view.points_board[:, 0], view.points_board[:, 1]
     return _points(view.pixels[[np.argmin(s) for s in (x + y, y - x, -x - y, x - y)]])
 
 
-def _points(pixels: np.ndarray) -> tuple[tuple[float, float], ...]:
+def _points(pixels: np.ndarray) -> Outline:
     return tuple((round(float(u), 1), round(float(v), 1)) for u, v in pixels)
 
 

@@ -10,7 +10,8 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile import pad_forces_n
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
+from services.alignment.synchronization import OnProgress, progress_within
 from services.alignment.synchronization.grid_actions import (
     COMMANDED_STREAMS,
     REQUIRED,
@@ -20,8 +21,6 @@ from services.alignment.synchronization.grid_actions import (
     make_actions,
     place_streams,
 )
-from services.alignment.synchronization.object_streams import marker_streams, with_tracked_objects
-from services.alignment.synchronization.progress import OnProgress, progress_within
 from services.alignment.synchronization.recorded_streams import (
     Block,
     DatedStream,
@@ -29,17 +28,17 @@ from services.alignment.synchronization.recorded_streams import (
     LoadedStream,
     cut_stream,
     date_stream,
-)
-from services.alignment.synchronization.refused_parts import (
-    refused_edges,
-    refused_matrices,
-    refused_stretches,
+    marker_streams,
+    with_tracked_objects,
 )
 from services.alignment.synchronization.resampling import (
     EDGE_PERIODS,
     MAX_GAP_PERIODS,
     grid_times_ns,
     longest_run,
+    refused_edges,
+    refused_matrices,
+    refused_stretches,
     stream_gap_ns,
 )
 

@@ -1,4 +1,4 @@
-"""Hand trajectories and 67-D actions at the steps of the model's grid."""
+"""Hand trajectories, 67-D actions and figures of motion at the steps of the model's grid."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -11,12 +11,11 @@ from dextouch.hands.actions import AnchorPoses, HandTrajectory, actions_from_pos
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.schemas import Domain, Matrix
 from dextouch.tactile.layout import SIDES, Side
-from services.alignment.options import WristChoice
 from services.alignment.retargeting import HandRetargeter, RetargetResult, RetargetStatus
 from services.alignment.retargeting.hand_profile import calibrated_profile
 from services.alignment.retargeting.wrist_frame import hand_axes_check
 from services.alignment.retargeting.wrist_transfer import NUM_PADS, transfer_by_touch
-from services.alignment.synchronization.motion_figures import motion_figures
+from services.alignment.settings import WristChoice
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import (
     GridPlacement,
@@ -38,6 +37,9 @@ REQUIRED: Mapping[Domain, tuple[str, ...]] = {
     "human": (*POSE_STREAMS, "keypoints_left", "keypoints_right"),
     "robot": (*POSE_STREAMS, "joints_measured"),
 }
+# Slower than this is at rest: tracking noise of a wrist, and the slightest motion of a finger.
+REST_M_S = 0.02
+REST_RAD_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ def _moved_by_touch(
             # Where touch is missing, none is known; at the edges forces are extrapolated.
             felt = np.where(gridded.at[name].valid[:, None], gridded.vectors(name), 0.0)
             forces = np.maximum(felt, 0.0)
-        hand = transfer_by_touch(
+        Ts_world_wrist, joints_rad, offset_m = transfer_by_touch(
             RobotHand(side),
             getattr(tracked, f"Ts_world_wrist_{side}"),
             getattr(tracked, f"joints_{side}_rad"),
@@ -149,9 +151,8 @@ def _moved_by_touch(
             pad_forces_n=forces,
             t_s=t_s,
         )
-        moved |= {f"Ts_world_wrist_{side}": hand.Ts_world_wrist}
-        moved |= {f"joints_{side}_rad": hand.joints_rad}
-        offset_mm = np.linalg.norm(hand.offset_m, axis=1).mean() * 1e3
+        moved |= {f"Ts_world_wrist_{side}": Ts_world_wrist, f"joints_{side}_rad": joints_rad}
+        offset_mm = np.linalg.norm(offset_m, axis=1).mean() * 1e3
         figures[f"retargeting_{side}_wrist_offset_mm"] = float(offset_mm)
     return replace(tracked, **moved), figures
 
@@ -226,3 +227,26 @@ def status_on_grid(status: np.ndarray, at: GridPlacement) -> UInt8[np.ndarray, "
     left = np.where(at.weight == 1, at.left + 1, at.left)
     right = np.where(at.weight == 0, at.left, at.left + 1)
     return np.maximum(status[left], status[right]).astype(np.uint8)
+
+
+def motion_figures(trajectory: HandTrajectory, *, rate_hz: float) -> Mapping[str, float]:
+    """Peak speed and jerk of each wrist, and the share of steps in which both hands are at rest.
+
+    The jerk is the 95th percentile of third differences, which a few outliers do not decide.
+    """
+    figures: dict[str, float] = {}
+    moves = np.zeros(max(len(trajectory.joints_left_rad) - 1, 0), dtype=bool)
+    for side in SIDES:
+        points_m = getattr(trajectory, f"Ts_world_wrist_{side}")[:, :3, 3]
+        joints_rad = getattr(trajectory, f"joints_{side}_rad")
+        speeds_m_s = np.linalg.norm(np.diff(points_m, axis=0), axis=1) * rate_hz
+        turns_rad_s = np.abs(np.diff(joints_rad, axis=0)).max(axis=1, initial=0.0) * rate_hz
+        moves |= (speeds_m_s >= REST_M_S) | (turns_rad_s >= REST_RAD_S)
+        if len(points_m) > 1:
+            figures[f"wrist_{side}_peak_speed_m_s"] = float(speeds_m_s.max())
+        if len(points_m) > 3:
+            jerks_m_s3 = np.linalg.norm(np.diff(points_m, n=3, axis=0), axis=1) * rate_hz**3
+            figures[f"wrist_{side}_jerk_p95_m_s3"] = float(np.percentile(jerks_m_s3, 95))
+    if moves.size:
+        figures["static_share"] = float(1 - moves.mean())
+    return figures

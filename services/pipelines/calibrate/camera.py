@@ -36,11 +36,6 @@ def _collect(options: argparse.Namespace) -> None:
             session.collect(folder_arrivals(options.photos))
             return
         link = HttpLink(options.url, api_key=options.key)
-        path = f"/v1/live/cameras/camera_{options.camera}"
-
-        def newest() -> bytes:
-            return link.request("GET", path, accept="image/jpeg").body
-
-        session.collect(station_arrivals(newest))
+        session.collect(station_arrivals(link, options.camera))
     except KeyboardInterrupt:
         print(f"stopped with {len(session.views)} views")

@@ -17,8 +17,8 @@ from services.alignment.station_calibration.boards import (
     turn_coverage,
 )
 from services.alignment.station_calibration.camera_views import read_lens, turns_picture
-from services.alignment.station_calibration.overview import TRACKERS
 from services.alignment.station_calibration.record import (
+    TRACKERS,
     poses_of_photos,
     read_pairs,
     write_picture,

@@ -26,9 +26,9 @@ from services.acquisition.mocks.faults import Fate
 from services.acquisition.mocks.replay import replay_calibration, replay_streams
 from services.acquisition.uploader import Uploader
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
 from services.alignment.recording_error import compare_with_truth, match_streams
 from services.alignment.schemas import AlignmentJob
+from services.alignment.settings import AlignmentOptions
 from services.episode_store.committing import commit_spool
 from services.evaluation.progress import Progress
 from services.pipelines.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan

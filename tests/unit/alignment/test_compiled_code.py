@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from services.alignment.retargeting.solver.compiled import folder_of_code
+from services.alignment.retargeting.solver import folder_of_code
 
 CHECKOUT = Path(__file__).parents[3]
 DOCKERFILE = CHECKOUT / "deploy" / "Dockerfile"
@@ -34,15 +34,15 @@ for name in [name for name in sys.modules if name.startswith("services.")]:
 """
 # A function that is compiled and kept like the solver, in a moment instead of half a minute.
 SMALL = """
-from services.alignment.retargeting.solver import compiled
+from services.alignment.retargeting import solver
 
-@compiled.compiled_once
+@solver.compiled_once
 def add(a, b):
     return a + b
 
 print(json.dumps({
     "total": add(1.5, 2.0),
-    "folder": compiled._FOLDER and str(compiled._FOLDER),
+    "folder": solver._FOLDER and str(solver._FOLDER),
     "is_loaded": bool(add.stats.cache_hits),
 }))
 """

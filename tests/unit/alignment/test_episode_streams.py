@@ -10,7 +10,7 @@ from dextouch.errors import NotFoundError
 from dextouch.streams import StreamDescriptor
 from services.alignment import jobs
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import recorded_streams
 from tests.system.long_take import encode_images
 from tests.unit.alignment.recordings import START_NS, write_recording

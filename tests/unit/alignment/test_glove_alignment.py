@@ -20,7 +20,7 @@ from services.acquisition.mocks.gloves import (
 from services.acquisition.mocks.replay import ReplayStream
 from services.alignment.command_line import main
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
 
 K_HEAD = ((60.0, 0.0, 32.0), (0.0, 60.0, 32.0), (0.0, 0.0, 1.0))
 POSE = np.array([0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])

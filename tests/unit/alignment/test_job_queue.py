@@ -10,9 +10,9 @@ import pytest
 
 from dextouch.errors import ConflictError, CorruptDataError, StorageFullError, UnavailableError
 from services.alignment.job_queue import DATABASE_FILE, JobDatabase, JobQueue
-from services.alignment.options import AlignmentOptions
 from services.alignment.schemas import AlignmentJob
-from services.alignment.synchronization.progress import Progress
+from services.alignment.settings import AlignmentOptions
+from services.alignment.synchronization import Progress
 
 
 def new_job(name):
@@ -121,7 +121,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from services.alignment.job_queue import JobDatabase
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
 from services.alignment.schemas import AlignmentJob
 database = JobDatabase(Path(sys.argv[1]))
 for number in range(100_000):

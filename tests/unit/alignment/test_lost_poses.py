@@ -8,7 +8,7 @@ from dextouch.geometry import pose_from_transform, transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.schemas import matrix_rows
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
 from tests.unit.alignment import recordings
 
 # Of 10 ms each: short enough to be bridged.

@@ -7,8 +7,7 @@ import pytest
 from dextouch.geometry import invert, pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from dextouch.schemas import ObjectMarker, SceneObject
-from services.alignment.marker_poses import (
-    CameraLens,
+from services.alignment.markers import (
     MarkerTracker,
     _Candidate,
     _decided,
@@ -82,7 +81,7 @@ def seen_from_above(yaw_rad, shift_m=(0.0, 0.0)):
 
 
 def tracked(one, images, Ts_world_camera=None, *, distortion=NO_DISTORTION):
-    tracker = MarkerTracker([one], DICTIONARY, CameraLens(K, distortion))
+    tracker = MarkerTracker([one], DICTIONARY, K, distortion)
     for index, image in enumerate(images):
         T = np.eye(4) if Ts_world_camera is None else Ts_world_camera[index]
         tracker.add(index * 33_000_000, image, T)

@@ -9,7 +9,7 @@ import pytest
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ObjectMarker, SceneObject, SceneObjects
 from services.alignment.command_line import main
-from services.alignment.marker_sheet import marker_sheet
+from services.alignment.markers import marker_sheet
 
 FLAT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 PX_PER_MM = 4

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.hands.actions import HandTrajectory
-from services.alignment.synchronization.motion_figures import motion_figures
+from services.alignment.synchronization.grid_actions import motion_figures
 
 RATE_HZ = 100.0
 

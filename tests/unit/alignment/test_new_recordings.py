@@ -9,12 +9,11 @@ from structlog.testing import capture_logs
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import StorageFullError
-from services.alignment import job_runner, new_recordings
+from services.alignment import job_runner
 from services.alignment.app import create_app
 from services.alignment.job_queue import JobDatabase
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
-from services.alignment.settings import AlignmentSettings
+from services.alignment.settings import AlignmentOptions, AlignmentSettings
 from tests.unit.alignment.recordings import write_recording
 from tests.unit.alignment.test_service import FakeWorker
 from tests.unit.episodes.hostile_group import stamp_version
@@ -94,7 +93,7 @@ async def looked_again(jobs):
 
 
 async def test_what_found_the_disk_full_is_tried_again(store, worker, monkeypatch):
-    monkeypatch.setattr(new_recordings, "RETRY_S", 0.5)
+    monkeypatch.setattr(job_runner, "RETRY_S", 0.5)
     run, is_full = worker.run, True
 
     def without_space(self, name, *more):
@@ -182,7 +181,7 @@ async def test_without_align_new_nothing_happens_unasked(store, worker):
 async def test_a_recording_that_cannot_be_read_keeps_no_other_from_being_aligned(
     store, worker, monkeypatch
 ):
-    monkeypatch.setattr(new_recordings, "RETRY_S", 0.0)
+    monkeypatch.setattr(job_runner, "RETRY_S", 0.0)
     write_recording(store, "old")
     stamp_version(store, "recording", "old", 1)
     with capture_logs() as logs:

@@ -9,7 +9,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.hands import chain_indices
 from dextouch.hands.hand_files import load_hand
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
 from services.cli.main import main
 from tests.accuracy.test_alignment import truth_streams, write_recording
 from tests.unit.alignment.recordings import write_recording as write_robot_recording

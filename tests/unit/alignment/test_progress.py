@@ -3,7 +3,7 @@
 from itertools import pairwise
 from typing import get_args
 
-from services.alignment.synchronization.progress import Stage, progress_within
+from services.alignment.synchronization import Stage, progress_within
 
 
 def test_every_stage_begins_where_the_one_before_ends():

@@ -5,14 +5,15 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from services.alignment.jobs import align_recording
-from services.alignment.options import AlignmentOptions
-from services.alignment.synchronization.refused_parts import (
+from services.alignment.settings import AlignmentOptions
+from services.alignment.synchronization.resampling import (
     RefusedPart,
+    longest_run,
     refused_matrices,
     refused_parts,
     refused_stretches,
+    runs_of,
 )
-from services.alignment.synchronization.resampling import longest_run, runs_of
 from tests.unit.alignment.recordings import write_recording
 
 SECOND_NS = 10**9

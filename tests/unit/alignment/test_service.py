@@ -15,7 +15,7 @@ from services.alignment import job_runner
 from services.alignment.app import create_app
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentSettings
-from services.alignment.synchronization.progress import Progress
+from services.alignment.synchronization import Progress
 from tests.unit.alignment.recordings import write_recording
 
 

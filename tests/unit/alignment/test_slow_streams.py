@@ -6,7 +6,7 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import StreamDescriptor
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization.episode_builder import build_episode
 from tests.unit.alignment.recordings import K_HEAD, POSE
 

@@ -9,10 +9,9 @@ import pytest
 
 from dextouch.clients import Reply
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnknownNameError
-from services.alignment.station_calibration.overview import overview
 from services.alignment.station_calibration.record import write_entry
-from services.alignment.station_calibration.runs import CalibrationRuns, StationLocation
-from services.alignment.station_calibration.schemas import RunRequest
+from services.alignment.station_calibration.routes import overview
+from services.alignment.station_calibration.runs import CalibrationRuns, RunRequest, StationLocation
 
 GLOVE = RunRequest(kind="glove", subject="left")
 STREAMS = ("head", "tactile_left", "camera_head", "keypoints_left")

@@ -9,7 +9,8 @@ from rich.console import Console
 
 from dextouch.schemas import ClockReport
 from dextouch.streams import ClockCapabilities, SampleBatch, StreamDescriptor
-from services.alignment.report import AlignmentReport, report_line, report_page
+from services.alignment.command_line import report_line, report_page
+from services.alignment.schemas import AlignmentReport
 from services.alignment.synchronization.stream_clock import time_stream
 
 PERIOD_NS = 10_000_000

@@ -7,7 +7,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.geometry import invert
 from dextouch.hands.actions import poses_from_actions
 from services.alignment.jobs import align_recording, episode_id_of
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
 from tests.accuracy.test_alignment import truth_streams, write_recording
 
 TOUCH = AlignmentOptions(wrist="touch")

@@ -11,7 +11,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnavailableError
 from services.alignment.command_line import align_batch, not_aligned
 from services.alignment.jobs import AlignmentWorker
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
 from tests.unit.alignment.recordings import write_recording
 
 OPTIONS = AlignmentOptions()

@@ -4,12 +4,15 @@ import json
 import re
 from argparse import Namespace
 from itertools import count
+from types import SimpleNamespace
+from unittest.mock import create_autospec
 
 import cv2
 import numpy as np
 import pytest
 
 from benchmarks.simulated.board_scenes import mount_difference
+from dextouch.clients import HttpLink
 from dextouch.errors import (
     InvalidInputError,
     StaleDataError,
@@ -180,14 +183,11 @@ def test_blurred_photos_are_named_and_do_not_count(tmp_path, capsys):
 
 
 def test_station_images_come_once_each_and_pauses_are_no_images():
-    bodies = iter([b"a", b"a", None, b"b"])
-
-    def newest():
-        if (body := next(bodies)) is None:
-            raise StaleDataError("the newest image is 1 s old")
-        return body
-
-    arrivals = camera.station_arrivals(newest, wait=lambda _: None)
+    bodies = [b"a", b"a", StaleDataError("the newest image is 1 s old"), b"b"]
+    replies = [one if isinstance(one, Exception) else SimpleNamespace(body=one) for one in bodies]
+    link = create_autospec(HttpLink, instance=True)
+    link.request.side_effect = replies
+    arrivals = camera.station_arrivals(link, "head", wait=lambda _: None)
     assert [next(arrivals)[1], next(arrivals)[1]] == [b"a", b"b"]
 
 

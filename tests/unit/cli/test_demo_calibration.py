@@ -10,7 +10,7 @@ from services.acquisition.mock_station import LATENCY_SIGMA_MS
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.gloves import GloveCalibration
 from services.acquisition.mocks.pattern import pattern_streams
-from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentOptions
 from services.pipelines import mock_takes
 from services.pipelines.demo import recording
 from tests.unit.bridges.takes import write_episode

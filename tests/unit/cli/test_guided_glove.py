@@ -20,7 +20,7 @@ from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.recorder import Recorder
 from services.acquisition.station import LiveView
 from services.alignment.calibration.tactile_tare import TactileCalibration
-from services.alignment.station_calibration import glove, glove_takes
+from services.alignment.station_calibration import glove
 from services.pipelines.calibrate.command import main
 
 TRUTH = GloveCalibration.seeded("left", 4)
@@ -70,8 +70,8 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path, monkeypatch):
-    monkeypatch.setattr(glove_takes, "REST_S", 2.0)
-    monkeypatch.setattr(glove_takes, "PRESS_S", 1.5)
+    monkeypatch.setattr(glove, "REST_S", 2.0)
+    monkeypatch.setattr(glove, "PRESS_S", 1.5)
     clock = VirtualClock(10**9)
     decoder = TactileGloveDecoder("left")
     driver = Driver("glove_left", transport=PtyPort("a").transport, decoder=decoder, clock=clock)
@@ -120,8 +120,8 @@ def guide(bench, tmp_path, script, monkeypatch, **changed):
     """The whole command with a fake link and operator."""
     ask, asked = operator(bench, script)
     given = options(tmp_path, **changed)
-    leads = glove_takes.Guide(given, bench.request, ask=ask, wait=bench.wait)
-    record = glove_takes.record_takes
+    leads = glove.Guide(given, bench.request, ask=ask, wait=bench.wait)
+    record = glove.record_takes
     monkeypatch.setattr(glove, "record_takes", lambda o, _: record(o, leads))
     return glove.calibrate(given), asked
 
@@ -164,7 +164,7 @@ def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsy
     assert np.abs(gain_error).max() < 0.02
     # The good takes are there, the dropped one too; the kept list repeats the calibration.
     assert len(list((tmp_path / "spool").glob("*/"))) == 4
-    rows = glove_takes.read_presses(tmp_path / "to/presses_left.csv", 0.02)
+    rows = glove.read_presses(tmp_path / "to/presses_left.csv", 0.02)
     assert [round(row.pressure_kpa, 2) for row in rows] == [10.0, 30.0]
     arguments = [
         "glove",
@@ -188,8 +188,8 @@ def test_a_glove_that_was_touched_rests_once_more(bench, tmp_path, monkeypatch, 
     bench.creeps = True
     ask, _ = operator(bench, [("", 20.0), ("", 0.0), ("", None)])
     given = options(tmp_path)
-    leads = glove_takes.Guide(given, bench.request, ask=ask, wait=bench.wait)
-    rest, rows = glove_takes.record_takes(given, leads)
+    leads = glove.Guide(given, bench.request, ask=ask, wait=bench.wait)
+    rest, rows = glove.record_takes(given, leads)
     assert rows == []
     assert rest.endswith("-2")
     assert "Once more: rest take" in capsys.readouterr().out
@@ -206,8 +206,8 @@ def test_presses_that_do_not_hold_are_not_used(bench, tmp_path, capsys):
         return ask(question)
 
     given = options(tmp_path)
-    leads = glove_takes.Guide(given, bench.request, ask=creeping, wait=bench.wait)
-    _, rows = glove_takes.record_takes(given, leads)
+    leads = glove.Guide(given, bench.request, ask=creeping, wait=bench.wait)
+    _, rows = glove.record_takes(given, leads)
     assert rows == []
     assert "changed while it lay" in capsys.readouterr().out
 
@@ -216,7 +216,7 @@ def test_interrupted_takes_are_discarded(bench, tmp_path):
     def interrupted(_):
         raise KeyboardInterrupt
 
-    takes = glove_takes.Guide(options(tmp_path), bench.request, wait=interrupted)
+    takes = glove.Guide(options(tmp_path), bench.request, wait=interrupted)
     with pytest.raises(KeyboardInterrupt):
         takes.record("take-1", "rest", 1.0, str.upper)
     assert bench.recorder.status().state == "discarded"
@@ -226,7 +226,7 @@ def test_interrupted_takes_are_discarded(bench, tmp_path):
 def test_a_busy_recorder_is_left_alone(bench, tmp_path):
     bench.recorder.arm(TakePrompt(task="t", instruction="i"))
     bench.recorder.record("other")
-    takes = glove_takes.Guide(options(tmp_path), bench.request, wait=bench.wait)
+    takes = glove.Guide(options(tmp_path), bench.request, wait=bench.wait)
     with pytest.raises(ConflictError, match="while recording"):
         takes.record("take-1", "rest", 1.0, str.upper)
     assert bench.recorder.status().recording_id == "other"
@@ -234,7 +234,7 @@ def test_a_busy_recorder_is_left_alone(bench, tmp_path):
 
 def test_takes_of_another_machine_come_from_the_store(bench, tmp_path):
     elsewhere = options(tmp_path, spool=tmp_path / "not-here")
-    takes = glove_takes.Guide(elsewhere, bench.request, wait=bench.wait)
+    takes = glove.Guide(elsewhere, bench.request, wait=bench.wait)
     with pytest.raises(NotFoundError, match=r"--spool.*--store"):
         takes.record("take-1", "rest", 1.0, str.upper)
     bench.uploaded = True
@@ -245,9 +245,9 @@ def test_takes_of_another_machine_come_from_the_store(bench, tmp_path):
 
 def test_nobody_there_and_contradicting_options_are_refused(bench, tmp_path):
     given, ask = options(tmp_path), operator(bench, [])[0]
-    leads = glove_takes.Guide(given, bench.request, ask=ask, wait=bench.wait)
+    leads = glove.Guide(given, bench.request, ask=ask, wait=bench.wait)
     with pytest.raises(InvalidInputError, match="nobody answers"):
-        glove_takes.record_takes(given, leads)
+        glove.record_takes(given, leads)
     with pytest.raises(InvalidInputError, match="one of the two"):
         glove.calibrate(options(tmp_path, rest="take"))
     with pytest.raises(InvalidInputError, match="--url of a running station"):
@@ -264,7 +264,7 @@ def test_nobody_there_and_contradicting_options_are_refused(bench, tmp_path):
     ],
 )
 def test_pressures_as_they_are_typed(words, kpa, pads):
-    row = glove_takes.parse_press(words, 0.02)
+    row = glove.parse_press(words, 0.02)
     assert row.pressure_kpa == pytest.approx(kpa)
     assert row.sigma_kpa == pytest.approx(0.02 * kpa)
     assert row.pads == pads
@@ -273,9 +273,9 @@ def test_pressures_as_they_are_typed(words, kpa, pads):
 @pytest.mark.parametrize("words", ["0", "-3", "3 3", "1.2.3", "2kg", "2kg/0cm2", "palm", "kpa"])
 def test_what_is_no_pressure_is_refused(words):
     with pytest.raises(InvalidInputError, match="pressure: got"):
-        glove_takes.parse_press(words, 0.02)
+        glove.parse_press(words, 0.02)
     with pytest.raises(UnknownNameError):
-        glove_takes.parse_press("3 toe", 0.02)
+        glove.parse_press("3 toe", 0.02)
 
 
 def test_a_station_starts_before_its_gloves_are_calibrated(bench):

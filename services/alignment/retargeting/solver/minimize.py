@@ -11,8 +11,8 @@ from typing import no_type_check
 
 import numpy as np
 
+from services.alignment.retargeting.solver import compiled
 from services.alignment.retargeting.solver.arrays import MAX_JOINTS, NUM_POINTS
-from services.alignment.retargeting.solver.compiled import compiled
 
 MAX_ITERATIONS = 40
 # The step below it is still made: what is left is its square, or a tenth of it with residuals.

@@ -12,6 +12,7 @@ from typing import no_type_check
 
 import numpy as np
 
+from services.alignment.retargeting.solver import compiled, compiled_once
 from services.alignment.retargeting.solver.arrays import (
     IMPLAUSIBLE,
     MISSING,
@@ -26,7 +27,6 @@ from services.alignment.retargeting.solver.arrays import (
     SOLVED,
     UNCONVERGED,
 )
-from services.alignment.retargeting.solver.compiled import compiled, compiled_once
 from services.alignment.retargeting.solver.minimize import (
     POSTURE_TOLERANCE_RAD,
     STEP_TOLERANCE_RAD,

@@ -1,21 +1,25 @@
-"""Poses of objects from ArUco or AprilTag markers on them, as a camera of known pose sees them.
+"""Markers on objects: poses of the objects in images, and sheets of markers to print.
 
-The pose of a single square has two solutions that look almost alike when it is small or seen from
-the front (Schweighofer and Pinz, 2006; IPPE of Collins and Bartoli, 2014, gives both). The other
-markers of the object decide, or a clearly smaller error, or the pose that the object had in
-neighbouring images; where nothing decides, the object counts as not seen.
+An object's pose comes from its ArUco or AprilTag markers, as a camera of known pose sees them. That
+of a single square has two solutions that look almost alike when it is small or seen from the front
+(Schweighofer and Pinz, 2006; IPPE of Collins and Bartoli, 2014, gives both). The other markers of
+the object decide, or a clearly smaller error, or the pose that the object had in neighbouring
+images; where nothing decides, the object counts as not seen.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from html import escape
+from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Bool, Float64, Int64, UInt8
 
+from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector, vector_from_rotation
-from dextouch.schemas import MarkerDictionary, SceneObject
+from dextouch.schemas import MarkerDictionary, ObjectMarker, SceneObject, SceneObjects
 
 # Markers whose corners do not fit the pose within this, or this share of the marker's side, are
 # partly hidden, or of another size or place than stated. On rendered markers of 25 to 50 px right
@@ -32,14 +36,10 @@ _MARGIN, _ZOOM = 0.35, 2
 _MAX_APART_NS = 1_000_000_000
 # A pose between two that are alike, but this far from both, is of a marker that was partly hidden.
 _JUMP_M, _JUMP_RAD, _JUMP_NS = 0.03, np.deg2rad(20.0), 300_000_000
-
-
-@dataclass(frozen=True)
-class CameraLens:
-    """A pinhole camera (K in px, pixel centres at half-integers) with distortion k1 k2 p1 p2 k3."""
-
-    K: Float64[np.ndarray, "3 3"]
-    distortion: Float64[np.ndarray, "5"]
+PAGE_MM: Final = (210.0, 297.0)
+# White around a marker, as a share of its side: detectors need about one cell of six.
+_WHITE: Final = 0.2
+_EDGE_MM, _LABEL_MM = 12.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -119,13 +119,24 @@ def _detected(
 
 
 class MarkerTracker:
-    """Finds the objects of one task in the images of a camera."""
+    """Finds the objects of one task in the images of a camera.
+
+    Args:
+        objects: of the task.
+        dictionary: of their markers.
+        K: of the camera, in px, pixel centres at half-integers.
+        distortion: k1 k2 p1 p2 k3.
+    """
 
     def __init__(
-        self, objects: Sequence[SceneObject], dictionary: MarkerDictionary, lens: CameraLens
+        self,
+        objects: Sequence[SceneObject],
+        dictionary: MarkerDictionary,
+        K: Float64[np.ndarray, "3 3"],
+        distortion: Float64[np.ndarray, "5"],
     ) -> None:
         self._objects = [one for one in objects if one.markers]
-        self._lens = lens
+        self._lens = (K, distortion)
         self._markers = MarkerDetector(dictionary)
         self._seen: dict[str, list[tuple[int, list[_Candidate]]]] = {
             one.name: [] for one in self._objects
@@ -166,11 +177,7 @@ class MarkerTracker:
             T_marker_object = invert(transform_from_pose(np.array(marker.pose)))
             flat = _flat_corners_m(marker.size_m)
             number, turns, shifts, _ = cv2.solvePnPGeneric(
-                flat,
-                found[marker.id][0],
-                self._lens.K,
-                self._lens.distortion,
-                flags=cv2.SOLVEPNP_IPPE_SQUARE,
+                flat, found[marker.id][0], *self._lens, flags=cv2.SOLVEPNP_IPPE_SQUARE
             )
             for turn, shift in zip(turns[:number], shifts[:number], strict=True):
                 T = transform(rotation_from_vector(turn.ravel()), shift.ravel()) @ T_marker_object
@@ -187,12 +194,11 @@ class MarkerTracker:
         turn, shift = cv2.solvePnPRefineLM(
             points_m,
             pixels,
-            self._lens.K,
-            self._lens.distortion,
+            *self._lens,
             vector_from_rotation(T[:3, :3]).reshape(3, 1),
             T[:3, 3].reshape(3, 1).copy(),
         )
-        seen, _ = cv2.projectPoints(points_m, turn, shift, self._lens.K, self._lens.distortion)
+        seen, _ = cv2.projectPoints(points_m, turn, shift, *self._lens)
         error_px = float(np.sqrt(np.square(seen.reshape(-1, 2) - pixels).sum(1).mean()))
         refined = transform(rotation_from_vector(turn.ravel()), shift.ravel())
         in_front = (refined[2, :3] @ points_m.T + refined[2, 3]).min() > 0
@@ -258,3 +264,96 @@ def _nearest(candidates: Sequence[_Candidate], near: _Candidate) -> _Candidate |
     turned_rad = [_turned_rad(near, one) for one in candidates]
     best = int(np.argmin(turned_rad))
     return candidates[best] if turned_rad[best] <= _MAX_TURN_RAD else None
+
+
+def marker_sheet(objects: SceneObjects) -> str:
+    """SVG with the markers of all objects on A4 pages below one another.
+
+    Every marker has a dashed line to cut along, and below it the object, its id and side.
+
+    Raises:
+        InvalidInputError: there is no marker, or one is larger than the page.
+    """
+    wanted = {
+        (one.name, marker.id, marker.size_m): marker
+        for listed in objects.tasks.values()
+        for one in listed
+        for marker in one.markers
+    }
+    if not wanted:
+        raise InvalidInputError("markers: the objects have none to print")
+    cells = cells_of_markers(objects)
+    places, height_mm = _places([marker.size_m for marker in wanted.values()])
+    drawn = [
+        part
+        for ((name, *_), marker), (x_mm, y_mm) in zip(wanted.items(), places, strict=True)
+        for part in _marker(name, marker, x_mm, y_mm, cells[marker.id])
+    ]
+    width_mm = PAGE_MM[0]
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width_mm:g}mm" '
+            f'height="{height_mm:g}mm" viewBox="0 0 {width_mm:g} {height_mm:g}">',
+            f'<rect width="{width_mm:g}" height="{height_mm:g}" fill="white"/>',
+            *drawn,
+            "</svg>",
+            "",
+        ]
+    )
+
+
+def cells_of_markers(objects: SceneObjects) -> dict[int, Bool[np.ndarray, "n n"]]:
+    """Which cells of each marker are white, by its id, from its upper left; the border is black."""
+    kind = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, objects.dictionary))
+    side = int(kind.markerSize) + 2
+    return {
+        marker.id: cv2.aruco.generateImageMarker(kind, marker.id, side) > 0
+        for listed in objects.tasks.values()
+        for one in listed
+        for marker in one.markers
+    }
+
+
+def _places(sizes_m: list[float]) -> tuple[list[tuple[float, float]], float]:
+    """Upper left corner (mm) of each black square, in rows, and the height of all pages."""
+    places, x_mm, y_mm, row_mm, page = [], _EDGE_MM, _EDGE_MM, 0.0, 0
+    for size_m in sizes_m:
+        whole_mm = 1e3 * size_m * (1 + 2 * _WHITE)
+        if whole_mm + 2 * _EDGE_MM + _LABEL_MM > PAGE_MM[0]:
+            raise InvalidInputError(
+                f"markers: one has a side of {1e3 * size_m:g} mm, expected what fits an A4 page"
+            )
+        if x_mm + whole_mm > PAGE_MM[0] - _EDGE_MM:
+            x_mm, y_mm, row_mm = _EDGE_MM, y_mm + row_mm, 0.0
+        if y_mm + whole_mm + _LABEL_MM > (page + 1) * PAGE_MM[1] - _EDGE_MM:
+            page += 1
+            x_mm, y_mm, row_mm = _EDGE_MM, page * PAGE_MM[1] + _EDGE_MM, 0.0
+        margin_mm = 1e3 * size_m * _WHITE
+        places.append((x_mm + margin_mm, y_mm + margin_mm))
+        x_mm += whole_mm + 2.0
+        row_mm = max(row_mm, whole_mm + _LABEL_MM + 2.0)
+    return places, (page + 1) * PAGE_MM[1]
+
+
+def _marker(
+    name: str, marker: ObjectMarker, x_mm: float, y_mm: float, is_white: Bool[np.ndarray, "n n"]
+) -> Iterator[str]:
+    side_mm = 1e3 * marker.size_m
+    cell_mm, margin_mm = side_mm / len(is_white), side_mm * _WHITE
+    whole_mm = side_mm + 2 * margin_mm
+    yield (
+        f'<rect x="{x_mm - margin_mm:.3f}" y="{y_mm - margin_mm:.3f}" width="{whole_mm:.3f}" '
+        f'height="{whole_mm:.3f}" fill="white" stroke="#999" stroke-width="0.1" '
+        'stroke-dasharray="1 1"/>'
+    )
+    yield f'<rect x="{x_mm:.3f}" y="{y_mm:.3f}" width="{side_mm:.3f}" height="{side_mm:.3f}"/>'
+    for row, column in np.argwhere(is_white).tolist():
+        yield (
+            f'<rect x="{x_mm + column * cell_mm:.3f}" y="{y_mm + row * cell_mm:.3f}" '
+            f'width="{cell_mm:.3f}" height="{cell_mm:.3f}" fill="white"/>'
+        )
+    yield (
+        f'<text x="{x_mm - margin_mm:.3f}" y="{y_mm + side_mm + margin_mm + 3.2:.3f}" '
+        f'font-family="sans-serif" font-size="3">{escape(name)} · id {marker.id} · '
+        f"{side_mm:g} mm · up ↑</text>"
+    )
