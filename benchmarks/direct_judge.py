@@ -41,18 +41,18 @@ from services.evaluation.calibration import (
     expected_calibration_error,
     fit_calibration,
 )
-from services.evaluation.checkpoints import (
+from services.evaluation.matched_starts import start_digest
+from services.evaluation.statistics import area_under_roc
+from services.evaluation.success_classifier_training import MIN_OUTCOMES
+from services.evaluation.trained_networks import (
     Checkpoint,
     CheckpointMetadata,
     load_checkpoint,
     load_network,
     network_tensors,
+    optimized,
     save_checkpoint,
 )
-from services.evaluation.matched_starts import start_digest
-from services.evaluation.optimization import optimized
-from services.evaluation.statistics import area_under_roc
-from services.evaluation.success_classifier_training import MIN_OUTCOMES
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.world_model.dynamics.core import NUM_PADS, OWN_SIZE, own_features
 from services.world_model.dynamics.features import (

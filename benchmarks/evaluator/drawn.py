@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.figures import Requirement, Sense
 from services.evaluation.calibration import expected_calibration_error
-from services.evaluation.comments import UNDEFINED, undefined_by
+from services.evaluation.scores import UNDEFINED, undefined_by
 from services.evaluation.statistics import (
     area_under_roc_of_draws,
     balanced_accuracy_of_draws,

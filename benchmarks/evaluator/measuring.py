@@ -12,7 +12,7 @@ from dextouch.metrics.image import PEAK, decibels
 from dextouch.metrics.tactile import mse
 from dextouch.schemas import CHUNK_STEPS
 from dextouch.tactile import in_contact
-from services.evaluation.scene_geometry import warp_over_table
+from services.evaluation.prediction_scenes import warp_over_table
 
 # Margin in pixels around an object's box that belongs to its region.
 _MARGIN_PX: Final = 1

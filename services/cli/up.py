@@ -195,8 +195,8 @@ def _world_model(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
 
 
 def _studies(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
+    from services.evaluation.settings import StudyServiceSettings
     from services.evaluation.studies.app import create_app
-    from services.evaluation.studies.settings import StudyServiceSettings
 
     return create_app(StudyServiceSettings(studies=settings.data / "studies"))
 

@@ -7,8 +7,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-_PRETRAINED = Path(__file__).parent / "pretrained"
-DEFAULT_POLICY = _PRETRAINED / "behaviour_cloning.safetensors"
+PRETRAINED = Path(__file__).parent / "pretrained"
+DEFAULT_POLICY = PRETRAINED / "behaviour_cloning.safetensors"
 
 
 @dataclass(frozen=True)

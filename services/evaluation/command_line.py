@@ -14,16 +14,15 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.free_text import printable
 from dextouch.serving import load_settings
 from services.evaluation.bundled_policies import bundled_policy, training_starts_of
-from services.evaluation.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
-from services.evaluation.closed_loop import EvaluationPlan, evaluate
+from services.evaluation.closed_loop import EvaluationPlan, ResultLog, evaluate
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
+from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.cloning_network import read_cloning_episodes
 from services.evaluation.policies.cloning_training import train_cloned_policy
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import ReportPictures, write_report
 from services.evaluation.reporting.sections import failure_rows, figure, undecided_note
-from services.evaluation.scores import ResultLog
 from services.evaluation.settings import (
     DEFAULT_PROBE,
     PACKAGE,
@@ -33,12 +32,12 @@ from services.evaluation.settings import (
     TrainPolicySettings,
     command_line,
 )
-from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_classifier import KIND, SuccessClassifier
 from services.evaluation.success_classifier_training import (
     calibrate_success_classifier,
     train_success_classifier,
 )
+from services.evaluation.trained_networks import Checkpoint, load_checkpoint, save_checkpoint
 
 EXIT_FAILED = 1
 

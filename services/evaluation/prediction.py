@@ -18,18 +18,19 @@ from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import CHUNK_STEPS
 from dextouch.worlds import World
-from services.evaluation import scene_geometry
 from services.evaluation.perceptual_networks import DESCRIPTIONS, Pairs, weighted_measures
 from services.evaluation.prediction_names import DEFAULT_BASELINES
 from services.evaluation.prediction_scenes import (
     Future,
     Scene,
     copied,
+    geometry_error,
     imagine,
     other_instruction,
     other_take,
     reconstructed,
     standing_still,
+    trajectory_accuracy,
     warped,
     with_instruction,
 )
@@ -141,7 +142,7 @@ METRICS: Final = {
             "nDTW of the hands and objects that move by 2 px or more, found by their colours, with "
             "a tolerance of 5 % of the image's width; 1 for equal trajectories",
             "geometry",
-            _of_geometry(scene_geometry.trajectory_accuracy),
+            _of_geometry(trajectory_accuracy),
         ),
         Metric(
             "geometry_error",
@@ -151,7 +152,7 @@ METRICS: Final = {
             "AbsRel of the depth of what each pixel shows, found by colour, after alignment of the "
             "scale",
             "geometry",
-            _of_geometry(scene_geometry.geometry_error),
+            _of_geometry(geometry_error),
         ),
         Metric(
             "tactile_psnr",

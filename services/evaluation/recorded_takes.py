@@ -25,13 +25,18 @@ from dextouch.errors import InvalidInputError
 from dextouch.images import square_of_at_most
 from dextouch.schemas import WorldDescription
 from dextouch.streams import HEAD_CAMERA
-from services.evaluation.matched_starts import MatchedStart, refuse_training_starts, start_digest
+from services.evaluation.closed_loop import RolloutRunner
+from services.evaluation.matched_starts import (
+    MatchedStart,
+    StudyWorlds,
+    WorldAddress,
+    refuse_training_starts,
+    start_digest,
+)
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.progress import Progress
-from services.evaluation.rollout_runner import RolloutRunner
 from services.evaluation.scores import Outcome, RolloutFailure, RolloutScore
 from services.evaluation.statistics import area_under_roc, wilson_interval
-from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
 from services.networks.training_settings import USUAL_IMAGE_PX
 

@@ -1,4 +1,4 @@
-"""Settings of training and evaluation, from flags and environment variables."""
+"""Settings of training, evaluation, studies and ratings; imports no torch, to be quick to show."""
 
 import re
 import shlex
@@ -8,9 +8,10 @@ from typing import Any
 from pydantic import Field, field_validator, model_validator
 
 from dextouch.command_line import JSON_HELP
+from dextouch.data_folder import data_folder, default_store
 from dextouch.frozen_model import FrozenModel
-from dextouch.serving import CommandSettings, service_config
-from services.evaluation.bundled_policies import DEFAULT_POLICY, BundledName
+from dextouch.serving import CommandSettings, ServiceSettings, service_config
+from services.evaluation.bundled_policies import DEFAULT_POLICY, PRETRAINED, BundledName
 from services.networks.training_settings import (
     USUAL_IMAGE_PX,
     Batch,
@@ -27,7 +28,15 @@ from services.networks.training_settings import (
     WeightDecay,
 )
 
-# Settings of the trainings of policies and judges; imports no torch, so that they can be shown.
+EARLY_POLICY = PRETRAINED / "behaviour_cloning_early.safetensors"
+# Word of `--base` for the next.
+PACKAGE = Path("package")
+DEFAULT_PROBE = PRETRAINED / "success_probe.safetensors"
+_SEEDS = re.compile(r"(\d+):(\d+)")
+DEFAULT_MARKS = Path("runs/ratings.sqlite")
+_MARKS = "append-only SQLite file of the marks"
+_STUDY = "name of the study whose rollouts are rated; default: all rollouts of the store"
+_RUBRICS = "TOML file of rubrics by task; default: the package's"
 
 
 class CloningSettings(FrozenModel):
@@ -118,14 +127,6 @@ class ClassifierSettings(FrozenModel):
     )
 
 
-PRETRAINED = Path(__file__).parent / "pretrained"
-EARLY_POLICY = PRETRAINED / "behaviour_cloning_early.safetensors"
-# Word of `--base` for the next.
-PACKAGE = Path("package")
-DEFAULT_PROBE = PRETRAINED / "success_probe.safetensors"
-_SEEDS = re.compile(r"(\d+):(\d+)")
-
-
 class TrainPolicySettings(CommandSettings):
     """Train a closed-loop policy on the successful robot episodes of some stores.
 
@@ -197,6 +198,18 @@ class TrainJudgeSettings(CommandSettings):
         default=ClassifierSettings(), description="training settings"
     )
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
+
+
+def command_line(word: str, arguments: list[str]) -> str:
+    """Command line of this service as typed; stored in checkpoints.
+
+    Files and folders are given by their last path component, since folders differ.
+    """
+    named = [
+        f"{flag}{separator}{value.rstrip('/').rsplit('/', 1)[-1]}"
+        for flag, separator, value in (one.rpartition("=") for one in arguments)
+    ]
+    return shlex.join(["dextouch", "train", word, *named])
 
 
 class ServedWorld(FrozenModel):
@@ -286,13 +299,66 @@ class RunSettings(CommandSettings):
         return range(int(first), int(stop))
 
 
-def command_line(word: str, arguments: list[str]) -> str:
-    """Command line of this service as typed; stored in checkpoints.
+class StudyServiceSettings(ServiceSettings):
+    """Serve the results of studies over HTTP, for the dashboard.
 
-    Files and folders are given by their last path component, since folders differ.
+    Reads only: studies are run by `dextouch study run`, and may run meanwhile.
+
+    Example:
+      dextouch study serve --studies data/studies --port 8086
     """
-    named = [
-        f"{flag}{separator}{value.rstrip('/').rsplit('/', 1)[-1]}"
-        for flag, separator, value in (one.rpartition("=") for one in arguments)
-    ]
-    return shlex.join(["dextouch", "train", word, *named])
+
+    model_config = service_config("studies", "dextouch study serve")
+
+    studies: Path = Field(
+        default_factory=lambda: data_folder() / "studies",
+        description="folder that holds the folder of each study",
+    )
+
+
+class RatingSettings(ServiceSettings):
+    """Serve a page on which people rate the rollouts of a store, without knowing their origin.
+
+    Every rater sees the rollouts in a different order, without policy, world or the marks of
+    others, and some of them twice. With API keys, a rater is the name of a key with the scope
+    `rate`.
+
+    Example:
+      dextouch rate serve --store-url runs/rollouts --marks runs/ratings.sqlite --port 8087
+    """
+
+    model_config = service_config("rating", "dextouch rate serve")
+
+    store_url: str = Field(
+        default_factory=default_store, min_length=1, description="folder or file:// URL"
+    )
+    marks: Path = Field(default=DEFAULT_MARKS, description=_MARKS)
+    rubrics: Path | None = Field(default=None, description=_RUBRICS)
+    tasks: tuple[str, ...] = Field(
+        default=(), description="tasks to rate; default: all that have a rubric"
+    )
+    study: str | None = Field(default=None, min_length=1, description=_STUDY)
+    raters_per_rollout: int = Field(
+        default=5, ge=1, le=100, description="number of people who rate each rollout"
+    )
+    repeat_share: float = Field(
+        default=0.08, ge=0, le=0.5, description="share of rollouts that a rater sees twice"
+    )
+
+
+class RatingReportSettings(CommandSettings):
+    """Print the scores of the rated rollouts of a store, and the agreement of raters.
+
+    Example:
+      dextouch rate report --store-url runs/rollouts --marks runs/ratings.sqlite --json ratings.json
+    """
+
+    model_config = service_config("rating_report", "dextouch rate report")
+
+    store_url: str = Field(
+        default_factory=default_store, min_length=1, description="folder or file:// URL"
+    )
+    marks: Path = Field(default=DEFAULT_MARKS, description=_MARKS)
+    rubrics: Path | None = Field(default=None, description=_RUBRICS)
+    study: str | None = Field(default=None, min_length=1, description=_STUDY)
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)

@@ -21,8 +21,8 @@ from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile.layout import NUM_TAXELS, split_pads
 from services.evaluation.calibration import UNFITTED, Calibration, Combination, sigmoid
-from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_network
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
+from services.evaluation.trained_networks import Checkpoint, load_checkpoint, load_network
 
 # Features of taxel pressures for small networks: a few numbers per pad.
 

@@ -27,10 +27,8 @@ from services.evaluation.calibration import (
     fit_combination,
     sigmoid,
 )
-from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
 from services.evaluation.endings import Ending, EndingEpisode, milestones_of
-from services.evaluation.matched_starts import instructions_of, refuse_training_starts
-from services.evaluation.optimization import optimized
+from services.evaluation.matched_starts import refuse_training_starts
 from services.evaluation.settings import ClassifierSettings
 from services.evaluation.statistics import area_under_roc, balanced_accuracy
 from services.evaluation.success_classifier import (
@@ -48,6 +46,13 @@ from services.evaluation.success_classifier import (
     unit_images,
 )
 from services.evaluation.success_classifier_data import Labelled, labelled_endings, object_scale
+from services.evaluation.trained_networks import (
+    Checkpoint,
+    CheckpointMetadata,
+    instructions_of,
+    network_tensors,
+    optimized,
+)
 
 # Calibration of a trained success classifier, and its metrics on held-out endings.
 

@@ -12,11 +12,11 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.serving import configure_logging
 from dextouch.worlds import WorldServiceSettings, create_world_app
+from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import HoldPolicy
 from services.evaluation.recorded_takes import REPLAY, read_takes, score_lines, score_recorded
-from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines.generate import refuse_trained_episodes
 from services.pipelines.imagined_data import WORLD

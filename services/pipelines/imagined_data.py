@@ -24,7 +24,7 @@ from dextouch.serving import configure_logging
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.evaluation.progress import Progress
-from services.generation.demonstrations import SHORT_CHUNK_STEPS, imagine_episode, whole_steps
+from services.generation import SHORT_CHUNK_STEPS, imagine_episode, whole_steps
 from services.pipelines.parsers import imagined_parser
 from services.pipelines.servers import served
 from services.world_model.state_world import StateWorld

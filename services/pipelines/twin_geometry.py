@@ -7,8 +7,7 @@ from jaxtyping import Float64
 
 from dextouch.episodes import EpisodeReader, object_track
 from dextouch.hands.actions import poses_from_actions
-from services.evaluation.prediction_scenes import Scene
-from services.evaluation.scene_geometry import FAR_M, SceneGeometry
+from services.evaluation.prediction_scenes import FAR_M, Scene, SceneGeometry
 from services.twin.scene_views import SceneViews
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage

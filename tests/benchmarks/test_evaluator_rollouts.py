@@ -29,7 +29,7 @@ from benchmarks.evaluator.playing import play_in_twin, start_in_twin
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, UnknownNameError
 from dextouch.geometry import transform
 from services.evaluation.policies.colour_servo import ColourServo
-from services.evaluation.scene_geometry import warp_over_table
+from services.evaluation.prediction_scenes import warp_over_table
 from services.evaluation.settings import DEFAULT_PROBE
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld

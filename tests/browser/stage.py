@@ -17,9 +17,8 @@ from services.dashboard.settings import DashboardSettings
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.rating.app import create_rating_app
-from services.evaluation.rating.settings import RatingSettings
+from services.evaluation.settings import RatingSettings, StudyServiceSettings
 from services.evaluation.studies.app import create_app as create_studies
-from services.evaluation.studies.settings import StudyServiceSettings
 from tests.browser import played_items
 from tests.browser.test_rollouts_page import START, NoisyWorld
 from tests.unit.episode_store.episodes import write_recording, write_take

@@ -8,7 +8,7 @@ from playwright.sync_api import expect
 from dextouch.episodes import EpisodeStore
 from services.evaluation.rating.app import create_rating_app
 from services.evaluation.rating.marks import MarkLog
-from services.evaluation.rating.settings import RatingSettings
+from services.evaluation.settings import RatingSettings
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.test_rating_app import RUBRICS
 from tests.unit.evaluation.toy_store import write

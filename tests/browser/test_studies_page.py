@@ -7,8 +7,8 @@ from playwright.sync_api import expect
 
 from services.dashboard.app import create_app
 from services.dashboard.settings import DashboardSettings
+from services.evaluation.settings import StudyServiceSettings
 from services.evaluation.studies.app import create_app as create_studies
-from services.evaluation.studies.settings import StudyServiceSettings
 from tests.unit.evaluation.study_rows import (
     DEFINITION,
     DOUBTED,

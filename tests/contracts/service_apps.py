@@ -8,7 +8,7 @@ from services.acquisition.settings import AcquisitionSettings
 from services.alignment.settings import AlignmentSettings
 from services.dashboard.settings import DashboardSettings
 from services.episode_store.settings import EpisodeStoreSettings
-from services.evaluation.rating.settings import RatingSettings
+from services.evaluation.settings import RatingSettings
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.toy_store import write
 from tests.unit.worlds.fakes import SumWorld
@@ -54,8 +54,8 @@ def worlds(_, **settings):
 
 
 def studies(folder, **settings):
+    from services.evaluation.settings import StudyServiceSettings
     from services.evaluation.studies.app import create_app
-    from services.evaluation.studies.settings import StudyServiceSettings
 
     return create_app(StudyServiceSettings(studies=folder, **settings))
 

@@ -24,7 +24,7 @@ from services.alignment.settings import AlignmentSettings
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.upstream import Upstream
 from services.episode_store.settings import EpisodeStoreSettings
-from services.evaluation.rating.settings import RatingSettings
+from services.evaluation.settings import RatingSettings
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.toy_store import write
 from tests.unit.worlds.fakes import SumWorld, actions

@@ -19,7 +19,6 @@ from dextouch.hands.actions import (
 )
 from dextouch.schemas import Observation
 from dextouch.streams import HEAD_CAMERA
-from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_network
 from services.evaluation.policies.cloning_network import (
     SLOT_STEPS,
     CloningBatch,
@@ -27,6 +26,7 @@ from services.evaluation.policies.cloning_network import (
     phase_features,
 )
 from services.evaluation.success_classifier import pad_features
+from services.evaluation.trained_networks import Checkpoint, load_checkpoint, load_network
 
 # Older checkpoints, "behaviour-cloning-policy", are incompatible: chunks began at the reached pose.
 KIND = "cloned-policy"

@@ -10,9 +10,6 @@ from dextouch.episodes import data_hash, split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT
 from dextouch.schemas import CHUNK_STEPS
-from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
-from services.evaluation.matched_starts import instructions_of
-from services.evaluation.optimization import optimized
 from services.evaluation.policies.behaviour_cloning import (
     KIND,
     CloningInput,
@@ -30,6 +27,13 @@ from services.evaluation.policies.cloning_network import (
     CloningNetwork,
 )
 from services.evaluation.settings import CloningSettings
+from services.evaluation.trained_networks import (
+    Checkpoint,
+    CheckpointMetadata,
+    instructions_of,
+    network_tensors,
+    optimized,
+)
 
 # Batch size of the held-out evaluation.
 _TESTED_AT_ONCE = 128

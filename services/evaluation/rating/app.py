@@ -24,7 +24,7 @@ from services.evaluation.rating.marks import (
     rubric_of,
 )
 from services.evaluation.rating.rating_queue import RatingQueue, RolloutPictures, rated_rollouts
-from services.evaluation.rating.settings import RatingSettings
+from services.evaluation.settings import RatingSettings
 
 STATIC: Final = FilePath(__file__).parent / "static"
 FILES: Final = {"/": "rate.html"} | {

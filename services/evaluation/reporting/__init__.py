@@ -1,13 +1,40 @@
-"""HTML report of an evaluation: one self-contained page of figures and images."""
+"""HTML page of a report (the content of report.json) and its pictures, in one file.
 
-from services.evaluation.reporting.page import write_report
+Every section is optional and omitted without data. The report may hold `title`, `about`, `stages`,
+`errors`, `world_model`, `prediction`, `policies`, `agreement` and `failures`; unknown keys only
+appear in the raw figures at the end.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+
+from dextouch.free_text import printable
 from services.evaluation.reporting.pictures import (
     ActionPicture,
     EpisodePicture,
     PredictionPicture,
     ReportPictures,
+    action_charts,
     action_picture,
+    clock_chart,
     episode_picture,
+    policy_panels,
+    strips,
+)
+from services.evaluation.reporting.sections import (
+    calibration_rows,
+    clock_rows,
+    comparison_bars,
+    error_rows,
+    failure_rows,
+    figure,
+    stage_bars,
+    tiles,
+    undecided_note,
 )
 
 __all__ = [
@@ -19,3 +46,55 @@ __all__ = [
     "episode_picture",
     "write_report",
 ]
+
+
+def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path) -> None:
+    """Write the page atomically.
+
+    Args:
+        report: figures; NaN and None are shown as "undefined".
+        pictures: arrays to draw.
+        path: HTML file; its folder is created.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".unfinished")
+    unfinished.write_text(render_report(report, pictures), encoding="utf-8")
+    unfinished.replace(path)
+
+
+def _visible(value: object) -> object:
+    """Texts from elsewhere with their unusual characters escaped; drawings and numbers as given."""
+    return printable(value, lines=True) if type(value) is str else value
+
+
+def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
+    """Render the page as text."""
+    environment = Environment(
+        loader=PackageLoader("services.evaluation.reporting"),
+        autoescape=select_autoescape(["j2"], default=True),
+        undefined=StrictUndefined,
+        finalize=_visible,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["figure"] = figure
+    return environment.get_template("report.html.j2").render(
+        title=report.get("title", "DexTouch report"),
+        about=report.get("about", {}),
+        tiles=tiles(report),
+        stages=stage_bars(report.get("stages", [])),
+        errors=error_rows(report.get("errors", {})),
+        calibrations=calibration_rows(report),
+        clocks=clock_rows(report.get("errors", {})),
+        clock_chart=clock_chart(pictures),
+        action_charts=action_charts(pictures.actions),
+        comparisons=comparison_bars(report.get("world_model", {})),
+        prediction=report.get("prediction"),
+        policies=policy_panels(report),
+        agreement=report.get("agreement", {}),
+        failures=failure_rows(report),
+        undecided_note=undecided_note,
+        num_rollouts=report.get("num_rollouts", 0),
+        strips=strips(pictures),
+        raw=json.dumps(report, indent=1, default=str, ensure_ascii=False),
+    )

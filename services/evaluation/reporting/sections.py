@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from services.evaluation.comments import UNDEFINED
-from services.evaluation.scores import REAL, ClosedLoopReport
+from services.evaluation.scores import REAL, UNDEFINED, ClosedLoopReport
 
 # Key of the figure, its name on the page, its unit, and its bound, if any.
 ERRORS: tuple[tuple[str, str, str, tuple[str, float] | None], ...] = (

@@ -13,12 +13,11 @@ from dextouch.clients import Policy
 from dextouch.episodes import EpisodeStore, select_episodes
 from dextouch.errors import UnavailableError
 from services.evaluation.bundled_policies import bundled_policy, checkpoint_of, training_starts_of
-from services.evaluation.closed_loop import EvaluationPlan, begin_matched
-from services.evaluation.matched_starts import FailedStart, MatchedStart
+from services.evaluation.closed_loop import EvaluationPlan, RolloutRunner, begin_matched
+from services.evaluation.matched_starts import FailedStart, MatchedStart, StudyWorlds
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.progress import Progress
-from services.evaluation.rollout_runner import RolloutRunner
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure
 from services.evaluation.studies.definition import PolicyChoice, StudyDefinition
 from services.evaluation.studies.results import (
@@ -29,7 +28,6 @@ from services.evaluation.studies.results import (
     keep_rollout,
     study_report,
 )
-from services.evaluation.study_worlds import StudyWorlds
 from services.evaluation.success_classifier import SuccessClassifier
 
 Start = MatchedStart | FailedStart

@@ -24,8 +24,8 @@ from dextouch.schemas import (
     WorldDescription,
     matrix_rows,
 )
+from services.evaluation.closed_loop import PlayedRollout
 from services.evaluation.matched_starts import MatchedStart
-from services.evaluation.rollout_runner import PlayedRollout
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
 from services.evaluation.studies.definition import StudyDefinition
 

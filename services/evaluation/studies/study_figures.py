@@ -10,10 +10,17 @@ from pydantic import AwareDatetime
 from dextouch.command_line import write_result
 from dextouch.frozen_model import FrozenModel
 from services.evaluation.calibration import LEAST_DECIDED
-from services.evaluation.comments import UNDEFINED, VAGUE_R, undefined_by
 from services.evaluation.reporting import ReportPictures, write_report
 from services.evaluation.reporting.sections import latex_tables
-from services.evaluation.scores import REAL, ClosedLoopReport, RolloutFailure, RolloutScore
+from services.evaluation.scores import (
+    REAL,
+    UNDEFINED,
+    VAGUE_R,
+    ClosedLoopReport,
+    RolloutFailure,
+    RolloutScore,
+    undefined_by,
+)
 from services.evaluation.studies.definition import StudyDefinition
 from services.evaluation.studies.results import (
     PlannedRollout,

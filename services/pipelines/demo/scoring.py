@@ -11,10 +11,10 @@ from dextouch.worlds import BatchWorld
 from services.evaluation.bundled_policies import DEFAULT_POLICY
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
 from services.evaluation.command_line import run_train_judge, run_train_policy
+from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.scores import REAL, RolloutScore
 from services.evaluation.settings import DEFAULT_PROBE
-from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines import imagined_data, training_data
 from services.pipelines.demo.settings import TASKS, DemoPlan

@@ -19,6 +19,7 @@ from services.evaluation.command_line import (
     print_failures,
     print_scores,
 )
+from services.evaluation.matched_starts import StudyWorlds, WorldAddress
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.progress import Progress
 from services.evaluation.scores import REAL, Outcome
@@ -39,7 +40,6 @@ from services.evaluation.studies.results import (
     cells_of,
 )
 from services.evaluation.studies.study_figures import REPORT_FILE, write_reports
-from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines.parsers import study_parser
 from services.pipelines.training_data import stage_of

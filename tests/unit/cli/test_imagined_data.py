@@ -12,7 +12,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import NotFoundError
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.endings import read_ending_episode
-from services.generation.demonstrations import imagine_episode
+from services.generation import imagine_episode
 from services.pipelines.imagined_data import (
     WORLD,
     chosen_episodes,

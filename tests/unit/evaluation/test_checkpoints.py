@@ -13,15 +13,15 @@ from dextouch.errors import (
     NonFiniteError,
     NotFoundError,
 )
-from services.evaluation.checkpoints import (
+from services.evaluation.policies.behaviour_cloning import KIND, BehaviourCloningPolicy
+from services.evaluation.success_classifier import KIND as PROBE_KIND
+from services.evaluation.success_classifier import SuccessClassifier
+from services.evaluation.trained_networks import (
     MAX_CHECKPOINT_BYTES,
     Checkpoint,
     load_checkpoint,
     save_checkpoint,
 )
-from services.evaluation.policies.behaviour_cloning import KIND, BehaviourCloningPolicy
-from services.evaluation.success_classifier import KIND as PROBE_KIND
-from services.evaluation.success_classifier import SuccessClassifier
 
 
 def changed(checkpoint: Checkpoint, **tensors: torch.Tensor | None) -> Checkpoint:

@@ -12,10 +12,9 @@ from dextouch.schemas import Doubt
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.baseline import CopyFirstWorld
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
-from services.evaluation.matched_starts import matched_start
+from services.evaluation.matched_starts import WorldAddress, matched_start
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.replay import HoldPolicy
-from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served

@@ -10,10 +10,10 @@ from dextouch.clients.policy import PolicyStart
 from dextouch.errors import UnknownNameError
 from dextouch.worlds.world import ReturnSelector, RolloutStart
 from services.evaluation.bundled_policies import DEFAULT_POLICY
-from services.evaluation.checkpoints import MAX_CHECKPOINT_BYTES
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.settings import DEFAULT_PROBE, EARLY_POLICY
 from services.evaluation.success_classifier import SuccessClassifier
+from services.evaluation.trained_networks import MAX_CHECKPOINT_BYTES
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 from tests.unit.evaluation import true_endings

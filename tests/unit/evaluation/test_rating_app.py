@@ -14,7 +14,7 @@ from services.cli.main import main
 from services.evaluation.rating.app import create_rating_app
 from services.evaluation.rating.marks import MarkLog
 from services.evaluation.rating.rating_queue import rated_rollouts, side_by_side
-from services.evaluation.rating.settings import RatingSettings
+from services.evaluation.settings import RatingSettings
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.toy_store import write
 

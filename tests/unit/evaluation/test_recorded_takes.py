@@ -10,7 +10,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.images import scaled_square
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.evaluation.matched_starts import start_digest
+from services.evaluation.matched_starts import WorldAddress, start_digest
 from services.evaluation.policies.replay import HoldPolicy
 from services.evaluation.recorded_takes import (
     REPLAY,
@@ -21,7 +21,6 @@ from services.evaluation.recorded_takes import (
     score_recorded,
 )
 from services.evaluation.scores import RolloutScore
-from services.evaluation.study_worlds import WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
 from tests.unit.evaluation import toy, toy_store
 from tests.unit.worlds.running import served

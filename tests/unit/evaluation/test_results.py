@@ -5,7 +5,8 @@ import json
 import pytest
 
 from dextouch.errors import StorageError
-from services.evaluation.scores import ResultLog, RolloutFailure, RolloutScore
+from services.evaluation.closed_loop import ResultLog
+from services.evaluation.scores import RolloutFailure, RolloutScore
 
 SCORE = RolloutScore("real", "mine", "reach", 3, "abc", success=True, probability=0.75)
 FAILURE = RolloutFailure("real", "mine", "reach", 4, "InvalidInputError", "act raised …", "trace")

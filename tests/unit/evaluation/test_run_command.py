@@ -8,9 +8,9 @@ import pytest
 
 from dextouch.errors import InvalidInputError
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.evaluation.checkpoints import save_checkpoint
 from services.evaluation.command_line import run_evaluation
 from services.evaluation.scores import REAL
+from services.evaluation.trained_networks import save_checkpoint
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
 

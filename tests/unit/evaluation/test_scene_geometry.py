@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.evaluation.scene_geometry import (
+from services.evaluation.prediction_scenes import (
     FAR_M,
     SceneGeometry,
     centroids,

@@ -13,9 +13,9 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 from dextouch.schemas import Doubt
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.evaluation.checkpoints import save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, begin_matched, evaluate
 from services.evaluation.endings import read_ending_episode
+from services.evaluation.matched_starts import StudyWorlds, WorldAddress
 from services.evaluation.policies.colour_servo import ColourServo
 from services.evaluation.policies.replay import HoldPolicy
 from services.evaluation.rating.marks import Rubric
@@ -31,8 +31,8 @@ from services.evaluation.studies.results import (
     rollout_episode_id,
     study_report,
 )
-from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_classifier import SuccessClassifier
+from services.evaluation.trained_networks import save_checkpoint
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
 

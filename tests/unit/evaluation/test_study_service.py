@@ -7,10 +7,10 @@ import shutil
 import httpx
 import pytest
 
-from services.evaluation.studies import study_folders
+from services.evaluation.settings import StudyServiceSettings
+from services.evaluation.studies import app
 from services.evaluation.studies.app import create_app
 from services.evaluation.studies.results import StudyResults
-from services.evaluation.studies.settings import StudyServiceSettings
 from tests.unit.evaluation.study_rows import (
     DEFINITION,
     DOUBTED,
@@ -169,7 +169,7 @@ async def test_new_rows_are_read_and_a_look_does_not_stop_a_study(root):
 
 
 async def test_a_running_study_is_read_again_only_now_and_then(tmp_path, monkeypatch):
-    monkeypatch.setattr(study_folders, "MAX_READING_SHARE", 1e-6)
+    monkeypatch.setattr(app, "MAX_READING_SHARE", 1e-6)
     path = write_study(tmp_path / "touch", unfinished=("blurred",))
     async with client(tmp_path) as opened:
 

@@ -11,7 +11,7 @@ from dextouch.images import scaled_square
 from dextouch.schemas import EVERYTHING, Doubt
 from dextouch.worlds import CopyFirstWorld, SteppedRollout, WorldServiceSettings, create_world_app
 from services.evaluation.endings import read_ending_episode
-from services.generation.demonstrations import imagine_episode
+from services.generation import imagine_episode
 from services.pipelines.servers import served
 from services.twin.episodes import record, write_episode
 from services.twin.settings import TwinSettings

@@ -6,7 +6,7 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.geometry import apply, invert
 from dextouch.hands.actions import poses_from_actions
-from services.evaluation.scene_geometry import labelled
+from services.evaluation.prediction_scenes import labelled
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.scene_views import TABLE_LABEL, SceneViews
 from services.twin.settings import TwinSettings

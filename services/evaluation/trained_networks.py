@@ -1,15 +1,17 @@
-"""Safetensors checkpoints of the evaluation's networks: weights, configuration and provenance."""
+"""Networks of the evaluation: their training loop, and checkpoints of weights with provenance."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.frozen_model import FrozenModel
+from services.evaluation.progress import Progress
+from services.networks.optimizer import Budget, OptimizerLoop, OptimizerOptions
 from services.networks.weight_files import (
     load_strictly,
     read_weights,
@@ -96,3 +98,73 @@ def load_network(network: nn.Module, checkpoint: Checkpoint) -> None:
     """
     where = f"checkpoint of {checkpoint.metadata.kind}"
     load_strictly({_PREFIX: network}, checkpoint.tensors, where=where)
+
+
+@runtime_checkable
+class RateSettings(Protocol):
+    """Settings that every training of this service has."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of weights and sampling."""
+
+    @property
+    def learning_rate(self) -> float:
+        """Peak of the cosine schedule."""
+
+    @property
+    def weight_decay(self) -> float:
+        """AdamW weight decay."""
+
+
+def optimized(
+    network: nn.Module,
+    loss: Callable[[torch.Generator], Tensor],
+    settings: RateSettings,
+    *,
+    limits: tuple[int, float],
+    title: str,
+    max_gradient_norm: float | None = 1.0,
+) -> Iterator[Budget]:
+    """Train a network; yields the used budget after each step.
+
+    Args:
+        network: module to train.
+        loss: loss of a batch drawn with the generator.
+        settings: seed, learning rate and weight decay.
+        limits: largest number of steps, and CPU seconds.
+        title: name beside the progress bar.
+        max_gradient_norm: norm that gradients are clipped to; None: not clipped.
+    """
+    num_steps, max_cpu_s = limits
+    generator = torch.Generator().manual_seed(settings.seed)
+    budget = Budget(max_cpu_s, num_steps)
+    options = OptimizerOptions(
+        settings.learning_rate, settings.weight_decay, max_gradient_norm, fused=False
+    )
+    network.train()
+    with Progress(title, num_steps) as progress:
+        for value in OptimizerLoop(network, options, budget).run(lambda: loss(generator)):
+            progress.advance(loss=value)
+            yield budget
+
+
+@runtime_checkable
+class Instructed(Protocol):
+    """Anything with a task and its instruction."""
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+
+    @property
+    def instruction(self) -> str:
+        """Instruction of the task."""
+
+
+def instructions_of(demonstrations: Iterable[Instructed]) -> dict[str, str]:
+    """Instruction of every task, from its first episode."""
+    found: dict[str, str] = {}
+    for item in demonstrations:
+        found.setdefault(item.task, item.instruction)
+    return found

@@ -1,1 +1,0 @@
-"""Imagined episodes: recorded actions replayed in an imagined world and stored."""
