@@ -37,13 +37,13 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import MAX_OBJECTS, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from services.evaluation.calibration import (
-    Calibration,
+    MIN_OUTCOMES,
     expected_calibration_error,
     fit_calibration,
 )
 from services.evaluation.matched_starts import start_digest
 from services.evaluation.statistics import area_under_roc
-from services.evaluation.success_classifier_training import MIN_OUTCOMES
+from services.evaluation.success_classifier import Calibration
 from services.evaluation.trained_networks import (
     Checkpoint,
     CheckpointMetadata,

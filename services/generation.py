@@ -109,8 +109,7 @@ def _played(
             rollout.observation,
             *(
                 rollout.step(
-                    actions[begin:end],
-                    selector=None if shown else ReturnSelector(cameras=()),
+                    actions[begin:end], selector=None if shown else ReturnSelector(cameras=())
                 )
                 for begin, end, shown in _chunks(len(actions), image_steps)
             ),

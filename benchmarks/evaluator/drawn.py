@@ -7,16 +7,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.figures import Requirement, Sense
-from services.evaluation.calibration import expected_calibration_error
-from services.evaluation.scores import UNDEFINED, undefined_by
-from services.evaluation.statistics import (
+from benchmarks.evaluator.resampling import (
     area_under_roc_of_draws,
     balanced_accuracy_of_draws,
     interval_of_draws,
     mean_of_draws,
-    start_counts,
 )
+from benchmarks.figures import Requirement, Sense
+from services.evaluation.calibration import expected_calibration_error
+from services.evaluation.scores import UNDEFINED, undefined_by
+from services.evaluation.statistics import start_counts
 
 NUM_DRAWS: Final = 1000
 _NUM_CALIBRATION_DRAWS: Final = 200

@@ -18,10 +18,11 @@ from benchmarks.evaluator.drawn import (
 )
 from benchmarks.evaluator.kind_lines import KindFigures
 from benchmarks.evaluator.plan import IDLE
+from benchmarks.evaluator.resampling import rates_of_draws
 from benchmarks.evaluator.rival_lines import rival_figures, rival_rows
 from dextouch.metrics.policy import mmrv, pearson
 from services.evaluation.calibration import UNDECIDED_RISK
-from services.evaluation.statistics import mmrv_of_draws, pearson_of_draws, rates_of_draws
+from services.evaluation.statistics import mmrv_of_draws, pearson_of_draws
 from services.twin.scripted_actions import mistake_of
 
 TRUE, IMAGINED = "true verdict", "imagined verdict"

@@ -1,102 +1,47 @@
-"""Calibration of a success classifier: maps log odds to probabilities that match frequencies.
+"""Calibration of a success classifier, and its metrics on endings that it was not trained on.
 
-Temperature and bias for each task and kind of ending are fitted on episodes that the classifier was
-not trained on, together with the band of probabilities in which it should abstain. `Combination`
-joins a classifier of imagined endings with the world's own estimate of success.
+Temperature and bias for each task and kind of ending map log odds to probabilities that match
+frequencies; they are fitted together with the band of probabilities in which the classifier should
+abstain.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
 from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from pydantic import Field
 
 from dextouch.errors import InvalidInputError
-from dextouch.frozen_model import FrozenModel
+from services.evaluation.endings import Ending, EndingEpisode
+from services.evaluation.scores import LEAST_DECIDED
+from services.evaluation.statistics import area_under_roc, balanced_accuracy
+from services.evaluation.success_classifier import (
+    IMAGINED,
+    TRUE,
+    WHOLE_BAND,
+    Calibration,
+    Combination,
+    SuccessClassifier,
+    calibration_name,
+    combination_name,
+    log_odds_of,
+    sigmoid,
+)
 
 NUM_BINS: Final = 10
+# The undecided band of a classifier alone is at most 5 % … 95 %.
+_WIDEST_BAND: Final = 0.45
 _MAX_NEWTON_STEPS: Final = 50
 # Weight of the prior (temperature 1, bias 0) in the fit, in endings.
 _PRIOR_ENDINGS: Final = 2.0
 # Allowed share of wrong answers among the decided endings. Kinds of mistakes that nothing was
 # calibrated on are judged wrongly about twice as often.
 UNDECIDED_RISK: Final = 0.05
-# Endings that should be decided where classifier and world are good enough.
-LEAST_DECIDED: Final = 0.60
-# The undecided band of a classifier alone is at most 5 % … 95 %.
-_WIDEST_BAND: Final = 0.45
-# The band within which everything is undecided.
-_WHOLE_BAND: Final = 0.5
-# Estimates are counted as at most this sure: the mean over a few members is often 0 or 1.
-_LEAST_PROBABILITY: Final = 0.01
 
 
-class Calibration(FrozenModel):
-    """Probability = sigmoid(log odds / temperature + bias); undecided within `band` of 0.5."""
-
-    temperature: float = Field(default=1.0, gt=0)
-    bias: float = 0.0
-    band: float = Field(default=0.0, ge=0, lt=0.5)
-
-    def probabilities(self, log_odds: np.ndarray) -> Float64[np.ndarray, " n"]:
-        """Calibrated probabilities of success."""
-        return sigmoid(np.asarray(log_odds, dtype=np.float64) / self.temperature + self.bias)
-
-
-class Combination(FrozenModel):
-    """Joins the calibrated probability of a classifier with the world's own estimate.
-
-    The log odds of the result are the weighted sum of both log odds and `bias`; it is undecided
-    within `band` of 0.5. The two contradict each other if they lie on different sides of 0.5, each
-    by more than `margin`; with a margin of 0.5 they never do.
-    """
-
-    probe_weight: float = Field(default=0.5, ge=0)
-    world_weight: float = Field(default=0.5, ge=0)
-    bias: float = 0.0
-    band: float = Field(default=0.0, ge=0, le=_WHOLE_BAND)
-    margin: float = Field(default=0.0, ge=0, le=0.5)
-
-    def probabilities(self, probe: np.ndarray, world: np.ndarray) -> Float64[np.ndarray, " n"]:
-        """Joint probabilities of success."""
-        odds = self.probe_weight * _log_odds(probe) + self.world_weight * _log_odds(world)
-        return sigmoid(odds + self.bias)
-
-    def contradictory(self, probe: np.ndarray, world: np.ndarray) -> Bool[np.ndarray, " n"]:
-        """Whether classifier and world contradict each other."""
-        low, high = np.minimum(probe, world), np.maximum(probe, world)
-        return np.asarray((low < 0.5 - self.margin) & (high > 0.5 + self.margin))
-
-
-# For probes that were trained before their world estimated success: the mean of both log odds, with
-# the band outside of which a tenth of the development kinds of mistakes was judged wrongly.
-UNFITTED: Final = Combination(band=0.3)
-
-
-@dataclass(frozen=True)
-class Reliability:
-    """Calibration metrics of probabilities; 0 is best for both."""
-
-    expected_calibration_error: float
-    brier: float
-
-    @classmethod
-    def of(cls, probabilities: np.ndarray, success: np.ndarray) -> "Reliability":
-        """Metrics of a set of endings."""
-        return cls(
-            expected_calibration_error(probabilities, success), brier(probabilities, success)
-        )
-
-
-def sigmoid(log_odds: np.ndarray) -> Float64[np.ndarray, "*n"]:
-    """1 / (1 + exp(−x)), without overflow."""
-    return np.asarray(np.exp(-np.logaddexp(0.0, -log_odds)))
-
-
-def expected_calibration_error(
-    probabilities: np.ndarray, success: np.ndarray, *, num_bins: int = NUM_BINS
-) -> float:
+def expected_calibration_error(probabilities: np.ndarray, success: np.ndarray) -> float:
     """Mean distance of predicted and true success rates over bins of equal width (Guo et al. 2017).
 
     Bins are weighted by their number of endings. Even a perfectly calibrated classifier has an
@@ -106,8 +51,8 @@ def expected_calibration_error(
         InvalidInputError: no endings, or arrays of different lengths.
     """
     predicted, outcomes = _pair(probabilities, success)
-    bins = np.minimum((predicted * num_bins).astype(int), num_bins - 1)
-    gaps = np.bincount(bins, weights=predicted - outcomes, minlength=num_bins)
+    bins = np.minimum((predicted * NUM_BINS).astype(int), NUM_BINS - 1)
+    gaps = np.bincount(bins, weights=predicted - outcomes, minlength=NUM_BINS)
     return float(np.abs(gaps).sum() / len(predicted))
 
 
@@ -180,7 +125,7 @@ def fit_combination(
     """
     told, outcomes = _pair(probe, success)
     estimated, _ = _pair(world, success)
-    odds, weights = np.stack([_log_odds(told), _log_odds(estimated)], axis=1), np.zeros(2)
+    odds, weights = (np.stack([log_odds_of(told), log_odds_of(estimated)], axis=1), np.zeros(2))
     slopes, bias = _platt(odds, outcomes > 0.5)
     if min(slopes) > 0:
         weights[:] = slopes
@@ -191,10 +136,10 @@ def fit_combination(
     fitted = Combination(probe_weight=weights[0], world_weight=weights[1], bias=bias, margin=margin)
     agreed = ~fitted.contradictory(told, estimated)
     if not agreed.any():
-        return fitted.model_copy(update={"band": _WHOLE_BAND})
+        return fitted.model_copy(update={"band": WHOLE_BAND})
     joint = fitted.probabilities(told, estimated)[agreed]
     for allowed in (risk, 2 * risk):
-        band = undecided_band(joint, outcomes[agreed], risk=allowed, widest=_WHOLE_BAND)
+        band = undecided_band(joint, outcomes[agreed], risk=allowed, widest=WHOLE_BAND)
         if np.mean(np.abs(joint - 0.5) > band) >= LEAST_DECIDED:
             break
     return fitted.model_copy(update={"band": band})
@@ -220,13 +165,6 @@ def undecided_band(
         if (wrong[decided].sum() + 1) / (decided.sum() + 1) <= risk:
             return float(width)
     return widest
-
-
-def _log_odds(probabilities: np.ndarray) -> Float64[np.ndarray, " n"]:
-    bounded = np.clip(
-        np.asarray(probabilities, np.float64), _LEAST_PROBABILITY, 1 - _LEAST_PROBABILITY
-    )
-    return np.asarray(np.log(bounded / (1 - bounded)))
 
 
 def _platt(
@@ -261,3 +199,161 @@ def _pair(probabilities: np.ndarray, success: np.ndarray) -> tuple[np.ndarray, n
             "expected one each, at least one"
         )
     return predicted, outcomes
+
+
+# No calibration is fitted with fewer endings of either outcome.
+MIN_OUTCOMES: Final = 5
+
+# Milestones with a lower area under the ROC curve are not reported by the probe.
+MIN_MILESTONE_AUC: Final = 0.9
+
+Figures = dict[str, float | int]
+
+
+def fit_calibrations(
+    probe: SuccessClassifier, episodes: Sequence[EndingEpisode], *, risk: float
+) -> dict[str, Calibration]:
+    """Calibration of every task and kind of ending with enough of both outcomes."""
+    found: dict[str, Calibration] = {}
+    for task in probe.shape.tasks:
+        for kind in (TRUE, IMAGINED):
+            endings, success = final_endings(episodes, task, kind)
+            if min(success.sum(), (~success).sum()) < MIN_OUTCOMES:
+                continue
+            odds = probe.log_odds(endings)[:, 0]
+            found[calibration_name(task, kind)] = fit_calibration(odds, success, risk=risk)
+    return found
+
+
+def fit_combinations(
+    probe: SuccessClassifier, episodes: Sequence[EndingEpisode], *, risk: float, margin: float
+) -> dict[str, Combination]:
+    """Combination of a calibrated probe with the world's own estimates, of every task.
+
+    Only imagined endings count that the world estimates and does not doubt, since it is for these
+    that the probe decides. Objects of unusual sizes have a combination of their own: a world is
+    right about them less often.
+    """
+    found: dict[str, Combination] = {}
+    for task, unusual_sizes in product(probe.shape.tasks, (False, True)):
+        endings, success = final_endings(episodes, task, IMAGINED)
+        rows = [
+            row
+            for row, ending in enumerate(endings)
+            if ending.success_probability is not None
+            and ending.doubted is None
+            and ending.has_unusual_sizes == unusual_sizes
+        ]
+        outcomes = success[rows]
+        if min(outcomes.sum(), (~outcomes).sum()) < MIN_OUTCOMES:
+            continue
+        mine = [endings[row] for row in rows]
+        world = np.array([ending.success_probability for ending in mine], dtype=np.float64)
+        name = combination_name(task, unusual_sizes=unusual_sizes)
+        found[name] = fit_combination(
+            probe.probabilities(mine), world, outcomes, risk=risk, margin=margin
+        )
+    return found
+
+
+def milestones_that_can_be_told(
+    probe: SuccessClassifier, episodes: Sequence[EndingEpisode]
+) -> dict[str, tuple[str, ...]]:
+    """Milestones of every task that the probe classifies well on held-out endings."""
+    areas = milestone_areas(probe, episodes)
+    return {
+        task: tuple(n for n in names if areas.get((task, n), 0.0) >= MIN_MILESTONE_AUC)
+        for task, names in probe.shape.milestones.items()
+    }
+
+
+def milestone_areas(
+    probe: SuccessClassifier, episodes: Sequence[EndingEpisode]
+) -> dict[tuple[str, str], float]:
+    """Area under the ROC curve of every task and milestone with both outcomes."""
+    areas: dict[tuple[str, str], float] = {}
+    for task, names in probe.shape.milestones.items():
+        mine = [e for e in episodes if e.task == task and e.event_times_s is not None]
+        if not mine:
+            continue
+        odds = probe.log_odds([_as_seen(e.final, TRUE) for e in mine])
+        for index, name in enumerate(names):
+            outcomes = np.array([bool((e.reached(names, e.last_step) or [])[index]) for e in mine])
+            if min(outcomes.sum(), (~outcomes).sum()) >= MIN_OUTCOMES:
+                areas[task, name] = area_under_roc(odds[:, 1 + index], outcomes)
+    return areas
+
+
+def held_out_figures(probe: SuccessClassifier, episodes: Sequence[EndingEpisode]) -> Figures:
+    """Share of correct decisions over all tasks, and metrics of true and imagined endings by task.
+
+    True endings are given without object poses, which a real robot does not have; `poses` are true
+    endings with poses and touch but no image; `imagined` endings are given as they are.
+
+    Raises:
+        InvalidInputError: a task has only one outcome.
+    """
+    figures: Figures = {}
+    right: list[bool] = []
+    for task in probe.shape.tasks:
+        endings, success = final_endings(episodes, task, TRUE)
+        right.extend(((probe.probabilities(endings) >= probe.threshold) == success).tolist())
+        figures |= _figures(probe, endings, success, f"held_out_{{}}_{task}")
+        figures[f"num_held_out_successes_{task}"] = int(success.sum())
+        figures[f"num_held_out_failures_{task}"] = int((~success).sum())
+        for kind, (others, outcomes) in {
+            "poses": _with_poses_only(episodes, task),
+            "imagined": final_endings(episodes, task, IMAGINED),
+        }.items():
+            if min(outcomes.sum(), (~outcomes).sum()) >= MIN_OUTCOMES:
+                figures |= _figures(probe, others, outcomes, f"held_out_{kind}_{{}}_{task}")
+    for (task, name), area in milestone_areas(probe, episodes).items():
+        figures[f"held_out_milestone_auc_{task}_{name}"] = area
+    return {"held_out_accuracy": float(np.mean(right)), **figures}
+
+
+def _figures(
+    probe: SuccessClassifier, endings: Sequence[Ending], success: np.ndarray, name: str
+) -> Figures:
+    verdicts = probe.verdicts(endings)
+    probabilities = np.array([v.probability for v in verdicts])
+    likely = np.array([v.likely_success for v in verdicts])
+    decided = np.array([v.decision != "cannot tell" for v in verdicts])
+    before = sigmoid(probe.log_odds(endings)[:, 0])
+    found: Figures = {
+        "auc": area_under_roc(probabilities, success),
+        "balanced_accuracy": balanced_accuracy(likely, success),
+        "ece": expected_calibration_error(probabilities, success),
+        "ece_uncalibrated": expected_calibration_error(before, success),
+        "brier": brier(probabilities, success),
+        "brier_uncalibrated": brier(before, success),
+        "undecided": float(1 - decided.mean()),
+    }
+    if decided.any():
+        found["accuracy_of_decided"] = float((likely == success)[decided].mean())
+    return {name.format(key): value for key, value in found.items()}
+
+
+def final_endings(
+    episodes: Sequence[EndingEpisode], task: str, kind: str
+) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
+    """Final endings of a task, true or imagined, as a probe gets them, and their outcomes."""
+    mine = [e for e in episodes if e.task == task and e.imagined == (kind == IMAGINED)]
+    success = np.array([e.success for e in mine], dtype=bool)
+    return [_as_seen(e.final, kind) for e in mine], success
+
+
+def _as_seen(ending: Ending, kind: str) -> Ending:
+    return replace(ending, object_poses=None) if kind == TRUE and not ending.imagined else ending
+
+
+def _with_poses_only(
+    episodes: Sequence[EndingEpisode], task: str
+) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
+    mine = [
+        e
+        for e in episodes
+        if e.task == task and not e.imagined and e.final.object_poses is not None
+    ]
+    success = np.array([e.success for e in mine], dtype=bool)
+    return [replace(e.final, images=None) for e in mine], success

@@ -18,13 +18,7 @@ from jaxtyping import Float64
 
 from dextouch.clients import Policy, Rollout
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, StorageError
-from dextouch.schemas import (
-    MAX_SEED,
-    Observation,
-    ReturnSelector,
-    RolloutDoubt,
-    rollout_doubt,
-)
+from dextouch.schemas import MAX_SEED, Observation, ReturnSelector, RolloutDoubt, rollout_doubt
 from dextouch.streams import HEAD_CAMERA
 from dextouch.tracing import current_trace_id, in_trace
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
@@ -34,9 +28,9 @@ from services.evaluation.matched_starts import (
     StudyWorlds,
     WorldAddress,
     first_digest,
+    matched_start,
     refuse_training_starts,
     rollout_failure,
-    try_matched_start,
 )
 from services.evaluation.policies.outside import action_chunk, ask
 from services.evaluation.progress import Progress
@@ -101,7 +95,7 @@ def evaluate(
     cells = list(itertools.product(starts, policies, worlds.addresses))
     with Progress("rollouts", len(cells)) as progress:
         for start, policy, world in cells:
-            outcome = runner.outcome(start, policies[policy], policy, world)
+            outcome, _ = runner.run(start, policies[policy], policy, world)
             if keep is not None:
                 keep(outcome)
             if isinstance(outcome, RolloutScore):
@@ -121,7 +115,7 @@ def begin_matched(
         ConflictError: a start was trained on.
     """
     starts = [
-        try_matched_start(real, task, seed, instruction)
+        matched_start(real, task, seed, instruction)
         for task, instruction in plan.instructions.items()
         for seed in plan.seeds
     ]
@@ -180,12 +174,6 @@ class RolloutRunner:
     shows_all: bool = False
     own_probes: Mapping[str, SuccessClassifier] = field(default_factory=dict)
 
-    def outcome(
-        self, start: MatchedStart | FailedStart, actor: Policy, policy: str, world: str
-    ) -> Outcome:
-        """Play and score one rollout; an error becomes a failure with its reason."""
-        return self.run(start, actor, policy, world)[0]
-
     def run(
         self,
         start: MatchedStart | FailedStart,
@@ -194,7 +182,7 @@ class RolloutRunner:
         world: str,
         repeat: int = 0,
     ) -> tuple[Outcome, PlayedRollout | None]:
-        """Play and score one rollout.
+        """Play and score one rollout; an error becomes a failure with its reason.
 
         Args:
             start: where it begins.

@@ -17,8 +17,7 @@ from services.evaluation.bundled_policies import bundled_policy, training_starts
 from services.evaluation.closed_loop import EvaluationPlan, ResultLog, evaluate
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
 from services.evaluation.matched_starts import WorldAddress
-from services.evaluation.policies.cloning_network import read_cloning_episodes
-from services.evaluation.policies.cloning_training import train_cloned_policy
+from services.evaluation.policies.cloning_training import read_cloning_episodes, train_cloned_policy
 from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import ReportPictures, write_report
@@ -54,15 +53,15 @@ def run_train_policy(arguments: list[str]) -> int:
         episodes += read_cloning_episodes(
             *generated, tasks=settings.tasks, image_px=settings.image_px, imagined=True
         )
-    trained = train_cloned_policy(
+    finished, early = train_cloned_policy(
         episodes,
         settings.training,
         command=command_line("policy", arguments),
         early_at=settings.early_at,
     )
-    if trained.early is not None:
-        _keep(trained.early, settings.early_output(), None)
-    return _keep(trained.finished, settings.output, settings.json_path)
+    if early is not None:
+        _keep(early, settings.early_output(), None)
+    return _keep(finished, settings.output, settings.json_path)
 
 
 def run_train_judge(arguments: list[str]) -> int:

@@ -201,22 +201,17 @@ def first_digest(observation: Observation) -> str:
     return start_digest(observation.images[HEAD_CAMERA][0], observation.tactile_kpa[0])
 
 
-def matched_start(real: WorldAddress, task: str, seed: int, instruction: str) -> MatchedStart:
-    """First observation of the real world for a task and seed, with all its cameras."""
-    with real.client.start(
-        world=real.world, task=task, seed=seed, instruction=instruction
-    ) as rollout:
-        return MatchedStart(
-            task, seed, instruction, rollout.observation, rollout.anchor, rollout.K_head
-        )
-
-
-def try_matched_start(
+def matched_start(
     real: WorldAddress, task: str, seed: int, instruction: str
 ) -> MatchedStart | FailedStart:
-    """`matched_start`, or why the real world refused it."""
+    """First observation of the real world, with all its cameras, or why the world refused it."""
     try:
-        return matched_start(real, task, seed, instruction)
+        with real.client.start(
+            world=real.world, task=task, seed=seed, instruction=instruction
+        ) as rollout:
+            return MatchedStart(
+                task, seed, instruction, rollout.observation, rollout.anchor, rollout.K_head
+            )
     except DexTouchError as error:
         return FailedStart(task, seed, error)
 

@@ -1,11 +1,12 @@
-"""Networks of perceptual image metrics, read from local safetensors files: LPIPS, CLIP and DINO.
+"""Metrics with pretrained networks, read from local safetensors files: LPIPS, CLIP and DINO.
 
 Nothing is ever downloaded. A folder of weights has a subfolder for each network; see
 docs/evaluation.md for their contents.
 """
 
 from collections.abc import Callable
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Final, Literal
 
@@ -21,6 +22,10 @@ from dextouch.tactile.layout import SIDES
 from services.evaluation.prediction_scenes import Future, Scene
 from services.networks.weight_files import load_strictly, read_tensors
 
+Pairs = list[tuple[Scene, Future]]
+Better = Literal["higher", "lower"]
+Of = Literal["images", "touch", "geometry", "objects"]
+NO_WEIGHTS: Final = "not available (weights)"
 BATCH: Final = 32
 # Mean and deviation by which LPIPS scales images in -1 … 1 (Zhang et al. 2018, reference code).
 _LPIPS_SHIFT: Final = (-0.030, -0.088, -0.188)
@@ -40,6 +45,25 @@ _CONVOLUTIONS: Final = (
 )
 _POOLED_AFTER: Final = (0, 1)
 MIN_LPIPS_PX: Final = 63
+# Heat maps are enlarged by this factor, so that LPIPS can read them.
+_CELL_PX: Final = 4
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A figure of predicted futures; `measure` gets all pairs of a task, or of all tasks.
+
+    Without it, `missing` says why the metric is not available.
+    """
+
+    name: str
+    title: str
+    unit: str
+    better: Better
+    of: Of
+    measure: Callable[[Pairs], float] | None
+    about: str
+    missing: str = ""
 
 
 class Lpips(nn.Module):
@@ -212,51 +236,6 @@ def _resized(images: Float32[Tensor, "n 3 h w"]) -> Float32[Tensor, "n 3 224 224
     return large[..., top : top + _INPUT_PX, left : left + _INPUT_PX]
 
 
-# Prediction metrics that need pretrained networks, by their own definitions or not at all.
-
-Pairs = list[tuple[Scene, Future]]
-# Subfolders of weights that each metric needs.
-FOLDERS: Final[dict[str, tuple[str, ...]]] = {
-    "lpips": ("lpips",),
-    "tactile_lpips": ("lpips",),
-    "aesthetic_quality": ("clip", "aesthetic"),
-    "subject_consistency": ("dino",),
-}
-NO_WEIGHTS: Final = "not available (weights)"
-# Metrics of the paper's table whose definition needs more than local weights.
-UNDEFINED: Final = {
-    "image_quality": "not available: MUSIQ's maintained implementation is non-commercial",
-    "jepa_similarity": "not available: how V-JEPA features are compared is not published",
-    "semantic_alignment": "not available: what the captioning model is asked is not published",
-}
-# Heat maps are enlarged by this factor, so that LPIPS can read them.
-_CELL_PX: Final = 4
-
-
-def weighted_measures(folder: Path | None) -> dict[str, Callable[[Pairs], float] | str]:
-    """Functions of the metrics whose weights are in a folder; for others, why there is none."""
-    networks = None if folder is None else PerceptualNetworks(folder)
-    functions: dict[str, Callable[[PerceptualNetworks, Pairs], float]] = {
-        "lpips": _lpips,
-        "tactile_lpips": _tactile_lpips,
-        "aesthetic_quality": _aesthetic_quality,
-        "subject_consistency": _subject_consistency,
-    }
-    found: dict[str, Callable[[Pairs], float] | str] = dict(UNDEFINED)
-    for name, function in functions.items():
-        if networks is None or not networks.has(*FOLDERS[name]):
-            found[name] = NO_WEIGHTS
-        else:
-            found[name] = _bound(function, networks)
-    return found
-
-
-def _bound(
-    function: Callable[[PerceptualNetworks, Pairs], float], networks: PerceptualNetworks
-) -> Callable[[Pairs], float]:
-    return lambda pairs: function(networks, pairs)
-
-
 def heat_maps(tactile_kpa: np.ndarray) -> UInt8[np.ndarray, "n h w 3"]:
     """Both hands' taxels [n, 2, 320] as pictures, side by side, four pixels a cell."""
     rows = []
@@ -299,56 +278,46 @@ def _subject_consistency(networks: PerceptualNetworks, pairs: Pairs) -> float:
     return float(np.mean(values))
 
 
-Better = Literal["higher", "lower"]
-# Name, title, direction, definition, and what it is of.
-DESCRIPTIONS: Final[tuple[tuple[str, str, Better, str, Literal["images", "touch"]], ...]] = (
-    (
-        "lpips",
-        "LPIPS",
-        "lower",
-        "learned perceptual image patch similarity with AlexNet, mean over images",
-        "images",
-    ),
-    (
-        "aesthetic_quality",
-        "Aesthetic Quality",
-        "higher",
-        "rating of LAION's linear head on CLIP ViT-L/14, divided by ten, mean over images",
-        "images",
-    ),
-    (
-        "image_quality",
-        "Image Quality",
-        "higher",
-        "MUSIQ",
-        "images",
-    ),
-    (
-        "jepa_similarity",
-        "JEPA Similarity",
-        "higher",
-        "distance of V-JEPA features of all clips",
-        "images",
-    ),
-    (
-        "subject_consistency",
-        "Subject Consistency",
-        "higher",
-        "similarity of DINO ViT-B/16 features to the image before and the first, as in VBench",
-        "images",
-    ),
-    (
-        "semantic_alignment",
-        "Semantic Alignment",
-        "higher",
-        "similarity of captions of true and predicted clips",
-        "images",
-    ),
-    (
-        "tactile_lpips",
-        "LPIPS of heat maps",
-        "lower",
-        "LPIPS of both hands' taxels as pictures on a square-root scale of 0 … 40 kPa",
-        "touch",
-    ),
-)
+# Name, title, direction, what it is of, subfolders of weights that it needs, its function or why it
+# needs more than local weights, and its definition.
+_Measure = Callable[[PerceptualNetworks, Pairs], float]
+_WEIGHTED: Final[tuple[tuple[str, str, Better, Of, tuple[str, ...], _Measure | str, str], ...]] = (
+    ("lpips", "LPIPS", "lower", "images", ("lpips",), _lpips,
+     "learned perceptual image patch similarity with AlexNet, mean over images"),
+    ("aesthetic_quality", "Aesthetic Quality", "higher", "images", ("clip", "aesthetic"),
+     _aesthetic_quality,
+     "rating of LAION's linear head on CLIP ViT-L/14, divided by ten, mean over images"),
+    ("image_quality", "Image Quality", "higher", "images", (),
+     "not available: MUSIQ's maintained implementation is non-commercial", "MUSIQ"),
+    ("jepa_similarity", "JEPA Similarity", "higher", "images", (),
+     "not available: how V-JEPA features are compared is not published",
+     "distance of V-JEPA features of all clips"),
+    ("subject_consistency", "Subject Consistency", "higher", "images", ("dino",),
+     _subject_consistency,
+     "similarity of DINO ViT-B/16 features to the image before and the first, as in VBench"),
+    ("semantic_alignment", "Semantic Alignment", "higher", "images", (),
+     "not available: what the captioning model is asked is not published",
+     "similarity of captions of true and predicted clips"),
+    ("tactile_lpips", "LPIPS of heat maps", "lower", "touch", ("lpips",), _tactile_lpips,
+     "LPIPS of both hands' taxels as pictures on a square-root scale of 0 … 40 kPa"),
+)  # fmt: skip
+
+
+def weighted_metrics(folder: Path | None) -> list[Metric]:
+    """Prediction metrics that need pretrained networks, by their own definitions or not at all.
+
+    Args:
+        folder: of weights; metrics whose weights it does not have say so.
+    """
+    networks = None if folder is None else PerceptualNetworks(folder)
+    found = []
+    for name, title, better, of, folders, function, about in _WEIGHTED:
+        measure, missing = None, ""
+        if isinstance(function, str):
+            missing = function
+        elif networks is None or not networks.has(*folders):
+            missing = NO_WEIGHTS
+        else:
+            measure = partial(function, networks)
+        found.append(Metric(name, title, "", better, of, measure, about, missing))
+    return found

@@ -8,17 +8,16 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
 from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import CHUNK_STEPS
 from dextouch.worlds import World
-from services.evaluation.perceptual_networks import DESCRIPTIONS, Pairs, weighted_measures
+from services.evaluation.perceptual_networks import Metric, Pairs, weighted_metrics
 from services.evaluation.prediction_names import DEFAULT_BASELINES
 from services.evaluation.prediction_scenes import (
     Future,
@@ -39,23 +38,6 @@ from services.evaluation.reporting import PredictionPicture
 
 MODEL: Final = "model"
 ALL_TASKS: Final = "all"
-
-
-@dataclass(frozen=True)
-class Metric:
-    """A figure of predicted futures; `measure` gets all pairs of a task, or of all tasks.
-
-    Without it, `missing` says why the metric is not available.
-    """
-
-    name: str
-    title: str
-    unit: str
-    better: Literal["higher", "lower"]
-    about: str
-    of: Literal["images", "touch", "geometry", "objects"]
-    measure: Callable[[Pairs], float] | None
-    missing: str = ""
 
 
 def _of_images(function: Callable[..., float]) -> Callable[[Pairs], float]:
@@ -113,144 +95,50 @@ def _object_error(pairs: Pairs) -> float:
 
 
 _PEAK = f"{tactile_metrics.PEAK_KPA:g} kPa"
-METRICS: Final = {
-    metric.name: metric
-    for metric in (
-        Metric(
-            "psnr",
-            "PSNR",
-            "dB",
-            "higher",
-            "peak signal-to-noise ratio of 8-bit images, mean over images, at most 100",
-            "images",
-            _of_images(image_metrics.psnr),
-        ),
-        Metric(
-            "ssim",
-            "SSIM",
-            "",
-            "higher",
-            "structural similarity, Gaussian window of 11 px, mean over images; 1 for equal ones",
-            "images",
-            _of_images(image_metrics.ssim),
-        ),
-        Metric(
-            "trajectory_accuracy",
-            "Trajectory Accuracy",
-            "",
-            "higher",
-            "nDTW of the hands and objects that move by 2 px or more, found by their colours, with "
-            "a tolerance of 5 % of the image's width; 1 for equal trajectories",
-            "geometry",
-            _of_geometry(trajectory_accuracy),
-        ),
-        Metric(
-            "geometry_error",
-            "Geometry Error",
-            "",
-            "lower",
-            "AbsRel of the depth of what each pixel shows, found by colour, after alignment of the "
-            "scale",
-            "geometry",
-            _of_geometry(geometry_error),
-        ),
-        Metric(
-            "tactile_psnr",
-            "PSNR of taxels",
-            "dB",
-            "higher",
-            f"of the error over all taxels together, with a peak of {_PEAK}",
-            "touch",
-            _of_touch(tactile_metrics.psnr),
-        ),
-        Metric(
-            "tactile_ssim",
-            "SSIM of taxels",
-            "",
-            "higher",
-            f"windows of 4 by 4 taxels in each pad, range 0 … {_PEAK}; 1 for equal pads",
-            "touch",
-            _of_touch(tactile_metrics.ssim),
-        ),
-        Metric(
-            "tactile_mse",
-            "MSE",
-            "kPa²",
-            "lower",
-            "mean squared error over all taxels",
-            "touch",
-            _of_touch(tactile_metrics.mse),
-        ),
-        Metric(
-            "tactile_mae",
-            "MAE",
-            "kPa",
-            "lower",
-            "mean absolute error over all taxels",
-            "touch",
-            _of_touch(tactile_metrics.mae),
-        ),
-        Metric(
-            "contact_mae",
-            "Contact-MAE",
-            "kPa",
-            "lower",
-            "mean absolute error over taxels in true contact (at least 2 kPa)",
-            "touch",
-            _of_touch(tactile_metrics.contact_mae),
-        ),
-        Metric(
-            "contact_iou",
-            "Contact-IoU",
-            "",
-            "higher",
-            "intersection over union of taxels in contact; 1 if neither side has any",
-            "touch",
-            _of_touch(tactile_metrics.contact_iou),
-        ),
-        Metric(
-            "contact_f1",
-            "Contact-F1",
-            "",
-            "higher",
-            "F1 of taxels in contact; 1 if neither side has any",
-            "touch",
-            _of_touch(tactile_metrics.contact_f1),
-        ),
-        Metric(
-            "pad_contact_f1",
-            "Contact-F1 of pads",
-            "",
-            "higher",
-            "F1 of fingertips and palms in contact; 1 if neither side has any",
-            "touch",
-            _of_touch(tactile_metrics.pad_contact_f1),
-        ),
-        Metric(
-            "object_error",
-            "Object error",
-            "mm",
-            "lower",
-            "median error at the last step of objects that moved by 1 cm or more, whose true poses "
-            "are known",
-            "objects",
-            _object_error,
-        ),
-    )
-}
+METRICS: Final = {metric.name: metric for metric in (
+    Metric("psnr", "PSNR", "dB", "higher", "images", _of_images(image_metrics.psnr),
+           "peak signal-to-noise ratio of 8-bit images, mean over images, at most 100"),
+    Metric("ssim", "SSIM", "", "higher", "images", _of_images(image_metrics.ssim),
+           "structural similarity, Gaussian window of 11 px, mean over images; 1 for equal ones"),
+    Metric("trajectory_accuracy", "Trajectory Accuracy", "", "higher", "geometry",
+           _of_geometry(trajectory_accuracy),
+           "nDTW of the hands and objects that move by 2 px or more, found by their colours, with "
+           "a tolerance of 5 % of the image's width; 1 for equal trajectories"),
+    Metric("geometry_error", "Geometry Error", "", "lower", "geometry",
+           _of_geometry(geometry_error),
+           "AbsRel of the depth of what each pixel shows, found by colour, after alignment of the "
+           "scale"),
+    Metric("tactile_psnr", "PSNR of taxels", "dB", "higher", "touch",
+           _of_touch(tactile_metrics.psnr),
+           f"of the error over all taxels together, with a peak of {_PEAK}"),
+    Metric("tactile_ssim", "SSIM of taxels", "", "higher", "touch",
+           _of_touch(tactile_metrics.ssim),
+           f"windows of 4 by 4 taxels in each pad, range 0 … {_PEAK}; 1 for equal pads"),
+    Metric("tactile_mse", "MSE", "kPa²", "lower", "touch", _of_touch(tactile_metrics.mse),
+           "mean squared error over all taxels"),
+    Metric("tactile_mae", "MAE", "kPa", "lower", "touch", _of_touch(tactile_metrics.mae),
+           "mean absolute error over all taxels"),
+    Metric("contact_mae", "Contact-MAE", "kPa", "lower", "touch",
+           _of_touch(tactile_metrics.contact_mae),
+           "mean absolute error over taxels in true contact (at least 2 kPa)"),
+    Metric("contact_iou", "Contact-IoU", "", "higher", "touch",
+           _of_touch(tactile_metrics.contact_iou),
+           "intersection over union of taxels in contact; 1 if neither side has any"),
+    Metric("contact_f1", "Contact-F1", "", "higher", "touch",
+           _of_touch(tactile_metrics.contact_f1),
+           "F1 of taxels in contact; 1 if neither side has any"),
+    Metric("pad_contact_f1", "Contact-F1 of pads", "", "higher", "touch",
+           _of_touch(tactile_metrics.pad_contact_f1),
+           "F1 of fingertips and palms in contact; 1 if neither side has any"),
+    Metric("object_error", "Object error", "mm", "lower", "objects", _object_error,
+           "median error at the last step of objects that moved by 1 cm or more, whose true poses "
+           "are known"),
+)}  # fmt: skip
 
 
 def all_metrics(weights: Path | None = None) -> dict[str, Metric]:
     """Every metric of the paper's table; those with networks need a folder of their weights."""
-    measures = weighted_measures(weights)
-    found = dict(METRICS)
-    for name, title, better, about, of in DESCRIPTIONS:
-        measure = measures[name]
-        if isinstance(measure, str):
-            found[name] = Metric(name, title, "", better, about, of, None, measure)
-        else:
-            found[name] = Metric(name, title, "", better, about, of, measure)
-    return found
+    return METRICS | {metric.name: metric for metric in weighted_metrics(weights)}
 
 
 GEOMETRY: Final = tuple(name for name, metric in METRICS.items() if metric.of == "geometry")
@@ -353,28 +241,20 @@ def _future(source: str, world: World[Any], scene: Scene, scenes: Sequence[Scene
     }
     if source in simple:
         return simple[source]()
-    asked = _asked(source, scene, scenes)
-    return asked if isinstance(asked, str) else imagine(world, *asked)
-
-
-def _asked(
-    source: str, scene: Scene, scenes: Sequence[Scene]
-) -> tuple[Scene, Float64[np.ndarray, "steps 67"]] | str:
-    """Scene and actions that the model is given, or why there are none."""
     actions = scene.actions
     if source == "other_take":
         other = other_take(scene, scenes)
-        changed = None if other is None else (scene, other.actions[: len(actions)])
-        return changed or "no other take of the task is as long from this step"
-    if source in ("hold", "hands_still"):
-        return scene, standing_still(scene, head_moves=source == "hands_still")
-    if source == "no_instruction":
-        return with_instruction(scene, ""), actions
-    if source == "other_instruction":
-        sentence = other_instruction(scene, scenes)
-        changed = None if sentence is None else (with_instruction(scene, sentence), actions)
-        return changed or "no other task has another instruction"
-    return scene, actions
+        if other is None:
+            return "no other take of the task is as long from this step"
+        actions = other.actions[: len(actions)]
+    elif source in ("hold", "hands_still"):
+        actions = standing_still(scene, head_moves=source == "hands_still")
+    elif source in ("no_instruction", "other_instruction"):
+        sentence = "" if source == "no_instruction" else other_instruction(scene, scenes)
+        if sentence is None:
+            return "no other task has another instruction"
+        scene = with_instruction(scene, sentence)
+    return imagine(world, scene, actions)
 
 
 def _figures(

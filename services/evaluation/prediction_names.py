@@ -22,24 +22,8 @@ DEFAULT_BASELINES: Final = tuple(name for name in BASELINES if "instruction" not
 
 # As in all_metrics of services.evaluation.prediction.
 METRIC_NAMES: Final = (
-    "psnr",
-    "ssim",
-    "trajectory_accuracy",
-    "geometry_error",
-    "tactile_psnr",
-    "tactile_ssim",
-    "tactile_mse",
-    "tactile_mae",
-    "contact_mae",
-    "contact_iou",
-    "contact_f1",
-    "pad_contact_f1",
-    "object_error",
-    "lpips",
-    "aesthetic_quality",
-    "image_quality",
-    "jepa_similarity",
-    "subject_consistency",
-    "semantic_alignment",
-    "tactile_lpips",
-)
+    "psnr", "ssim", "trajectory_accuracy", "geometry_error", "tactile_psnr", "tactile_ssim",
+    "tactile_mse", "tactile_mae", "contact_mae", "contact_iou", "contact_f1", "pad_contact_f1",
+    "object_error", "lpips", "aesthetic_quality", "image_quality", "jepa_similarity",
+    "subject_consistency", "semantic_alignment", "tactile_lpips",
+)  # fmt: skip

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from dextouch.episodes import EpisodeGrid, EpisodeReader
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert
-from dextouch.hands.actions import CAMERA_HEAD, AnchorPoses, poses_from_actions
+from dextouch.hands.actions import CAMERA_HEAD, poses_from_actions
 from dextouch.metrics import geometry as depth_metrics
 from dextouch.metrics import trajectory as trajectory_metrics
 from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutStart
@@ -181,7 +181,7 @@ class Scene:
         return self.first.images[HEAD_CAMERA]
 
 
-def read_rollout(reader: EpisodeReader, *, image_every: int = CHUNK_STEPS) -> Scene:
+def read_rollout(reader: EpisodeReader) -> Scene:
     """A whole episode as one scene, up to its last complete chunk.
 
     Raises:
@@ -194,7 +194,7 @@ def read_rollout(reader: EpisodeReader, *, image_every: int = CHUNK_STEPS) -> Sc
             f"prediction: episode {reader.attributes.episode_id!r} has {reader.num_steps} steps, "
             f"expected at least {CHUNK_STEPS + 1}"
         )
-    return _read(EpisodeGrid(reader), 0, num_steps, image_every=image_every)
+    return _read(EpisodeGrid(reader), 0, num_steps, image_every=CHUNK_STEPS)
 
 
 def read_windows(reader: EpisodeReader) -> list[Scene]:
@@ -332,18 +332,13 @@ def warped(scene: Scene) -> UInt8[np.ndarray, "shown h w 3"]:
     if anchor is None or K_head is None:
         raise InvalidInputError(f"scene {scene.episode_id!r}: begins without camera")
     cameras = poses_from_actions(scene.actions, anchor).Ts_world_camera_head
+    image, T_world_then = scene.first.images[HEAD_CAMERA][0], anchor.T_world_camera_head
     return np.stack(
         [
-            _warp(scene.first.images[HEAD_CAMERA][0], K_head, anchor, cameras[step - 1])
+            warp_over_table(image, K_head, T_world_then, cameras[step - 1])
             for step in scene.truth.image_steps
         ]
     )
-
-
-def _warp(
-    image: np.ndarray, K_head: np.ndarray, anchor: AnchorPoses, T_world_now: np.ndarray
-) -> UInt8[np.ndarray, "h w 3"]:
-    return warp_over_table(image, K_head, anchor.T_world_camera_head, T_world_now)
 
 
 def reconstructed(world: World[Any], scene: Scene) -> Future | str:

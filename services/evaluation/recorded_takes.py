@@ -236,7 +236,7 @@ def score_recorded(
             num_steps = len(take.actions) // multiple * multiple
             runner = RolloutRunner(worlds, probe, num_steps)
             for name, actor in actors.items():
-                outcomes.append(runner.outcome(take.start, actor, name, IMAGINED))
+                outcomes.append(runner.run(take.start, actor, name, IMAGINED)[0])
                 failed = sum(isinstance(one, RolloutFailure) for one in outcomes)
                 progress.advance(failed=float(failed))
     return RecordedScores(tuple(takes), tuple(outcomes), tuple(policies))

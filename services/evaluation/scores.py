@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,9 +18,10 @@ from services.evaluation.agreement import (
     pooled_agreement,
     task_agreement,
 )
-from services.evaluation.calibration import LEAST_DECIDED
 from services.evaluation.statistics import MatchedScores, known_mean, wilson_interval
 
+# Endings that should be decided where classifier and world are good enough.
+LEAST_DECIDED: Final = 0.60
 REAL = "real"
 UNDEFINED = "undefined"
 # Smaller mean differences of success are not mentioned.

@@ -71,29 +71,17 @@ class ClassifierSettings(FrozenModel):
     # Shares of true endings with both inputs that lose their poses, or their image: real endings
     # come without poses, and with poses the network would ignore the image.
     true_without_poses: float = Field(
-        default=0.85,
-        ge=0,
-        le=1,
-        description="share of true endings with object poses dropped",
+        default=0.85, ge=0, le=1, description="share of true endings with object poses dropped"
     )
     true_without_images: float = Field(
-        default=0.1,
-        ge=0,
-        le=1,
-        description="share of true endings with images dropped",
+        default=0.1, ge=0, le=1, description="share of true endings with images dropped"
     )
     # The same for imagined endings: worlds always predict poses, but render images on request.
     imagined_without_poses: float = Field(
-        default=0.3,
-        ge=0,
-        le=1,
-        description="share of imagined endings with object poses dropped",
+        default=0.3, ge=0, le=1, description="share of imagined endings with object poses dropped"
     )
     imagined_without_images: float = Field(
-        default=0.3,
-        ge=0,
-        le=1,
-        description="share of imagined endings with images dropped",
+        default=0.3, ge=0, le=1, description="share of imagined endings with images dropped"
     )
     pose_noise: float = Field(
         default=0.03,

@@ -11,6 +11,8 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.metrics.policy import MIN_POLICIES
 
+CONFIDENCE: Final = 0.95
+
 
 @dataclass(frozen=True)
 class Interval:
@@ -18,11 +20,6 @@ class Interval:
 
     low: float
     high: float
-
-
-def _check_confidence(confidence: float) -> None:
-    if not 0 < confidence < 1:
-        raise InvalidInputError(f"confidence: got {confidence}, expected between 0 and 1")
 
 
 def area_under_roc(scores: np.ndarray, success: np.ndarray) -> float:
@@ -59,21 +56,20 @@ def _by_outcome(values: np.ndarray, success: np.ndarray) -> tuple[np.ndarray, np
     return values[positive], values[~positive]
 
 
-def wilson_interval(successes: int | float, trials: int, *, confidence: float = 0.95) -> Interval:
-    """Wilson score interval of a success rate, inside 0 … 1 (Wilson 1927).
+def wilson_interval(successes: int | float, trials: int) -> Interval:
+    """95 % Wilson score interval of a success rate, inside 0 … 1 (Wilson 1927).
 
     A trial that was repeated counts as one, with its share of successes.
 
     Raises:
         InvalidInputError: no trials, or more successes than trials.
     """
-    _check_confidence(confidence)
     if trials < 1 or not 0 <= successes <= trials:
         raise InvalidInputError(
             f"Wilson interval: got {successes} successes of {trials} trials, "
             "expected at least one trial and 0 … trials successes"
         )
-    z = NormalDist().inv_cdf(0.5 + confidence / 2)
+    z = NormalDist().inv_cdf(0.975)
     rate = successes / trials
     spread = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
     shrink = 1 + z * z / trials
@@ -85,54 +81,32 @@ def wilson_interval(successes: int | float, trials: int, *, confidence: float = 
 
 
 def bootstrap_mean_interval(
-    values: np.ndarray,
-    generator: np.random.Generator,
-    *,
-    num_draws: int = 1000,
-    confidence: float = 0.95,
+    values: np.ndarray, generator: np.random.Generator, *, num_draws: int = 1000
 ) -> Interval:
-    """Percentile interval of the mean of independent values [n].
+    """95 % percentile interval of the mean of independent values [n].
 
     Raises:
         ShapeError: not one axis with at least one value.
     """
-    _check_confidence(confidence)
     checked = np.asarray(values, dtype=np.float64)
     if checked.ndim != 1 or len(checked) == 0:
         raise ShapeError(f"bootstrap: got shape {checked.shape}, expected [n ≥ 1]")
     drawn = generator.integers(0, len(checked), (num_draws, len(checked)))
-    return central_interval(checked[drawn].mean(axis=1), confidence=confidence)
+    return central_interval(checked[drawn].mean(axis=1))
 
 
-def central_interval(draws: np.ndarray, *, confidence: float = 0.95) -> Interval:
-    """Interval between quantiles of draws [n ≥ 1] that leaves equal shares on both sides."""
-    low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
+def central_interval(draws: np.ndarray) -> Interval:
+    """95 % interval between quantiles of draws [n ≥ 1] that leaves equal shares on both sides."""
+    low, high = np.quantile(draws, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Interval(float(low), float(high))
 
 
-def shortest_interval(draws: np.ndarray, *, confidence: float = 0.95) -> Interval:
+def shortest_interval(draws: np.ndarray, *, confidence: float = CONFIDENCE) -> Interval:
     """The shortest interval that holds a share of draws [n ≥ 1], at least `confidence`."""
     ordered = np.sort(draws)
     held = math.ceil(confidence * len(ordered))
     first = int(np.argmin(ordered[held - 1 :] - ordered[: len(ordered) - held + 1]))
     return Interval(float(ordered[first]), float(ordered[first + held - 1]))
-
-
-def interval_of_draws(figures: np.ndarray, *, confidence: float = 0.95) -> Interval | None:
-    """Percentile interval of the figures [draws] of a bootstrap; undefined draws are NaN.
-
-    Returns:
-        The interval of the defined draws; None where more than half are undefined.
-
-    Raises:
-        ShapeError: not one axis with at least one draw.
-    """
-    _check_confidence(confidence)
-    if figures.ndim != 1 or len(figures) == 0:
-        raise ShapeError(f"bootstrap: got shape {figures.shape}, expected [draws ≥ 1]")
-    defined = figures[np.isfinite(figures)]
-    enough = 2 * len(defined) > len(figures)
-    return central_interval(defined, confidence=confidence) if enough else None
 
 
 # Bootstrap of evaluation figures over matched starts, vectorized over all draws.
@@ -156,20 +130,6 @@ def start_counts(num_starts: int, generator: np.random.Generator, *, num_draws: 
     return counts
 
 
-def _weights(counts: Counts, start_index: np.ndarray) -> Float64[np.ndarray, "draws n"]:
-    return counts[:, np.asarray(start_index)]
-
-
-def rates_of_draws(outcomes: np.ndarray, counts: Counts) -> Float64[np.ndarray, "draws policies"]:
-    """Mean outcome of every policy in every draw.
-
-    Args:
-        outcomes: [policies, starts].
-        counts: from `start_counts`.
-    """
-    return counts @ np.asarray(outcomes, dtype=np.float64).T / counts.sum(axis=1, keepdims=True)
-
-
 def pearson_of_draws(real: np.ndarray, imagined: np.ndarray) -> Float64[np.ndarray, " draws"]:
     """Linear correlation of every row [draws, policies]; NaN where it is undefined."""
     if real.shape[1] < MIN_POLICIES:
@@ -188,49 +148,6 @@ def mmrv_of_draws(real: np.ndarray, imagined: np.ndarray) -> Float64[np.ndarray,
     a, b = real[:, :, None] - real[:, None, :], imagined[:, :, None] - imagined[:, None, :]
     violated = (a > 0) != (b > 0)
     return np.asarray(np.mean(np.max(np.abs(a) * violated, axis=2), axis=1))
-
-
-def area_under_roc_of_draws(
-    scores: np.ndarray, success: np.ndarray, start_index: np.ndarray, counts: Counts
-) -> Float64[np.ndarray, " draws"]:
-    """Area under the ROC curve of every draw, ties half; NaN where one outcome is missing.
-
-    Args:
-        scores: [n], higher for more certain success.
-        success: [n] outcomes.
-        start_index: [n], start of each rollout.
-        counts: from `start_counts`.
-    """
-    scores, positive = np.asarray(scores), np.asarray(success, dtype=bool)
-    weight = _weights(counts, start_index)
-    wins, losses = weight[:, positive], weight[:, ~positive]
-    ordered = (np.sign(scores[positive][:, None] - scores[~positive][None, :]) + 1) / 2
-    pairs = wins.sum(axis=1) * losses.sum(axis=1)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.sum((wins @ ordered) * losses, axis=1) / pairs)
-
-
-def balanced_accuracy_of_draws(
-    decisions: np.ndarray, success: np.ndarray, start_index: np.ndarray, counts: Counts
-) -> Float64[np.ndarray, " draws"]:
-    """Balanced accuracy of every draw; NaN where one outcome is missing."""
-    right = np.asarray(decisions, dtype=bool) == np.asarray(success, dtype=bool)
-    positive = np.asarray(success, dtype=bool)
-    weight = _weights(counts, start_index)
-    with np.errstate(invalid="ignore"):
-        shares = [
-            (weight[:, of] @ right[of]) / weight[:, of].sum(axis=1) for of in (positive, ~positive)
-        ]
-    return np.asarray((shares[0] + shares[1]) / 2)
-
-
-def mean_of_draws(
-    values: np.ndarray, start_index: np.ndarray, counts: Counts
-) -> Float64[np.ndarray, " draws"]:
-    """Mean of values [n] over the rollouts of every draw; NaN for a draw without any."""
-    weight = _weights(counts, start_index)
-    with np.errstate(invalid="ignore"):
-        return np.asarray((weight @ np.asarray(values, dtype=np.float64)) / weight.sum(axis=1))
 
 
 # Draws of policies' true scores given a few rollouts: posterior, and hierarchical bootstrap.

@@ -5,137 +5,26 @@ Its inputs are images, touch and, for imagined endings, the predicted object pos
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from itertools import combinations
 from pathlib import Path
 from typing import Final, Literal, cast
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from pydantic import Field
 from torch import nn
 
-from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
+from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.frozen_model import FrozenModel
-from dextouch.geometry import invert, transform_from_pose
-from dextouch.geometry.rotations import rotation_angle
-from dextouch.schemas import MAX_OBJECTS
-from dextouch.tactile.layout import NUM_TAXELS, split_pads
-from services.evaluation.calibration import UNFITTED, Calibration, Combination, sigmoid
-from services.evaluation.endings import NUM_SEEN_STEPS, Ending
+from services.evaluation.endings import (
+    NUM_OBJECT_FEATURES,
+    NUM_PAD_FEATURES,
+    NUM_SEEN_STEPS,
+    Ending,
+    object_features,
+    pad_features,
+)
 from services.evaluation.trained_networks import Checkpoint, load_checkpoint, load_network
-
-# Features of taxel pressures for small networks: a few numbers per pad.
-
-NUM_PAD_FEATURES = 24
-
-
-def pad_features(tactile_kpa: np.ndarray) -> Float32[np.ndarray, "*batch 24"]:
-    """Mean and maximum of √kPa / 4 per hand and pad: where the hand touches, and how hard.
-
-    Args:
-        tactile_kpa: [..., 2, 320]; small negative readings count as zero.
-
-    Raises:
-        ShapeError: not [..., 2, 320].
-        NonFiniteError: NaN or infinity.
-    """
-    taxels = np.asarray(tactile_kpa, dtype=np.float32)
-    if taxels.shape[-2:] != (2, NUM_TAXELS):
-        raise ShapeError(f"tactile: got shape {taxels.shape}, expected [..., 2, {NUM_TAXELS}]")
-    if not np.isfinite(taxels).all():
-        raise NonFiniteError("tactile: NaN or infinite pressure; expected finite kPa")
-    tips, palm = split_pads(np.sqrt(np.maximum(taxels, 0.0)) / 4)
-    parts = [tips.mean((-2, -1)), palm.mean((-2, -1))[..., None]]
-    parts += [tips.max((-2, -1)), palm.max((-2, -1))[..., None]]
-    features = np.concatenate(parts, axis=-1)
-    return features.reshape(*features.shape[:-2], NUM_PAD_FEATURES)
-
-
-# Features of object poses that predict success: heights, axes, relative positions, motion.
-#
-# Success is decided by millimetres within half a metre, so distances enter twice: linearly, and
-# compressed by asinh.
-
-_PAIRS: Final = tuple(combinations(range(MAX_OBJECTS), 2))
-_WIDE_M, _NEAR_M, _STILL_M, _STILL_RAD = 0.1, 0.01, 0.002, 0.05
-_OF_OBJECT, _OF_PAIR = 17, 18
-NUM_OBJECT_FEATURES: Final = MAX_OBJECTS * _OF_OBJECT + len(_PAIRS) * _OF_PAIR
-
-
-def object_features(object_poses: np.ndarray) -> Float32[np.ndarray, "105"]:
-    """Features of the poses at the last steps; an absent object and its pairs give zeros.
-
-    Args:
-        object_poses: T_world_object [steps, objects ≤ 3, 7] (x y z m, qw qx qy qz), the last step
-            being the current one. An object with a non-finite number or a zero quaternion counts as
-            absent.
-
-    Raises:
-        ShapeError: other shapes, or more objects.
-    """
-    poses = np.asarray(object_poses, dtype=np.float64)
-    if poses.ndim != 3 or poses.shape[2] != 7 or not 0 < poses.shape[1] <= MAX_OBJECTS:
-        raise ShapeError(
-            f"object poses: got shape {poses.shape}, expected [steps, 1 … {MAX_OBJECTS}, 7]"
-        )
-    present = known_objects(poses)
-    safe = np.where(present[:, None], poses, np.array([0.0, 0, 0, 1, 0, 0, 0]))
-    T = transform_from_pose(safe)
-    parts = []
-    for slot in range(MAX_OBJECTS):
-        there = slot < len(present) and bool(present[slot])
-        parts.append(_of_object(T[:, slot]) if there else np.zeros(_OF_OBJECT))
-    for first, second in _PAIRS:
-        there = second < len(present) and bool(present[first] and present[second])
-        pair = _of_pair(T[-1, first], T[-1, second]) if there else np.zeros(_OF_PAIR)
-        parts.append(pair)
-    return np.concatenate(parts).astype(np.float32)
-
-
-def known_objects(object_poses: np.ndarray) -> Bool[np.ndarray, " objects"]:
-    """Mask of objects in poses [steps, objects, 7] that have a pose at every step."""
-    finite = np.isfinite(object_poses).all(axis=(0, 2))
-    length = np.linalg.norm(np.nan_to_num(object_poses[..., 3:]), axis=-1)
-    return np.asarray(finite & (length > 1e-6).all(axis=0))
-
-
-def _of_object(Ts_world_object: np.ndarray) -> Float64[np.ndarray, "17"]:
-    T = Ts_world_object[-1]
-    moved_m = T[:3, 3] - Ts_world_object[0, :3, 3]
-    turned_rad = rotation_angle(T[:3, :3] @ Ts_world_object[0, :3, :3].T)
-    return np.concatenate(
-        [
-            [1.0, np.arcsinh(T[2, 3] / _NEAR_M)],
-            T[:3, 3] / _WIDE_M,
-            T[:3, :3].ravel(),
-            [
-                np.arcsinh(np.linalg.norm(moved_m) / _STILL_M),
-                np.arcsinh(moved_m[2] / _STILL_M),
-                np.arcsinh(float(turned_rad) / _STILL_RAD),
-            ],
-        ]
-    )
-
-
-def _of_pair(T_world_a: np.ndarray, T_world_b: np.ndarray) -> Float64[np.ndarray, "18"]:
-    """Second object relative to the first, and their horizontal and vertical distance."""
-    T_a_b = invert(T_world_a) @ T_world_b
-    apart_m = T_world_b[:3, 3] - T_world_a[:3, 3]
-    return np.concatenate(
-        [
-            [1.0],
-            T_a_b[:3, 3] / _WIDE_M,
-            np.arcsinh(T_a_b[:3, 3] / _NEAR_M),
-            T_a_b[:3, :3].ravel(),
-            [
-                np.arcsinh(np.linalg.norm(apart_m[:2]) / _NEAR_M),
-                np.arcsinh(apart_m[2] / _NEAR_M),
-            ],
-        ]
-    )
-
-
-# Network of the success classifier: final image, touch and, where known, object poses.
 
 NUM_TOUCH_FEATURES = 2 * NUM_PAD_FEATURES
 _CHANNELS = (24, 32, 48, 48)
@@ -305,6 +194,68 @@ def _check(ending: Ending, shape: ClassifierShape) -> None:
         raise InvalidInputError(
             f"success classifier: got images {ending.images.shape}, expected {size}"
         )
+
+
+# The band within which everything is undecided.
+WHOLE_BAND: Final = 0.5
+
+# Estimates are counted as at most this sure: the mean over a few members is often 0 or 1.
+_LEAST_PROBABILITY: Final = 0.01
+
+
+class Calibration(FrozenModel):
+    """Probability = sigmoid(log odds / temperature + bias); undecided within `band` of 0.5."""
+
+    temperature: float = Field(default=1.0, gt=0)
+    bias: float = 0.0
+    band: float = Field(default=0.0, ge=0, lt=0.5)
+
+    def probabilities(self, log_odds: np.ndarray) -> Float64[np.ndarray, " n"]:
+        """Calibrated probabilities of success."""
+        return sigmoid(np.asarray(log_odds, dtype=np.float64) / self.temperature + self.bias)
+
+
+class Combination(FrozenModel):
+    """Joins the calibrated probability of a classifier with the world's own estimate.
+
+    The log odds of the result are the weighted sum of both log odds and `bias`; it is undecided
+    within `band` of 0.5. The two contradict each other if they lie on different sides of 0.5, each
+    by more than `margin`; with a margin of 0.5 they never do.
+    """
+
+    probe_weight: float = Field(default=0.5, ge=0)
+    world_weight: float = Field(default=0.5, ge=0)
+    bias: float = 0.0
+    band: float = Field(default=0.0, ge=0, le=WHOLE_BAND)
+    margin: float = Field(default=0.0, ge=0, le=0.5)
+
+    def probabilities(self, probe: np.ndarray, world: np.ndarray) -> Float64[np.ndarray, " n"]:
+        """Joint probabilities of success."""
+        odds = self.probe_weight * log_odds_of(probe) + self.world_weight * log_odds_of(world)
+        return sigmoid(odds + self.bias)
+
+    def contradictory(self, probe: np.ndarray, world: np.ndarray) -> Bool[np.ndarray, " n"]:
+        """Whether classifier and world contradict each other."""
+        low, high = np.minimum(probe, world), np.maximum(probe, world)
+        return np.asarray((low < 0.5 - self.margin) & (high > 0.5 + self.margin))
+
+
+# For probes that were trained before their world estimated success: the mean of both log odds, with
+# the band outside of which a tenth of the development kinds of mistakes was judged wrongly.
+UNFITTED: Final = Combination(band=0.3)
+
+
+def sigmoid(log_odds: np.ndarray) -> Float64[np.ndarray, "*n"]:
+    """1 / (1 + exp(−x)), without overflow."""
+    return np.asarray(np.exp(-np.logaddexp(0.0, -log_odds)))
+
+
+def log_odds_of(probabilities: np.ndarray) -> Float64[np.ndarray, " n"]:
+    """Log odds of probabilities that are counted as 0.01 … 0.99."""
+    bounded = np.clip(
+        np.asarray(probabilities, np.float64), _LEAST_PROBABILITY, 1 - _LEAST_PROBABILITY
+    )
+    return np.asarray(np.log(bounded / (1 - bounded)))
 
 
 # Version 4 of the network, one per task; older checkpoints are rejected by this name.

@@ -7,12 +7,11 @@ Three disjoint sets of episodes: training, development (to calibrate the probabi
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
 from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Float64
 from torch import Tensor
 from torch.nn import functional
 
@@ -20,32 +19,31 @@ from dextouch.episodes import data_hash, split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.jobs import worker_pool
 from services.evaluation.calibration import (
-    Calibration,
-    Combination,
-    Reliability,
-    fit_calibration,
-    fit_combination,
-    sigmoid,
+    fit_calibrations,
+    fit_combinations,
+    held_out_figures,
+    milestones_that_can_be_told,
 )
-from services.evaluation.endings import Ending, EndingEpisode, milestones_of
+from services.evaluation.endings import (
+    Ending,
+    EndingEpisode,
+    early_step,
+    middle_step,
+    milestones_of,
+)
 from services.evaluation.matched_starts import refuse_training_starts
 from services.evaluation.settings import ClassifierSettings
-from services.evaluation.statistics import area_under_roc, balanced_accuracy
 from services.evaluation.success_classifier import (
     DECISION_THRESHOLD,
-    IMAGINED,
     KIND,
-    TRUE,
     ClassifierBatch,
     ClassifierNetwork,
     ClassifierShape,
     SuccessClassifier,
     TaskNetwork,
-    calibration_name,
-    combination_name,
+    probe_batch,
     unit_images,
 )
-from services.evaluation.success_classifier_data import Labelled, labelled_endings, object_scale
 from services.evaluation.trained_networks import (
     Checkpoint,
     CheckpointMetadata,
@@ -54,163 +52,146 @@ from services.evaluation.trained_networks import (
     optimized,
 )
 
-# Calibration of a trained success classifier, and its metrics on held-out endings.
+# Share of early endings in the weight of a task's failures. They are easy: with more weight they
+# would dominate the near misses, which matter.
+EARLY_SHARE: Final = 0.1
 
-# No calibration is fitted with fewer endings of either outcome.
-MIN_OUTCOMES: Final = 5
-# Milestones with a lower area under the ROC curve are not reported by the probe.
-MIN_MILESTONE_AUC: Final = 0.9
-Figures = dict[str, float | int]
+# Share of middle endings, which train milestones only, in a task's total weight.
+MIDDLE_SHARE: Final = 0.15
 
-
-def fit_calibrations(
-    probe: SuccessClassifier, episodes: Sequence[EndingEpisode], *, risk: float
-) -> dict[str, Calibration]:
-    """Calibration of every task and kind of ending with enough of both outcomes."""
-    found: dict[str, Calibration] = {}
-    for task in probe.shape.tasks:
-        for kind in (TRUE, IMAGINED):
-            endings, success = final_endings(episodes, task, kind)
-            if min(success.sum(), (~success).sum()) < MIN_OUTCOMES:
-                continue
-            odds = probe.log_odds(endings)[:, 0]
-            found[calibration_name(task, kind)] = fit_calibration(odds, success, risk=risk)
-    return found
+# Lower bound of the deviation of features that hardly vary in a task, so that noise stays small.
+_LEAST_STD: Final = 0.05
 
 
-def fit_combinations(
-    probe: SuccessClassifier, episodes: Sequence[EndingEpisode], *, risk: float, margin: float
-) -> dict[str, Combination]:
-    """Combination of a calibrated probe with the world's own estimates, of every task.
+@dataclass(frozen=True)
+class Labelled:
+    """Endings as tensors, with their outcomes and weights.
 
-    Only imagined endings count that the world estimates and does not doubt, since it is for these
-    that the probe decides. Objects of unusual sizes have a combination of their own: a world is
-    right about them less often.
+    `outcome` [n, outputs] holds success and the task's milestones, `known` marks those that are
+    known.
     """
-    found: dict[str, Combination] = {}
-    for task, unusual_sizes in product(probe.shape.tasks, (False, True)):
-        endings, success = final_endings(episodes, task, IMAGINED)
-        rows = [
-            row
-            for row, ending in enumerate(endings)
-            if ending.success_probability is not None
-            and ending.doubted is None
-            and ending.has_unusual_sizes == unusual_sizes
-        ]
-        outcomes = success[rows]
-        if min(outcomes.sum(), (~outcomes).sum()) < MIN_OUTCOMES:
-            continue
-        mine = [endings[row] for row in rows]
-        world = np.array([ending.success_probability for ending in mine], dtype=np.float64)
-        name = combination_name(task, unusual_sizes=unusual_sizes)
-        found[name] = fit_combination(
-            probe.probabilities(mine), world, outcomes, risk=risk, margin=margin
-        )
-    return found
+
+    batch: ClassifierBatch
+    outcome: torch.Tensor
+    known: torch.Tensor
+    weight: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.outcome)
+
+    def of_task(self, index: int) -> "Labelled":
+        """Endings of one task."""
+        mine = torch.nonzero(self.batch.task == index)[:, 0]
+        return Labelled(self.batch[mine], self.outcome[mine], self.known[mine], self.weight[mine])
 
 
-def milestones_that_can_be_told(
-    probe: SuccessClassifier, episodes: Sequence[EndingEpisode]
-) -> dict[str, tuple[str, ...]]:
-    """Milestones of every task that the probe classifies well on held-out endings."""
-    areas = milestone_areas(probe, episodes)
-    return {
-        task: tuple(n for n in names if areas.get((task, n), 0.0) >= MIN_MILESTONE_AUC)
-        for task, names in probe.shape.milestones.items()
-    }
+@dataclass(frozen=True)
+class _Example:
+    """`part` is "final", "early" or "middle"; `success` is None in the middle."""
+
+    ending: Ending
+    part: str
+    success: bool | None
+    reached: list[bool] | None
 
 
-def milestone_areas(
-    probe: SuccessClassifier, episodes: Sequence[EndingEpisode]
-) -> dict[tuple[str, str], float]:
-    """Area under the ROC curve of every task and milestone with both outcomes."""
-    areas: dict[tuple[str, str], float] = {}
-    for task, names in probe.shape.milestones.items():
-        mine = [e for e in episodes if e.task == task and e.event_times_s is not None]
-        if not mine:
-            continue
-        odds = probe.log_odds([_as_seen(e.final, TRUE) for e in mine])
-        for index, name in enumerate(names):
-            outcomes = np.array([bool((e.reached(names, e.last_step) or [])[index]) for e in mine])
-            if min(outcomes.sum(), (~outcomes).sum()) >= MIN_OUTCOMES:
-                areas[task, name] = area_under_roc(odds[:, 1 + index], outcomes)
-    return areas
+def labelled_endings(
+    episodes: Sequence[EndingEpisode], shape: ClassifierShape, *, imagined_share: float = 0.5
+) -> Labelled:
+    """Endings with outcomes, weighted so that both outcomes count the same in every task.
 
+    Every episode contributes its end and the step before; an early ending, as a failure with a
+    tenth of the weight of all failures; and a middle ending where its milestones are known.
 
-def held_out_figures(probe: SuccessClassifier, episodes: Sequence[EndingEpisode]) -> Figures:
-    """Share of correct decisions over all tasks, and metrics of true and imagined endings by task.
-
-    True endings are given without object poses, which a real robot does not have; `poses` are true
-    endings with poses and touch but no image; `imagined` endings are given as they are.
+    Args:
+        episodes: episodes with known success.
+        shape: shape of the probe.
+        imagined_share: weight of a task's imagined endings relative to its true ones.
 
     Raises:
         InvalidInputError: a task has only one outcome.
     """
-    figures: Figures = {}
-    right: list[bool] = []
-    for task in probe.shape.tasks:
-        endings, success = final_endings(episodes, task, TRUE)
-        right.extend(((probe.probabilities(endings) >= probe.threshold) == success).tolist())
-        figures |= _figures(probe, endings, success, f"held_out_{{}}_{task}")
-        figures[f"num_held_out_successes_{task}"] = int(success.sum())
-        figures[f"num_held_out_failures_{task}"] = int((~success).sum())
-        for kind, (others, outcomes) in {
-            "poses": _with_poses_only(episodes, task),
-            "imagined": final_endings(episodes, task, IMAGINED),
-        }.items():
-            if min(outcomes.sum(), (~outcomes).sum()) >= MIN_OUTCOMES:
-                figures |= _figures(probe, others, outcomes, f"held_out_{kind}_{{}}_{task}")
-    for (task, name), area in milestone_areas(probe, episodes).items():
-        figures[f"held_out_milestone_auc_{task}_{name}"] = area
-    return {"held_out_accuracy": float(np.mean(right)), **figures}
+    examples = [example for item in episodes for example in _examples(item, shape)]
+    weight = _weights(examples, imagined_share)
+    outcome = torch.zeros((len(examples), shape.num_outputs))
+    known = torch.zeros((len(examples), shape.num_outputs), dtype=torch.bool)
+    for row, example in enumerate(examples):
+        if example.success is not None:
+            outcome[row, 0], known[row, 0] = float(example.success), True
+        if example.reached:
+            columns = slice(1, 1 + len(example.reached))
+            outcome[row, columns] = torch.tensor(example.reached, dtype=torch.float32)
+            known[row, columns] = True
+    batch = probe_batch([example.ending for example in examples], shape)
+    scaled = torch.tensor(weight / weight.mean(), dtype=torch.float32)
+    return Labelled(batch, outcome, known, scaled)
 
 
-def _figures(
-    probe: SuccessClassifier, endings: Sequence[Ending], success: np.ndarray, name: str
-) -> Figures:
-    verdicts = probe.verdicts(endings)
-    probabilities = np.array([v.probability for v in verdicts])
-    likely = np.array([v.likely_success for v in verdicts])
-    decided = np.array([v.decision != "cannot tell" for v in verdicts])
-    before = Reliability.of(sigmoid(probe.log_odds(endings)[:, 0]), success)
-    after = Reliability.of(probabilities, success)
-    found: Figures = {
-        "auc": area_under_roc(probabilities, success),
-        "balanced_accuracy": balanced_accuracy(likely, success),
-        "ece": after.expected_calibration_error,
-        "ece_uncalibrated": before.expected_calibration_error,
-        "brier": after.brier,
-        "brier_uncalibrated": before.brier,
-        "undecided": float(1 - decided.mean()),
-    }
-    if decided.any():
-        found["accuracy_of_decided"] = float((likely == success)[decided].mean())
-    return {name.format(key): value for key, value in found.items()}
-
-
-def final_endings(
-    episodes: Sequence[EndingEpisode], task: str, kind: str
-) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
-    """Final endings of a task, true or imagined, as a probe gets them, and their outcomes."""
-    mine = [e for e in episodes if e.task == task and e.imagined == (kind == IMAGINED)]
-    success = np.array([e.success for e in mine], dtype=bool)
-    return [_as_seen(e.final, kind) for e in mine], success
-
-
-def _as_seen(ending: Ending, kind: str) -> Ending:
-    return replace(ending, object_poses=None) if kind == TRUE and not ending.imagined else ending
-
-
-def _with_poses_only(
-    episodes: Sequence[EndingEpisode], task: str
-) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
-    mine = [
-        e
-        for e in episodes
-        if e.task == task and not e.imagined and e.final.object_poses is not None
+def _examples(item: EndingEpisode, shape: ClassifierShape) -> list[_Example]:
+    last = item.last_step
+    steps: list[tuple[int, str, bool | None]] = [
+        (last, "final", item.success),
+        (last - 1, "final", item.success),
+        (early_step(item.scene, last), "early", False),
     ]
-    success = np.array([e.success for e in mine], dtype=bool)
-    return [replace(e.final, images=None) for e in mine], success
+    names = shape.milestones.get(item.task, ())
+    if names and item.event_times_s is not None:
+        steps.append((middle_step(item.scene, last), "middle", None))
+    return [
+        _Example(item.endings[step], part, success, item.reached(names, step))
+        for step, part, success in steps
+        if step in item.endings
+    ]
+
+
+def _weights(examples: Sequence[_Example], imagined_share: float) -> Float64[np.ndarray, " n"]:
+    weight = np.zeros(len(examples))
+    group = [(e.ending.task, e.ending.imagined) for e in examples]
+    for task, imagined in sorted(set(group)):
+        mine = np.array([one == (task, imagined) for one in group])
+        both = (task, not imagined) in group
+        share = (imagined_share if imagined else 1 - imagined_share) if both else 1.0
+        kind = "imagined" if imagined else "true"
+        weight[mine] = share * _group_weights(
+            [e for e, chosen in zip(examples, mine, strict=True) if chosen], f"{kind} {task!r}"
+        )
+    return weight
+
+
+def _group_weights(examples: Sequence[_Example], what: str) -> Float64[np.ndarray, " n"]:
+    """Weights of the endings of one task and kind, which sum to one and a little more.
+
+    Where no early steps are shown, final failures have their share of the weight.
+    """
+    part = np.array([e.part for e in examples])
+    success = np.array([bool(e.success) for e in examples])
+    weight = np.zeros(len(examples))
+    middle = MIDDLE_SHARE if (part == "middle").any() else 0.0
+    early = EARLY_SHARE if (part == "early").any() else 0.0
+    for word, chosen, share in (
+        ("successful", (part == "final") & success, 0.5),
+        ("failed", (part == "final") & ~success, 0.5 * (1 - early)),
+        ("early", part == "early", 0.5 * early),
+        ("middle", part == "middle", middle),
+    ):
+        if share and not chosen.any():
+            raise InvalidInputError(
+                f"success classifier: no {word} episode of {what} among {len(examples)} endings; "
+                "record with more noise levels"
+            )
+        weight[chosen] = share / max(chosen.sum(), 1)
+    return weight
+
+
+def object_scale(batch: ClassifierBatch) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean and standard deviation of the object pose features, each [features].
+
+    They are 0 and 1 for fewer than two known poses.
+    """
+    known = batch.objects[batch.has_objects]
+    if len(known) < 2:
+        return torch.zeros(batch.objects.shape[1]), torch.ones(batch.objects.shape[1])
+    return known.mean(dim=0), known.std(dim=0).clamp_min(_LEAST_STD)
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,11 @@ from typing import Any
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, needs, select_episodes
 from dextouch.errors import UnknownNameError
+from services.evaluation.perceptual_networks import Metric
 from services.evaluation.prediction import (
     ALL_TASKS,
     GEOMETRY,
     MODEL,
-    Metric,
     PredictionResult,
     all_metrics,
     described,

@@ -22,9 +22,9 @@ from benchmarks.direct_judge import (
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.schemas import Observation, Review, RolloutStart
-from services.evaluation.calibration import Calibration
 from services.evaluation.matched_starts import start_digest
 from services.evaluation.statistics import area_under_roc
+from services.evaluation.success_classifier import Calibration
 from services.evaluation.trained_networks import save_checkpoint
 from services.twin.episodes import record, write_episode
 from services.twin.motions import Motion

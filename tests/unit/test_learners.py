@@ -9,7 +9,7 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.schemas import Review
 from services.evaluation.endings import read_ending_episodes
-from services.evaluation.policies.cloning_network import read_cloning_episodes
+from services.evaluation.policies.cloning_training import read_cloning_episodes
 from services.evaluation.recorded_takes import read_takes
 from services.pipelines.imagined_data import chosen_episodes
 from services.twin.episodes import record, write_episode

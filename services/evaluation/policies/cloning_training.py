@@ -1,30 +1,40 @@
-"""Training of behaviour cloning, with held-out error and an optional early checkpoint."""
+"""Training of behaviour cloning on successful episodes, with an optional early checkpoint."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import torch
+from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.episodes import data_hash, split_by_scene
+from dextouch.episodes import (
+    TRUE_ORIGINS,
+    EpisodeGrid,
+    EpisodeReader,
+    EpisodeStore,
+    Split,
+    data_hash,
+    needs,
+    select_episodes,
+    split_by_scene,
+)
 from dextouch.errors import InvalidInputError
-from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT
-from dextouch.schemas import CHUNK_STEPS
+from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT, AnchorPoses
+from dextouch.schemas import CHUNK_STEPS, Origin
+from services.evaluation.matched_starts import start_digest
 from services.evaluation.policies.behaviour_cloning import (
     KIND,
+    NUM_POSE_FEATURES,
+    SLOT_STEPS,
+    CloningBatch,
     CloningInput,
+    CloningNetwork,
     CloningShape,
     cloning_state,
     half_size,
     in_world,
     scaled_images,
-)
-from services.evaluation.policies.cloning_network import (
-    DECISION_STRIDE,
-    NUM_POSE_FEATURES,
-    CloningBatch,
-    CloningEpisode,
-    CloningNetwork,
 )
 from services.evaluation.settings import CloningSettings
 from services.evaluation.trained_networks import (
@@ -34,6 +44,108 @@ from services.evaluation.trained_networks import (
     network_tensors,
     optimized,
 )
+from services.networks.training_settings import USUAL_IMAGE_PX
+
+# Training uses every such step; an evaluation with chunks of 16 decides at every second of them.
+DECISION_STRIDE: Final = SLOT_STEPS
+
+# What an episode of a cloned policy must have.
+IMITATED: Final = (needs.WHOLE, needs.OUTCOME, needs.SUCCESS, needs.image_every(DECISION_STRIDE))
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Image and touch at one step."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    tactile_kpa: Float32[np.ndarray, "2 320"]
+
+
+@dataclass(frozen=True)
+class CloningEpisode:
+    """One robot episode: measured and commanded actions at every step, observations at some.
+
+    `commanded` are the measured ones where the episode has no commands. Both actions are relative
+    to the measured poses of step 0, which are `anchor`. `moments` maps steps to observations and
+    includes step 0. `start_digest` is that of the first observation as recorded.
+    """
+
+    episode_id: str
+    task: str
+    instruction: str
+    scene: str
+    success: bool
+    anchor: AnchorPoses
+    moments: Mapping[int, Moment]
+    measured: Float64[np.ndarray, "steps 67"]
+    commanded: Float64[np.ndarray, "steps 67"]
+    start_digest: str
+    content_sha256: str
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of the model grid, including the first one."""
+        return len(self.measured)
+
+
+def read_cloning_episode(
+    reader: EpisodeReader, *, image_px: int = USUAL_IMAGE_PX
+) -> CloningEpisode:
+    """Read one robot episode; only images at decision steps are decoded.
+
+    Args:
+        reader: the episode; it must have what is `IMITATED`.
+        image_px: side that the middle square of larger images is scaled to.
+
+    Raises:
+        InvalidInputError: the outcome is unknown.
+    """
+    grid, about = EpisodeGrid(reader, image_px), reader.attributes
+    steps = range(0, len(grid), DECISION_STRIDE)
+    touch_kpa, _ = grid.touch()
+    return CloningEpisode(
+        about.episode_id,
+        about.task,
+        about.instruction,
+        grid.scene,
+        grid.success,
+        grid.anchor,
+        {
+            step: Moment(image, touch_kpa[step].copy())
+            for step, image in zip(steps, grid.images(steps), strict=True)
+        },
+        grid.measured,
+        grid.sent,
+        start_digest(EpisodeGrid(reader).images([0])[0], touch_kpa[0]),
+        grid.content_sha256,
+    )
+
+
+def read_cloning_episodes(
+    *stores: EpisodeStore,
+    tasks: Sequence[str] = (),
+    splits: Collection[Split] = (),
+    image_px: int = USUAL_IMAGE_PX,
+    imagined: bool = False,
+) -> list[CloningEpisode]:
+    """Read the successful robot episodes of some stores, store by store in the order of ids.
+
+    Args:
+        stores: stores to read.
+        tasks: tasks to read; empty for all.
+        splits: splits of the scenes; empty for all.
+        image_px: side that the middle square of larger images is scaled to.
+        imagined: whether imagined episodes are read instead of true ones.
+
+    Raises:
+        NotFoundError, ConflictError: as `select_episodes`.
+    """
+    origins: Collection[Origin] = ("imagined",) if imagined else TRUE_ORIGINS
+    readers = select_episodes(
+        stores, domain="robot", tasks=tasks, splits=splits, origins=origins, needs=IMITATED
+    )
+    return [read_cloning_episode(reader, image_px=image_px) for reader in readers]
+
 
 # Batch size of the held-out evaluation.
 _TESTED_AT_ONCE = 128
@@ -42,14 +154,6 @@ MOMENTS_AN_EPISODE = 3
 MIN_VARIANCE = 1e-9
 # Large weights stored as float16 to keep files below a megabyte.
 _KEPT_AS_HALF = ("codec.basis", "head.0.weight", "head.2.weight")
-
-
-@dataclass(frozen=True)
-class Trained:
-    """The final policy, and the early one if requested."""
-
-    finished: Checkpoint
-    early: Checkpoint | None = None
 
 
 @dataclass(frozen=True)
@@ -150,7 +254,7 @@ def train_cloned_policy(
     *,
     command: str,
     early_at: float | None = None,
-) -> Trained:
+) -> tuple[Checkpoint, Checkpoint | None]:
     """Train a policy on successful episodes.
 
     Args:
@@ -160,7 +264,8 @@ def train_cloned_policy(
         early_at: fraction of the training after which the early policy is saved.
 
     Returns:
-        The weights; the metadata holds the held-out error and that of the mean chunk.
+        The final policy and, if requested, the early one; their metadata hold the held-out error
+        and that of the mean chunk.
     """
     torch.manual_seed(settings.seed)
     tasks = tuple(sorted({item.task for item in episodes}))
@@ -217,7 +322,7 @@ def train_cloned_policy(
         if early_at is not None and early is None and used.share() >= early_at:
             with used.paused():
                 early = checkpoint(cpu_s, round(used.share(), 4))
-    return Trained(checkpoint(cpu_s, 1.0), early)
+    return checkpoint(cpu_s, 1.0), early
 
 
 def _fit_statistics(network: CloningNetwork, learned: Decisions) -> None:

@@ -1,4 +1,4 @@
-"""Replay policy: sends the commanded actions of recorded demonstrations, whatever it observes."""
+"""Open-loop policies: replay of recorded actions, and holding of the first pose."""
 
 from collections.abc import Iterable, Mapping
 
@@ -13,7 +13,7 @@ from dextouch.schemas import Observation
 
 
 class ReplayPolicy:
-    """Open-loop baseline; as good as the recorded demonstrator.
+    """Sends the commanded actions of recorded episodes; as good as their demonstrator.
 
     Args:
         actions: commanded actions [T, 67] of steps 1 … T for every (task, seed), relative to the
@@ -26,11 +26,7 @@ class ReplayPolicy:
     def __init__(
         self, actions: Mapping[tuple[str, int], np.ndarray], *, chunk_steps: int = 16
     ) -> None:
-        if chunk_steps < 4 or chunk_steps % 4:
-            raise InvalidInputError(
-                f"replay policy: got chunks of {chunk_steps} steps, expected a multiple of 4"
-            )
-        self.chunk_steps = chunk_steps
+        self.chunk_steps = _multiple_of_four(chunk_steps, "replay policy")
         self._actions = {
             (task, seed): check_actions(rows, where=f"replay of {task!r}, seed {seed}")
             for (task, seed), rows in actions.items()
@@ -86,11 +82,8 @@ class ReplayPolicy:
         return self._playing[np.minimum(wanted, len(self._playing) - 1)]
 
 
-# Hold policy: keeps the hands where they are; the weakest baseline.
-
-
 class HoldPolicy:
-    """Keeps the pose of the first observation.
+    """The weakest baseline: keeps the pose of the first observation.
 
     Args:
         chunk_steps: length of its chunks, a multiple of 4.
@@ -99,11 +92,7 @@ class HoldPolicy:
     looks = False
 
     def __init__(self, *, chunk_steps: int = 16) -> None:
-        if chunk_steps < 4 or chunk_steps % 4:
-            raise InvalidInputError(
-                f"hold policy: got chunks of {chunk_steps} steps, expected a multiple of 4"
-            )
-        self.chunk_steps = chunk_steps
+        self.chunk_steps = _multiple_of_four(chunk_steps, "hold policy")
         self._pose: np.ndarray | None = None
 
     def reset(self, start: PolicyStart) -> None:
@@ -116,3 +105,11 @@ class HoldPolicy:
         if self._pose is None:
             self._pose = np.array(observation.action_reached[-1])
         return np.tile(self._pose, (self.chunk_steps, 1))
+
+
+def _multiple_of_four(chunk_steps: int, what: str) -> int:
+    if chunk_steps < 4 or chunk_steps % 4:
+        raise InvalidInputError(
+            f"{what}: got chunks of {chunk_steps} steps, expected a multiple of 4"
+        )
+    return chunk_steps

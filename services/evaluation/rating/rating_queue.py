@@ -19,6 +19,9 @@ from dextouch.streams import HEAD_CAMERA
 from services.evaluation.rating.marks import FIRST, REPEAT, MarkLog, Rubric, StoredMark
 from services.evaluation.reporting.pictures import touch_image
 
+# A rater is shown a rollout again after this many other marks, at least.
+REPEAT_GAP: Final = 10
+
 
 @dataclass(frozen=True)
 class RatedRollout:
@@ -55,14 +58,13 @@ class RatingQueue:
 
     Rollouts with the fewest raters come first; ties are broken by an order specific to the rater.
     After every `1 / repeat_share` rollouts a rater is shown one again that they rated at least
-    `repeat_gap` marks ago. A repeated request without a mark returns the same rollout.
+    `REPEAT_GAP` marks ago. A repeated request without a mark returns the same rollout.
 
     Args:
         rollouts: to be rated.
         marks: those given so far.
         raters_per_rollout: number of people who rate each rollout.
         repeat_share: share of rollouts that a rater sees twice.
-        repeat_gap: marks between the two.
     """
 
     def __init__(
@@ -72,13 +74,11 @@ class RatingQueue:
         *,
         raters_per_rollout: int = 5,
         repeat_share: float = 0.08,
-        repeat_gap: int = 10,
     ) -> None:
         self._rollouts = {one.token: one for one in rollouts}
         self._marks = marks
         self._raters_per_rollout = raters_per_rollout
         self._repeat_share = repeat_share
-        self._repeat_gap = repeat_gap
 
     def rollout(self, token: str) -> RatedRollout:
         """The rollout behind an address.
@@ -122,7 +122,7 @@ class RatingQueue:
         repeats = {one.mark.episode_id for one in mine if one.mark.presentation == REPEAT}
         if len(repeats) >= int(num_seen * self._repeat_share):
             return None
-        old = [one.mark.episode_id for one in mine[: max(0, len(mine) - self._repeat_gap)]]
+        old = [one.mark.episode_id for one in mine[: max(0, len(mine) - REPEAT_GAP)]]
         known = [self._rollouts[t] for t in map(token_of, old) if t in self._rollouts]
         fresh = [one for one in known if one.episode_id not in repeats]
         return min(fresh, key=lambda one: _order(rater, one.episode_id), default=None)

@@ -111,8 +111,6 @@ def rater_biases(
     raters: Sequence[str],
     ratings: Float64[np.ndarray, "_ _"],
     generator: np.random.Generator,
-    *,
-    num_draws: int = 1000,
 ) -> list[RaterBias]:
     """Bias of each rater who shares rollouts with others, with a bootstrap over rollouts.
 
@@ -130,7 +128,7 @@ def rater_biases(
         if not shared.any():
             continue
         apart = ratings[shared, column] - np.nanmean(others[shared], axis=1)
-        counts = start_counts(len(apart), generator, num_draws=num_draws)
+        counts = start_counts(len(apart), generator, num_draws=1000)
         interval = central_interval(counts @ apart / len(apart))
         found.append(RaterBias(rater, float(apart.mean()), interval, len(apart)))
     return found

@@ -115,6 +115,7 @@ _PALETTE = (
     "#3658a7", "#d0652b", "#2d8a6d", "#a4407f", "#8a7a1c", "#4b96b8", "#7b5bb5", "#6b6f76",
 )  # fmt: skip
 _KEY_PX = 24
+_WIDTH, _HEIGHT, _SIDE = 560, 240, 300
 
 
 @dataclass(frozen=True)
@@ -157,24 +158,22 @@ class _Axes:
         )
 
 
-def ticks(low: float, high: float, *, about: int = 5) -> list[float]:
-    """Round numbers in low … high, roughly `about` of them."""
-    step = 10.0 ** math.floor(math.log10((high - low) / about))
+def ticks(low: float, high: float) -> list[float]:
+    """Round numbers in low … high, roughly five of them."""
+    step = 10.0 ** math.floor(math.log10((high - low) / 5))
     for factor in (1, 2, 5, 10):
-        if (high - low) / (step * factor) <= about + 1:
+        if (high - low) / (step * factor) <= 6:
             step *= factor
             break
     first = math.ceil(low / step - 1e-9)
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
-def line_chart(
-    lines: Sequence[Line], *, x_label: str, y_label: str, width: int = 560, height: int = 240
-) -> Markup:
+def line_chart(lines: Sequence[Line], *, x_label: str, y_label: str) -> Markup:
     """Curves over a common axis; long ones are decimated to at most 600 points each."""
     x = np.concatenate([line.x for line in lines])
     y = np.concatenate([line.y for line in lines])
-    axes = _Axes(_range(x, margin=0.0), _range(y, margin=0.06), width, height)
+    axes = _Axes(_range(x, margin=0.0), _range(y, margin=0.06), _WIDTH, _HEIGHT)
     body = [_grid(axes, x_label, y_label)]
     for line in lines:
         stride = max(1, -(-len(line.x) // MAX_POINTS))
@@ -190,9 +189,9 @@ def line_chart(
     return _svg(body, axes, f"{y_label} over {x_label}")
 
 
-def agreement_chart(points: Sequence[Point], *, size: int = 300) -> Markup:
+def agreement_chart(points: Sequence[Point]) -> Markup:
     """Imagined over real success, both 0 … 1, with intervals and the identity line."""
-    axes = _Axes((-0.04, 1.04), (-0.04, 1.04), size + _LEFT - _TOP, size)
+    axes = _Axes((-0.04, 1.04), (-0.04, 1.04), _SIDE + _LEFT - _TOP, _SIDE)
     (x0, y0), (x1, y1) = axes.to_px(0.0, 0.0), axes.to_px(1.0, 1.0)
     body = [
         _grid(axes, "success in the twin", "success imagined"),
@@ -212,29 +211,29 @@ def agreement_chart(points: Sequence[Point], *, size: int = 300) -> Markup:
     return _svg(body, axes, "imagined over real success of each policy")
 
 
-def stand_alone(
-    charts: Sequence[Markup], keys: Mapping[str, int], *, width: int = 560, height: int = 240
-) -> str:
-    """One SVG file of charts of one size side by side, with its own colours and a key of styles."""
-    total = width * len(charts)
+def stand_alone(charts: Sequence[Markup], keys: Mapping[str, int]) -> str:
+    """One SVG file of line charts side by side, with its own colours and a key of styles."""
+    total, total_height = _WIDTH * len(charts), _HEIGHT + _KEY_PX
     style = (
         ".grid{stroke:#e4e5e0}.axis{stroke:#6a7280}text{fill:#4b5563;font:11px sans-serif}"
         ".curve{fill:none;stroke-width:1.6;stroke-linejoin:round}"
     )
     style += "".join(f".curve.s{k}{{stroke:{colour}}}" for k, colour in enumerate(_PALETTE))
     body: list[str] = [
-        str(chart).replace("<svg ", f'<svg x="{k * width}" width="{width}" height="{height}" ', 1)
+        str(chart).replace(
+            "<svg ", f'<svg x="{k * _WIDTH}" width="{_WIDTH}" height="{_HEIGHT}" ', 1
+        )
         for k, chart in enumerate(charts)
     ]
     for k, (label, chosen) in enumerate(keys.items()):
-        x, y = _LEFT + k * (total - _LEFT) // len(keys), height + _KEY_PX // 2
+        x, y = _LEFT + k * (total - _LEFT) // len(keys), _HEIGHT + _KEY_PX // 2
         body.append(
             f'<path class="curve s{chosen % NUM_STYLES}" d="M{x} {y}h20"/>'
             f'<text x="{x + 26}" y="{y + 4}">{escape(label)}</text>'
         )
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {total} {height + _KEY_PX}" '
-        f'width="{total}" height="{height + _KEY_PX}"><style>{style}</style>'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {total} {total_height}" '
+        f'width="{total}" height="{total_height}"><style>{style}</style>'
         f'<rect width="100%" height="100%" fill="white"/>{"".join(body)}</svg>\n'
     )
 

@@ -16,12 +16,7 @@ from pydantic import Field, ValidationError
 from dextouch.errors import CorruptDataError, DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
-from dextouch.serving import (
-    RequireScope,
-    ServedFolder,
-    create_service_app,
-    serve,
-)
+from dextouch.serving import RequireScope, ServedFolder, create_service_app, serve
 from services.evaluation.scores import RolloutFailure
 from services.evaluation.settings import StudyServiceSettings
 from services.evaluation.studies.definition import NAME_PATTERN, StudyDefinition

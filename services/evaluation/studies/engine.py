@@ -167,11 +167,7 @@ class _Workers:
         for cell in cells:
             by_world.setdefault(cell.world, []).append(cell)
         num_failed = 0
-        with (
-            self._connections,
-            Progress("rollouts", len(cells)) as progress,
-            ExitStack() as pools,
-        ):
+        with self._connections, Progress("rollouts", len(cells)) as progress, ExitStack() as pools:
             pending: set[Future[Outcome | None]] = set()
             for world, wanted in by_world.items():
                 pool = ThreadPoolExecutor(self._definition.in_flight, f"rollouts of {world}")

@@ -9,10 +9,10 @@ from pydantic import AwareDatetime
 
 from dextouch.command_line import write_result
 from dextouch.frozen_model import FrozenModel
-from services.evaluation.calibration import LEAST_DECIDED
 from services.evaluation.reporting import ReportPictures, write_report
 from services.evaluation.reporting.sections import latex_tables
 from services.evaluation.scores import (
+    LEAST_DECIDED,
     REAL,
     UNDEFINED,
     VAGUE_R,

@@ -8,7 +8,7 @@ import pytest
 from dextouch.episodes import EpisodeStore, split_of
 from dextouch.errors import NotFoundError
 from services.cli import main
-from services.evaluation.policies.cloning_network import read_cloning_episodes
+from services.evaluation.policies.cloning_training import read_cloning_episodes
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage

@@ -33,7 +33,7 @@ def trained_policies(demonstrations):
 def policy_checkpoint(demonstrations):
     settings = CloningSettings(num_training_steps=3, batch_size=32)
     episodes = [toy.cloning_episode(item) for item in demonstrations]
-    return train_cloned_policy(episodes, settings, command="a test", early_at=0.5).finished
+    return train_cloned_policy(episodes, settings, command="a test", early_at=0.5)[0]
 
 
 def _probe(demonstrations, num_steps):

@@ -11,15 +11,17 @@ from dextouch.geometry.transforms import transform
 from dextouch.hands.actions import AnchorPoses, pose_to_9d
 from services.evaluation.policies.behaviour_cloning import (
     BehaviourCloningPolicy,
+    ChunkCodec,
     CloningInput,
     CloningShape,
+    SpatialSoftmax,
     cloning_batch,
     from_world,
     half_size,
     in_world,
 )
-from services.evaluation.policies.cloning_network import ChunkCodec, CloningEpisode, SpatialSoftmax
 from services.evaluation.policies.cloning_training import (
+    CloningEpisode,
     CloningSettings,
     decisions_of,
     train_cloned_policy,
@@ -50,7 +52,7 @@ def roll(policy: Policy, task: str, seed: int, *, num_chunks: int = 5) -> np.nda
 
 @pytest.fixture(scope="module")
 def policy_checkpoint(trained_policies):
-    return trained_policies.finished
+    return trained_policies[0]
 
 
 def test_held_out_error_is_well_below_the_mean_chunk(policy_checkpoint):
@@ -77,7 +79,7 @@ def test_training_repeats_itself():
     few = episodes(range(12))
     settings = CloningSettings(num_training_steps=3, batch_size=4, held_out_share=0.3)
     first, second, other = (
-        train_cloned_policy(few, settings.model_copy(update={"seed": seed}), command="x").finished
+        train_cloned_policy(few, settings.model_copy(update={"seed": seed}), command="x")[0]
         for seed in (0, 0, 1)
     )
     for name, tensor in first.tensors.items():
@@ -86,19 +88,19 @@ def test_training_repeats_itself():
 
 
 def test_an_early_policy_comes_from_the_same_training(trained_policies):
-    early, finished = trained_policies.early.metadata, trained_policies.finished.metadata
+    finished, early = (one.metadata for one in trained_policies)
     assert early.training_starts == finished.training_starts
     assert early.tasks == finished.tasks
     assert early.settings["share_of_training"] == 0.02
     assert finished.settings["share_of_training"] == 1.0
     assert finished.metrics["wrist_error_mm"] < early.metrics["wrist_error_mm"]
-    policies = [BehaviourCloningPolicy(c) for c in vars(trained_policies).values()]
+    policies = [BehaviourCloningPolicy(c) for c in trained_policies]
     assert roll(policies[0], "reach", 1003) != roll(policies[1], "reach", 1003)
 
 
 def test_without_being_asked_there_is_no_early_policy():
     settings = CloningSettings(num_training_steps=2, batch_size=4, held_out_share=0.3)
-    assert train_cloned_policy(episodes(range(12)), settings, command="x").early is None
+    assert train_cloned_policy(episodes(range(12)), settings, command="x")[1] is None
 
 
 def test_training_needs_a_success():

@@ -5,17 +5,14 @@ import pytest
 
 from dextouch.errors import InvalidInputError
 from services.evaluation.calibration import (
-    LEAST_DECIDED,
-    Calibration,
-    Combination,
-    Reliability,
     brier,
     expected_calibration_error,
     fit_calibration,
     fit_combination,
-    sigmoid,
     undecided_band,
 )
+from services.evaluation.scores import LEAST_DECIDED
+from services.evaluation.success_classifier import Calibration, Combination, sigmoid
 
 # Allowed share of wrong answers among what is decided.
 RISK = 0.10
@@ -43,11 +40,10 @@ def test_a_known_temperature_and_bias_are_found():
     found = fit_calibration(said, came)
     assert found.temperature == pytest.approx(3.0, rel=0.05)
     assert found.bias == pytest.approx(-0.5, abs=0.05)
-    before = Reliability.of(sigmoid(said), came)
-    after = Reliability.of(found.probabilities(said), came)
-    assert before.expected_calibration_error > 0.05
-    assert after.expected_calibration_error < 0.015
-    assert after.brier < before.brier
+    before, after = sigmoid(said), found.probabilities(said)
+    assert expected_calibration_error(before, came) > 0.05
+    assert expected_calibration_error(after, came) < 0.015
+    assert brier(after, came) < brier(before, came)
 
 
 def test_separable_endings_stay_finite():

@@ -75,7 +75,7 @@ def policies(trained_policies):
     return {
         "script": toy.replay(good),
         "clumsy script": toy.replay(poor),
-        "cloned": BehaviourCloningPolicy(trained_policies.finished),
+        "cloned": BehaviourCloningPolicy(trained_policies[0]),
         "hold": HoldPolicy(),
     }
 

@@ -9,13 +9,18 @@ import torch
 
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Doubt, Observation, RolloutDoubt
-from services.evaluation.calibration import Calibration, Combination
+from services.evaluation.calibration import fit_combinations
 from services.evaluation.endings import Ending, EndingEpisode, milestones_of
-from services.evaluation.success_classifier import ClassifierShape, SuccessClassifier, probe_batch
-from services.evaluation.success_classifier_data import labelled_endings
+from services.evaluation.success_classifier import (
+    Calibration,
+    ClassifierShape,
+    Combination,
+    SuccessClassifier,
+    probe_batch,
+)
 from services.evaluation.success_classifier_training import (
     ClassifierSettings,
-    fit_combinations,
+    labelled_endings,
     some_parts,
     train_success_classifier,
 )

@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import ShapeError
-from services.evaluation.success_classifier import (
-    NUM_OBJECT_FEATURES,
-    known_objects,
-    object_features,
-)
+from services.evaluation.endings import NUM_OBJECT_FEATURES, known_objects, object_features
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 # A quarter turn about x lays a standing object down: its z axis points along −y.

@@ -10,10 +10,10 @@ from scipy.stats import mannwhitneyu
 from dextouch.episodes import split_by_scene
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from services.evaluation.success_classifier import ClassifierShape, SuccessClassifier
-from services.evaluation.success_classifier_data import labelled_endings
 from services.evaluation.success_classifier_training import (
     ClassifierSettings,
     calibrate_success_classifier,
+    labelled_endings,
     train_success_classifier,
 )
 from tests.unit.evaluation import toy

@@ -17,11 +17,7 @@ from dextouch.worlds.world import (
     WorldDescription,
 )
 from services.evaluation.matched_starts import start_digest
-from services.evaluation.policies.cloning_network import (
-    DECISION_STRIDE,
-    CloningEpisode,
-    Moment,
-)
+from services.evaluation.policies.cloning_training import DECISION_STRIDE, CloningEpisode, Moment
 from services.evaluation.policies.replay import ReplayPolicy
 
 SIZE = 32

@@ -4,17 +4,16 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from dextouch.errors import ShapeError
-from dextouch.metrics.policy import mmrv, pearson
-from services.evaluation.statistics import (
+from benchmarks.evaluator.resampling import (
     area_under_roc_of_draws,
     balanced_accuracy_of_draws,
+    interval_of_draws,
     mean_of_draws,
-    mmrv_of_draws,
-    pearson_of_draws,
     rates_of_draws,
-    start_counts,
 )
+from dextouch.errors import ShapeError
+from dextouch.metrics.policy import mmrv, pearson
+from services.evaluation.statistics import mmrv_of_draws, pearson_of_draws, start_counts
 
 
 def _drawn_starts(counts: np.ndarray) -> np.ndarray:
@@ -74,3 +73,13 @@ def test_draws_without_both_outcomes_are_undefined():
 def test_no_starts_are_refused():
     with pytest.raises(ShapeError, match="0 starts"):
         start_counts(0, np.random.default_rng(0), num_draws=5)
+
+
+def test_an_interval_of_mostly_undefined_draws_is_none():
+    draws = np.full(10, np.nan)
+    draws[:5] = 0.5
+    assert interval_of_draws(draws) is None
+    draws[5] = 0.5
+    assert interval_of_draws(draws) is not None
+    with pytest.raises(ShapeError, match="draws"):
+        interval_of_draws(np.empty(0))

@@ -1,0 +1,80 @@
+"""Bootstrap of judges' figures over matched starts, vectorized over the draws of `start_counts`."""
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import ShapeError
+from services.evaluation.statistics import Counts, Interval, central_interval
+
+
+def interval_of_draws(figures: np.ndarray) -> Interval | None:
+    """95 % percentile interval of the figures [draws] of a bootstrap; undefined draws are NaN.
+
+    Returns:
+        The interval of the defined draws; None where more than half are undefined.
+
+    Raises:
+        ShapeError: not one axis with at least one draw.
+    """
+    if figures.ndim != 1 or len(figures) == 0:
+        raise ShapeError(f"bootstrap: got shape {figures.shape}, expected [draws ≥ 1]")
+    defined = figures[np.isfinite(figures)]
+    enough = 2 * len(defined) > len(figures)
+    return central_interval(defined) if enough else None
+
+
+def _weights(counts: Counts, start_index: np.ndarray) -> Float64[np.ndarray, "draws n"]:
+    return counts[:, np.asarray(start_index)]
+
+
+def rates_of_draws(outcomes: np.ndarray, counts: Counts) -> Float64[np.ndarray, "draws policies"]:
+    """Mean outcome of every policy in every draw.
+
+    Args:
+        outcomes: [policies, starts].
+        counts: from `start_counts`.
+    """
+    return counts @ np.asarray(outcomes, dtype=np.float64).T / counts.sum(axis=1, keepdims=True)
+
+
+def area_under_roc_of_draws(
+    scores: np.ndarray, success: np.ndarray, start_index: np.ndarray, counts: Counts
+) -> Float64[np.ndarray, " draws"]:
+    """Area under the ROC curve of every draw, ties half; NaN where one outcome is missing.
+
+    Args:
+        scores: [n], higher for more certain success.
+        success: [n] outcomes.
+        start_index: [n], start of each rollout.
+        counts: from `start_counts`.
+    """
+    scores, positive = np.asarray(scores), np.asarray(success, dtype=bool)
+    weight = _weights(counts, start_index)
+    wins, losses = weight[:, positive], weight[:, ~positive]
+    ordered = (np.sign(scores[positive][:, None] - scores[~positive][None, :]) + 1) / 2
+    pairs = wins.sum(axis=1) * losses.sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sum((wins @ ordered) * losses, axis=1) / pairs)
+
+
+def balanced_accuracy_of_draws(
+    decisions: np.ndarray, success: np.ndarray, start_index: np.ndarray, counts: Counts
+) -> Float64[np.ndarray, " draws"]:
+    """Balanced accuracy of every draw; NaN where one outcome is missing."""
+    right = np.asarray(decisions, dtype=bool) == np.asarray(success, dtype=bool)
+    positive = np.asarray(success, dtype=bool)
+    weight = _weights(counts, start_index)
+    with np.errstate(invalid="ignore"):
+        shares = [
+            (weight[:, of] @ right[of]) / weight[:, of].sum(axis=1) for of in (positive, ~positive)
+        ]
+    return np.asarray((shares[0] + shares[1]) / 2)
+
+
+def mean_of_draws(
+    values: np.ndarray, start_index: np.ndarray, counts: Counts
+) -> Float64[np.ndarray, " draws"]:
+    """Mean of values [n] over the rollouts of every draw; NaN for a draw without any."""
+    weight = _weights(counts, start_index)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((weight @ np.asarray(values, dtype=np.float64)) / weight.sum(axis=1))
