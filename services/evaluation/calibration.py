@@ -39,6 +39,11 @@ _PRIOR_ENDINGS: Final = 2.0
 # Allowed share of wrong answers among the decided endings. Kinds of mistakes that nothing was
 # calibrated on are judged wrongly about twice as often.
 UNDECIDED_RISK: Final = 0.05
+# No calibration is fitted with fewer endings of either outcome.
+MIN_OUTCOMES: Final = 5
+# Milestones with a lower area under the ROC curve are not reported by the probe.
+MIN_MILESTONE_AUC: Final = 0.9
+Figures = dict[str, float | int]
 
 
 def expected_calibration_error(probabilities: np.ndarray, success: np.ndarray) -> float:
@@ -199,15 +204,6 @@ def _pair(probabilities: np.ndarray, success: np.ndarray) -> tuple[np.ndarray, n
             "expected one each, at least one"
         )
     return predicted, outcomes
-
-
-# No calibration is fitted with fewer endings of either outcome.
-MIN_OUTCOMES: Final = 5
-
-# Milestones with a lower area under the ROC curve are not reported by the probe.
-MIN_MILESTONE_AUC: Final = 0.9
-
-Figures = dict[str, float | int]
 
 
 def fit_calibrations(

@@ -37,6 +37,9 @@ from services.evaluation.progress import Progress
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
 from services.evaluation.success_classifier import SuccessClassifier
 
+# Repeats of an imagined rollout differ by this in the seed of their noise.
+_REPEAT_STRIDE = 2**40
+
 
 @dataclass(frozen=True)
 class EvaluationPlan:
@@ -124,10 +127,6 @@ def begin_matched(
     for what, trained in trained_on.items():
         refuse_training_starts(digests, trained_on=trained, what=what)
     return starts
-
-
-# Repeats of an imagined rollout differ by this in the seed of their noise.
-_REPEAT_STRIDE = 2**40
 
 
 @dataclass(frozen=True)

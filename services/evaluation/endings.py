@@ -41,6 +41,13 @@ MIDDLE_ENDS: Final = (32, 48, 64)
 _USUAL_END: Final = 80
 # What an episode of a judge must have.
 JUDGED: Final = (needs.WHOLE, needs.OUTCOME, needs.longer_than(16), needs.IMAGES)
+NUM_PAD_FEATURES = 24
+_PAIRS: Final = tuple(combinations(range(MAX_OBJECTS), 2))
+# Success is decided by millimetres within half a metre, so distances enter features of poses twice:
+# linearly, and compressed by asinh.
+_WIDE_M, _NEAR_M, _STILL_M, _STILL_RAD = 0.1, 0.01, 0.002, 0.05
+_OF_OBJECT, _OF_PAIR = 17, 18
+NUM_OBJECT_FEATURES: Final = MAX_OBJECTS * _OF_OBJECT + len(_PAIRS) * _OF_PAIR
 
 
 def early_step(scene: str, last_step: int = _USUAL_END) -> int:
@@ -276,9 +283,6 @@ def milestones_of(episodes: Iterable[EndingEpisode]) -> dict[str, tuple[str, ...
     }
 
 
-NUM_PAD_FEATURES = 24
-
-
 def pad_features(tactile_kpa: np.ndarray) -> Float32[np.ndarray, "*batch 24"]:
     """Mean and maximum of √kPa / 4 per hand and pad: where the hand touches, and how hard.
 
@@ -299,15 +303,6 @@ def pad_features(tactile_kpa: np.ndarray) -> Float32[np.ndarray, "*batch 24"]:
     parts += [tips.max((-2, -1)), palm.max((-2, -1))[..., None]]
     features = np.concatenate(parts, axis=-1)
     return features.reshape(*features.shape[:-2], NUM_PAD_FEATURES)
-
-
-_PAIRS: Final = tuple(combinations(range(MAX_OBJECTS), 2))
-
-_WIDE_M, _NEAR_M, _STILL_M, _STILL_RAD = 0.1, 0.01, 0.002, 0.05
-
-_OF_OBJECT, _OF_PAIR = 17, 18
-
-NUM_OBJECT_FEATURES: Final = MAX_OBJECTS * _OF_OBJECT + len(_PAIRS) * _OF_PAIR
 
 
 def object_features(object_poses: np.ndarray) -> Float32[np.ndarray, "105"]:

@@ -38,6 +38,10 @@ from services.evaluation.reporting import PredictionPicture
 
 MODEL: Final = "model"
 ALL_TASKS: Final = "all"
+# Objects that stay where they are say nothing of a prediction.
+_MOVED_M: Final = 0.01
+_PEAK = f"{tactile_metrics.PEAK_KPA:g} kPa"
+Figures = dict[str, dict[str, float | None]]
 
 
 def _of_images(function: Callable[..., float]) -> Callable[[Pairs], float]:
@@ -76,10 +80,6 @@ def _of_geometry(function: Callable[..., float]) -> Callable[[Pairs], float]:
     return measure
 
 
-# Objects that stay where they are say nothing of a prediction.
-_MOVED_M: Final = 0.01
-
-
 def _object_error(pairs: Pairs) -> float:
     """Median error in mm of objects that moved; NaN if there are none, or no prediction of them."""
     errors_m = [np.zeros(0)]
@@ -94,7 +94,6 @@ def _object_error(pairs: Pairs) -> float:
     return 1e3 * float(np.median(found_m)) if len(found_m) else float("nan")
 
 
-_PEAK = f"{tactile_metrics.PEAK_KPA:g} kPa"
 METRICS: Final = {metric.name: metric for metric in (
     Metric("psnr", "PSNR", "dB", "higher", "images", _of_images(image_metrics.psnr),
            "peak signal-to-noise ratio of 8-bit images, mean over images, at most 100"),
@@ -142,7 +141,6 @@ def all_metrics(weights: Path | None = None) -> dict[str, Metric]:
 
 
 GEOMETRY: Final = tuple(name for name, metric in METRICS.items() if metric.of == "geometry")
-Figures = dict[str, dict[str, float | None]]
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ MIN_PIXELS: Final = 3
 TOLERANCE: Final = 0.05
 # A body that moves less than this over a scene has no trajectory to compare.
 MIN_PATH_PX: Final = 2.0
+_NO_IMAGE = ReturnSelector(cameras=())
+_LAST_STEP = ReturnSelector(cameras=(HEAD_CAMERA,), steps="last")
 
 
 @dataclass(frozen=True)
@@ -130,10 +132,6 @@ def geometry_error(
         for geometry, images in pairs
     ]
     return float(np.mean(found)) if found else float("nan")
-
-
-_NO_IMAGE = ReturnSelector(cameras=())
-_LAST_STEP = ReturnSelector(cameras=(HEAD_CAMERA,), steps="last")
 
 
 @dataclass(frozen=True)

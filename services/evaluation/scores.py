@@ -31,6 +31,8 @@ NOTABLE_INFLUENCE = 0.1
 # A correlation that may be below this is not shown to be good.
 VAGUE_R = 0.5
 _SEED = 0
+# Policies of one task that are compared, for the agreement over all tasks.
+_Compared = tuple[tuple[str, ...], MatchedScores, Draws]
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,6 @@ class RolloutFailure:
 
 
 Outcome = RolloutScore | RolloutFailure
-# Policies of one task that are compared, for the agreement over all tasks.
-_Compared = tuple[tuple[str, ...], MatchedScores, Draws]
 
 
 @dataclass(frozen=True)

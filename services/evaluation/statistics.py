@@ -1,4 +1,11 @@
-"""Success rates and classification metrics, and confidence intervals."""
+"""Success rates and classification metrics, their confidence intervals, and draws of both.
+
+Ten starts give little information about a policy, and a bootstrap of a correlation is biased: noise
+in the scores of both worlds shrinks every correlation towards zero, and resampling adds the same
+noise again. `posterior_scores` models that noise; use it for intervals. `bootstrap_scores` is the
+baseline, and shows how often a figure is undefined. `python -m benchmarks agreement` measures how
+often the intervals of both contain the true value.
+"""
 
 import math
 from dataclasses import dataclass
@@ -12,6 +19,14 @@ from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.metrics.policy import MIN_POLICIES
 
 CONFIDENCE: Final = 0.95
+Counts = Float64[np.ndarray, "draws starts"]
+# Grid of the spread of policies' true scores in each world, and of their correlation; the prior is
+# uniform in both spreads and in artanh of the correlation.
+_SPREADS: Final = np.array([0.02, 0.04, 0.08, 0.12, 0.17, 0.23, 0.30, 0.40, 0.55])
+_CORRELATIONS: Final = np.tanh(np.linspace(-3.0, 3.0, 25))
+# Starts at which correlations of the noise count fully; with fewer they are shrunk towards zero.
+_SHRINK_STARTS: Final = 4.0
+_BATCH: Final = 1000
 
 
 @dataclass(frozen=True)
@@ -109,17 +124,11 @@ def shortest_interval(draws: np.ndarray, *, confidence: float = CONFIDENCE) -> I
     return Interval(float(ordered[first]), float(ordered[first + held - 1]))
 
 
-# Bootstrap of evaluation figures over matched starts, vectorized over all draws.
-#
-# A draw resamples the starts with replacement; all rollouts of a start are drawn together, since
-# they share its objects and errors. Call `start_counts` once and pass its counts to every figure of
-# a table, so that all figures use the same draws.
-
-Counts = Float64[np.ndarray, "draws starts"]
-
-
 def start_counts(num_starts: int, generator: np.random.Generator, *, num_draws: int) -> Counts:
-    """How often each start is drawn, [draws, starts]; every row sums to the number of starts."""
+    """How often each start is drawn, [draws, starts]; every row sums to the number of starts.
+
+    All rollouts of a start are drawn together, since they share its objects and errors.
+    """
     if num_starts < 1 or num_draws < 1:
         raise ShapeError(
             f"bootstrap: got {num_starts} starts and {num_draws} draws, expected at least one each"
@@ -148,23 +157,6 @@ def mmrv_of_draws(real: np.ndarray, imagined: np.ndarray) -> Float64[np.ndarray,
     a, b = real[:, :, None] - real[:, None, :], imagined[:, :, None] - imagined[:, None, :]
     violated = (a > 0) != (b > 0)
     return np.asarray(np.mean(np.max(np.abs(a) * violated, axis=2), axis=1))
-
-
-# Draws of policies' true scores given a few rollouts: posterior, and hierarchical bootstrap.
-#
-# Ten starts give little information about a policy, and a bootstrap of a correlation is biased:
-# noise in the scores of both worlds shrinks every correlation towards zero, and resampling adds the
-# same noise again. `posterior_scores` models that noise; use it for intervals. `bootstrap_scores`
-# is the baseline, and shows how often a figure is undefined. `python -m benchmarks agreement`
-# measures how often the intervals of both contain the true value.
-
-# Grid of the spread of policies' true scores in each world, and of their correlation; the prior is
-# uniform in both spreads and in artanh of the correlation.
-_SPREADS: Final = np.array([0.02, 0.04, 0.08, 0.12, 0.17, 0.23, 0.30, 0.40, 0.55])
-_CORRELATIONS: Final = np.tanh(np.linspace(-3.0, 3.0, 25))
-# Starts at which correlations of the noise count fully; with fewer they are shrunk towards zero.
-_SHRINK_STARTS: Final = 4.0
-_BATCH: Final = 1000
 
 
 def known_mean(scores: np.ndarray, *, axis: int) -> np.ndarray:

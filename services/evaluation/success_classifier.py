@@ -31,6 +31,16 @@ _CHANNELS = (24, 32, 48, 48)
 _OBJECT_HIDDEN, _OBJECT_OUTPUT = 64, 32
 # Pose features are clipped to this many standard deviations.
 _FARTHEST = 5.0
+# The band within which everything is undecided.
+WHOLE_BAND: Final = 0.5
+# Estimates are counted as at most this sure: the mean over a few members is often 0 or 1.
+_LEAST_PROBABILITY: Final = 0.01
+# Version 4 of the network, one per task; older checkpoints are rejected by this name.
+KIND = "success-probe-4"
+DECISION_THRESHOLD = 0.5
+Decision = Literal["success", "failure", "cannot tell"]
+TRUE, IMAGINED = "true", "imagined"
+_BATCH = 256
 
 
 class ClassifierShape(FrozenModel):
@@ -196,13 +206,6 @@ def _check(ending: Ending, shape: ClassifierShape) -> None:
         )
 
 
-# The band within which everything is undecided.
-WHOLE_BAND: Final = 0.5
-
-# Estimates are counted as at most this sure: the mean over a few members is often 0 or 1.
-_LEAST_PROBABILITY: Final = 0.01
-
-
 class Calibration(FrozenModel):
     """Probability = sigmoid(log odds / temperature + bias); undecided within `band` of 0.5."""
 
@@ -256,14 +259,6 @@ def log_odds_of(probabilities: np.ndarray) -> Float64[np.ndarray, " n"]:
         np.asarray(probabilities, np.float64), _LEAST_PROBABILITY, 1 - _LEAST_PROBABILITY
     )
     return np.asarray(np.log(bounded / (1 - bounded)))
-
-
-# Version 4 of the network, one per task; older checkpoints are rejected by this name.
-KIND = "success-probe-4"
-DECISION_THRESHOLD = 0.5
-Decision = Literal["success", "failure", "cannot tell"]
-TRUE, IMAGINED = "true", "imagined"
-_BATCH = 256
 
 
 @dataclass(frozen=True)

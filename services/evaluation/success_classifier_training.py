@@ -55,10 +55,8 @@ from services.evaluation.trained_networks import (
 # Share of early endings in the weight of a task's failures. They are easy: with more weight they
 # would dominate the near misses, which matter.
 EARLY_SHARE: Final = 0.1
-
 # Share of middle endings, which train milestones only, in a task's total weight.
 MIDDLE_SHARE: Final = 0.15
-
 # Lower bound of the deviation of features that hardly vary in a task, so that noise stays small.
 _LEAST_STD: Final = 0.05
 

@@ -34,7 +34,6 @@ _WORLD = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
 # Coefficients are clipped to this many standard deviations from the mean chunk, so that no image or
 # touch sends a hand far from all demonstrations.
 MAX_DEVIATIONS = 5.0
-
 CHUNK_SIZE = CHUNK_STEPS * ACTION_DIM
 NUM_PHASE_FEATURES = 8
 SLOT_STEPS = 8

@@ -48,9 +48,15 @@ from services.networks.training_settings import USUAL_IMAGE_PX
 
 # Training uses every such step; an evaluation with chunks of 16 decides at every second of them.
 DECISION_STRIDE: Final = SLOT_STEPS
-
 # What an episode of a cloned policy must have.
 IMITATED: Final = (needs.WHOLE, needs.OUTCOME, needs.SUCCESS, needs.image_every(DECISION_STRIDE))
+# Batch size of the held-out evaluation.
+_TESTED_AT_ONCE = 128
+MOMENTS_AN_EPISODE = 3
+# Chunks that vary less (in squared deviations of their principal axes) teach nothing.
+MIN_VARIANCE = 1e-9
+# Large weights stored as float16 to keep files below a megabyte.
+_KEPT_AS_HALF = ("codec.basis", "head.0.weight", "head.2.weight")
 
 
 @dataclass(frozen=True)
@@ -145,15 +151,6 @@ def read_cloning_episodes(
         stores, domain="robot", tasks=tasks, splits=splits, origins=origins, needs=IMITATED
     )
     return [read_cloning_episode(reader, image_px=image_px) for reader in readers]
-
-
-# Batch size of the held-out evaluation.
-_TESTED_AT_ONCE = 128
-MOMENTS_AN_EPISODE = 3
-# Chunks that vary less (in squared deviations of their principal axes) teach nothing.
-MIN_VARIANCE = 1e-9
-# Large weights stored as float16 to keep files below a megabyte.
-_KEPT_AS_HALF = ("codec.basis", "head.0.weight", "head.2.weight")
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,9 @@ from dextouch.errors import InvalidInputError, NotFoundError, ShapeError, Unknow
 from dextouch.hands.actions import ACTION_DIM, check_actions
 from dextouch.schemas import Observation, WorldDescription
 
-# Calls into policy code, with validation of results and errors that name the policy.
-
 # Frames cut from tracebacks: this file and the import machinery.
 _OUR_FRAMES = (__file__, "<frozen importlib", importlib.__file__)
+_SOURCE = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<module>[A-Za-z_][\w.]*):(?P<factory>[A-Za-z_]\w*)")
 
 
 def ask(call: Callable[..., Any], *arguments: object, where: str, **keywords: object) -> Any:  # noqa: ANN401 - whatever the policy gives
@@ -93,9 +92,6 @@ def _described(answer: object, rows: np.ndarray) -> str:
     if rows.dtype.kind == "O":
         return f"{type(answer).__name__}"
     return f"{type(answer).__name__} of shape {list(rows.shape)} and {rows.dtype}"
-
-
-_SOURCE = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<module>[A-Za-z_][\w.]*):(?P<factory>[A-Za-z_]\w*)")
 
 
 @dataclass(frozen=True)

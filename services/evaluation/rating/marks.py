@@ -31,6 +31,8 @@ BEGIN SELECT RAISE(ABORT, 'marks are never changed'); END;
 CREATE TRIGGER IF NOT EXISTS marks_are_kept BEFORE DELETE ON marks
 BEGIN SELECT RAISE(ABORT, 'marks are never deleted'); END;
 """
+BUNDLED: Final = Path(__file__).with_name("rubrics.toml")
+_NAME: Final = r"^[a-z][a-z0-9_]{0,63}$"
 
 
 class Judgement(FrozenModel):
@@ -150,12 +152,6 @@ class MarkLog:
         connection.execute("PRAGMA journal_mode=WAL")
         connection.execute("PRAGMA synchronous=FULL")
         return connection
-
-
-# Rubrics: criteria with points by which a rollout is scored, the same for people and the twin.
-
-BUNDLED: Final = Path(__file__).with_name("rubrics.toml")
-_NAME: Final = r"^[a-z][a-z0-9_]{0,63}$"
 
 
 class Criterion(FrozenModel):

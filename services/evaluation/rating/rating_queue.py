@@ -21,6 +21,8 @@ from services.evaluation.reporting.pictures import touch_image
 
 # A rater is shown a rollout again after this many other marks, at least.
 REPEAT_GAP: Final = 10
+IMAGE_HEIGHT_PX: Final = 384
+_BACKGROUND: Final = 24
 
 
 @dataclass(frozen=True)
@@ -130,12 +132,6 @@ class RatingQueue:
 
 def _order(rater: str, episode_id: str) -> str:
     return hashlib.sha256(f"{rater}/{episode_id}".encode()).hexdigest()
-
-
-# Rollouts of an episode store as raters see them: prompts, and pictures of image and touch.
-
-IMAGE_HEIGHT_PX: Final = 384
-_BACKGROUND: Final = 24
 
 
 def rated_rollouts(

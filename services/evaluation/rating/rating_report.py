@@ -1,4 +1,8 @@
-"""Scores of rated rollouts, and the agreement of raters."""
+"""Scores of rated rollouts, and the agreement of raters: Krippendorff's alpha, ICC and biases.
+
+Ratings are arrays [rollouts, raters] with NaN where a rater did not rate. Read alpha first: below
+0.667 even tentative conclusions are not supported (Krippendorff, Content Analysis, 2004, p. 241).
+"""
 
 import math
 from collections import defaultdict
@@ -18,13 +22,9 @@ from services.evaluation.statistics import (
     start_counts,
 )
 
-# Agreement between raters: Krippendorff's alpha, intraclass correlation, bias of each rater.
-#
-# Ratings are arrays [rollouts, raters] with NaN where a rater did not rate. Read alpha first: below
-# 0.667 even tentative conclusions are not supported (Krippendorff, Content Analysis, 2004, p. 241).
-
 Level = Literal["nominal", "interval"]
 LEAST_ALPHA: Final = 0.667
+UNDEFINED = "undefined"
 
 
 @dataclass(frozen=True)
@@ -138,9 +138,6 @@ def _checked(ratings: np.ndarray) -> np.ndarray:
     if np.isinf(ratings).any():
         raise InvalidInputError("ratings: got an infinite rating; expected numbers, NaN if missing")
     return np.isfinite(ratings)
-
-
-UNDEFINED = "undefined"
 
 
 def rating_report(

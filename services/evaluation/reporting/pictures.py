@@ -22,6 +22,16 @@ from services.evaluation.reporting.sections import AgreementFigure, agreement_fi
 
 # Photographs larger than this are embedded as JPEG.
 MAX_PNG_SIDE_PX = 256
+MAX_POINTS = 600
+NUM_STYLES = 8
+_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 10, 36
+_PALETTE = (
+    "#3658a7", "#d0652b", "#2d8a6d", "#a4407f", "#8a7a1c", "#4b96b8", "#7b5bb5", "#6b6f76",
+)  # fmt: skip
+_KEY_PX = 24
+_WIDTH, _HEIGHT, _SIDE = 560, 240, 300
+# S2 of every finger is abduction; the other three joints are flexion.
+_FLEXION_HINGES = [0, 2, 3]
 
 
 @dataclass(frozen=True)
@@ -104,18 +114,6 @@ def touch_image(tactile_kpa: np.ndarray, *, scale: int = 3) -> UInt8[np.ndarray,
     opacity = np.where(np.isnan(canvas), 0, 255).astype(np.uint8)
     both = np.concatenate([colour(canvas), opacity[..., None]], axis=-1)
     return both.repeat(scale, axis=0).repeat(scale, axis=1)
-
-
-# Small SVG charts that take their colours from the page, and pictures that stand alone.
-
-MAX_POINTS = 600
-NUM_STYLES = 8
-_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 10, 36
-_PALETTE = (
-    "#3658a7", "#d0652b", "#2d8a6d", "#a4407f", "#8a7a1c", "#4b96b8", "#7b5bb5", "#6b6f76",
-)  # fmt: skip
-_KEY_PX = 24
-_WIDTH, _HEIGHT, _SIDE = 560, 240, 300
 
 
 @dataclass(frozen=True)
@@ -282,12 +280,6 @@ def _svg(body: Sequence[str], axes: _Axes, title: str) -> Markup:
     )
 
 
-# Charts and image strips of the report.
-
-# S2 of every finger is abduction; the other three joints are flexion.
-_FLEXION_HINGES = [0, 2, 3]
-
-
 @dataclass(frozen=True)
 class NamedChart:
     """A chart with its title and legend."""
@@ -419,9 +411,6 @@ def strips(pictures: ReportPictures) -> list[Strip]:
         predicted = moments(p.times_s, p.predicted_images, p.predicted_tactile_kpa)
         found.append(Strip(p.title, "prediction", [("true", true), ("predicted", predicted)]))
     return found
-
-
-# Report pictures of stored episodes.
 
 
 def episode_picture(reader: EpisodeReader, *, num_moments: int = 8) -> EpisodePicture:

@@ -72,6 +72,12 @@ COMPARISONS: tuple[tuple[str, str, str, tuple[tuple[str, str], ...]], ...] = (
         ),
     ),
 )
+_ESCAPED: Final = {letter: rf"\{letter}" for letter in "#$%&_{}"} | {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+}
+_FIGURES: Final = (("pearson", "Pearson"), ("mmrv", "MMRV"), ("mmrv_paper", "MMRV (paper)"))
 
 
 @dataclass(frozen=True)
@@ -325,49 +331,33 @@ def _agreement_tile(name: str, key: str, what: str, tasks: Sequence[Mapping[str,
     return Tile(name, value, f"{what}, {len(defined)} of {len(tasks)} tasks; {interval}")
 
 
-# LaTeX tables of a study: success rates by policy and world, and agreement by world.
-#
-# They have the form of tables `policy_evaluator` and `wm_real_corr` of the paper, and need the
-# packages booktabs and multirow.
-
-_ESCAPED: Final = {letter: rf"\{letter}" for letter in "#$%&_{}"} | {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-}
-_FIGURES: Final = (("pearson", "Pearson"), ("mmrv", "MMRV"), ("mmrv_paper", "MMRV (paper)"))
-
-
 def latex_tables(report: ClosedLoopReport) -> str:
-    """Both tables; rates are followed by 95 % Wilson intervals, agreement by its own intervals.
+    """LaTeX tables of a study: success rates by policy and world, and agreement by world.
 
-    Undecided rollouts are in no rate; their number follows it.
+    Rates are followed by 95 % Wilson intervals, agreement by its own intervals. Undecided rollouts
+    are in no rate; their number follows it. The tables have the form of `policy_evaluator` and
+    `wm_real_corr` of the paper, and need the packages booktabs and multirow.
     """
     rows = {(row["task"], row["policy"]): row for row in report.policy_rows()}
-    worlds = (REAL, *report.imagined_worlds)
-    lines = _head(report.tasks, "Policy", "World")
-    for policy in report.policies:
-        for index, world in enumerate(worlds):
-            label = rf"\multirow{{{len(worlds)}}}{{*}}{{{escape(policy)}}}" if index == 0 else ""
-            cells = [_rate(rows[task, policy], world, report) for task in report.tasks]
-            name = "Real world" if world == REAL else escape(world)
-            lines.append(_row(label, name, cells))
-        lines.append(r"\midrule")
-    lines[-1:] = [r"\bottomrule", r"\end{tabular}", ""]
-    if not report.imagined_worlds:
-        return "\n".join(lines)
-    lines += _head(report.tasks, "World", "Figure")
-    for world in report.imagined_worlds:
-        agreement = report.agreement(world)
-        for index, (key, name) in enumerate(_FIGURES):
-            label = rf"\multirow{{{len(_FIGURES)}}}{{*}}{{{escape(world)}}}" if index == 0 else ""
-            cells = [
-                _with_interval(agreement[task].get(key), agreement[task].get(f"{key}_interval"))
-                for task in report.tasks
-            ]
-            lines.append(_row(label, name, cells))
-        lines.append(r"\midrule")
-    lines[-1:] = [r"\bottomrule", r"\end{tabular}", ""]
+    worlds = {REAL: "Real world"} | {world: escape(world) for world in report.imagined_worlds}
+    rates = {
+        policy: [
+            (name, [_rate(rows[task, policy], world, report) for task in report.tasks])
+            for world, name in worlds.items()
+        ]
+        for policy in report.policies
+    }
+    agreement = {
+        world: [
+            (name, [_with_interval(one.get(key), one.get(f"{key}_interval")) for one in found])
+            for key, name in _FIGURES
+        ]
+        for world in report.imagined_worlds
+        for found in [report.agreement(world).values()]
+    }
+    lines = _table(report.tasks, "Policy", "World", rates)
+    if agreement:
+        lines += _table(report.tasks, "World", "Figure", agreement)
     return "\n".join(lines)
 
 
@@ -376,13 +366,24 @@ def escape(text: str) -> str:
     return "".join(_ESCAPED.get(letter, letter) for letter in text)
 
 
-def _head(tasks: Sequence[str], first: str, second: str) -> list[str]:
-    return [
+def _table(
+    tasks: Sequence[str],
+    first: str,
+    second: str,
+    groups: Mapping[str, Sequence[tuple[str, Sequence[str]]]],
+) -> list[str]:
+    """Lines of a table with a column a task, whose groups of rows have a label in common."""
+    lines = [
         rf"\begin{{tabular}}{{ll{'c' * len(tasks)}}}",
         r"\toprule",
         _row(first, second, [escape(task.replace("_", " ")) for task in tasks]),
-        r"\midrule",
     ]
+    for title, rows in groups.items():
+        label = rf"\multirow{{{len(rows)}}}{{*}}{{{escape(title)}}}"
+        lines.append(r"\midrule")
+        for index, (name, cells) in enumerate(rows):
+            lines.append(_row("" if index else label, name, cells))
+    return [*lines, r"\bottomrule", r"\end{tabular}", ""]
 
 
 def _row(first: str, second: str, cells: Sequence[str]) -> str:
@@ -394,10 +395,8 @@ def _rate(row: Mapping[str, Any], world: str, report: ClosedLoopReport) -> str:
         return _with_interval(row[REAL], row.get("real_interval"))
     is_first = world == report.imagined_worlds[0]
     name, cell = ("imagined", row) if is_first else ("success", row["other_worlds"][world])
-    rate, undecided = (
-        _with_interval(cell[name], cell.get(f"{name}_interval")),
-        undecided_note(cell, name),
-    )
+    rate = _with_interval(cell[name], cell.get(f"{name}_interval"))
+    undecided = undecided_note(cell, name)
     return rf"{rate} {{\scriptsize {escape(undecided)}}}" if undecided else rate
 
 

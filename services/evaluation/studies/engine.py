@@ -221,9 +221,6 @@ class _Workers:
         return runner, policies
 
 
-# Policies of a study.
-
-
 def file_digest(path: Path) -> str:
     """SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

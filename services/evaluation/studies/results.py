@@ -33,6 +33,7 @@ FILE: Final = "results.jsonl"
 _MAX_LABEL: Final = 64
 _LOCK_TRIES: Final = 10
 _LOCK_PAUSE_S: Final = 0.05
+_ORIGINS: Final[dict[str, Origin]] = {"twin": "twin", "robot": "recorded"}
 
 
 class PlannedRollout(NamedTuple):
@@ -58,7 +59,7 @@ class StudyHeader:
     digests: dict[str, str]
 
 
-_ROW: Final = TypeAdapter[RolloutScore | RolloutFailure](RolloutScore | RolloutFailure)
+_ROW: Final = TypeAdapter[Outcome](Outcome)
 _HEADER: Final = TypeAdapter(StudyHeader)
 
 
@@ -240,11 +241,6 @@ def _refuse_others(path: Path, old: Mapping[str, str], new: Mapping[str, str]) -
             f"results {path}: belong to another study ({', '.join(changed)} changed); "
             "choose another --folder, or delete this one"
         )
-
-
-# Rollouts of a study as episodes, to be played, rated or trained on.
-
-_ORIGINS: Final[dict[str, Origin]] = {"twin": "twin", "robot": "recorded"}
 
 
 def keep_rollout(

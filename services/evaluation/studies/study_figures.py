@@ -52,6 +52,8 @@ MEANINGS: Final = {
     "step. "
     f"With fewer than {LEAST_DECIDED:.0%} of its rollouts decided a policy is not compared.",
 }
+REPORT_FILE: Final = "report.json"
+TABLES_FILE: Final = "tables.tex"
 
 
 class StudySummary(FrozenModel):
@@ -290,12 +292,6 @@ def _agreed(
         num_starts=found["num_starts"],
         comments=comments,
     )
-
-
-# Reports of a study: JSON, a page for each imagined world, and LaTeX tables.
-
-REPORT_FILE: Final = "report.json"
-TABLES_FILE: Final = "tables.tex"
 
 
 def write_reports(results: StudyResults, json_path: Path | None) -> dict[str, Any]:
