@@ -1,7 +1,8 @@
 from . import care as care
 from . import needs as needs
 from . import spool as spool
-from .content import ContentDigest as ContentDigest
+from .files import GroupFiles as GroupFiles
+from .files import LocalGroup as LocalGroup
 from .files import disk_errors as disk_errors
 from .files import folder_bytes as folder_bytes
 from .files import replace_file as replace_file
@@ -22,13 +23,13 @@ from .image_codecs import check_video_size as check_video_size
 from .image_codecs import decoder_of_this_thread as decoder_of_this_thread
 from .image_codecs import is_keyframe as is_keyframe
 from .image_codecs import parameter_sets as parameter_sets
-from .object_clicks import ClickedPoses as ClickedPoses
-from .object_clicks import clicked_poses as clicked_poses
-from .object_clicks import first_camera as first_camera
-from .object_clicks import listed_objects as listed_objects
+from .object_poses import ClickedPoses as ClickedPoses
 from .object_poses import ObjectSource as ObjectSource
 from .object_poses import ObjectTrack as ObjectTrack
+from .object_poses import clicked_poses as clicked_poses
+from .object_poses import first_camera as first_camera
 from .object_poses import has_object_poses as has_object_poses
+from .object_poses import listed_objects as listed_objects
 from .object_poses import object_track as object_track
 from .reader import EpisodeReader as EpisodeReader
 from .reader import NativeWindow as NativeWindow
@@ -39,9 +40,6 @@ from .reader import decode_window as decode_window
 from .reader import encode_window as encode_window
 from .reader import mean_over_ranges as mean_over_ranges
 from .reader import step_ranges as step_ranges
-from .rollout_episode import write_rollout as write_rollout
-from .sources import GroupFiles as GroupFiles
-from .sources import LocalGroup as LocalGroup
 from .splits import SPLITS as SPLITS
 from .splits import Split as Split
 from .splits import is_in as is_in
@@ -53,6 +51,8 @@ from .splits import split_of as split_of
 from .splits import split_of_scene as split_of_scene
 from .store import EpisodeStore as EpisodeStore
 from .store import local_folder as local_folder
+from .store import write_rollout as write_rollout
+from .stream_writer import ContentDigest as ContentDigest
 from .stream_writer import WriteOptions as WriteOptions
 from .table import TRUE_ORIGINS as TRUE_ORIGINS
 from .table import EpisodeGrid as EpisodeGrid

@@ -3,14 +3,19 @@
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import Field, ValidationError
 
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import ID_PATTERN, EpisodeAttributes, LedgerEntry, RecordingAttributes
+from dextouch.schemas import (
+    ID_PATTERN,
+    EpisodeAttributes,
+    RecordingAttributes,
+    StreamContent,
+)
 from dextouch.streams import H264_UNIT, JPEG_UNIT, StreamDescriptor
 
 Kind = Literal["episode", "recording"]
@@ -103,15 +108,6 @@ def group_attributes(metadata: bytes, model: type[M]) -> M:
     return model.model_validate_json(json.dumps(plain))
 
 
-def with_counts(attributes: Attributes, event: str, counts: Mapping[str, int]) -> Attributes:
-    """The attributes with counts of an event by stream: quality of an episode, ledger of a take."""
-    if isinstance(attributes, EpisodeAttributes):
-        figures = {f"{name}_{event}": float(count) for name, count in counts.items()}
-        return attributes.model_copy(update={"quality": attributes.quality | figures})
-    entries = (LedgerEntry(stream=name, event=event, count=n) for name, n in counts.items())
-    return attributes.model_copy(update={"ledger": (*attributes.ledger, *entries)})
-
-
 def with_rows(entry: ArrayEntry, num_rows: int) -> ArrayEntry:
     """A copy of the entry with another number of rows."""
     return entry.model_copy(update={"shape": (num_rows, *entry.shape[1:])})
@@ -144,6 +140,11 @@ def stream_arrays(descriptor: StreamDescriptor, kind: Kind) -> dict[str, ArrayEn
         dtype="int64", shape=(0,), chunk_rows=stamp_rows, dimension_names=(time,), sha256=no_hash
     )
     return {name: values} | {f"{name}_{stamp}": stamps for stamp in STAMPS[kind]}
+
+
+def stream_content(num_samples: int, digests: Iterable[str]) -> StreamContent:
+    """Digest of a stream of a recording, from the sha256 of its arrays."""
+    return StreamContent(num_samples=num_samples, sha256=sha256_hex(" ".join(digests).encode()))
 
 
 def canonical_json(value: object) -> bytes:

@@ -231,8 +231,7 @@ class GopDecoder:
         if place != len(access_units):
             # From the first access unit on that gave no image in time, numbers may be wrong.
             raise CorruptDataError(
-                f"H.264: got {place} images from {len(access_units)} access units",
-                place=late or 0,
+                f"H.264: got {place} images from {len(access_units)} access units", place=late or 0
             )
 
     def _check(self, frame: "VideoFrame", place: int, gap: int | None) -> None:

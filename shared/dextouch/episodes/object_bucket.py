@@ -6,7 +6,9 @@ Errors of obstore, which no other module uses, are mapped to DexTouch errors.
 import hashlib
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import threading
+from collections import OrderedDict
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -26,7 +28,6 @@ from obstore.store import S3Store
 from pydantic import Field, ValidationError
 
 from dextouch.data_folder import data_folder
-from dextouch.episodes.sources import LruCache
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,
@@ -144,6 +145,32 @@ class ObjectFacts:
     size: int
     etag: str
     modified: datetime
+
+
+class LruCache:
+    """Thread-safe cache of bytes that evicts the least recently used ones beyond a total size."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self._guard = threading.Lock()
+        self._values: OrderedDict[Hashable, bytes] = OrderedDict()
+        self._size = 0
+
+    def get(self, key: Hashable) -> bytes | None:
+        """The value of a key; None if it is not in the cache."""
+        with self._guard:
+            value = self._values.get(key)
+            if value is not None:
+                self._values.move_to_end(key)
+        return value
+
+    def put(self, key: Hashable, value: bytes) -> None:
+        """Add or replace a value."""
+        with self._guard:
+            self._size += len(value) - len(self._values.pop(key, b""))
+            self._values[key] = value
+            while self._size > self.capacity:
+                self._size -= len(self._values.popitem(last=False)[1])
 
 
 # The first process to use object storage; the library's threads do not exist in its forks.

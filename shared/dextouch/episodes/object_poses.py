@@ -1,25 +1,37 @@
-"""Poses of an episode's objects at given times, from whichever streams the episode has of them."""
+"""Poses of an episode's objects: from its streams at any time, and from clicks at its first step.
 
-from dataclasses import dataclass
+A clicked pixel is a ray; where the ray meets the height of the clicked point over the table, there
+the point is. Of an object that is not symmetric, a second click says where it points.
+"""
+
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from dextouch.episodes.reader import EpisodeReader
+from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.geometry import (
     bracket,
     interpolate_poses,
+    points_on_level,
     pose_from_transform,
+    transform,
     transform_from_pose,
 )
 from dextouch.geometry.rotations import rotation_angle
-from dextouch.schemas import object_stream
+from dextouch.schemas import (
+    EpisodeAttributes,
+    EpisodeClicks,
+    SceneObject,
+    SceneObjects,
+    object_stream,
+)
 from dextouch.streams import HEAD_CAMERA
 
 # Ground truth, and what imagined worlds say: all objects in one stream, without gaps.
 OBJECT_POSES: Final = "object_poses"
-# Which camera sees markers, and is clicked in.
 # Where the pose of an object is from; "none" of one that is known nowhere.
 ObjectSource = Literal["twin", "markers", "tracker", "clicks", "none"]
 # Between two sightings that are at most so far apart, an object is taken to have moved evenly ...
@@ -28,6 +40,14 @@ _MAX_GAP_NS: Final = 250_000_000
 _STOOD_M, _STOOD_RAD = 0.015, np.deg2rad(10.0)
 # Periods of a stream beyond its first and last sample.
 _EDGE_PERIODS: Final = 1.5
+Pixel = tuple[float, float]
+# Of people's clicks, on each axis of the image.
+CLICK_SD_PX: Final = 3.0
+# Second clicks that are nearer to the first say nothing of a heading.
+LEAST_HEADING_M: Final = 0.01
+# Objects farther than this from the world's origin count as absent in world models.
+_REACH_M: Final = 1.0
+_ABSENT_POSE: Final = np.array([0.0, 0.0, -2.0 * _REACH_M, 1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -140,3 +160,181 @@ def _one(
     known = inside & (joined[left] | (weight == 0.0) | (weight == 1.0))
     held = np.where(joined[left] | (weight == 1.0), weight, 0.0)
     return pose_from_transform(interpolate_poses(Ts, left, held)), known
+
+
+@dataclass(frozen=True)
+class ClickedPoses:
+    """Poses T_world_object (x y z m, qw qx qy qz) of objects at the first step, where known.
+
+    `sd_m` is the standard deviation of each position on each axis of the table.
+    """
+
+    objects: tuple[SceneObject, ...]
+    poses: Float64[np.ndarray, "objects 7"]
+    known: Bool[np.ndarray, " objects"]
+    sd_m: Float64[np.ndarray, " objects"]
+
+    def fill(self, track: ObjectTrack) -> ObjectTrack:
+        """A track with these poses where it has none; those of fixed objects hold at every step."""
+        chosen = self.known & ~track.known.any(axis=0)
+        fixed = np.array([one.fixed for one in self.objects])
+        at_step = (np.arange(len(track.known)) == 0)[:, None] | fixed
+        return replace(
+            track,
+            poses=np.where(chosen[:, None], self.poses, track.poses).astype(np.float32),
+            known=np.where(chosen, at_step, track.known),
+            sources=tuple(
+                "clicks" if is_clicked else source
+                for is_clicked, source in zip(chosen.tolist(), track.sources, strict=True)
+            ),
+            clicked_sd_m=np.where(chosen, self.sd_m, track.clicked_sd_m).astype(np.float32),
+        )
+
+
+@dataclass(frozen=True)
+class _View:
+    """The image of the first step: size (px), camera, height of the table, and what to call it."""
+
+    size_px: tuple[int, ...]
+    camera: tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "5"]]
+    T_world_camera: Float64[np.ndarray, "4 4"]
+    table_z_m: float
+    where: str
+
+
+def first_camera(
+    about: EpisodeAttributes,
+) -> tuple[tuple[np.ndarray, np.ndarray], Float64[np.ndarray, "4 4"]]:
+    """K (px) and distortion of an episode's head camera, and T_world_camera at its first step."""
+    camera = about.K_head_matrix(), about.head_distortion()
+    return camera, about.anchor.to_poses().T_world_camera_head
+
+
+def listed_objects(about: EpisodeAttributes, objects: SceneObjects) -> tuple[SceneObject, ...]:
+    """The objects that a file lists for an episode's task.
+
+    Raises:
+        UnknownNameError: the file does not have the task.
+        InvalidInputError: the episode has other objects.
+    """
+    if about.task not in objects.tasks:
+        raise UnknownNameError("task of the objects", about.task, list(objects.tasks))
+    listed = objects.tasks[about.task]
+    names = tuple(one.name for one in listed)
+    if about.object_names not in {(), names}:
+        raise InvalidInputError(
+            f"episode {about.episode_id!r}: has the objects {list(about.object_names)}, and the "
+            f"file of objects {list(names)}; expected the same in the same order"
+        )
+    return listed
+
+
+def clicked_poses(
+    about: EpisodeAttributes,
+    objects: SceneObjects,
+    clicks: EpisodeClicks,
+    *,
+    may_lack_headings: bool = False,
+) -> ClickedPoses:
+    """Poses of an episode's objects at its first step.
+
+    Objects that were not clicked, or are hidden, are unknown; absent ones are known to be away.
+
+    Args:
+        about: the episode.
+        objects: of the tasks, with the height of the table.
+        clicks: on objects of this episode.
+        may_lack_headings: whether an object whose second click is missing counts as unknown,
+            and is not refused.
+
+    Raises:
+        UnknownNameError: a task or an object that the file of objects does not have.
+        InvalidInputError: a click outside the image or beside the table, or a missing or too near
+            second click.
+    """
+    listed = listed_objects(about, objects)
+    names = [one.name for one in listed]
+    for name in clicks.objects:
+        if name not in names:
+            raise UnknownNameError(f"object of episode {about.episode_id!r}", name, names)
+    sizes_px = [stream.shape[1::-1] for stream in about.streams if stream.name == HEAD_CAMERA]
+    if not sizes_px:
+        raise InvalidInputError(f"episode {about.episode_id!r}: has no {HEAD_CAMERA} to click in")
+    camera, T_world_camera = first_camera(about)
+    poses = np.tile(_ABSENT_POSE, (len(listed), 1))
+    known, sd_m = np.zeros(len(listed), dtype=np.bool_), np.zeros(len(listed))
+    for index, one in enumerate(listed):
+        click = clicks.objects.get(one.name)
+        if click is None or click.state == "hidden":
+            continue
+        where = f"episode {about.episode_id!r}, object {one.name!r}"
+        lacks = click.heading_px is None and not one.click.symmetric
+        if click.point_px is not None:
+            if lacks and not may_lack_headings:
+                raise InvalidInputError(
+                    f"{where}: has no heading_px, which an object needs that is not symmetric; "
+                    f"click a second point along its axis {one.click.heading}"
+                )
+            view = _View(sizes_px[0], camera, T_world_camera, objects.table_z_m, where)
+            poses[index], sd_m[index] = _pose(one, (click.point_px, click.heading_px), view)
+        known[index] = click.state == "absent" or not lacks
+    return ClickedPoses(listed, poses, known, sd_m)
+
+
+def _pose(
+    one: SceneObject, places_px: tuple[Pixel, Pixel | None], view: _View
+) -> tuple[Float64[np.ndarray, "7"], float]:
+    """Pose of an object, and the standard deviation of its position on each axis of the table."""
+    point_px, heading_px = places_px
+    up, ahead = _axis(one.click.up), _axis(one.click.heading)
+    box_m = np.array(one.box_m)
+    half_m = float(np.abs(up) @ box_m[3:])
+    given = one.click.point_m
+    point_m = box_m[:3] + half_m * up if given is None else np.array(given)
+    height_m = view.table_z_m + one.click.base_m + half_m - float(up @ box_m[:3])
+    z_m = height_m + float(up @ point_m)
+    here_m = _on_level(point_px, z_m, view, "point_px")
+    direction = np.array([1.0, 0.0, 0.0])
+    if heading_px is not None and not one.click.symmetric:
+        way_m = _on_level(heading_px, z_m, view, "heading_px") - here_m
+        length_m = float(np.linalg.norm(way_m))
+        if length_m < LEAST_HEADING_M:
+            raise InvalidInputError(
+                f"{view.where}: heading_px is {1e3 * length_m:.0f} mm from point_px on the table, "
+                f"expected at least {1e3 * LEAST_HEADING_M:.0f} mm; click farther along its axis "
+                f"{one.click.heading}"
+            )
+        direction = way_m / length_m
+    level = np.array([0.0, 0.0, 1.0])
+    R = np.stack([level, direction, np.cross(level, direction)], axis=1) @ np.stack(
+        [up, ahead, np.cross(up, ahead)]
+    )
+    pose = pose_from_transform(transform(R, here_m - R @ point_m))
+    # How far a pixel along each axis of the image is on the table.
+    shifts = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+    around_m, _ = points_on_level(point_px + shifts, view.camera, view.T_world_camera, z_m)
+    spread_m = np.linalg.norm(around_m[::2] - around_m[1::2])
+    return pose, CLICK_SD_PX * float(spread_m) / np.sqrt(2.0)
+
+
+def _axis(name: str) -> Float64[np.ndarray, "3"]:
+    return (-1.0 if name[0] == "-" else 1.0) * np.eye(3)["xyz".index(name[-1])]
+
+
+def _on_level(pixel: Pixel, z_m: float, view: _View, what: str) -> Float64[np.ndarray, "3"]:
+    """What a pixel shows at a height; refuses those outside the image, and rays that miss it."""
+    if not ((np.zeros(2) <= pixel) & (pixel <= np.array(view.size_px))).all():
+        raise InvalidInputError(
+            f"{view.where}: {what} is {list(pixel)}, expected a place in the image of "
+            f"{view.size_px[0]} by {view.size_px[1]} px"
+        )
+    (point_m,), (is_hit,) = points_on_level(
+        np.array([pixel]), view.camera, view.T_world_camera, z_m
+    )
+    if not is_hit or np.linalg.norm(point_m) > _REACH_M:
+        raise InvalidInputError(
+            f"{view.where}: the ray of {what} {list(pixel)} does not meet the height {z_m:.3f} m "
+            f"in front of the camera and within {_REACH_M:g} m of the world's origin; click on the "
+            "object, or correct table_z_m, box_m and click in the file of objects"
+        )
+    return point_m

@@ -1,4 +1,7 @@
-"""Readers of episodes and recordings: streams by time, and windows on the model grid."""
+"""Readers of episodes and recordings: streams by time, and windows on the model grid.
+
+Windows also have a form on the wire (msgpack).
+"""
 
 import os
 from collections.abc import Callable, Iterable
@@ -9,8 +12,7 @@ from typing import Any, Literal, TypeVar, get_args, overload
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 
-from dextouch.episodes.content import committed_content
-from dextouch.episodes.format import STAMPS
+from dextouch.episodes.format import STAMPS, stream_arrays, stream_content
 from dextouch.episodes.groups import GroupReader
 from dextouch.episodes.image_codecs import FULL_FORM, ImageForm
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
@@ -20,8 +22,13 @@ from dextouch.schemas import ActionKind, EpisodeAttributes, RecordingAttributes,
 from dextouch.streams import HEAD_CAMERA, SampleBatch, pack, unpack
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
-# Windows of an episode, resampling to the model grid, and their form on the wire (msgpack).
-
+R = TypeVar("R")
+# Half a step, for a free-running camera at the model rate, plus some jitter.
+OWN_IMAGE_SHARE = 0.6
+# Tolerated share of dropped images; images of every second step miss more.
+MAX_UNSHOWN_SHARE = 0.05
+ACTION_STREAMS: dict[ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
+MAX_CAMERA_THREADS = 8
 # Stamps of one instant may differ by rounding.
 SAME_INSTANT_NS = 1_000
 _IMAGES, _IMAGE_DT = "images/", "image_dt_ns/"
@@ -185,15 +192,6 @@ def _check_arrays(arrays: dict[str, np.ndarray], cameras: list[str]) -> None:
             )
 
 
-# Half a step, for a free-running camera at the model rate, plus some jitter.
-OWN_IMAGE_SHARE = 0.6
-# Tolerated share of dropped images; images of every second step miss more.
-MAX_UNSHOWN_SHARE = 0.05
-ACTION_STREAMS: dict[ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
-
-
-R = TypeVar("R")
-MAX_CAMERA_THREADS = 8
 _pools: list[ThreadPoolExecutor] = []
 # A forked worker does not inherit its parent's threads, so it must not reuse their pools.
 os.register_at_fork(after_in_child=_pools.clear)
@@ -230,8 +228,12 @@ class RecordingReader(GroupReader[RecordingAttributes]):
 
     def content(self) -> dict[str, StreamContent]:
         """Number of samples and digest of each stream, as committed; nothing is read for it."""
-        entries = self._contents.entries
-        return {s.name: committed_content(s, entries) for s in self.attributes.streams}
+        found = {}
+        for stream in self.attributes.streams:
+            arrays = [self._contents.entries[name] for name in stream_arrays(stream, "recording")]
+            digests = [array.sha256 for array in arrays]
+            found[stream.name] = stream_content(arrays[0].shape[0], digests)
+        return found
 
     def stamps(self, name: str) -> SampleBatch:
         """All stamps of a stream, without the values (which are [n, 0] here).

@@ -18,9 +18,8 @@ import numpy as np
 import zstandard
 from jaxtyping import Shaped
 
-from dextouch.episodes.files import disk_errors, write_all
+from dextouch.episodes.files import ByteSource, OpenedGroup, disk_errors, write_all
 from dextouch.episodes.format import ZSTD_LEVEL, ArrayEntry, shard_path, with_rows
-from dextouch.episodes.sources import ByteSource, OpenedGroup
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 
 CRC_BYTES = 4

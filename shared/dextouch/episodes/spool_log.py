@@ -1,4 +1,6 @@
-"""Append-only, checksummed record file of a spool, shared by all of its streams.
+"""Files of a spool: its checksummed record file, attributes, and the seal of a closed one.
+
+The record file is append-only and shared by all streams of the spool.
 
 A record is a header with its own offset and checksum, followed by the body of a batch
 (`dextouch.streams.batch`). All streams share one file, so that a single sync covers them. A torn
@@ -50,6 +52,10 @@ RECORD_ROW = np.dtype(
 _ROW = struct.Struct("<QQIIIII")
 _BLOCK_BYTES = 1 << 14
 _SEARCH_BYTES = 1 << 20
+RECORDING_FILE: Final = "recording.json"
+CLOSED_FILE: Final = "closed"
+# The last member of `recording.json`: of the bytes before it, closed by a brace.
+_CHECKSUM = re.compile(rb',"sha256":"([0-9a-f]{64})"\}\Z')
 
 
 @dataclass(frozen=True)
@@ -315,14 +321,6 @@ def trusted_records(folder: Path, records: LogRecords) -> LogRecords:
         while num_rows and body_at(data, records.rows[num_rows - 1]) is None:
             num_rows -= 1
     return replace(records, rows=records.rows[:num_rows])
-
-
-# Checksums of a spool: of its attributes, and the seal that shows what a closed spool has lost.
-
-RECORDING_FILE: Final = "recording.json"
-CLOSED_FILE: Final = "closed"
-# The last member of `recording.json`: of the bytes before it, closed by a brace.
-_CHECKSUM = re.compile(rb',"sha256":"([0-9a-f]{64})"\}\Z')
 
 
 class Seal(FrozenModel):

@@ -1,5 +1,6 @@
-"""Writer of one stream of a group: validates blocks, encodes images, appends to the arrays."""
+"""Writer of one stream of a group, and digest of what a stream of a recording holds."""
 
+import hashlib
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,6 +15,7 @@ from dextouch.episodes.format import (
     Kind,
     codec_of,
     stream_arrays,
+    stream_content,
 )
 from dextouch.episodes.image_codecs import (
     GopEncoder,
@@ -26,7 +28,8 @@ from dextouch.episodes.shards import ShardWriter
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, StorageError
 from dextouch.frozen_model import FrozenModel
 from dextouch.images import DEFAULT_QUALITY, encode_jpeg
-from dextouch.streams import StreamDescriptor, check_encoded_image
+from dextouch.schemas import StreamContent
+from dextouch.streams import SampleBatch, StreamDescriptor, check_encoded_image
 
 MAX_WAITING_IMAGES = 32
 Stamps = Mapping[str, np.ndarray]
@@ -291,3 +294,44 @@ class _ImageQueue:
         done, num_images = self._waiting.popleft()
         self._num_images -= num_images
         done.result()
+
+
+class ContentDigest:
+    """Digest of the samples of one stream of a recording, batch by batch.
+
+    By it a station proves that a recording has all of its take: it is made of what a commit record
+    says of the stream (`stream_content`), and a station computes it from its spool.
+    Images of `jpeg` and `h264` streams are encoded, as in a spool.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor) -> None:
+        self._codec = codec_of(descriptor)
+        self._dtype = descriptor.numpy_dtype().newbyteorder("<")
+        # As in `stream_arrays`: values first.
+        self._columns = [hashlib.sha256() for _ in range(1 + len(STAMPS["recording"]))]
+        self._group: list[bytes] = []
+        self._num_samples = 0
+
+    def add(self, batch: SampleBatch) -> None:
+        """Add the next samples of the stream."""
+        values, *stamps = self._columns
+        self._num_samples += len(batch)
+        for column, stamp in zip(stamps, STAMPS["recording"], strict=True):
+            column.update(getattr(batch, stamp).astype("<i8").tobytes())
+        if self._codec == "zstd":
+            values.update(batch.values.astype(self._dtype, order="C", copy=False).data)
+            return
+        # Storage chunks of images: one of JPEG, a group of H.264.
+        num_images = GOP_IMAGES if self._codec == "h264" else 1
+        for image in batch.values:
+            self._group.append(image)
+            if len(self._group) == num_images:
+                values.update(pack_chunk(self._codec, self._group))
+                self._group = []
+
+    def content(self) -> StreamContent:
+        """What was added so far."""
+        values, *stamps = (column.copy() for column in self._columns)
+        if self._group:
+            values.update(pack_chunk(self._codec, self._group))
+        return stream_content(self._num_samples, [c.hexdigest() for c in (values, *stamps)])

@@ -1,4 +1,4 @@
-"""Trash of a store: deleted groups can be restored until they are purged.
+"""Trash of a store, from where deleted groups can be restored, and remarks on its items.
 
 An entry is a folder `.trash/KIND.ID.TIME`, TIME being nanoseconds since 1970. Deleting and
 restoring are one rename each, hence atomic.
@@ -14,9 +14,8 @@ from typing import Final, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from dextouch.episodes.files import disk_errors, folder_bytes, sync_folder
+from dextouch.episodes.files import GroupFiles, disk_errors, folder_bytes, sync_folder
 from dextouch.episodes.format import COMMIT_FILE, KINDS
-from dextouch.episodes.sources import GroupFiles
 from dextouch.errors import ConflictError, CorruptDataError, NotFoundError, UnknownNameError
 
 TRASH = ".trash"
@@ -28,6 +27,12 @@ HOMES: dict[TrashKind, str] = {
     "recording": "recordings",
     "upload": ".uploads",
 }
+# What people say of items: files beside the content of a group. They are no part of it, so they
+# may change, and they go where the item goes: to the trash, back, and away for good.
+REVIEW_FILE: Final = "review.json"
+CLICKS_FILE: Final = "clicks.json"
+REMARK_FILES: Final = (REVIEW_FILE, CLICKS_FILE)
+Remark = TypeVar("Remark", bound=BaseModel)
 _NAME = re.compile(rf"({'|'.join(TRASH_KINDS)})\.([a-z0-9_-]+)\.([0-9]{{1,20}})")
 
 
@@ -139,19 +144,6 @@ def _home(kind: TrashKind) -> str:
     if kind not in HOMES:
         raise UnknownNameError("kind", kind, list(HOMES))
     return HOMES[kind]
-
-
-# What people say of stored items, kept beside their content: reviews, and clicks on objects.
-#
-# Each is a file of the item's group. It is no part of the content, so it may change, and it goes
-# where the item goes: to the trash, back, and away for good.
-
-REVIEW_FILE: Final = "review.json"
-CLICKS_FILE: Final = "clicks.json"
-# All files beside the content.
-REMARK_FILES: Final = (REVIEW_FILE, CLICKS_FILE)
-
-Remark = TypeVar("Remark", bound=BaseModel)
 
 
 def read_remark(files: GroupFiles, name: str, form: type[Remark], *, what: str) -> Remark | None:

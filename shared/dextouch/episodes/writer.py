@@ -1,10 +1,14 @@
-"""Writer of a new episode or recording, which appears atomically on commit."""
+"""Writer of a new episode or recording, which appears atomically on commit.
+
+It is written in a folder of its own, the stage. What an interrupted writer leaves of a stage is
+never read: a sweep removes it.
+"""
 
 import errno
 import os
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 
@@ -47,10 +51,6 @@ from dextouch.streams import (
     NO_SEQUENCE,
     StreamDescriptor,
 )
-
-# A stage: the folder in which a group is written, and its commit to the final place.
-#
-# What an interrupted writer leaves of a stage is never read: a sweep removes it.
 
 STAGING = ".staging"
 
@@ -131,10 +131,6 @@ def _taken(target: Path) -> ConflictError:
     return ConflictError(
         f"{target.parent.name.rstrip('s')} {target.name!r} exists already; choose another id"
     )
-
-
-# Values, and stamps by name.
-Block = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 class EpisodeWriter:
@@ -297,26 +293,6 @@ class EpisodeWriter:
             for stream in self._streams.values()
             for name, entry in stream.finish().items()
         }
-        commit_stage(self._stage, self._target, self._with_streams(), entries)
-
-    def _with_streams(self) -> Attributes:
         descriptors = tuple(stream.descriptor for stream in self._streams.values())
-        return self._attributes.model_copy(update={"streams": descriptors})
-
-
-def write_blocks(
-    stage: Path,
-    target: Path,
-    attributes: Attributes,
-    streams: Iterable[tuple[str, Iterable[Block]]],
-) -> None:
-    """Write a group of streams, by name, with blocks of their samples.
-
-    Stage and target are those of `EpisodeWriter`.
-    """
-    with EpisodeWriter(
-        stage=stage, target=target, attributes=attributes, options=WriteOptions()
-    ) as writer:
-        for name, blocks in streams:
-            for values, stamps in blocks:
-                writer.append(name, values=values, **stamps)
+        attributes = self._attributes.model_copy(update={"streams": descriptors})
+        commit_stage(self._stage, self._target, attributes, entries)

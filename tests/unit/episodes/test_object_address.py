@@ -53,7 +53,7 @@ def test_options_that_do_not_fit():
 
 def test_without_the_library_the_message_says_what_to_install(monkeypatch):
     for name in list(sys.modules):
-        if name.startswith(("obstore", "dextouch.episodes.object_", "dextouch.episodes.uploads")):
+        if name.startswith(("obstore", "dextouch.episodes.object_")):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "obstore", None)
     with pytest.raises(UnavailableError, match=r"pip install 'dextouch-wm\[s3\]'"):

@@ -15,8 +15,7 @@ from zarr.storage import ObjectStore
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.object_bucket import Bucket
-from dextouch.episodes.object_storage import BLOCK_BYTES
-from dextouch.episodes.uploads import ORPHAN_AGE, sweep_orphans
+from dextouch.episodes.object_storage import BLOCK_BYTES, ORPHAN_AGE, sweep_orphans
 from dextouch.errors import (
     InvalidInputError,
     NotFoundError,
@@ -290,7 +289,7 @@ def test_ctrl_c_while_an_uploaded_take_is_removed_here_costs_nothing(store, monk
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("dextouch.episodes.uploads.shutil.rmtree", interrupted)
+        patch.setattr("dextouch.episodes.object_storage.shutil.rmtree", interrupted)
         with pytest.raises(KeyboardInterrupt):
             writer.__exit__(None, None, None)
     assert store.complete_uploads() == ()

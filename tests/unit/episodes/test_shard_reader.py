@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import shards
+from dextouch.episodes.files import LocalFile
 from dextouch.episodes.format import ArrayEntry
 from dextouch.episodes.shards import ShardReader, compress, decode_rows, with_crc
-from dextouch.episodes.sources import LocalFile
 from dextouch.errors import CorruptDataError, StorageError
 
 ROWS_EACH = 30

@@ -1,30 +1,28 @@
-"""Repair of damaged groups from an intact copy, or by salvaging the readable samples.
+"""Inspection of a store for damage, and repair from an intact copy or by salvage of what is whole.
 
-Repairing is reversible: damaged groups go to the trash, from where they can be restored.
+A reader stops at the first damage; an inspection continues and lists all of it. Repairing is
+reversible: damaged groups go to the trash, from where they can be restored.
 """
 
+import itertools
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from dextouch.episodes.care.salvage import (
-    group_streams,
-    spool_streams,
-    write_salvaged,
-)
-from dextouch.episodes.care.store_facts import (
-    UPLOADS,
-    inspect_group,
-    inspect_upload,
-    open_contents,
-)
-from dextouch.episodes.files import disk_errors, replace_file
+import numpy as np
+
+from dextouch.data_folder import is_system_file
+from dextouch.episodes.care.salvage import SalvagedStream, group_streams, on_one_grid, spool_streams
+from dextouch.episodes.files import GroupFiles, LocalGroup, disk_errors, replace_file, try_lock
 from dextouch.episodes.format import (
     ATTRIBUTES,
     COMMIT_FILE,
     MALFORMED,
     METADATA_FILE,
+    STAMPS,
     ArrayEntry,
     Attributes,
     CommitRecord,
@@ -39,14 +37,200 @@ from dextouch.episodes.format import (
     stream_arrays,
     with_rows,
 )
-from dextouch.episodes.sources import GroupFiles, LocalGroup
-from dextouch.episodes.spool import read_attributes
-from dextouch.episodes.trash import TrashKind, put_into_trash
-from dextouch.episodes.writer import unheld_folders
-from dextouch.errors import ConflictError, CorruptDataError, DexTouchError, StorageError
-from dextouch.schemas import LineageEntry
+from dextouch.episodes.groups import GroupContents, read_group
+from dextouch.episodes.spool import SpoolReader, read_attributes
+from dextouch.episodes.spool_log import RECORDING_FILE, body_at, find_records, open_log
+from dextouch.episodes.stream_writer import WriteOptions
+from dextouch.episodes.trash import HOMES, REMARK_FILES, TrashKind, put_into_trash
+from dextouch.episodes.writer import STAGING, EpisodeWriter, new_stage, unheld_folders
+from dextouch.errors import (
+    ConflictError,
+    CorruptDataError,
+    DexTouchError,
+    InvalidInputError,
+    NotFoundError,
+    StorageError,
+)
+from dextouch.schemas import EpisodeAttributes, LedgerEntry, LineageEntry, RecordingAttributes
 
+UPLOADS = HOMES["upload"]
+Group = GroupContents[EpisodeAttributes] | GroupContents[RecordingAttributes]
+# Called after every storage chunk with the number of bytes read.
+Progress = Callable[[int], None]
 WHOLE, MENDED, SALVAGED, LEFT = "whole", "mended", "salvaged", "left"
+LOST = "lost_to_damage"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One damaged part; without `array` the whole item, without `chunk` the whole array."""
+
+    message: str
+    array: str | None = None
+    chunk: int | None = None
+    foreign: bool = False
+
+
+@dataclass(frozen=True)
+class ItemReport:
+    """Findings on one group, unfinished upload or stage; `busy` if a writer holds its lock."""
+
+    kind: str
+    item_id: str
+    num_arrays: int = 0
+    num_bytes: int = 0
+    findings: tuple[Finding, ...] = ()
+    busy: bool = False
+
+    @property
+    def damaged(self) -> bool:
+        """Whether there is any finding."""
+        return bool(self.findings)
+
+
+def open_contents(files: GroupFiles, kind: Kind) -> Group:
+    """Open a committed group of either kind; raises as `read_group`."""
+    if kind == "episode":
+        return read_group(files, EpisodeAttributes)
+    return read_group(files, RecordingAttributes)
+
+
+def inspect_group(
+    files: GroupFiles, kind: Kind, *, progress: Progress = lambda _: None
+) -> ItemReport:
+    """Read a committed group completely and list all damage.
+
+    Raises:
+        NotFoundError: there is no such group, or it was deleted meanwhile.
+    """
+    try:
+        contents = open_contents(files, kind)
+    except StorageError as error:
+        if isinstance(files, LocalGroup) and not os.path.lexists(files.folder):
+            raise NotFoundError(f"{kind} {files.item_id!r}: was deleted") from error
+        return ItemReport(kind, files.item_id, findings=(Finding(error.message),))
+    sizes: list[int] = []
+
+    def count(size: int) -> None:
+        sizes.append(size)
+        progress(size)
+
+    findings = [
+        Finding(error.message, name, number)
+        for name in contents.entries
+        for number, error in contents.inspect_array(name, progress=count)
+    ]
+    if not findings:
+        findings += _stamp_findings(contents)
+    if isinstance(files, LocalGroup):
+        findings += [
+            Finding(f"{contents.what}: {path} belongs to no array; move it away", foreign=True)
+            for path in _foreign_paths(files.folder, contents.entries)
+        ]
+    if findings:
+        contents.opened.check_present()
+    return ItemReport(kind, files.item_id, len(contents.entries), sum(sizes), tuple(findings))
+
+
+def _stamp_findings(contents: Group) -> list[Finding]:
+    """Stamps that are out of order, which breaks binary search in them."""
+    first, strictly = STAMPS[contents.kind][0], contents.kind == "episode"
+    findings = []
+    for stream in contents.attributes.streams:
+        name = f"{stream.name}_{first}"
+        stamps = contents.shard(name).read()
+        earlier, later = stamps[:-1], stamps[1:]
+        if len(bad := np.flatnonzero(later <= earlier if strictly else later < earlier)):
+            message = f"{contents.what}: array {name!r}: goes back after row {int(bad[0])}"
+            findings.append(Finding(message, name))
+    return findings
+
+
+def _foreign_paths(folder: Path, entries: dict[str, ArrayEntry]) -> list[str]:
+    """Files, folders and links in a group's folder that belong to no array."""
+    wanted = {COMMIT_FILE, METADATA_FILE, *REMARK_FILES}
+    for name, entry in entries.items():
+        wanted |= {f"{name}/{METADATA_FILE}", f"{name}/{shard_path(len(entry.shape))}"}
+    folders = {str(parent) for path in wanted for parent in Path(path).parents}
+    found = []
+    with disk_errors(f"look through {folder.name}"):
+        for path in sorted(folder.rglob("*")):
+            relative = path.relative_to(folder).as_posix()
+            if is_system_file(relative):
+                continue
+            right = relative in folders if path.is_dir() else relative in wanted
+            if not right or path.is_symlink():
+                found.append(relative)
+    return found
+
+
+def inspect_upload(folder: Path) -> ItemReport:
+    """Inspect an unfinished upload or any other spool; a torn tail does not count as damage."""
+    with disk_errors(f"look at upload {folder.name}"):
+        # A name with a dot, or a folder without attributes, is still being created.
+        if not (folder / RECORDING_FILE).exists():
+            return ItemReport("upload", folder.name)
+    try:
+        names = [stream.name for stream in read_attributes(folder).streams]
+    except StorageError as error:
+        return ItemReport("upload", folder.name, findings=(Finding(error.message),))
+    report = _inspect_batches(folder, names)
+    if not report.damaged:
+        try:
+            SpoolReader(folder).scan()
+        except StorageError as error:
+            # Closed, and not as it was then.
+            return replace(report, findings=(Finding(error.message),))
+    return report
+
+
+def _inspect_batches(folder: Path, names: list[str]) -> ItemReport:
+    what, busy = f"upload {folder.name}", is_held(folder)
+    findings, torn, num_bytes = [], [], 0
+    numbers = dict.fromkeys(range(len(names)), 0)
+    try:
+        with open_log(folder) as data:
+            records = find_records(data)
+            for start, stop in records.damage:
+                message = f"{what}: bytes {start} … {stop - 1} of its log are not a record"
+                findings.append(Finding(message))
+            for row in records.rows:
+                stream = int(row["stream"])
+                number = numbers[stream] = numbers.get(stream, 0) + 1
+                if body_at(data, row) is None:
+                    name = names[stream] if stream < len(names) else str(stream)
+                    message = f"{what}: batch {number - 1} of {name!r} does not match its checksum"
+                    torn.append(Finding(message, name, number - 1))
+                else:
+                    # Data that a live writer has not written yet is neither damage nor a torn tail.
+                    findings += torn
+                    torn, num_bytes = [], num_bytes + int(row["length"])
+    except StorageError as error:
+        findings.append(Finding(f"{what}: {error.message}"))
+    return ItemReport("upload", folder.name, len(names), num_bytes, tuple(findings), busy)
+
+
+def inspect_stage(folder: Path) -> ItemReport:
+    """Say whether a stage is that of a running writer; a sweep removes it otherwise."""
+    return ItemReport("stage", folder.name, busy=is_held(folder))
+
+
+def is_held(folder: Path) -> bool:
+    """Whether a writer holds the lock of a stage or a spool."""
+    with disk_errors(f"look at {folder.name}"):
+        lock = try_lock(folder)
+    if lock is not None:
+        os.close(lock)
+    return lock is None
+
+
+def unfinished_folders(root: Path) -> Iterator[tuple[str, Path]]:
+    """Kind and folder of every upload and stage below a store's folder."""
+    for kind, name in (("upload", UPLOADS), ("stage", STAGING)):
+        folder = root / name
+        with disk_errors(f"list {name}"):
+            paths = sorted(folder.iterdir()) if folder.is_dir() else []
+        yield from ((kind, path) for path in paths if not is_system_file(path.name))
 
 
 @dataclass(frozen=True)
@@ -116,13 +300,65 @@ def _salvage(root: Path, kind: TrashKind, folder: Path, notes: tuple[str, ...]) 
             streams = group_streams(folder, attributes, entries)
         item_id = attributes_id(attributes)
         source = LineageEntry(kind=kind_of(attributes), id=item_id, sha256=sha256)
-        new_id, lost = write_salvaged(root, attributes, streams, source)
+        new_id, lost = _write_salvaged(root, attributes, streams, source)
     except DexTouchError as error:
         # Often the inspection has already found the same.
         notes = tuple(dict.fromkeys((*notes, error.message)))
         return RepairReport(kind, folder.name, LEFT, notes=notes)
     put_into_trash(root, kind, folder.name)
     return RepairReport(kind, folder.name, SALVAGED, new_id, lost, notes)
+
+
+def _write_salvaged(
+    root: Path, attributes: Attributes, streams: Sequence[SalvagedStream], source: LineageEntry
+) -> tuple[str, dict[str, int]]:
+    """Write the readable samples of a damaged item, the source, as a new group `ID-salvaged-N`.
+
+    If an interrupted repair has done so already, its group is returned.
+
+    Returns:
+        The new id, and the number of dropped samples by stream.
+
+    Raises:
+        InvalidInputError: no sample is readable.
+    """
+    kind, item_id = kind_of(attributes), attributes_id(attributes)
+    streams = on_one_grid(streams) if kind == "episode" else list(streams)
+    if not any(stream.kept.any() for stream in streams):
+        raise InvalidInputError(f"{kind} {item_id!r}: no sample is intact; delete it")
+    lost = {stream.descriptor.name: stream.num_lost for stream in streams if stream.num_lost}
+    for folder in sorted((root / f"{kind}s").glob(f"{item_id[:112]}-salvaged-*")):
+        with suppress(StorageError):
+            if source in open_contents(LocalGroup(folder), kind).attributes.lineage:
+                return folder.name, lost
+    free = _free_id(root, kind, item_id)
+    lineage = (*attributes.lineage, source)
+    update = {f"{kind}_id": free, "recovered": True, "lineage": lineage}
+    with EpisodeWriter(
+        stage=new_stage(root, kind, free),
+        target=root / f"{kind}s" / free,
+        attributes=attributes.model_copy(update=update | _counted(attributes, lost)),
+        options=WriteOptions(),
+    ) as writer:
+        for stream in streams:
+            for values, stamps in stream.blocks():
+                writer.append(stream.descriptor.name, values=values, **stamps)
+    return free, lost
+
+
+def _counted(attributes: Attributes, lost: Mapping[str, int]) -> dict[str, object]:
+    """Where attributes count dropped samples: the quality of an episode, the ledger of a take."""
+    if isinstance(attributes, EpisodeAttributes):
+        figures = {f"{name}_{LOST}": float(count) for name, count in lost.items()}
+        return {"quality": attributes.quality | figures}
+    entries = (LedgerEntry(stream=name, event=LOST, count=count) for name, count in lost.items())
+    return {"ledger": (*attributes.ledger, *entries)}
+
+
+def _free_id(root: Path, kind: Kind, item_id: str) -> str:
+    """The first id `ID-salvaged-1`, `ID-salvaged-2` … that is not in use."""
+    names = (f"{item_id[:112]}-salvaged-{number}" for number in itertools.count(1))
+    return next(name for name in names if not (root / f"{kind}s" / name).exists())
 
 
 def _rewrite_metadata(files: LocalGroup, kind: Kind) -> None:

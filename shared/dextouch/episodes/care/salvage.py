@@ -1,10 +1,8 @@
-"""Salvage of the readable samples of a damaged group or spool into a new group.
+"""The readable samples of a damaged group or spool.
 
-Nothing is filled in: a damaged storage chunk or sample is dropped with its stamps, and counted as
-`lost_to_damage`.
+Nothing is filled in: a damaged storage chunk or sample is dropped with its stamps.
 """
 
-import itertools
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,41 +15,31 @@ import google_crc32c
 import numpy as np
 import zstandard
 
-from dextouch.episodes.care.store_facts import open_contents
+from dextouch.episodes.files import LocalFile
 from dextouch.episodes.format import (
     GOP_IMAGES,
     STAMPS,
     ArrayEntry,
     Attributes,
-    Kind,
-    attributes_id,
     codec_of,
     kind_of,
     shard_path,
-    with_counts,
 )
-from dextouch.episodes.group_contents import hashed_bytes
+from dextouch.episodes.groups import hashed_bytes
 from dextouch.episodes.image_codecs import ImageChunks
-from dextouch.episodes.shards import (
-    CRC_BYTES,
-    INDEX_ENTRY_BYTES,
-    ShardReader,
-    decode_rows,
-)
-from dextouch.episodes.sources import LocalFile, LocalGroup
+from dextouch.episodes.shards import CRC_BYTES, INDEX_ENTRY_BYTES, ShardReader, decode_rows
 from dextouch.episodes.spool_log import body_at, find_records, open_log, read_batch, read_seal
-from dextouch.episodes.writer import Block, new_stage, write_blocks
-from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
-from dextouch.schemas import LineageEntry
+from dextouch.errors import CorruptDataError, InvalidInputError
 from dextouch.streams import StreamDescriptor, check_batch, decode_body, encoded_values
 
-LOST = "lost_to_damage"
 # The rows of these streams correspond by index: the steps of the model grid.
 GRID_STREAMS = ("action", "action_commanded")
 BLOCK_SAMPLES = 256
 # One day of 30 images per second, each a storage chunk.
 _MAX_CHUNKS = 86_400 * 30
 _JPEG_END = b"\xff\xd9"
+# Values, and stamps by name.
+Block = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -151,46 +139,6 @@ def _sealed_samples(spool: Path) -> dict[str, int]:
     return {} if seal is None else seal.num_samples
 
 
-def write_salvaged(
-    root: Path, attributes: Attributes, streams: Sequence[SalvagedStream], source: LineageEntry
-) -> tuple[str, dict[str, int]]:
-    """Write the readable samples of a damaged item, the source, as a new group `ID-salvaged-N`.
-
-    If an interrupted repair has done so already, its group is returned.
-
-    Returns:
-        The new id, and the number of dropped samples by stream.
-
-    Raises:
-        InvalidInputError: no sample is readable.
-    """
-    kind, item_id = kind_of(attributes), attributes_id(attributes)
-    streams = _on_one_grid(streams) if kind == "episode" else list(streams)
-    if not any(stream.kept.any() for stream in streams):
-        raise InvalidInputError(f"{kind} {item_id!r}: no sample is intact; delete it")
-    lost = {stream.descriptor.name: stream.num_lost for stream in streams if stream.num_lost}
-    for folder in sorted((root / f"{kind}s").glob(f"{item_id[:112]}-salvaged-*")):
-        with suppress(StorageError):
-            if source in open_contents(LocalGroup(folder), kind).attributes.lineage:
-                return folder.name, lost
-    free = _free_id(root, kind, item_id)
-    lineage = (*attributes.lineage, source)
-    update = {f"{kind}_id": free, "recovered": True, "lineage": lineage}
-    write_blocks(
-        new_stage(root, kind, free),
-        root / f"{kind}s" / free,
-        with_counts(attributes.model_copy(update=update), LOST, lost),
-        ((stream.descriptor.name, stream.blocks()) for stream in streams),
-    )
-    return free, lost
-
-
-def _free_id(root: Path, kind: Kind, item_id: str) -> str:
-    """The first id `ID-salvaged-1`, `ID-salvaged-2` … that is not in use."""
-    names = (f"{item_id[:112]}-salvaged-{number}" for number in itertools.count(1))
-    return next(name for name in names if not (root / f"{kind}s" / name).exists())
-
-
 def _streams(
     attributes: Attributes, array: Callable[[str], _SalvagedArray]
 ) -> list[SalvagedStream]:
@@ -229,7 +177,7 @@ def _whole_groups(kept: np.ndarray, size: int) -> np.ndarray:
     return np.repeat(whole, size)[: len(kept)]
 
 
-def _on_one_grid(streams: Sequence[SalvagedStream]) -> list[SalvagedStream]:
+def on_one_grid(streams: Sequence[SalvagedStream]) -> list[SalvagedStream]:
     """Keep the longest gap-free run of the model grid, since steps are addressed by number."""
     grid = [stream for stream in streams if stream.descriptor.name in GRID_STREAMS]
     if not grid:
