@@ -121,7 +121,7 @@ def test_promised_modules_are_public():
         "import dextouch.streams.batch",
         "import dextouch.streams.batch as batch",
         "def late():\n    from dextouch.clocks.clock_model import find_steps",
-        "from dextouch.bridges.lerobot.frames import frames_of",
+        "from dextouch.bridges.lerobot.layout import frames_of",
         "from dextouch.hands.hand_files.loading import load_hand",
         "from dextouch.episodes.care.repair import repair_group",
     ],
@@ -136,7 +136,7 @@ def test_an_import_past_a_door_is_found(line, importer):
     [
         ("from dextouch.streams import decode_batch", ""),
         ("from dextouch.streams.batch import decode_batch", "dextouch.streams.samples"),
-        ("from dextouch.bridges.model_grid import blocks", "dextouch.bridges.lerobot.frames"),
+        ("from dextouch.bridges.model_grid import blocks", "dextouch.bridges.lerobot.video"),
         ("from dextouch.hands.actions import reanchor", "dextouch.worlds.routes"),
         ("from dextouch.hands.hand_files import load_hand", ""),
         ("from dextouch.episodes.files import disk_errors", "dextouch.episodes.care.repair"),

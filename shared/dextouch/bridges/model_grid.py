@@ -1,4 +1,8 @@
-"""Writing of episodes whose streams have one row per step, as other formats hold them."""
+"""What importers and exporters share.
+
+Importers write episodes whose streams have one row per step, as other formats hold them; exporters
+iterate over samples in bounded memory, and write a file that appears whole.
+"""
 
 import os
 import uuid
@@ -36,6 +40,8 @@ from dextouch.tactile.layout import SIDES
 
 ImageUnit = Literal["h264", "jpeg", "rgb8"]
 BLOCK_IMAGES: Final = 32
+Reader = EpisodeReader | RecordingReader
+BLOCK_SECONDS: Final = 1.0
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,6 @@ class GridNumbers:
     kind: StreamKind
     unit: str
     values: Shaped[np.ndarray, "n ..."]
-    frame: str | None = None
     keep: Bool[np.ndarray, " n"] | None = None
 
 
@@ -58,14 +63,12 @@ class GridImages:
         t_ref_ns: of each image. A stamp that comes twice is one image, the nearest to two steps.
         read: decodes the images one by one.
         read_units: copies them as H.264 access units; None where that is not possible.
-        frame: of the camera.
     """
 
     shape: tuple[int, ...]
     t_ref_ns: Int64[np.ndarray, " n"]
     read: Callable[[], Iterator[UInt8[np.ndarray, "h w 3"]]]
-    read_units: Callable[[], list[bytes] | None] = lambda: None
-    frame: str | None = None
+    read_units: Callable[[], list[bytes] | None]
 
 
 @dataclass(frozen=True)
@@ -89,11 +92,7 @@ def tactile_numbers(
 
 
 def store_episode(
-    store: EpisodeStore,
-    attributes: EpisodeAttributes,
-    episode: GridEpisode,
-    *,
-    images: ImageUnit = "rgb8",
+    store: EpisodeStore, attributes: EpisodeAttributes, episode: GridEpisode, images: ImageUnit
 ) -> None:
     """Write an episode into the store, atomically.
 
@@ -118,17 +117,10 @@ def store_episode(
         for name, found in episode.numbers.items():
             keep = slice(None) if found.keep is None else found.keep
             shape, dtype = found.values.shape[1:], str(found.values.dtype)
-            add(name, kind=found.kind, shape=shape, dtype=dtype, unit=found.unit, frame=found.frame)
+            add(name, kind=found.kind, shape=shape, dtype=dtype, unit=found.unit)
             writer.append(name, values=found.values[keep], t_ref_ns=episode.t_ref_ns[keep])
         for name, camera in episode.cameras.items():
-            add(
-                name,
-                kind="image",
-                shape=camera.shape,
-                dtype="uint8",
-                unit=images,
-                frame=camera.frame,
-            )
+            add(name, kind="image", shape=camera.shape, dtype="uint8", unit=images)
             _store_images(writer, name, camera, images)
 
 
@@ -147,12 +139,6 @@ def _store_images(writer: EpisodeWriter, name: str, camera: GridImages, unit: Im
     # Exhausts the reader, so that a file that is too short is refused.
     for _ in images:
         pass
-
-
-# What exporters share: iteration over samples in bounded memory, and a file that appears whole.
-
-Reader = EpisodeReader | RecordingReader
-BLOCK_SECONDS: Final = 1.0
 
 
 @dataclass(frozen=True)

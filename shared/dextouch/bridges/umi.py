@@ -89,10 +89,7 @@ def _write_group(group: zarr.Group, readers: Iterable[EpisodeReader]) -> int:
         _append_episode(group, reader, cameras)
         ends.append(ends[-1] + reader.num_steps)
         episodes.append(
-            {
-                "attributes": json_ready(reader.attributes),
-                "content_sha256": reader.content_sha256,
-            }
+            {"attributes": json_ready(reader.attributes), "content_sha256": reader.content_sha256}
         )
     if first is None:
         raise InvalidInputError("UMI export: got no episode, expected at least one")

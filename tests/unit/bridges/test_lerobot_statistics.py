@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dextouch.bridges.lerobot.frames import (
+from dextouch.bridges.lerobot.layout import (
     QUANTILES,
     SAMPLED_SIDE_PX,
     combine,

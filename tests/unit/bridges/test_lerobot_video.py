@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dextouch.bridges.lerobot import ExportOptions, ImportOptions, export_lerobot, import_lerobot
-from dextouch.bridges.lerobot.frames import frames_of
+from dextouch.bridges.lerobot.layout import frames_of
 from dextouch.bridges.lerobot.video import (
     CameraVideo,
     VideoSpan,

@@ -10,8 +10,7 @@ import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from dextouch.bridges.mcap import export_mcap, import_mcap
-from dextouch.bridges.mcap.messages import MAX_RECORD_BYTES
+from dextouch.bridges.mcap import MAX_RECORD_BYTES, export_mcap, import_mcap
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
     ConflictError,

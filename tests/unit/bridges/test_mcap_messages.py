@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dextouch.bridges.mcap import import_mcap
-from dextouch.bridges.mcap.messages import MessageCodec, Sent, descriptor_set
+from dextouch.bridges.mcap_messages import MessageCodec, Sent, descriptor_set
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import CorruptDataError
 from tests.unit.bridges.takes import (

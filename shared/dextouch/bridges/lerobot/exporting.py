@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dextouch.bridges.lerobot import layout
-from dextouch.bridges.lerobot.frames import (
+from dextouch.bridges.lerobot.layout import (
     EpisodeFrames,
     Statistics,
     combine,

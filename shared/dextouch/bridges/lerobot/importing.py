@@ -12,7 +12,7 @@ from jaxtyping import Int64
 from pydantic import ValidationError
 
 from dextouch.bridges.lerobot import layout
-from dextouch.bridges.lerobot.frames import WORLD
+from dextouch.bridges.lerobot.layout import WORLD
 from dextouch.bridges.lerobot.source import DatasetInfo, EpisodeEntry, FeatureInfo, LeRobotFolder
 from dextouch.bridges.lerobot.video import read_images, read_units
 from dextouch.bridges.model_grid import (
@@ -116,7 +116,7 @@ def import_lerobot(
                 f"episode {attributes.episode_id!r} exists already; give another "
                 "id_prefix (`dextouch import --id-prefix`)"
             )
-        store_episode(store, attributes, episode, images=options.images)
+        store_episode(store, attributes, episode, options.images)
         ids.append(attributes.episode_id)
     return ids
 

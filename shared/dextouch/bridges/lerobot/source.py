@@ -16,12 +16,7 @@ from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.video import VideoSpan
 from dextouch.data_folder import is_system_file
 from dextouch.episodes import disk_errors
-from dextouch.errors import (
-    CorruptDataError,
-    InvalidInputError,
-    LimitExceededError,
-    NotFoundError,
-)
+from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError, NotFoundError
 from dextouch.schemas import first_problems
 
 MAX_INFO_BYTES: Final = 1 << 24
