@@ -13,7 +13,7 @@ from benchmarks.rounds import interleaved
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
 from services.pipelines.training_data import Scope, make_training_data
-from services.twin.data_mix import MIXES
+from services.twin.take_options import MIXES
 from services.twin.tasks import TASK_NAMES
 
 if TYPE_CHECKING:

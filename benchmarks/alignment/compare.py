@@ -37,7 +37,7 @@ from services.alignment.synchronization.recorded_streams import (
 from services.alignment.synchronization.resampling import grid_times_ns
 from services.alignment.synchronization.stream_clock import TimedStream, time_stream
 from services.episode_store.committing import commit_spool
-from services.pipelines.demo.recording import errors_of
+from services.pipelines.demo_takes import errors_of
 
 OURS, LINEAR, NEAREST = "ours", "arrivals, interpolated", "arrivals, nearest sample"
 METHODS = (OURS, LINEAR, NEAREST)

@@ -17,7 +17,7 @@ from dextouch.schemas import EpisodeAttributes, StoredAnchor
 from dextouch.streams import StreamDescriptor, StreamKind
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 from services.acquisition.mock_station import MockTake
-from services.pipelines.demo.recording import record_take
+from services.pipelines.demo_takes import record_take
 
 POSE_RATE_HZ, GLOVE_RATE_HZ, IMAGE_RATE_HZ = 100.0, 60.0, 30.0
 IMAGE_PX = 64

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64
 
 from dextouch.tactile import PADS, in_contact
 from dextouch.tactile.layout import SIDES, split_pads
-from services.twin.recorder import TruthStream
+from services.twin.episodes import TruthStream
 
 # The whole hand comes last: in contact if any of its pads is.
 PLACES: Final = (*PADS, "hand")

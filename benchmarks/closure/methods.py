@@ -34,13 +34,12 @@ from services.alignment.synchronization.resampling import (
     vectors_on_grid,
 )
 from services.twin.demonstrators import NUM_GRID_STEPS
-from services.twin.episodes import TruthEpisode
+from services.twin.episodes import TruthEpisode, TruthStream
 from services.twin.mjcf import (
     FINGER_STIFFNESS_NM_RAD,
     WRIST_STIFFNESS_N_M,
     WRIST_STIFFNESS_NM_RAD,
 )
-from services.twin.recorder import TruthStream
 from services.twin.simulation import MODEL_RATE_HZ
 
 Wrist = Literal["copied", "constant", "touch"]

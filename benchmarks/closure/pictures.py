@@ -12,7 +12,7 @@ from benchmarks.closure.replay import human_take, replay
 from dextouch.geometry import nearest_index
 from dextouch.images import encode_jpeg
 from dextouch.streams import HEAD_CAMERA
-from services.twin.recorder import TruthStream
+from services.twin.episodes import TruthStream
 
 # Approach, grasp, lift, carry, set down, release, withdraw.
 _AT_S: Final = (0.4, 1.0, 1.4, 1.9, 2.5, 3.1, 3.6, 4.2, 5.3)

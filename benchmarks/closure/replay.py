@@ -14,9 +14,8 @@ from benchmarks.closure.methods import (
 )
 from dextouch.hands.actions import HandTrajectory, actions_from_poses, poses_from_actions
 from services.twin.demonstrators import NUM_GRID_STEPS
-from services.twin.episodes import TakeOptions, TruthEpisode, record
+from services.twin.episodes import Recorder, TakeOptions, TruthEpisode, TruthStream, record
 from services.twin.names import Domain
-from services.twin.recorder import Recorder, TruthStream
 from services.twin.settings import TwinSettings
 from services.twin.stage import Plan, Stage, command_row
 

@@ -16,8 +16,7 @@ from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.hands import CHAINS, NODE_INDEX
 from dextouch.hands.robot_hand import NUM_FINGERS
 from dextouch.tactile.layout import Side
-from services.twin.hands import HumanHand
-from services.twin.human_hand import METACARPAL_BASES_M, human_fingers
+from services.twin.hands import METACARPAL_BASES_M, HumanHand, human_fingers
 
 # Sizes of the people against the average; each of their bones differs by up to 8 % more.
 SIZES: Final = (0.85, 0.92, 1.0, 1.08, 1.15)

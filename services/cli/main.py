@@ -32,8 +32,8 @@ class Command(NamedTuple):
 COMMANDS = {
     "demo": Command(
         "record, align, predict and evaluate on this machine",
-        "pipelines.demo.command:main",
-        "pipelines.demo.settings:demo_parser",
+        "pipelines.demo:main",
+        "pipelines.parsers:demo_parser",
     ),
     "up": Command("run every service in one process, with a dashboard", "cli.up:main", "up"),
     "doctor": Command("check what this machine can do and what is missing", "cli.doctor:main"),
@@ -61,8 +61,7 @@ COMMANDS = {
     ),
     "store serve": Command("serve the store over HTTP", "episode_store.app:main", "episode_store"),
     "store enrol": Command(
-        "get a one-time token with which a station gets its key",
-        "cli.enrolment:store_enrol_main",
+        "get a one-time token with which a station gets its key", "cli.enrolment:store_enrol_main"
     ),
     "store stations": Command("list enrolled stations", "cli.enrolment:store_stations_main"),
     "store revoke": Command(
@@ -112,7 +111,7 @@ COMMANDS = {
     ),
     "train imagined": Command(
         "predict the episodes of a store with the world model",
-        "pipelines.imagined_data:main",
+        "pipelines.imagined_data:imagined_main",
         "pipelines.parsers:imagined_parser",
     ),
     "train policy": Command(
@@ -127,7 +126,7 @@ COMMANDS = {
     ),
     "generate": Command(
         "generate demonstrations from the actions of recorded ones",
-        "pipelines.generate:main",
+        "pipelines.imagined_data:generate_main",
         "pipelines.parsers:generate_parser",
     ),
     "checkpoint": Command(
@@ -145,17 +144,17 @@ COMMANDS = {
     ),
     "evaluate prediction": Command(
         "measure predicted images and touch on held-out episodes",
-        "pipelines.evaluate_prediction:main",
+        "pipelines.evaluate:prediction_main",
         "pipelines.parsers:prediction_parser",
     ),
     "evaluate recorded": Command(
         "score policies from recorded first observations, and how far to trust it",
-        "pipelines.evaluate_recorded:main",
+        "pipelines.evaluate:recorded_main",
         "pipelines.parsers:recorded_parser",
     ),
     "study": Command(
         "score policies in several worlds, defined in a file and resumable",
-        "pipelines.study.command:main",
+        "pipelines.study:main",
         "pipelines.parsers:study_parser",
     ),
     "study serve": Command(

@@ -1,19 +1,22 @@
-"""Command `dextouch up`: runs every service in one process and prints their addresses."""
+"""Command `dextouch up`: runs every service in one process, which locks the data folder."""
 
 import asyncio
+import fcntl
+import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from fastapi import FastAPI
 from pydantic import ValidationError
 
 from dextouch.command_line import write_result
+from dextouch.episodes import disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.serving import configure_logging, explained, load_settings
-from services.cli.data_lock import held_data_folder
 from services.cli.extras import missing_package
 from services.cli.standard_streams import discard_output
 from services.cli.up_settings import UpSettings
@@ -26,6 +29,8 @@ LOOPBACK = "127.0.0.1"
 NEEDED = ("episode_store", "acquisition", "dashboard")
 # Makes the app of one service from the settings and the addresses of all services.
 Builder = Callable[[UpSettings, Mapping[str, str]], FastAPI]
+LOCK_FILE: Final = "up.lock"
+MAX_TOLD_BYTES: Final = 1000
 
 
 def ports_of_up() -> dict[str, int]:
@@ -58,7 +63,7 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
         stop_on_signals(stop)
     builders = _wanted(settings)
     with ExitStack() as held:
-        lock = held.enter_context(held_data_folder(settings.data))
+        tell = held.enter_context(held_data_folder(settings.data))
         # Explicit ports first, so that no default takes one of them.
         given = settings.model_fields_set
         bound = {}
@@ -66,7 +71,7 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
             bound[name] = _bind(name, settings)
             held.callback(bound[name].socket.close)
         urls = {name: bound[name].url for name in builders}
-        lock.tell(urls["dashboard"])
+        tell(urls["dashboard"])
         placed = [(bound[name], _build(name, settings, urls)) for name in builders]
         await serve_all(placed, stop=stop, on_ready=partial(_announce, settings, urls))
     return 0
@@ -221,3 +226,45 @@ BUILDERS: Mapping[str, Builder] = {
     "studies": _studies,
     "dashboard": _dashboard,
 }
+
+
+@contextmanager
+def held_data_folder(folder: Path) -> Iterator[Callable[[str], None]]:
+    """Context manager that holds the lock of a data folder, which is created if needed.
+
+    It yields a function by which the file tells others the address of the dashboard. The kernel
+    releases the lock when the process ends, however it does.
+
+    Raises:
+        ConflictError: another process holds it.
+        StorageError: the folder cannot be created or written.
+    """
+    path = folder / LOCK_FILE
+    with disk_errors(
+        f"use the data folder {folder}", advice="free space, or choose another --data"
+    ):
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            told = os.pread(descriptor, MAX_TOLD_BYTES, 0).decode(errors="replace")
+            raise ConflictError(
+                f"the data folder {folder.resolve()} is in use by another `dextouch up` "
+                f"({told or 'which is just starting'}); stop that one with Ctrl-C or kill, or give "
+                "this one a folder of its own with --data"
+            ) from error
+        tell = partial(_tell, descriptor)
+        tell("an address that is not known yet")
+        yield tell
+    finally:
+        os.close(descriptor)
+
+
+def _tell(descriptor: int, dashboard_url: str) -> None:
+    """Write who holds the lock."""
+    text = f"process {os.getpid()}, dashboard at {dashboard_url}"
+    with disk_errors("write the lock of the data folder"):
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, text.encode(), 0)

@@ -27,10 +27,7 @@ class UpSettings(CommandSettings):
     """
 
     model_config = SettingsConfigDict(
-        frozen=True,
-        extra="forbid",
-        env_prefix="DEXTOUCH_UP_",
-        cli_prog_name="dextouch up",
+        frozen=True, extra="forbid", env_prefix="DEXTOUCH_UP_", cli_prog_name="dextouch up"
     )
 
     data: Path = Field(

@@ -10,15 +10,19 @@ from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, Gauge
 
 from dextouch.serving import AccessControl, create_service_app, serve
-from services.dashboard.audit import AuditLog
-from services.dashboard.audit_trail import AuditTrail
+from services.dashboard.audit import AuditLog, AuditTrail
 from services.dashboard.comparison import Comparisons
 from services.dashboard.feeds import Feeds
 from services.dashboard.fleet import Fleet
-from services.dashboard.forwarding import forwarding_router
 from services.dashboard.pages import Sessions, page_router, refusal_page
 from services.dashboard.rollout_feeds import RolloutFeeds
-from services.dashboard.routes import api_router, comparison_router, live_router, system_router
+from services.dashboard.routes import (
+    api_router,
+    comparison_router,
+    forwarding_router,
+    live_router,
+    system_router,
+)
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.system import System
 from services.dashboard.upstream import Upstream, upstream_histogram

@@ -13,13 +13,7 @@ from pydantic import ValidationError
 
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import (
-    CameraLive,
-    HealthLevel,
-    HoursByField,
-    StationOverview,
-    first_problems,
-)
+from dextouch.schemas import CameraLive, HealthLevel, HoursByField, StationOverview, first_problems
 from dextouch.streams import unpack
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 from services.dashboard.feeds import MAX_LIVE_BYTES, Feeds, Message, Topic, topic_message

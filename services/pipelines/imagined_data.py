@@ -1,38 +1,40 @@
-"""Predict the robot episodes of a store with the world model (`dextouch train imagined`)."""
+"""Episodes imagined from those of a store (`dextouch train imagined`, `dextouch generate`)."""
 
 import argparse
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+import numpy as np
 import torch
 
 from dextouch.clients import RolloutClient
 from dextouch.command_line import write_result
-from dextouch.episodes import (
-    EpisodeReader,
-    EpisodeStore,
-    Split,
-    needs,
-    scene_of,
-    select_episodes,
-)
+from dextouch.episodes import EpisodeReader, EpisodeStore, Split, needs, scene_of, select_episodes
+from dextouch.errors import ConflictError
 from dextouch.jobs import Workers, results_of, run_jobs
 from dextouch.schemas import EpisodeAttributes
 from dextouch.serving import configure_logging
-from dextouch.worlds import WorldServiceSettings, create_world_app
+from dextouch.streams import HEAD_CAMERA
+from dextouch.worlds import World, WorldServiceSettings, create_world_app
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.evaluation.progress import Progress
+from services.evaluation.reporting import PredictionPicture, ReportPictures, write_report
 from services.generation import SHORT_CHUNK_STEPS, imagine_episode, whole_steps
-from services.pipelines.parsers import imagined_parser
+from services.pipelines.parsers import generate_parser, imagined_parser
 from services.pipelines.servers import served
+from services.world_model.checkpoints import read_checkpoint
+from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.state_world import StateWorld
+from services.world_model.training.dataset import fingerprint, read_episode
 from services.world_model.world import open_world
 
 WORLD = "world_model"
 # Episodes of a job on a cluster, which opens the model: some ten times as long as opening it.
 _IN_A_JOB: Final = 16
+_NUM_MOMENTS = 8
 
 
 def chosen_episodes(
@@ -82,8 +84,7 @@ def imagine_all(
     torch.set_num_threads(1)
     configure_logging(service="imagined", log_format="auto", level="warning")
     world = open_world(checkpoint)
-    app = create_world_app({WORLD: world}, WorldServiceSettings(), name="imagined")
-    with served({"imagined": app}) as urls, RolloutClient(urls["imagined"]) as client:
+    with served_world(world) as client:
         is_drawn_apart = only_judged and isinstance(world, StateWorld)
         made = []
         for episode_id in episode_ids:
@@ -91,6 +92,14 @@ def imagine_all(
             steps = judged_steps(reader) if is_drawn_apart else None
             made.append(imagine_episode(reader, client, WORLD, target, image_steps=steps))
     return made
+
+
+@contextmanager
+def served_world(world: World[Any]) -> Iterator[RolloutClient]:
+    """Context manager that serves a world by the name `WORLD`, and yields a client of it."""
+    app = create_world_app({WORLD: world}, WorldServiceSettings(), name="imagined")
+    with served({"imagined": app}) as urls, RolloutClient(urls["imagined"]) as client:
+        yield client
 
 
 def judged_steps(episode: EpisodeReader) -> set[int]:
@@ -124,7 +133,7 @@ def imagine(options: argparse.Namespace, wanted: Sequence[str], *, only_judged: 
     return made
 
 
-def main(argv: Sequence[str]) -> int:
+def imagined_main(argv: Sequence[str]) -> int:
     """Run `dextouch train imagined`."""
     options = imagined_parser().parse_args(list(argv))
     splits = (options.split,) if options.split else ()
@@ -136,3 +145,96 @@ def main(argv: Sequence[str]) -> int:
     print(f"{count} imagined")
     write_result(options.json, {"imagined": count})
     return 0
+
+
+def generate_main(arguments: Sequence[str]) -> int:
+    """Run `dextouch generate`."""
+    options = generate_parser().parse_args(list(arguments))
+    source = EpisodeStore(options.episodes)
+    wanted = chosen_sources(source, options)
+    # What a killed run left unfinished.
+    EpisodeStore(options.store).sweep()
+    refuse_trained_episodes(source, wanted, options.checkpoint, command="generate")
+    made = imagine(options, wanted, only_judged=False)
+    target = EpisodeStore(options.store)
+    num_bytes = sum(target.open(one).verify().num_bytes for one in made)
+    print(
+        f"{len(made)} episodes imagined and verified, {num_bytes / 1e6:.1f} MB in {options.store}"
+    )
+    if options.strips is not None:
+        pictures = [
+            _picture(source, target.open(one)) for one in sorted(made)[: options.num_strips]
+        ]
+        about = {"world model": options.checkpoint.name, "episodes": len(made)}
+        page = {"title": "Recorded and imagined episodes", "about": about}
+        write_report(page, ReportPictures(predictions=tuple(pictures)), options.strips)
+        print(f"recorded and imagined images: {options.strips}")
+    write_result(options.json, {"episodes": sorted(made), "num_bytes": num_bytes})
+    return 0
+
+
+def chosen_sources(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
+    """Ids of the robot episodes to imagine, spread evenly over tasks.
+
+    Raises:
+        NotFoundError: there is none.
+    """
+    chosen = chosen_episodes(
+        store,
+        options.tasks,
+        options.seeds,
+        splits=(options.split,) if options.split else (),
+        also=() if options.with_failures else (needs.OUTCOME, needs.SUCCESS),
+    )
+    by_task: dict[str, list[str]] = {}
+    for about in chosen:
+        by_task.setdefault(about.task, []).append(about.episode_id)
+    longest = max(map(len, by_task.values()))
+    in_turn = [ids[k] for k in range(longest) for ids in by_task.values() if k < len(ids)]
+    return in_turn[: options.count]
+
+
+def refuse_trained_episodes(
+    store: EpisodeStore, wanted: Sequence[str], checkpoint: Path, *, command: str
+) -> None:
+    """Refuse episodes that the world model was trained on.
+
+    Raises:
+        ConflictError: there is one.
+    """
+    if is_state_checkpoint(checkpoint):
+        metadata = read_state_checkpoint(checkpoint).metadata
+        trained = [
+            one for one in wanted if metadata.may_have_seen_episode(store.open(one).attributes)
+        ]
+    else:
+        about = read_checkpoint(checkpoint).metadata
+        prints, px = set(about.train_fingerprints), about.network.image_px
+        trained = [
+            one
+            for one in wanted
+            if fingerprint(read_episode(store.open(one), image_px=px)) in prints
+        ]
+    if trained:
+        raise ConflictError(
+            f"{command}: {checkpoint.name} was trained on the scenes of {len(trained)} of "
+            f"{len(wanted)} episodes, such as {trained[0]!r}; choose another --split or --seeds",
+            episodes=trained,
+        )
+
+
+def _picture(source: EpisodeStore, imagined: EpisodeReader) -> PredictionPicture:
+    about = imagined.attributes
+    (true_id,) = {one.id for one in about.lineage if one.kind == "episode"}
+    truth, steps = source.open(true_id), imagined.num_steps
+    true = truth.window(0, steps, cameras=(HEAD_CAMERA,))
+    predicted = imagined.window(0, steps, cameras=(HEAD_CAMERA,))
+    shown = np.unique(np.linspace(0, steps - 1, _NUM_MOMENTS).round().astype(int))
+    return PredictionPicture(
+        f"{about.task}: {true_id}",
+        shown / about.model_rate_hz,
+        true.images[HEAD_CAMERA][shown],
+        predicted.images[HEAD_CAMERA][shown],
+        true.tactile_kpa[shown],
+        predicted.tactile_kpa[shown],
+    )

@@ -24,16 +24,14 @@ from dextouch.serving import configure_logging
 from services.evaluation.policies.outside import PolicySource, action_chunk, ask
 from services.evaluation.progress import Progress
 from services.pipelines.parsers import training_data_parser
-from services.twin.bounding_boxes import object_boxes_m
-from services.twin.data_mix import MIXES, Mix, options_of
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TruthEpisode, episode_id, record, write_episode
 from services.twin.markers import Markers, marked_objects
 from services.twin.names import DOMAINS, Domain, StreamChoice, TakePath
 from services.twin.settings import TwinSettings
-from services.twin.sizes import Sizes
+from services.twin.sizes import Sizes, object_boxes_m
 from services.twin.stage import Stage
-from services.twin.take_options import PlayedActions, TakeOptions
+from services.twin.take_options import MIXES, Mix, PlayedActions, TakeOptions, options_of
 from services.twin.tasks import EVALUATED, TASK_NAMES, named_tasks
 from services.twin.world import TwinWorld
 
@@ -42,8 +40,6 @@ MAX_LABEL = 32
 # Markers of 3 cm are 20 px wide in such images.
 _MARKED_IMAGE_PX: Final = 400
 _VARIED_DRAW, _SIZES_DRAW = 103, 104
-# How a take becomes an episode: written as it is; by devices, drivers, recorder and alignment, with
-# the twin's labels; or the same without them, objects being measured by the markers on them.
 
 
 @dataclass(frozen=True)
@@ -51,10 +47,10 @@ class Scope:
     """Tasks, domains, images and streams to record.
 
     In a share `varied` of the scenes, colours, light and head camera are drawn anew, in a share
-    `resized` the sizes of the objects. Images are
-    recorded at the grid steps (15 Hz) that are multiples of `image_every`, and at the last three.
-    Without a `path` robots are written directly and humans by devices: the actions of a human take
-    that is written directly are the joint angles of a human hand.
+    `resized` the sizes of the objects. Images are recorded at the grid steps (15 Hz) that are
+    multiples of `image_every`, and at the last three. Without a `path` robots are written directly
+    and humans by devices: the actions of a human take that is written directly are the joint angles
+    of a human hand.
     """
 
     tasks: tuple[str, ...] = EVALUATED
@@ -208,7 +204,7 @@ def _write_directly(order: Order) -> TruthEpisode:
 
 def _write_by_devices(order: Order) -> TruthEpisode:
     # Loads the compiled solver of retargeting.
-    from services.pipelines.device_takes import device_options, write_through_devices
+    from services.pipelines.mock_takes import device_options, write_through_devices
 
     episode = _recorded(order, device_options(order.options))
     write_through_devices(
@@ -218,7 +214,7 @@ def _write_by_devices(order: Order) -> TruthEpisode:
 
 
 def _write_as_a_station(order: Order) -> TruthEpisode:
-    from services.pipelines.device_takes import device_options, write_as_recorded
+    from services.pipelines.mock_takes import device_options, write_as_recorded
 
     stage, objects = marked_stage(order.task, order.domain)
     options = replace(device_options(order.options), image_every=1)
@@ -233,6 +229,8 @@ def _write_as_a_station(order: Order) -> TruthEpisode:
     return episode
 
 
+# How a take becomes an episode: written as it is; by devices, drivers, recorder and alignment, with
+# the twin's labels; or the same without them, objects being measured by the markers on them.
 _WRITERS: Final[dict[TakePath, Callable[[Order], TruthEpisode]]] = {
     "direct": _write_directly,
     "devices": _write_by_devices,

@@ -4,7 +4,7 @@ import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -12,9 +12,9 @@ from dextouch.command_line import progress, write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.jobs import Workers, results_of, run_jobs
+from services.twin.demonstrators import Motion
 from services.twin.episodes import record, write_episode
 from services.twin.mistakes import Mistake
-from services.twin.motions import Motion
 from services.twin.names import Domain
 from services.twin.parser import twin_parser
 from services.twin.settings import TwinSettings
@@ -23,22 +23,13 @@ from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
 
 _MISS_DRAW = 5
-
-
-@dataclass(frozen=True)
-class TakeOrder:
-    """Order for one episode, for a worker process."""
-
-    task: str
-    domain: Domain
-    seed: int
-    options: TakeOptions
-    store_url: str
+# Seed and options of a take, for a worker process.
+Order = tuple[int, TakeOptions]
 
 
 @dataclass(frozen=True)
 class TakeReport:
-    """Result of one order; `kept` if the same command had recorded the episode before."""
+    """Result of one take; `kept` if the same command had recorded the episode before."""
 
     episode_id: str
     seed: int
@@ -53,9 +44,10 @@ def _stage(task: str, domain: Domain) -> Stage:
     return Stage(task, domain, TwinSettings())
 
 
-def _take(order: TakeOrder) -> TakeReport:
-    episode = record(_stage(order.task, order.domain), order.seed, order.options)
-    about, store = episode.attributes, EpisodeStore(order.store_url)
+def _take(task: str, domain: Domain, store_url: str, order: Order) -> TakeReport:
+    seed, options = order
+    episode = record(_stage(task, domain), seed, options)
+    about, store = episode.attributes, EpisodeStore(store_url)
     kept = False
     try:
         write_episode(store, episode)
@@ -65,12 +57,10 @@ def _take(order: TakeOrder) -> TakeReport:
         if existing.generator_command != about.generator_command:
             raise
         kept = True
-    return TakeReport(
-        about.episode_id, order.seed, bool(about.success), order.options.miss, kept=kept
-    )
+    return TakeReport(about.episode_id, seed, bool(about.success), options.miss, kept=kept)
 
 
-def _orders(arguments: argparse.Namespace) -> list[TakeOrder]:
+def _orders(arguments: argparse.Namespace) -> list[Order]:
     if not 0.0 <= arguments.miss_fraction <= 1.0:
         raise InvalidInputError(
             f"twin record: got --miss-fraction {arguments.miss_fraction}, expected 0 … 1"
@@ -91,7 +81,7 @@ def _orders(arguments: argparse.Namespace) -> list[TakeOrder]:
             arguments.varied,
             Sizes(arguments.width, arguments.height),
         )
-        orders.append(TakeOrder(arguments.task, arguments.domain, seed, options, arguments.store))
+        orders.append((seed, options))
     return orders
 
 
@@ -117,7 +107,8 @@ def main(argv: Sequence[str]) -> int:
     start_s = time.monotonic()
     orders = _orders(arguments)
     workers = Workers(arguments.jobs, arguments.ray)
-    jobs = run_jobs(_take, orders, workers, folders=EpisodeStore(arguments.store).folders)
+    take = partial(_take, arguments.task, arguments.domain, arguments.store)
+    jobs = run_jobs(take, orders, workers, folders=EpisodeStore(arguments.store).folders)
     done = results_of(progress(jobs, "twin record", len(orders)))
     reports = sorted(done, key=lambda report: report.seed)
     summary = _summary(arguments, reports, time.monotonic() - start_s)

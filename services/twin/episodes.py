@@ -1,37 +1,56 @@
 """Recording of ground-truth episodes: all streams of one take, scripted or played, and success."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from functools import partial
+from typing import Final, cast
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64, Shaped
 
 from dextouch.episodes import EpisodeStore
 from dextouch.geometry import pose_from_transform, transform_from_pose
-from dextouch.hands.actions import AnchorPoses, actions_from_poses, poses_from_actions
+from dextouch.hands import NUM_KEYPOINTS
+from dextouch.hands.actions import (
+    ACTION_DIM,
+    AnchorPoses,
+    HandTrajectory,
+    actions_from_poses,
+    poses_from_actions,
+)
 from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
-from services.twin.bounding_boxes import object_boxes_m
-from services.twin.demonstrators import NUM_GRID_STEPS
+from dextouch.streams import StreamDescriptor, StreamKind
+from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
+from services.twin.demonstrators import NUM_GRID_STEPS, MotionScene, with_motion
+from services.twin.hands import HumanHand
 from services.twin.mistakes import with_mistakes
-from services.twin.motions import MotionScene, with_motion
-from services.twin.recorder import EventTimes, GridLog, Recorder, TruthStream, action_stream
+from services.twin.mjcf import PHYSICS_RATE_HZ
 from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID
+from services.twin.sizes import object_boxes_m
 from services.twin.stage import Plan, Stage, command_row
 from services.twin.take_options import PlayedActions, TakeOptions, episode_id
 
-__all__ = [
-    "TAKE_STEPS",
-    "PlayedActions",
-    "TakeOptions",
-    "TruthEpisode",
-    "episode_id",
-    "record",
-    "write_episode",
-]
+__all__ = ["PlayedActions", "TakeOptions", "TruthEpisode", "episode_id", "record", "write_episode"]
 
-TAKE_STEPS: Final = (NUM_GRID_STEPS - 1) * STEPS_PER_GRID
 # Random stream of motions, independent of those of `Stage.plan`.
 _MOTION: Final = 101
+TACTILE_RATE_HZ: Final = 60
+POSE_RATE_HZ: Final = 100
+KEYPOINT_RATE_HZ: Final = 120
+IMAGE_RATE_HZ: Final = 30
+# Number of final grid steps that always have images, since the success classifier needs them.
+NUM_LAST_SHOWN_STEPS: Final = 3
+_NS_PER_S: Final = 1_000_000_000
+Source = Callable[[], np.ndarray]
+
+
+@dataclass(frozen=True)
+class TruthStream:
+    """A recorded stream."""
+
+    descriptor: StreamDescriptor
+    t_ref_ns: Int64[np.ndarray, " n"]
+    values: Shaped[np.ndarray, "n ..."]
 
 
 @dataclass(frozen=True)
@@ -74,24 +93,33 @@ def record(
     recorder, grid = Recorder(stage, options), GridLog(stage)
     recorder.sample(0)
     grid.sample()
-    events = EventTimes(stage.task)
-    events.sample(0, stage.simulation)
+    # When each milestone is first reached; those never reached are absent.
+    times_s: dict[str, float] = {}
+    _note(stage, 0, times_s)
     for row in range(1, NUM_GRID_STEPS):
         for step_index in stage.simulation.advance(command_row(commands, row)):
             recorder.sample(step_index)
         grid.sample()
-        events.sample(row, stage.simulation)
+        _note(stage, row, times_s)
     streams = recorder.streams()
     streams["action"] = action_stream("action", actions_from_poses(grid.trajectory(), anchor))
     if stage.domain == "robot":
         streams["action_commanded"] = action_stream("action_commanded", actions_commanded)
-    found: dict[str, object] = {"event_times_s": events.times_s}
+    found: dict[str, object] = {"event_times_s": times_s}
     if played is not None:
         name = episode_id(stage.task.name, stage.domain, seed, options, played=played.name)
         quality = options.figures() | {"played": 1.0}
         found |= {"episode_id": name, "generator_command": played.command, "quality": quality}
     attributes = _attributes(stage, seed, options, anchor).model_copy(update=found)
     return TruthEpisode(attributes, streams, np.stack(recorder.pad_forces_n))
+
+
+def _note(stage: Stage, step: int, times_s: dict[str, float]) -> None:
+    """Note the milestones that are reached for the first time at a grid step."""
+    reached = stage.task.reached(stage.simulation)
+    for name, holds in zip(stage.task.milestones, reached, strict=True):
+        if holds:
+            times_s.setdefault(name, step / MODEL_RATE_HZ)
 
 
 def _commanded(
@@ -159,3 +187,174 @@ def write_episode(store: EpisodeStore, episode: TruthEpisode) -> str:
             writer.add_stream(stream.descriptor)
             writer.append(name, values=stream.values, t_ref_ns=stream.t_ref_ns)
     return episode.attributes.episode_id
+
+
+class Recorder:
+    """Records the ground truth of one take; call `sample` at every physics step from step 0."""
+
+    def __init__(self, stage: Stage, options: TakeOptions) -> None:
+        self._stage, self._every = stage, options.image_every
+        self._sources = {
+            descriptor.name: (descriptor, s) for descriptor, s in _sources(stage, options)
+        }
+        self._samples: dict[str, list[np.ndarray]] = {name: [] for name in self._sources}
+        self._due: dict[int, list[str]] = {}
+        self.pad_forces_n: list[np.ndarray] = []
+        for name, (descriptor, _) in self._sources.items():
+            if descriptor.kind == "image" and self._every is not None:
+                steps = [step * STEPS_PER_GRID for step in shown_steps(self._every)]
+            else:
+                period = PHYSICS_RATE_HZ // round(descriptor.nominal_rate_hz)
+                steps = list(range(0, NUM_GRID_STEPS * STEPS_PER_GRID, period))
+            for step_index in steps:
+                self._due.setdefault(step_index, []).append(name)
+
+    def sample(self, step_index: int) -> None:
+        """Record the samples due at this physics step."""
+        for name in self._due.get(step_index, ()):
+            self._samples[name].append(np.array(self._sources[name][1]()))
+        if step_index % (PHYSICS_RATE_HZ // TACTILE_RATE_HZ) == 0:
+            self.pad_forces_n.append(self._stage.simulation.pad_forces_n.copy())
+
+    def streams(self) -> dict[str, TruthStream]:
+        """All streams recorded so far, by name."""
+        finished = {}
+        for name, (descriptor, _) in self._sources.items():
+            values = np.stack(self._samples[name])
+            if descriptor.kind == "keypoints":
+                values = self._keypoints(descriptor, values)
+            if descriptor.kind == "image" and self._every is not None:
+                shown_ns = _regular_ns(NUM_GRID_STEPS, MODEL_RATE_HZ)[shown_steps(self._every)]
+                finished[name] = TruthStream(descriptor, shown_ns[: len(values)], values)
+            else:
+                finished[name] = timed_stream(descriptor, values)
+        return finished
+
+    def _keypoints(self, descriptor: StreamDescriptor, joints_rad: np.ndarray) -> np.ndarray:
+        hands = {hand.side: hand.kinematics for hand in self._stage.simulation.scene.hands}
+        human = cast("HumanHand", hands[cast("Side", descriptor.side)])
+        return human.keypoints_m(joints_rad)
+
+
+def _sources(stage: Stage, options: TakeOptions) -> list[tuple[StreamDescriptor, Source]]:
+    """The streams of a take, each with what is sampled for it."""
+    simulation, rig = stage.simulation, stage.rig
+    found: list[tuple[StreamDescriptor, Source]] = [
+        (
+            _descriptor(f"tactile_{side}", "tactile", "kPa", (NUM_TAXELS,), TACTILE_RATE_HZ),
+            partial(_of_hand, lambda: simulation.tactile_kpa, index),
+        )
+        for index, side in enumerate(SIDES)
+    ]
+    # For training, sampled at the grid steps to avoid interpolation.
+    rate_hz: int | float = POSE_RATE_HZ if options.streams == "all" else MODEL_RATE_HZ
+    shape = (len(stage.task.object_names), 7)
+    objects = _descriptor("object_poses", "pose", "pose_m_wxyz", shape, rate_hz)
+    found.append((objects, simulation.object_poses))
+    if options.streams == "all":
+        found += _hand_sources(stage)
+    every = options.image_every
+    rate_hz = IMAGE_RATE_HZ if every is None else MODEL_RATE_HZ / every
+    for camera in options.images:
+        images = _descriptor(camera, "image", "rgb8", (*rig.shape_px, 3), rate_hz)
+        found.append((images, partial(rig.image, simulation, camera)))
+    return found
+
+
+def _hand_sources(stage: Stage) -> list[tuple[StreamDescriptor, Source]]:
+    """Poses of head and wrists, and joint angles, which become the keypoints of human hands."""
+    simulation, is_robot = stage.simulation, stage.domain == "robot"
+
+    def pose(name: str, source: Source) -> tuple[StreamDescriptor, Source]:
+        return _descriptor(name, "pose", "pose_m_wxyz", (7,), POSE_RATE_HZ), source
+
+    found = [pose("head", simulation.head_pose)]
+    for index, side in enumerate(SIDES):
+        found.append(pose(f"wrist_{side}", partial(_of_hand, simulation.wrist_poses, index)))
+        if is_robot:
+            commanded = partial(_of_hand, simulation.commanded_poses, index)
+            found.append(pose(f"wrist_{side}_commanded", commanded))
+        else:
+            name, shape = f"keypoints_{side}", (NUM_KEYPOINTS, 3)
+            keypoints = _descriptor(name, "keypoints", "m", shape, KEYPOINT_RATE_HZ)
+            found.append((keypoints, partial(_of_hand, simulation.joints_rad, index)))
+    if is_robot:
+        sources = {"measured": simulation.joints_rad, "commanded": simulation.commanded_joints_rad}
+        for name, source in sources.items():
+            joints = _descriptor(f"joints_{name}", "robot_state", "rad", (40,), POSE_RATE_HZ)
+            found.append((joints, partial(_flat, source)))
+    return found
+
+
+def _of_hand(source: Source, index: int) -> np.ndarray:
+    return source()[index]
+
+
+def _flat(source: Source) -> np.ndarray:
+    return source().ravel()
+
+
+def _descriptor(
+    name: str, kind: StreamKind, unit: str, shape: tuple[int, ...], rate_hz: int | float
+) -> StreamDescriptor:
+    sides = [side for side in SIDES if f"_{side}" in name]
+    return StreamDescriptor(
+        name=name,
+        kind=kind,
+        shape=shape,
+        dtype="float32" if kind == "tactile" else "uint8" if kind == "image" else "float64",
+        unit=unit,
+        nominal_rate_hz=rate_hz,
+        frame=f"wrist_{sides[0]}" if kind == "keypoints" else "world" if kind == "pose" else None,
+        side=sides[0] if sides else None,
+    )
+
+
+def action_stream(name: str, actions: np.ndarray) -> TruthStream:
+    """Actions [81, 67] on the model grid as a stream."""
+    descriptor = _descriptor(name, "robot_state", "action_m_rad", (ACTION_DIM,), MODEL_RATE_HZ)
+    return timed_stream(descriptor, actions)
+
+
+def timed_stream(descriptor: StreamDescriptor, values: np.ndarray) -> TruthStream:
+    """A stream that starts at time 0 with its exact nominal rate."""
+    t_ref_ns = _regular_ns(len(values), round(descriptor.nominal_rate_hz))
+    return TruthStream(descriptor, t_ref_ns, values)
+
+
+def _regular_ns(num_samples: int, rate_hz: int) -> Int64[np.ndarray, " n"]:
+    return (np.arange(num_samples, dtype=np.int64) * _NS_PER_S + rate_hz // 2) // rate_hz
+
+
+def shown_steps(image_every: int) -> list[int]:
+    """Grid steps with images: multiples of `image_every` and the last three."""
+    last = range(NUM_GRID_STEPS - NUM_LAST_SHOWN_STEPS, NUM_GRID_STEPS)
+    return sorted({*range(0, NUM_GRID_STEPS, image_every), *last})
+
+
+class GridLog:
+    """Collects measured poses and joints at grid steps as a trajectory."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._simulation = stage.simulation
+        self._wrists: list[np.ndarray] = []
+        self._heads: list[np.ndarray] = []
+        self._joints: list[np.ndarray] = []
+
+    def sample(self) -> None:
+        """Record the current measurements."""
+        self._wrists.append(self._simulation.wrist_poses())
+        self._heads.append(self._simulation.head_pose())
+        self._joints.append(self._simulation.joints_rad())
+
+    def trajectory(self) -> HandTrajectory:
+        """Trajectory of all recorded steps."""
+        Ts = transform_from_pose(np.stack(self._wrists))
+        joints = np.stack(self._joints)
+        return HandTrajectory(
+            Ts[:, 0],
+            Ts[:, 1],
+            joints[:, 0],
+            joints[:, 1],
+            transform_from_pose(np.stack(self._heads)),
+        )

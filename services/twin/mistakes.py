@@ -20,8 +20,7 @@ from dextouch.geometry import interpolate_linear, interpolate_poses, transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands.actions import HandTrajectory
 from dextouch.tactile.layout import SIDES
-from services.twin.demonstrators import NUM_GRID_STEPS
-from services.twin.motions import MotionScene
+from services.twin.demonstrators import NUM_GRID_STEPS, MotionScene
 from services.twin.simulation import MODEL_RATE_HZ
 
 _STEPS: Final = np.arange(NUM_GRID_STEPS, dtype=np.float64)
@@ -123,6 +122,11 @@ class _Take:
                 left, weight = _places(joint_steps[side])
             joints.append(interpolate_linear(self.joints[side], left, weight))
         return self.of(np.stack(Ts), np.stack(joints))
+
+    def closed_by(self, share: float | np.ndarray) -> HandTrajectory:
+        """The take with fingers that go this share of their way from the first posture."""
+        first = self.joints[:, :1]
+        return self.of(joints=first + share * (self.joints - first))
 
     def shifted(self, offsets_m: np.ndarray) -> HandTrajectory:
         """The take with both wrists [81, 3], or each [2, 81, 3], moved in the world."""
@@ -246,8 +250,7 @@ def _finger_time(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
 
 def _grip(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
     share = 1 - strength if draw.random() < 0.6 else 1 + 0.5 * strength
-    first = take.joints[:, :1]
-    return take.of(joints=first + share * (take.joints - first))
+    return take.closed_by(share)
 
 
 def _opening(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
@@ -261,18 +264,14 @@ def _finger(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
     """One finger does not close, or two do not."""
     chosen = np.zeros(5)
     chosen[draw.permutation(5)[: draw.integers(1, 3)]] = strength
-    first = take.joints[:, :1]
-    share = 1 - np.repeat(chosen, 4)
-    return take.of(joints=first + share * (take.joints - first))
+    return take.closed_by(1 - np.repeat(chosen, 4))
 
 
 def _release(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
     """Fingers open for a while, or for good."""
     first = draw.uniform(12, 65)
     last = first + draw.uniform(3, 15) if draw.random() < 0.5 else NUM_GRID_STEPS + 9.0
-    share = 1 - strength * (_ramp(first, first + 3) - _ramp(last, last + 3))[:, None]
-    open_rad = take.joints[:, :1]
-    return take.of(joints=open_rad + share * (take.joints - open_rad))
+    return take.closed_by(1 - strength * (_ramp(first, first + 3) - _ramp(last, last + 3))[:, None])
 
 
 def _bumps(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
@@ -407,9 +406,8 @@ def _regrasp(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
     """After closing, fingers open and close again."""
     first = take.closing_step + draw.uniform(2, 10)
     length = 2 + 12 * strength
-    share = 1 - (_ramp(first, first + 3) - _ramp(first + length, first + length + 4))[:, None]
-    open_rad = take.joints[:, :1]
-    return take.of(joints=open_rad + share * (take.joints - open_rad))
+    opened = _ramp(first, first + 3) - _ramp(first + length, first + length + 4)
+    return take.closed_by(1 - opened[:, None])
 
 
 def _short(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
@@ -447,41 +445,17 @@ def _quantized(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
 
 
 Kind = Callable[[_Take, float, Draw], HandTrajectory]
-TRAINING: Final[dict[str, Kind]] = {
-    "height": _height,
-    "offset": _offset,
-    "yaw": _yaw,
-    "tilt": _tilt,
-    "wrist_turn": _wrist_turn,
-    "tempo": _tempo,
-    "pause": _pause,
-    "finger_time": _finger_time,
-    "grip": _grip,
-    "opening": _opening,
-    "finger": _finger,
-    "release": _release,
-    "bumps": _bumps,
-    "sweep": _sweep,
-    "wrong_object": _wrong_object,
-    "jitter": _jitter,
-    "drift": _drift,
-    "second_half": _second_half,
-}
-DEVELOPMENT: Final[dict[str, Kind]] = {
-    "one_hand_late": _one_hand_late,
-    "side_approach": _side_approach,
-    "low_rate": _low_rate,
-    "overshoot": _overshoot,
-    "frame_yaw": _frame_yaw,
-}
-HELD_OUT: Final[dict[str, Kind]] = {
-    "smooth": _smooth,
-    "gain": _gain,
-    "shake": _shake,
-    "regrasp": _regrasp,
-    "short": _short,
-    "roll": _roll,
-    "rush": _rush,
-    "quantized": _quantized,
-}
+
+
+def _named(*kinds: Kind) -> dict[str, Kind]:
+    return {kind.__name__.removeprefix("_"): kind for kind in kinds}
+
+
+TRAINING: Final = _named(
+    *(_height, _offset, _yaw, _tilt, _wrist_turn, _tempo, _pause, _finger_time, _grip),
+    *(_opening, _finger, _release, _bumps, _sweep, _wrong_object, _jitter, _drift),
+    _second_half,
+)
+DEVELOPMENT: Final = _named(_one_hand_late, _side_approach, _low_rate, _overshoot, _frame_yaw)
+HELD_OUT: Final = _named(_smooth, _gain, _shake, _regrasp, _short, _roll, _rush, _quantized)
 KINDS: Final[dict[str, Kind]] = TRAINING | DEVELOPMENT | HELD_OUT

@@ -12,7 +12,7 @@ MOTION_KINDS: Final[tuple[MotionKind, ...]] = get_args(MotionKind)
 # How takes become episodes: as they are, by devices and alignment, or as a station records them.
 TakePath = Literal["direct", "devices", "station"]
 TAKE_PATHS: Final[tuple[TakePath, ...]] = get_args(TakePath)
-# Of `mistakes.KINDS` and `data_mix.MIXES`.
+# Of `mistakes.KINDS` and `take_options.MIXES`.
 MISTAKE_KINDS: Final = (
     *("height", "offset", "yaw", "tilt", "wrist_turn", "tempo", "pause", "finger_time", "grip"),
     *("opening", "finger", "release", "bumps", "sweep", "wrong_object", "jitter", "drift"),

@@ -14,9 +14,8 @@ from dextouch.hands.actions import (
     actions_from_poses,
     poses_from_actions,
 )
-from services.twin.demonstrators import NUM_GRID_STEPS
+from services.twin.demonstrators import NUM_GRID_STEPS, MotionScene
 from services.twin.mistakes import Mistake, with_mistakes
-from services.twin.motions import MotionScene
 from services.twin.stage import Stage
 
 # Names of the policies that should fail; others are named by `script_name` and `mistake_name`.

@@ -9,7 +9,6 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import transform_from_pose
 from dextouch.hands.actions import AnchorPoses, HandTrajectory
-from services.twin.bounding_boxes import object_boxes_m
 from services.twin.cameras import CameraRig
 from services.twin.demonstrators import (
     WaypointNoise,
@@ -22,7 +21,7 @@ from services.twin.names import Domain
 from services.twin.scene import compile_scene
 from services.twin.settings import TwinSettings
 from services.twin.simulation import Command, Simulation
-from services.twin.sizes import USUAL, Geometry, Sizes
+from services.twin.sizes import USUAL, Geometry, Sizes, object_boxes_m
 from services.twin.tasks import get_task
 
 MAX_NOISE_M: Final = 0.2
@@ -90,12 +89,9 @@ class Stage:
             )
         placed = self.task.place(np.random.default_rng([seed, _PLACEMENT]))
         errors = np.random.default_rng([seed, _NOISE])
-        waypoints = self.task.script(
-            placed,
-            domain=self.domain,
-            generator=np.random.default_rng([seed, _HABIT]),
-            noise=(WaypointNoise.draw(errors, noise_m), WaypointNoise.draw(errors, noise_m)),
-        )
+        noise = (WaypointNoise.draw(errors, noise_m), WaypointNoise.draw(errors, noise_m))
+        habits = np.random.default_rng([seed, _HABIT])
+        waypoints = self.task.script(placed, self.domain, habits, noise)
         waypoints = at_own_tempo(waypoints, np.random.default_rng([seed, _TEMPO]))
         head = head_sway(np.random.default_rng([seed, _SWAY]))
         if varied:

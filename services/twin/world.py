@@ -10,22 +10,14 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.hands.actions import (
-    AnchorPoses,
-    actions_from_poses,
-    poses_from_actions,
-)
+from dextouch.hands.actions import AnchorPoses, actions_from_poses, poses_from_actions
 from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
 from dextouch.streams import pack, unpack
 from dextouch.worlds import StartedRollout, SteppedRollout
+from services.twin.episodes import GridLog
 from services.twin.names import CAMERAS
-from services.twin.recorder import GridLog
 from services.twin.settings import TwinSettings
-from services.twin.simulation import (
-    MODEL_RATE_HZ,
-    STEPS_PER_GRID,
-    STEPS_PER_TACTILE,
-)
+from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID, STEPS_PER_TACTILE
 from services.twin.sizes import Sizes
 from services.twin.stage import Stage, command_row
 from services.twin.tasks import TASK_NAMES, get_task

@@ -16,7 +16,7 @@ from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile import pad_forces_n
 from services.acquisition.mocks.gloves import GloveCalibration
 from services.alignment.recording_error import compare_with_truth, match_streams
-from services.pipelines.device_takes import SESSION_SEEDS, device_options, write_through_devices
+from services.pipelines.mock_takes import SESSION_SEEDS, device_options, write_through_devices
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage

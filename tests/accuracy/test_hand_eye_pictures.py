@@ -17,7 +17,7 @@ from services.alignment.calibration.intrinsics import edge_width_px
 from services.alignment.calibration.motion import move
 from services.alignment.station_calibration.boards import find_board, parse_board
 from services.alignment.station_calibration.record import write_entry
-from services.pipelines.calibrate.command import main
+from services.pipelines.calibrate import main
 from tests.unit.cli.rendered_boards import (
     CHARUCO,
     CHARUCO_K,

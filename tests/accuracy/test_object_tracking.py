@@ -8,7 +8,7 @@ import pytest
 from dextouch.episodes import EpisodeStore, object_track
 from dextouch.geometry import interpolate_poses, transform_from_pose
 from dextouch.geometry.transforms import bracket
-from services.pipelines.device_takes import device_options, write_as_recorded
+from services.pipelines.mock_takes import device_options, write_as_recorded
 from services.pipelines.training_data import marked_stage
 from services.twin.episodes import record
 from services.twin.take_options import TakeOptions

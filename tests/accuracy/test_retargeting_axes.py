@@ -14,7 +14,7 @@ from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import HandModel, RobotHand
 from services.alignment.retargeting import HandRetargeter, RetargetStatus
-from services.twin.human_hand import METACARPAL_BASES_M, human_fingers
+from services.twin.hands import METACARPAL_BASES_M, human_fingers
 
 SADDLE_OFFSET_M = 0.003
 NUM_STEPS = 120

@@ -13,7 +13,7 @@ from services.evaluation.endings import read_ending_episodes
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines.training_data import Scope, make_training_data
-from services.twin.data_mix import LADDER_M, MIXES
+from services.twin.take_options import LADDER_M, MIXES
 
 pytestmark = pytest.mark.slow
 # Far from the seeds of training and of the checkpoint's own held-out set.

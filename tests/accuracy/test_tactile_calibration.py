@@ -30,7 +30,7 @@ from services.alignment.calibration.tactile_tare import (
     measure_tare,
     rounding_rms_counts,
 )
-from services.pipelines.calibrate.command import main as calibrate
+from services.pipelines.calibrate import main as calibrate
 
 PRESSURES_KPA = (5.0, 10.0, 20.0, 30.0)
 EVERYWHERE = np.ones(NUM_TAXELS, dtype=bool)

@@ -26,8 +26,8 @@ from services.evaluation.matched_starts import start_digest
 from services.evaluation.statistics import area_under_roc
 from services.evaluation.success_classifier import Calibration
 from services.evaluation.trained_networks import save_checkpoint
+from services.twin.demonstrators import Motion
 from services.twin.episodes import record, write_episode
-from services.twin.motions import Motion
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions

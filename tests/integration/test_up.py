@@ -21,7 +21,7 @@ from dextouch.errors import (
 from dextouch.serving import ServiceSettings, create_service_app
 from services.alignment.retargeting import hand_retargeter
 from services.cli import up
-from services.cli.data_lock import held_data_folder
+from services.cli.up import held_data_folder
 from services.pipelines.servers import bind
 
 # Of a machine that is busy with other things; the solver may be compiled first.
@@ -226,8 +226,8 @@ def other_up(folder, seconds=120):
 
 
 async def test_a_second_up_on_a_data_folder_says_who_has_it(tmp_path):
-    with held_data_folder(tmp_path) as lock:
-        lock.tell("http://127.0.0.1:8080")
+    with held_data_folder(tmp_path) as tell:
+        tell("http://127.0.0.1:8080")
         done = await asyncio.to_thread(other_up, tmp_path)
     assert (done.returncode, done.stdout) == (3, "")
     (line,) = done.stderr.splitlines()

@@ -10,7 +10,7 @@ from dextouch.bridges.lerobot import source
 from dextouch.serving import configuration_file
 from services.acquisition.devices import load_calibration
 from services.alignment.station_calibration import record
-from services.dashboard.documents import DEFAULT_TASKS, load_tasks
+from services.dashboard.pages import DEFAULT_TASKS, load_tasks
 from services.dashboard.settings import DashboardSettings
 from services.evaluation.rating.marks import BUNDLED, read_rubrics
 

@@ -27,7 +27,7 @@ from services.acquisition.settings import AcquisitionSettings
 from services.alignment.station_calibration.runs import Answer, RunRequest
 from services.cli.main import main
 from services.cli.up_settings import UpSettings
-from services.dashboard.documents import load_tasks
+from services.dashboard.pages import load_tasks
 from services.dashboard.settings import DashboardSettings
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings

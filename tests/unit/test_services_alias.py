@@ -21,7 +21,7 @@ def test_modules_are_the_same_objects():
 
 def test_either_name_may_come_first():
     code = (
-        "import dextouch_services.twin.tasks.registry as a, services.twin.tasks.registry as b;"
+        "import dextouch_services.twin.tasks as a, services.twin.tasks as b;"
         "import services.twin.tasks.task as c, dextouch_services.twin.tasks.task as d;"
         "assert a is b and c is d"
     )

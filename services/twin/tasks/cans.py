@@ -10,14 +10,22 @@ from typing import Final, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.geometry import transform, transform_from_pose
-from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
-from services.twin.grasps import CylinderGrasp, opened, pressing
-from services.twin.hands import twin_hand
+from dextouch.geometry import transform_from_pose
+from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, moved
+from services.twin.grasps import CylinderGrasp
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import REST_SPEED, THUMB_UP, relaxed, yawed
+from services.twin.tasks.task import (
+    REST_SPEED,
+    THUMB_UP,
+    Draw,
+    Grip,
+    Noise,
+    Poses,
+    with_right_hand,
+    yawed,
+)
 
 Goal = Literal["up", "left", "right"]
 
@@ -101,32 +109,19 @@ class CanTask:
         poses[0, 2], poses[:, 3] = _HALF_LENGTH_M, 1.0
         return poses
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "3 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Approach, close, lift as in every task of the four; then hold, or carry and set down."""
-        grasp = CAN_GRASPS[domain]
-        open_hand = opened(grasp, domain, gap_m=_OPEN_M)
-        press = pressing(grasp, domain, force_n=_SQUEEZE_N)
-        R_axis = grasp.axis_rotation()
-        gripped = grasp.axis_point_m(twin_hand("right", domain))
-        start_m, over_m = generator.uniform(-0.02, 0.02, size=(2, 3))
+        grip = Grip(CAN_GRASPS[domain], domain, gap_m=_OPEN_M, force_n=_SQUEEZE_N)
+        start_m, over_m = draw.uniform(-0.02, 0.02, size=(2, 3))
 
         def hand(can_m: np.ndarray, error: WaypointNoise) -> HandPose:
             """Open hand with its palm to the left, around a can that stands at a point."""
-            R = yawed(error.yaw_rad) @ THUMB_UP @ R_axis.T
-            grip = np.array([can_m[0], can_m[1], _HALF_LENGTH_M + _GRIP_M]) + error.offset_m
-            return HandPose(transform(R, grip - R @ gripped), open_hand)
+            point = np.array([can_m[0], can_m[1], _HALF_LENGTH_M + _GRIP_M]) + error.offset_m
+            return grip.around(yawed(error.yaw_rad) @ THUMB_UP, point)
 
-        exact = WaypointNoise(np.zeros(3), 0.0)
-        beside = moved(hand(object_poses[0], exact), start_m + np.array([0.12, -0.07, 0.03]))
-        reach = hand(object_poses[0], noise[0])
-        took = bent(reach, press)
+        beside = moved(hand(poses[0], NO_NOISE), start_m + np.array([0.12, -0.07, 0.03]))
+        reach = hand(poses[0], noise[0])
+        took = grip.pressed(reach)
         raised = moved(took, [0.0, 0.0, _LIFT_M])
         path = [(0.0, beside), (0.8, reach), (1.15, took), (1.3, took), (1.9, raised)]
         # Equal times in all four tasks, so that `at_own_tempo` draws equal ones.
@@ -135,13 +130,12 @@ class CanTask:
             high = moved(raised, 0.5 * over_m + [0.0, 0.0, 0.01])
             path += [(time_s, high) for time_s in times_s]
         else:
-            left = hand(object_poses[_MATS[self.goal]], noise[1])
-            put = moved(bent(left, press), [0.0, 0.0, -_PUSH_M])
+            left = hand(poses[_MATS[self.goal]], noise[1])
+            put = moved(grip.pressed(left), [0.0, 0.0, -_PUSH_M])
             over = moved(put, 0.5 * over_m + [0.0, 0.0, 0.06])
             away = moved(left, [0.13, -0.02, 0.03])
             path += zip(times_s, (over, put, put, left, away), strict=True)
-        rest = relaxed("left", domain)
-        return [Waypoint(time_s, rest, pose) for time_s, pose in path]
+        return with_right_hand(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Held up by a hand and at rest; or upright on its mat, at rest, untouched."""

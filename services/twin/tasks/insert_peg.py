@@ -5,14 +5,22 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.geometry import transform, transform_from_pose
-from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
-from services.twin.grasps import CylinderGrasp, opened, pressing
-from services.twin.hands import twin_hand
+from dextouch.geometry import transform_from_pose
+from services.twin.demonstrators import Waypoint, moved
+from services.twin.grasps import CylinderGrasp
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import REST_SPEED, THUMB_UP, relaxed, yawed
+from services.twin.tasks.task import (
+    THUMB_UP,
+    Draw,
+    Grip,
+    Noise,
+    Poses,
+    is_left,
+    with_right_hand,
+    yawed,
+)
 
 _RADIUS_M, _HALF_LENGTH_M, _FOOT_HALF_M = 0.022, 0.090, 0.020
 # Grasp height above the peg's centre, to keep the hand clear of the block.
@@ -122,34 +130,20 @@ class InsertPeg:
         poses[1, 3], poses[1, 6] = np.cos(half_yaw), np.sin(half_yaw)
         return poses
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "2 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Approach, enclose, close, lift, move over the hole, insert, open, withdraw."""
-        grasp = _GRASPS[domain]
-        open_hand = opened(grasp, domain, gap_m=_OPEN_M)
-        press = pressing(grasp, domain, force_n=_SQUEEZE_N)
-        R_axis = grasp.axis_rotation()
-        gripped = grasp.axis_point_m(twin_hand("right", domain))
-        held_foot = gripped + R_axis @ _HELD_FEET_M[domain]
-        start_m, over_m = generator.uniform(-0.02, 0.02, size=(2, 3))
+        grip = Grip(_GRASPS[domain], domain, gap_m=_OPEN_M, force_n=_SQUEEZE_N)
+        start_m, over_m = draw.uniform(-0.02, 0.02, size=(2, 3))
 
-        def hand(point_m: np.ndarray, held: np.ndarray, yaw_rad: float) -> HandPose:
-            """Hand with its palm to the left, with `held` (in its own frame) at a point."""
-            R = yawed(yaw_rad) @ THUMB_UP @ R_axis.T
-            return HandPose(transform(R, point_m - R @ held), open_hand)
-
-        grip = object_poses[0, :3] + [0.0, 0.0, _GRIP_M]
-        beside = moved(hand(grip, gripped, 0.0), start_m + np.array([0.12, -0.02, 0.03]))
-        reach = hand(grip + noise[0].offset_m, gripped, noise[0].yaw_rad)
-        took = bent(reach, press)
-        left = hand(object_poses[1, :3] + noise[1].offset_m, held_foot, noise[1].yaw_rad)
-        put = bent(left, press)
+        peg_m = poses[0, :3] + [0.0, 0.0, _GRIP_M]
+        beside = moved(
+            grip.around(yawed(0.0) @ THUMB_UP, peg_m), start_m + np.array([0.12, -0.02, 0.03])
+        )
+        reach = grip.around(yawed(noise[0].yaw_rad) @ THUMB_UP, peg_m + noise[0].offset_m)
+        took = grip.pressed(reach)
+        hole_m, R_hole = poses[1, :3] + noise[1].offset_m, yawed(noise[1].yaw_rad) @ THUMB_UP
+        left = grip.around(R_hole, hole_m, held_m=_HELD_FEET_M[domain])
+        put = grip.pressed(left)
         path = [
             (0.0, beside),
             (0.8, reach),
@@ -163,16 +157,11 @@ class InsertPeg:
             (4.0, left),
             (4.8, moved(left, [0.13, -0.02, 0.03])),
         ]
-        rest = relaxed("left", domain)
-        return [Waypoint(time_s, rest, pose) for time_s, pose in path]
+        return with_right_hand(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Foot within 1 cm of the hole's bottom, upright within 10°, at rest, untouched."""
-        return bool(
-            _is_inserted(simulation.object_poses())
-            and simulation.object_speeds().max() < REST_SPEED
-            and not simulation.hand_touches_object()
-        )
+        return _is_inserted(simulation.object_poses()) and is_left(simulation)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """Touched by a hand; lifted by 3 cm; foot over the hole; inserted; released."""

@@ -7,13 +7,11 @@ from jaxtyping import Float64
 
 from dextouch.geometry import invert, transform, transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation
-from dextouch.tactile.layout import Side
-from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise
-from services.twin.hands import twin_hand
+from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import REST_SPEED, THUMB_UP, flat, yawed
+from services.twin.tasks.task import SIGNS, THUMB_UP, Draw, Noise, Poses, is_left, with_palm, yawed
 
 _HALF_M: Final = (0.075, 0.055, 0.031)
 _MASS_KG: Final = 0.4
@@ -78,17 +76,10 @@ class LiftBox:
         poses[:, 3:] = [quaternion_from_rotation(yawed(turn)) for turn in yaw]
         return poses
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "2 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Lower beside the box, squeeze, lift, carry, set down, open, withdraw."""
-        start_m, over_m = generator.uniform(-0.02, 0.02, size=(2, 3))
-        T_world_box, T_world_goal = transform_from_pose(object_poses)
+        start_m, over_m = draw.uniform(-0.02, 0.02, size=(2, 3))
+        T_world_box, T_world_goal = transform_from_pose(poses)
         T_world_goal = T_world_goal @ transform(np.eye(3), np.array([0.0, 0.0, _TOP_M]))
 
         def beside(
@@ -97,24 +88,20 @@ class LiftBox:
             """Palms at both sides of a box at a pose."""
             R_box = yawed(error.yaw_rad) @ T_world_x[:3, :3]
             hands = []
-            sides: tuple[tuple[Side, float], ...] = (("left", -1.0), ("right", 1.0))
-            for side, sign in sides:
+            for side, sign in SIGNS:
                 palm = np.array([sign * (_HALF_M[0] + gap_m), 0.0, _PALM_UP_M + up_m])
                 palm_world = T_world_x[:3, 3] + error.offset_m + R_box @ palm
-                R = R_box @ THUMB_UP
-                wrist = palm_world - R @ twin_hand(side, domain).palm_centre_m
-                hands.append(HandPose(transform(R, wrist), flat(domain)))
+                hands.append(with_palm(side, domain, R_box @ THUMB_UP, palm_world))
             return hands[0], hands[1]
 
         took, put = noise
-        exact = WaypointNoise(np.zeros(3), 0.0)
         before, halfway = T_world_box.copy(), 0.5 * (T_world_box + T_world_goal)
         before[:3, 3] += start_m
         halfway[:3, :3] = T_world_box[:3, :3]
         halfway[:3, 3] += over_m + took.offset_m
         turned = WaypointNoise(np.zeros(3), took.yaw_rad)
         steps = [
-            (0.0, beside(before, _OPEN_M + 0.02, 0.12, exact)),
+            (0.0, beside(before, _OPEN_M + 0.02, 0.12, NO_NOISE)),
             (0.7, beside(T_world_box, _OPEN_M, 0.0, took)),
             (1.1, beside(T_world_box, _SQUEEZE_M, 0.0, took)),
             (1.3, beside(T_world_box, _SQUEEZE_M, 0.0, took)),
@@ -142,11 +129,7 @@ class LiftBox:
 
     def succeeded(self, simulation: Simulation) -> bool:
         """On the platform within 22 mm and 20°, upright, at rest, untouched."""
-        return bool(
-            self._is_placed(simulation)
-            and simulation.object_speeds()[_BOX] < REST_SPEED
-            and not simulation.hand_touches_object()
-        )
+        return self._is_placed(simulation) and is_left(simulation, _BOX)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """Touched by both hands; lifted by 3 cm; over the platform; on it; released."""

@@ -8,12 +8,21 @@ from jaxtyping import Float64
 
 from dextouch.geometry import apply, transform, transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation
-from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, moved
+from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, moved
 from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import PALM_DOWN, REST_SPEED, flat, relaxed, yawed
+from services.twin.tasks.task import (
+    PALM_DOWN,
+    Draw,
+    Noise,
+    Poses,
+    flat,
+    is_left,
+    with_right_hand,
+    yawed,
+)
 
 # The cabinet's frame: on the table below the middle of its front; the drawer opens along -y.
 _CABINET_HALF_M: Final = (0.085, 0.060, 0.042)
@@ -119,33 +128,22 @@ class OpenDrawer:
         drawer = cabinet + np.array([0.0, 0.0, _DRAWER_Z_M])
         return np.array([[*cabinet, *q_wxyz], [*drawer, *q_wxyz]])
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "2 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Move over the handle, down behind it, pull, stop, up, withdraw."""
         joints, tips = _hook(domain), _tips_m(domain)
-        start_m, away_m = generator.uniform(-0.02, 0.02, size=(2, 3))
-        T_world_cabinet = transform_from_pose(object_poses[0])
+        start_m, away_m = draw.uniform(-0.02, 0.02, size=(2, 3))
+        T_world_cabinet = transform_from_pose(poses[0])
         bar_z = _DRAWER_Z_M + _BAR_Z_M
         gap = np.array([0.0, _FRONT_Y_M - 0.5 * _GAP_M, bar_z])
 
-        def hand(offset_m: tuple[float, float], error: WaypointNoise | None) -> HandPose:
+        def hand(offset_m: tuple[float, float], error: WaypointNoise) -> HandPose:
             """Fingertips at the gap, shifted along the cabinet's y and upwards."""
-            yaw = 0.0 if error is None else error.yaw_rad
-            R_yaw = yawed(yaw)
-            R = R_yaw @ T_world_cabinet[:3, :3] @ PALM_DOWN
+            R = yawed(error.yaw_rad) @ T_world_cabinet[:3, :3] @ PALM_DOWN
             tip = apply(T_world_cabinet, (gap + np.array([0.0, *offset_m]))[None])[0]
-            if error is not None:
-                tip = tip + error.offset_m
-            return HandPose(transform(R, tip - R @ tips), joints)
+            return HandPose(transform(R, tip + error.offset_m - R @ tips), joints)
 
         took, put = noise
-        above, away = hand((-0.03, 0.09), None), hand((-_PULL_M - 0.04, 0.09), put)
+        above, away = hand((-0.03, 0.09), NO_NOISE), hand((-_PULL_M - 0.04, 0.09), put)
         path = [
             (0.0, moved(above, start_m + _BESIDE_M)),
             (0.7, hand((0.0, 0.045), took)),
@@ -157,16 +155,11 @@ class OpenDrawer:
             (3.8, hand((-_PULL_M + _UNLOAD_M, 0.06), put)),
             (4.7, moved(away, away_m + _BESIDE_M)),
         ]
-        rest = relaxed("left", domain)
-        return [Waypoint(time_s, rest, pose) for time_s, pose in path]
+        return with_right_hand(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Open by 6 cm or more, at rest, untouched."""
-        return bool(
-            _opening_m(simulation.object_poses()) > _OPEN_M
-            and simulation.object_speeds().max() < REST_SPEED
-            and not simulation.hand_touches_object()
-        )
+        return _opening_m(simulation.object_poses()) > _OPEN_M and is_left(simulation)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """Drawer touched by a hand; open by 1 cm; open by 6 cm; released and at rest."""

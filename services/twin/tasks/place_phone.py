@@ -8,12 +8,20 @@ from jaxtyping import Float64
 from dextouch.geometry import apply, invert, transform, transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, moved
-from services.twin.grasps import CylinderGrasp, opened, pressing
-from services.twin.hands import twin_hand
+from services.twin.grasps import CylinderGrasp
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import PALM_DOWN, REST_SPEED, relaxed, yawed
+from services.twin.tasks.task import (
+    PALM_DOWN,
+    Draw,
+    Grip,
+    Noise,
+    Poses,
+    is_left,
+    with_right_hand,
+    yawed,
+)
 
 # Phone frame: x across, y towards its top, z out of the screen; origin at its centre.
 _PHONE_HALF_M: Final = (0.036, 0.075, 0.0045)
@@ -97,11 +105,6 @@ def _in_cradle(simulation: Simulation) -> Float64[np.ndarray, "4 4"]:
     return invert(T_world_stand @ _T_STAND_CRADLE) @ T_world_phone
 
 
-def _is_near(T_cradle_phone: Float64[np.ndarray, "4 4"]) -> bool:
-    """Whether the phone's centre is near its seat."""
-    return bool(np.linalg.norm(T_cradle_phone[:3, 3] - _SEATED_M) < _NEAR_M)
-
-
 def _is_seated(T_cradle_phone: Float64[np.ndarray, "4 4"]) -> bool:
     offset_m = np.abs(T_cradle_phone[:3, 3] - _SEATED_M)
     turned = np.trace(T_cradle_phone[:3, :3]) < 1 + 2 * np.cos(_SEATED_RAD)
@@ -144,35 +147,23 @@ class PlacePhone:
         poses[0, 2] = _PHONE_Z_M
         return poses
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "3 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Move over it, down, close, lift, lean, lower into the stand, open, withdraw."""
-        grasp = _GRASPS[domain]
-        open_hand = opened(grasp, domain, gap_m=_OPEN_M)
-        press = pressing(grasp, domain, force_n=_SQUEEZE_N)
-        R_axis = grasp.axis_rotation()
-        T_world_phone, T_world_stand, _ = transform_from_pose(object_poses)
+        grip = Grip(_GRASPS[domain], domain, gap_m=_OPEN_M, force_n=_SQUEEZE_N)
+        T_world_phone, T_world_stand, _ = transform_from_pose(poses)
         # Wrist in the phone's frame: palm over the screen, fingers across it.
-        R_phone_wrist = _FINGERS_LEFT @ R_axis.T
-        middle = grasp.axis_point_m(twin_hand("right", domain)) + R_axis @ [-_ALONG_M, 0.0, 0.0]
-        T_phone_wrist = transform(R_phone_wrist, -R_phone_wrist @ middle)
+        held = grip.around(_FINGERS_LEFT, np.zeros(3), held_m=(-_ALONG_M, 0.0, 0.0))
         held_m, held_rad = np.array(_HELD[domain])
         T_held_phone = invert(transform(rotation_from_vector(held_rad), held_m))
-        start_m, over_m = generator.uniform(-0.02, 0.02, size=(2, 3))
+        start_m, over_m = draw.uniform(-0.02, 0.02, size=(2, 3))
 
         def misread(T: np.ndarray, error: WaypointNoise) -> np.ndarray:
             return transform(yawed(error.yaw_rad) @ T[:3, :3], T[:3, 3] + error.offset_m)
 
         def hand(T: np.ndarray, joints: np.ndarray) -> HandPose:
-            return HandPose(T @ T_phone_wrist, joints)
+            return HandPose(T @ held.T_world_wrist, joints)
 
-        above = moved(hand(T_world_phone, open_hand), start_m + np.array([0.03, -0.03, 0.12]))
+        above = moved(hand(T_world_phone, grip.open_rad), start_m + np.array([0.03, -0.03, 0.12]))
         took = misread(T_world_phone, noise[0])
         put = misread(T_world_stand, noise[1]) @ _T_STAND_CRADLE
 
@@ -182,28 +173,23 @@ class PlacePhone:
 
         path = [
             (0.0, above),
-            (0.8, hand(took, open_hand)),
-            (1.15, hand(took, press)),
-            (1.3, hand(took, press)),
-            (1.8, moved(hand(took, press), [0.0, 0.0, 0.10])),
-            (2.7, moved(seat(0.05, 0.04, press), over_m * 0.5)),
-            (3.2, seat(0.012, 0.005, press)),
-            (3.5, seat(0.0, 0.003, press)),
-            (3.65, seat(0.0, 0.003, press)),
-            (4.05, seat(0.0, 0.003, open_hand)),
-            (4.45, seat(0.0, 0.07, open_hand)),
-            (5.0, moved(seat(0.0, 0.07, open_hand), [0.16, -0.04, 0.02])),
+            (0.8, hand(took, grip.open_rad)),
+            (1.15, hand(took, grip.press_rad)),
+            (1.3, hand(took, grip.press_rad)),
+            (1.8, moved(hand(took, grip.press_rad), [0.0, 0.0, 0.10])),
+            (2.7, moved(seat(0.05, 0.04, grip.press_rad), over_m * 0.5)),
+            (3.2, seat(0.012, 0.005, grip.press_rad)),
+            (3.5, seat(0.0, 0.003, grip.press_rad)),
+            (3.65, seat(0.0, 0.003, grip.press_rad)),
+            (4.05, seat(0.0, 0.003, grip.open_rad)),
+            (4.45, seat(0.0, 0.07, grip.open_rad)),
+            (5.0, moved(seat(0.0, 0.07, grip.open_rad), [0.16, -0.04, 0.02])),
         ]
-        rest = relaxed("left", domain)
-        return [Waypoint(time_s, rest, pose) for time_s, pose in path]
+        return with_right_hand(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Seated in the stand, at rest, untouched."""
-        return bool(
-            _is_seated(_in_cradle(simulation))
-            and simulation.object_speeds()[0] < REST_SPEED
-            and not simulation.hand_touches_object()
-        )
+        return _is_seated(_in_cradle(simulation)) and is_left(simulation, 0)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """Touched by a hand; lifted by 3 cm; over the stand; seated; released."""
@@ -214,7 +200,7 @@ class PlacePhone:
         return (
             touched,
             lifted,
-            lifted and _is_near(T_cradle_phone),
+            lifted and bool(np.linalg.norm(T_cradle_phone[:3, 3] - _SEATED_M) < _NEAR_M),
             _is_seated(T_cradle_phone),
             self.succeeded(simulation),
         )

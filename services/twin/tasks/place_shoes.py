@@ -8,13 +8,12 @@ from jaxtyping import Float64
 from dextouch.geometry import transform, transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation
 from dextouch.tactile.layout import Side
-from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
-from services.twin.grasps import CylinderGrasp, opened, pressing
-from services.twin.hands import twin_hand
+from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, bent, moved
+from services.twin.grasps import CylinderGrasp
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import REST_SPEED, THUMB_UP, yawed
+from services.twin.tasks.task import SIGNS, THUMB_UP, Draw, Grip, Noise, Poses, is_left, yawed
 
 # A boot's frame: origin below the centre of its sole, y towards the toe, z up.
 _SOLE_HALF_M: Final = (0.030, 0.065, 0.008)
@@ -132,22 +131,14 @@ class PlaceShoes:
         poses[:, 3:] = [quaternion_from_rotation(yawed(turn)) for turn in yaw]
         return poses
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "3 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Both hands: approach the shafts, enclose, close, lift, carry, lower, open, withdraw."""
-        start_m = generator.uniform(-0.02, 0.02, size=(2, 3))
-        over_m = generator.uniform(-0.015, 0.015, size=3)
-        T_rack = transform_from_pose(object_poses[2])
+        start_m = draw.uniform(-0.02, 0.02, size=(2, 3))
+        over_m = draw.uniform(-0.015, 0.015, size=3)
+        T_rack = transform_from_pose(poses[2])
         tracks = []
-        sides: tuple[tuple[Side, float], ...] = (("left", -1.0), ("right", 1.0))
-        for index, (side, sign) in enumerate(sides):
-            T_shoe = transform_from_pose(object_poses[index])
+        for index, (side, sign) in enumerate(SIGNS):
+            T_shoe = transform_from_pose(poses[index])
             slot = T_rack @ np.array([sign * _SLOT_X_M, 0.0, 2 * _RACK_HALF_M[2], 1.0])
             T_goal = transform(T_rack[:3, :3], slot[:3])
             tracks.append(
@@ -168,23 +159,19 @@ class PlaceShoes:
     ) -> list[tuple[float, HandPose]]:
         """Timed poses of one hand that carries a boot from the first pose to the second."""
         grasp, outwards = _GRASPS[domain], -1.0 if side == "left" else 1.0
-        open_hand = opened(grasp, domain, gap_m=_OPEN_M)
-        press = pressing(grasp, domain, force_n=_SQUEEZE_N)
-        R_axis = grasp.axis_rotation()
-        axis_point = grasp.axis_point_m(twin_hand(side, domain))
+        grip = Grip(grasp, domain, gap_m=_OPEN_M, force_n=_SQUEEZE_N)
 
         def around(T_world_shoe: np.ndarray, error: WaypointNoise) -> HandPose:
             R_shoe = yawed(_yaw_rad(T_world_shoe) + error.yaw_rad)
             shaft = R_shoe @ np.array([0.0, _SHAFT_Y_M, _GRASP_HEIGHT_M])
-            R = R_shoe @ THUMB_UP @ R_axis.T
-            held_m = T_world_shoe[:3, 3] + error.offset_m + shaft
-            return HandPose(transform(R, held_m - R @ axis_point), open_hand)
+            point = T_world_shoe[:3, 3] + error.offset_m + shaft
+            return grip.around(R_shoe @ THUMB_UP, point, side=side)
 
         start_m, over_m = habits_m
         beside = np.array([outwards * 0.11, -0.02, 0.03])
         reach, put = around(Ts_world_shoe[0], noise[0]), around(Ts_world_shoe[1], noise[1])
-        before = moved(around(Ts_world_shoe[0], WaypointNoise(np.zeros(3), 0.0)), beside + start_m)
-        took, down = bent(reach, press), bent(moved(put, [0.0, 0.0, -_PUSH_M]), press)
+        before = moved(around(Ts_world_shoe[0], NO_NOISE), beside + start_m)
+        took, down = grip.pressed(reach), grip.pressed(moved(put, [0.0, 0.0, -_PUSH_M]))
         return [
             (0.0, before),
             (0.9, reach),
@@ -194,17 +181,13 @@ class PlaceShoes:
             (2.8, moved(down, over_m + np.array([0.0, 0.0, 0.8 * _LIFT_M]))),
             (3.4, down),
             (3.6, down),
-            (4.0, bent(down, open_hand)),
-            (4.9, moved(bent(down, open_hand), beside)),
+            (4.0, bent(down, grip.open_rad)),
+            (4.9, moved(bent(down, grip.open_rad), beside)),
         ]
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Both boots upright at their positions on the rack, at rest, untouched."""
-        return bool(
-            all(_in_place(simulation))
-            and simulation.object_speeds().max() < REST_SPEED
-            and not simulation.hand_touches_object()
-        )
+        return all(_in_place(simulation)) and is_left(simulation)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """A boot touched; one, then both lifted or placed; one, then both placed; released.

@@ -5,15 +5,22 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.geometry import transform, transform_from_pose
-from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
-from services.twin.grasps import opened, pressing
-from services.twin.hands import twin_hand
+from dextouch.geometry import transform_from_pose
+from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, moved
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
 from services.twin.tasks.cans import CAN_GRASPS, CAN_RADIUS_M, can_mjcf
-from services.twin.tasks.task import REST_SPEED, THUMB_UP, relaxed, yawed
+from services.twin.tasks.task import (
+    REST_SPEED,
+    THUMB_UP,
+    Draw,
+    Grip,
+    Noise,
+    Poses,
+    with_right_hand,
+    yawed,
+)
 
 _HALF_LENGTH_M, _MASS_KG = 0.100, 0.16
 # The stand: four walls around the can's lower part, so that only its upper half can be grasped.
@@ -71,42 +78,32 @@ class RegraspCan:
         poses[_CAN, 2] = _HALF_LENGTH_M
         return poses
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "2 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Approach, close, lift out, set down, open, move down, close, lift."""
-        grasp = CAN_GRASPS[domain]
-        open_hand = opened(grasp, domain, gap_m=_OPEN_M)
-        press = pressing(grasp, domain, force_n=_SQUEEZE_N)
-        R_axis = grasp.axis_rotation()
-        gripped = grasp.axis_point_m(twin_hand("right", domain))
-        start_m, aside_m, high_m = generator.uniform(-0.02, 0.02, size=(3, 3))
+        grip = Grip(CAN_GRASPS[domain], domain, gap_m=_OPEN_M, force_n=_SQUEEZE_N)
+        start_m, aside_m, high_m = draw.uniform(-0.02, 0.02, size=(3, 3))
 
         def hand(can_m: np.ndarray, height_m: float, error: WaypointNoise) -> HandPose:
             """Open hand with its palm to the left, around a can that stands at a point."""
-            R = yawed(error.yaw_rad) @ THUMB_UP @ R_axis.T
-            grip = np.array([can_m[0], can_m[1], height_m]) + error.offset_m
-            return HandPose(transform(R, grip - R @ gripped), open_hand)
+            point = np.array([can_m[0], can_m[1], height_m]) + error.offset_m
+            return grip.around(yawed(error.yaw_rad) @ THUMB_UP, point)
 
-        exact = WaypointNoise(np.zeros(3), 0.0)
-        stands_m = object_poses[_STAND, :3]
+        stands_m = poses[_STAND, :3]
         spot_m = stands_m + _ASIDE_M + aside_m * [1.0, 1.0, 0.0]
         reach = hand(stands_m, _HIGH_M, noise[0])
-        took = bent(reach, press)
+        took = grip.pressed(reach)
         put = moved(reach, spot_m - stands_m - [0.0, 0.0, _PUSH_M])
-        down = bent(put, press)
+        down = grip.pressed(put)
         again = hand(
             spot_m, _LOW_M, WaypointNoise(noise[0].offset_m + noise[1].offset_m, noise[1].yaw_rad)
         )
-        retook = bent(again, press)
+        retook = grip.pressed(again)
         raised = moved(retook, 0.5 * high_m + [0.0, 0.0, 0.11])
         path = [
-            (0.0, moved(hand(stands_m, _HIGH_M, exact), start_m + np.array([0.12, -0.05, 0.01]))),
+            (
+                0.0,
+                moved(hand(stands_m, _HIGH_M, NO_NOISE), start_m + np.array([0.12, -0.05, 0.01])),
+            ),
             (0.60, reach),
             (0.90, took),
             (1.00, took),
@@ -121,8 +118,7 @@ class RegraspCan:
             (4.05, raised),
             (4.80, raised),
         ]
-        rest = relaxed("left", domain)
-        return [Waypoint(time_s, rest, pose) for time_s, pose in path]
+        return with_right_hand(path, domain)
 
     @staticmethod
     def _can_transform(simulation: Simulation) -> Float64[np.ndarray, "4 4"]:

@@ -5,15 +5,23 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.geometry import invert, transform, transform_from_pose
+from dextouch.geometry import invert, transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation
-from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
-from services.twin.grasps import CylinderGrasp, opened, pressing
-from services.twin.hands import twin_hand
+from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, bent, moved
+from services.twin.grasps import CylinderGrasp
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import REST_SPEED, THUMB_UP, relaxed, yawed
+from services.twin.tasks.task import (
+    THUMB_UP,
+    Draw,
+    Grip,
+    Noise,
+    Poses,
+    is_left,
+    with_right_hand,
+    yawed,
+)
 
 # The ball's frame: on the table below it. The ball is two halves on springs along y. It is turned,
 # so that the viewer sees the hand behind the ball, and both pins.
@@ -99,60 +107,40 @@ class SqueezeBall:
         R = yawed(_TURNED_RAD + float(generator.uniform(-0.2, 0.2)))
         pin_z = _CENTRE_Z_M + _PIN_Z_M
         offsets = np.array(
-            [
-                [0.0, 0.0, 0.0],
-                *([0.0, -inwards * _PIN_Y_M, pin_z] for _, inwards in _SIDES),
-            ]
+            [[0.0, 0.0, 0.0], *([0.0, -inwards * _PIN_Y_M, pin_z] for _, inwards in _SIDES)]
         )
         places = np.array([0.01 + x, 0.03 + y, 0.0]) + offsets @ R.T
         return np.concatenate([places, np.tile(quaternion_from_rotation(R), (3, 1))], axis=1)
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "3 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Approach from the side, enclose, squeeze slowly, hold, open, withdraw."""
-        grasp = _GRASPS[domain]
-        open_hand = opened(grasp, domain, gap_m=_OPEN_M)
-        press = pressing(grasp, domain, force_n=_SQUEEZE_N)
-        R_axis = grasp.axis_rotation()
-        gripped = grasp.axis_point_m(twin_hand("right", domain))
-        start_m, away_m = generator.uniform(-0.02, 0.02, size=(2, 3))
-        T_world_stand = transform_from_pose(object_poses[0])
+        grip = Grip(_GRASPS[domain], domain, gap_m=_OPEN_M, force_n=_SQUEEZE_N)
+        start_m, away_m = draw.uniform(-0.02, 0.02, size=(2, 3))
+        T_world_stand = transform_from_pose(poses[0])
 
         def hand(error: WaypointNoise) -> HandPose:
             """Open hand around the ball, its palm to the left."""
-            R = yawed(error.yaw_rad) @ T_world_stand[:3, :3] @ THUMB_UP @ R_axis.T
             middle = T_world_stand[:3, 3] + error.offset_m + [0.0, 0.0, _CENTRE_Z_M]
-            return HandPose(transform(R, middle - R @ gripped), open_hand)
+            return grip.around(yawed(error.yaw_rad) @ T_world_stand[:3, :3] @ THUMB_UP, middle)
 
         aside = T_world_stand[:3, :3] @ np.array([0.13, -0.03, 0.02])
         reach = hand(noise[0])
         # The hand drifts by a part of the second error while it squeezes.
-        squeezed = bent(moved(reach, 0.3 * noise[1].offset_m), press)
-        opened_again = bent(squeezed, open_hand)
+        squeezed = grip.pressed(moved(reach, 0.3 * noise[1].offset_m))
+        opened_again = bent(squeezed, grip.open_rad)
         path = [
-            (0.0, moved(hand(WaypointNoise(np.zeros(3), 0.0)), aside + start_m)),
+            (0.0, moved(hand(NO_NOISE), aside + start_m)),
             (0.9, reach),
             (1.9, squeezed),
             (2.7, squeezed),
             (3.3, opened_again),
             (4.6, moved(opened_again, aside + away_m)),
         ]
-        rest = relaxed("left", domain)
-        return [Waypoint(time_s, rest, pose) for time_s, pose in path]
+        return with_right_hand(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Both pins pushed in by 4.5 mm, at rest, and neither they nor the ball touched."""
-        return bool(
-            _inwards_m(simulation) > _SQUEEZED_M
-            and simulation.object_speeds().max() < REST_SPEED
-            and not simulation.hand_touches_object()
-        )
+        return _inwards_m(simulation) > _SQUEEZED_M and is_left(simulation)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """Touched by a hand; both pins pushed in by 2 mm; by 4.5 mm; released."""

@@ -5,14 +5,12 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.geometry import transform, transform_from_pose
-from dextouch.tactile.layout import Side
-from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise
-from services.twin.hands import twin_hand
+from dextouch.geometry import transform_from_pose
+from services.twin.demonstrators import HandPose, Waypoint
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import REST_SPEED, THUMB_UP, flat, yawed
+from services.twin.tasks.task import SIGNS, THUMB_UP, Draw, Noise, Poses, is_left, with_palm, yawed
 
 _NUM_WALLS: Final = 12
 _WALL_HALF_M: Final = (0.017, 0.024, 0.003)
@@ -82,34 +80,23 @@ class StackBowls:
         poses[:, 3], poses[:, 6] = np.cos(half_yaw), np.sin(half_yaw)
         return poses
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "2 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Enclose the bowl, lower, squeeze, lift, carry, nest, open, withdraw."""
-        joints = flat(domain)
-        start_m, over_m = generator.uniform(-0.02, 0.02, size=(2, 3))
+        start_m, over_m = draw.uniform(-0.02, 0.02, size=(2, 3))
         rim_z = _RIM_HEIGHT_M + _PALM_ABOVE_RIM_M
 
         def around(
             bowl_m: np.ndarray, height_m: float, gap_m: float, yaw_rad: float
         ) -> tuple[HandPose, HandPose]:
             R_yaw = yawed(yaw_rad)
-            R = R_yaw @ THUMB_UP
             hands = []
-            sides: tuple[tuple[Side, float], ...] = (("left", -1.0), ("right", 1.0))
-            for side, sign in sides:
+            for side, sign in SIGNS:
                 reach = R_yaw @ np.array([sign * (_RIM_RADIUS_M + gap_m), 0.0, 0.0])
                 palm = np.array([bowl_m[0], bowl_m[1], rim_z + height_m]) + reach
-                wrist = palm - R @ twin_hand(side, domain).palm_centre_m
-                hands.append(HandPose(transform(R, wrist), joints))
+                hands.append(with_palm(side, domain, R_yaw @ THUMB_UP, palm))
             return hands[0], hands[1]
 
-        source, goal = object_poses[0, :3], object_poses[1, :3]
+        source, goal = poses[0, :3], poses[1, :3]
         took, put = source + noise[0].offset_m, goal + noise[1].offset_m
         turn_take, turn_put = noise[0].yaw_rad, noise[1].yaw_rad
         steps = [
@@ -129,11 +116,7 @@ class StackBowls:
 
     def succeeded(self, simulation: Simulation) -> bool:
         """One bowl upright in the other, within 12 mm sideways, both at rest and untouched."""
-        return bool(
-            _is_nested(simulation.object_poses())
-            and simulation.object_speeds().max() < REST_SPEED
-            and not simulation.hand_touches_object()
-        )
+        return _is_nested(simulation.object_poses()) and is_left(simulation)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """Touched by a hand; lifted by 3 cm; over the other bowl; nested; released."""

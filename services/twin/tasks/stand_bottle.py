@@ -5,15 +5,23 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.geometry import transform, transform_from_pose
+from dextouch.geometry import transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
-from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
-from services.twin.grasps import CylinderGrasp, opened, pressing
-from services.twin.hands import twin_hand
+from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, bent, moved
+from services.twin.grasps import CylinderGrasp
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import PALM_DOWN, REST_SPEED, relaxed, yawed
+from services.twin.tasks.task import (
+    PALM_DOWN,
+    Draw,
+    Grip,
+    Noise,
+    Poses,
+    is_left,
+    with_right_hand,
+    yawed,
+)
 
 _RADIUS_M: Final = 0.025
 _HALF_LENGTH_M: Final = 0.115
@@ -94,63 +102,48 @@ class StandBottle:
         R = yawed(float(generator.uniform(-0.25, 0.25))) @ _LYING
         return np.array([[0.08 + x, 0.02 + y, _FOOT_RADIUS_M, *quaternion_from_rotation(R)]])
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "1 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Move over it, down, close, lift, roll, set down, open, withdraw."""
-        grasp = _GRASPS[domain]
-        open_hand = opened(grasp, domain, gap_m=_OPEN_M)
-        press = pressing(grasp, domain, force_n=_SQUEEZE_N)
-        T_world_bottle = transform_from_pose(object_poses[0])
+        grip = Grip(_GRASPS[domain], domain, gap_m=_OPEN_M, force_n=_SQUEEZE_N)
+        T_world_bottle = transform_from_pose(poses[0])
         yaw = float(np.arctan2(-T_world_bottle[1, 2], -T_world_bottle[0, 2]))
-        R_axis = grasp.axis_rotation()
-        offset = grasp.axis_point_m(twin_hand("right", domain)) + _ALONG_M * R_axis[:, 0]
-        start_m, target_m = generator.uniform(-0.02, 0.02, size=(2, 3))
+        start_m, target_m = draw.uniform(-0.02, 0.02, size=(2, 3))
 
-        held = grasp.axis_point_m(twin_hand("right", domain)) + R_axis @ _HELD_MIDDLES_M[domain]
+        def hand(error: WaypointNoise) -> HandPose:
+            """Open hand around the bottle, its palm down."""
+            R, point = (
+                yawed(yaw + error.yaw_rad) @ PALM_DOWN,
+                T_world_bottle[:3, 3] + error.offset_m,
+            )
+            return grip.around(R, point, held_m=(_ALONG_M, 0.0, 0.0))
 
-        def hand(R_world_wrist: np.ndarray, bottle_m: np.ndarray, joints: np.ndarray) -> HandPose:
-            return HandPose(transform(R_world_wrist, bottle_m - R_world_wrist @ offset), joints)
-
-        R_down = yawed(yaw) @ PALM_DOWN @ R_axis.T
-        R_grasp = yawed(yaw + noise[0].yaw_rad) @ PALM_DOWN @ R_axis.T
         R_up = yawed(yaw + noise[1].yaw_rad) @ _ROLL_UP @ PALM_DOWN
-        R_up = R_up @ _turn_to_x(np.array(_HELD_AXES[domain])) @ R_axis.T
-        there = T_world_bottle[:3, 3]
-        above = moved(hand(R_down, there, open_hand), start_m + np.array([0.0, -0.02, 0.14]))
-        reach = hand(R_grasp, there + noise[0].offset_m, open_hand)
+        R_up = R_up @ _turn_to_x(np.array(_HELD_AXES[domain]))
+        above = moved(hand(NO_NOISE), start_m + np.array([0.0, -0.02, 0.14]))
+        reach = hand(noise[0])
+        took = grip.pressed(reach)
         target = np.array([0.08, 0.04, _HALF_LENGTH_M]) + target_m * [1.0, 1.0, 0.0]
-        stand = HandPose(transform(R_up, target + noise[1].offset_m - R_up @ held), press)
-        away = moved(bent(stand, open_hand), [0.13, -0.02, 0.02])
+        there = target + noise[1].offset_m
+        stand = grip.pressed(grip.around(R_up, there, held_m=_HELD_MIDDLES_M[domain]))
+        away = moved(bent(stand, grip.open_rad), [0.13, -0.02, 0.02])
         path = [
             (0.0, above),
             (0.8, reach),
-            (1.15, bent(reach, press)),
-            (1.3, bent(reach, press)),
-            (1.85, moved(bent(reach, press), [0.0, 0.0, 0.14])),
+            (1.15, took),
+            (1.3, took),
+            (1.85, moved(took, [0.0, 0.0, 0.14])),
             (2.6, moved(stand, [0.0, 0.0, 0.05])),
             (3.1, moved(stand, [0.0, 0.0, _PUSH_M])),
             (3.3, moved(stand, [0.0, 0.0, _PUSH_M])),
-            (3.3 + _RELEASE_S, moved(bent(stand, open_hand), [0.0, 0.0, _PUSH_M])),
+            (3.3 + _RELEASE_S, moved(bent(stand, grip.open_rad), [0.0, 0.0, _PUSH_M])),
             (4.8, away),
         ]
-        rest = relaxed("left", domain)
-        return [Waypoint(time_s, rest, pose) for time_s, pose in path]
+        return with_right_hand(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Upright within 8°, on the table within 1 cm, at rest, untouched."""
         pose = simulation.object_poses()[0]
-        return bool(
-            _is_upright(pose)
-            and _is_at_standing_height(pose)
-            and simulation.object_speeds()[0] < REST_SPEED
-            and not simulation.hand_touches_object()
-        )
+        return bool(_is_upright(pose) and _is_at_standing_height(pose) and is_left(simulation, 0))
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """Touched by a hand; lifted by 3 cm; upright; standing; released."""

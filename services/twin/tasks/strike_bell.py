@@ -7,12 +7,21 @@ from jaxtyping import Float64
 
 from dextouch.geometry import invert, transform, transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation
-from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, moved
+from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, moved
 from services.twin.hands import twin_hand
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import PALM_DOWN, REST_SPEED, flat, relaxed, yawed
+from services.twin.tasks.task import (
+    PALM_DOWN,
+    Draw,
+    Noise,
+    Poses,
+    flat,
+    is_left,
+    with_right_hand,
+    yawed,
+)
 
 # The bell's frame: on the table below the plunger, y away from the viewer. Top of the plunger,
 # its travel and the part of it after which its arm meets the flag's crank.
@@ -131,19 +140,12 @@ class StrikeBell:
         parts = stand + offsets
         return np.concatenate([parts, np.tile(quaternion_from_rotation(R), (3, 1))], axis=1)
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "3 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Move over the plunger, strike, withdraw upwards and to the right."""
-        start_m, away_m = generator.uniform(-0.02, 0.02, size=(2, 3))
+        start_m, away_m = draw.uniform(-0.02, 0.02, size=(2, 3))
         shape = twin_hand("right", domain).shape
         palm = np.array([_PALM_X_M, shape.palm_face_m, shape.palm_z_m])
-        T_world_stand = transform_from_pose(object_poses[_STAND])
+        T_world_stand = transform_from_pose(poses[_STAND])
 
         def hand(up_m: float, error: WaypointNoise) -> HandPose:
             """Palm at a height above the plunger's top."""
@@ -152,7 +154,7 @@ class StrikeBell:
             return HandPose(transform(R, top - R @ palm), flat(domain))
 
         aim = WaypointNoise(noise[0].offset_m + 0.3 * noise[1].offset_m, noise[0].yaw_rad)
-        before = moved(hand(_ABOVE_M, WaypointNoise(np.zeros(3), 0.0)), start_m)
+        before = moved(hand(_ABOVE_M, NO_NOISE), start_m)
         path = [
             (0.0, moved(before, _AWAY_M)),
             (1.0, hand(_ABOVE_M, aim)),
@@ -163,16 +165,14 @@ class StrikeBell:
             (3.2, moved(hand(_ABOVE_M, aim), away_m + _AWAY_M)),
             (4.8, moved(hand(_ABOVE_M, aim), 1.1 * (away_m + _AWAY_M))),
         ]
-        rest = relaxed("left", domain)
-        return [Waypoint(time_s, rest, pose) for time_s, pose in path]
+        return with_right_hand(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """The flag thrown over, the plunger up again, all at rest and untouched."""
         return bool(
             _flag_rad(simulation) > _RUNG_RAD
             and _depth_m(simulation) < 0.1 * _TRAVEL_M
-            and simulation.object_speeds().max() < REST_SPEED
-            and not simulation.hand_touches_object()
+            and is_left(simulation)
         )
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:

@@ -1,5 +1,6 @@
 """Protocol of tasks: objects and placement, demonstrator script, milestones, success check."""
 
+from collections.abc import Iterable, Sequence
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
@@ -8,13 +9,24 @@ from jaxtyping import Float64
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.tactile.layout import Side
-from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise
+from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent
+from services.twin.grasps import CylinderGrasp, opened, pressing
 from services.twin.hands import twin_hand
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
 
 # An object slower than this (m/s and rad/s) is at rest.
 REST_SPEED: Final = 0.05
+# Hands with the sign of the x axis on their side.
+SIGNS: Final[tuple[tuple[Side, float], ...]] = (("left", -1.0), ("right", 1.0))
+# R_world_wrist with fingers forward (world +y) and the palm down, for the right and left hand.
+PALM_DOWN: Final = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+PALM_DOWN_LEFT: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+# Thumbs up, fingers forward: the right palm faces world -x, the left one +x.
+THUMB_UP: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+Poses = Float64[np.ndarray, "objects 7"]
+Draw = np.random.Generator
+Noise = tuple[WaypointNoise, WaypointNoise]
 
 
 @runtime_checkable
@@ -45,28 +57,21 @@ class Task(Protocol):
         """MJCF of the bodies, with geoms of class `object`.
 
         Each has a free joint, or is a fixed `mocap="true"` body, or is attached to one by hinges or
-        slides; see `services.twin.object_bodies`.
+        slides; see `services.twin.scene`.
         """
         ...
 
-    def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "objects 7"]:
+    def place(self, generator: Draw) -> Poses:
         """T_world_object at the start, joints at rest: x y z (m), qw qx qy qz."""
         ...
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "objects 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Waypoints of the demonstrator.
 
         Args:
-            object_poses: poses assumed by the demonstrator.
+            poses: those of the objects that the demonstrator assumes.
             domain: robot or human hands.
-            generator: source of variations between takes that are independent of `noise`.
+            draw: source of variations between takes that are independent of `noise`.
             noise: errors at the first (grasp) and second (place) location. The first waypoint has
                 none.
         """
@@ -85,15 +90,6 @@ class Task(Protocol):
         Contacts of the simulation must be current, as at every grid step.
         """
         ...
-
-
-# Hand orientations and postures shared by several tasks.
-
-# R_world_wrist with fingers forward (world +y) and the palm down, for the right and left hand.
-PALM_DOWN: Final = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
-PALM_DOWN_LEFT: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-# Thumbs up, fingers forward: the right palm faces world -x, the left one +x.
-THUMB_UP: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 def yawed(yaw_rad: float) -> Float64[np.ndarray, "3 3"]:
@@ -119,3 +115,57 @@ def relaxed(side: Side, domain: Domain) -> HandPose:
     hand = twin_hand(side, domain)
     clipped = np.clip(joints, hand.kinematics.lower_rad, hand.kinematics.upper_rad)
     return HandPose(transform(R, np.array([x, -0.16, 0.13])), clipped)
+
+
+def with_right_hand(path: Iterable[tuple[float, HandPose]], domain: Domain) -> list[Waypoint]:
+    """Waypoints of a right hand at times (s), while the left one rests."""
+    rest = relaxed("left", domain)
+    return [Waypoint(time_s, rest, pose) for time_s, pose in path]
+
+
+def with_palm(side: Side, domain: Domain, R: np.ndarray, palm_m: np.ndarray) -> HandPose:
+    """A flat hand, turned by R_world_wrist, with the centre of its palm at a point."""
+    wrist_m = palm_m - R @ twin_hand(side, domain).palm_centre_m
+    return HandPose(transform(R, wrist_m), flat(domain))
+
+
+class Grip:
+    """A hand around a cylinder: open by `gap_m`, and the targets that press it with `force_n`."""
+
+    def __init__(
+        self, grasp: CylinderGrasp, domain: Domain, *, gap_m: float, force_n: float
+    ) -> None:
+        self.open_rad = opened(grasp, domain, gap_m=gap_m)
+        self.press_rad = pressing(grasp, domain, force_n=force_n)
+        self._grasp, self._domain, self._R_wrist_axis = grasp, domain, grasp.axis_rotation()
+
+    def around(
+        self,
+        R: Float64[np.ndarray, "3 3"],
+        point_m: np.ndarray,
+        *,
+        side: Side = "right",
+        held_m: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> HandPose:
+        """The open hand at a cylinder.
+
+        Args:
+            R: R_world_axis; x is the axis of the cylinder.
+            point_m: in the world.
+            side: of the hand.
+            held_m: what is at that point, in the frame of the cylinder.
+        """
+        R_world_wrist = R @ self._R_wrist_axis.T
+        middle_m = self._grasp.axis_point_m(twin_hand(side, self._domain))
+        held = middle_m + self._R_wrist_axis @ held_m
+        return HandPose(transform(R_world_wrist, point_m - R_world_wrist @ held), self.open_rad)
+
+    def pressed(self, hand: HandPose) -> HandPose:
+        """A hand that presses."""
+        return bent(hand, self.press_rad)
+
+
+def is_left(simulation: Simulation, index: int | slice = slice(None)) -> bool:
+    """Whether objects are at rest, all or one, and no hand touches any."""
+    at_rest = np.max(simulation.object_speeds()[index]) < REST_SPEED
+    return bool(at_rest and not simulation.hand_touches_object())

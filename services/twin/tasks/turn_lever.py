@@ -5,14 +5,22 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.geometry import transform, transform_from_pose
+from dextouch.geometry import transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation
-from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, moved
-from services.twin.hands import twin_hand
+from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, moved
 from services.twin.mjcf import numbers
 from services.twin.names import Domain
 from services.twin.simulation import Simulation
-from services.twin.tasks.task import REST_SPEED, THUMB_UP, flat, relaxed, yawed
+from services.twin.tasks.task import (
+    THUMB_UP,
+    Draw,
+    Noise,
+    Poses,
+    is_left,
+    with_palm,
+    with_right_hand,
+    yawed,
+)
 
 # The valve's frame: on the table below the pivot; the closed lever points along x and turns
 # clockwise, seen from above.
@@ -82,18 +90,10 @@ class TurnLever:
         poses[_LEVER, 2] = _ARM_Z_M
         return poses
 
-    def script(
-        self,
-        object_poses: Float64[np.ndarray, "2 7"],
-        *,
-        domain: Domain,
-        generator: np.random.Generator,
-        noise: tuple[WaypointNoise, WaypointNoise],
-    ) -> list[Waypoint]:
+    def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
         """Move over the table beside the grip, down, push along the arc, back, up, withdraw."""
-        start_m, away_m = generator.uniform(-0.02, 0.02, size=(2, 3))
-        T_world_valve = transform_from_pose(object_poses[_VALVE])
-        palm = twin_hand("right", domain).palm_centre_m
+        start_m, away_m = draw.uniform(-0.02, 0.02, size=(2, 3))
+        T_world_valve = transform_from_pose(poses[_VALVE])
 
         def hand(angle_rad: float, gap_m: float, up_m: float, error: WaypointNoise) -> HandPose:
             """Fingers towards the pivot, the palm behind the grip of a lever at an angle."""
@@ -102,12 +102,11 @@ class TurnLever:
             palm_world = T_world_valve[:3, 3] + R_lever @ behind + error.offset_m
             palm_world[2] = _PALM_Z_M + up_m
             R = yawed(error.yaw_rad) @ R_lever @ yawed(0.5 * np.pi) @ THUMB_UP
-            return HandPose(transform(R, palm_world - R @ palm), flat(domain))
+            return with_palm("right", domain, R, palm_world)
 
         took, put = noise
-        exact = WaypointNoise(np.zeros(3), 0.0)
         path = [
-            (0.0, moved(hand(0.0, _AWAY_M + 0.05, 0.06, exact), start_m)),
+            (0.0, moved(hand(0.0, _AWAY_M + 0.05, 0.06, NO_NOISE), start_m)),
             (0.7, hand(0.0, _BESIDE_M, 0.08, took)),
             (1.1, hand(0.0, _BESIDE_M, 0.0, took)),
             (1.4, hand(0.0, 0.0, 0.0, took)),
@@ -125,16 +124,11 @@ class TurnLever:
             (4.1, hand(_PUSH_RAD, _AWAY_M, 0.08, put)),
             (4.8, moved(hand(_PUSH_RAD, _AWAY_M + 0.08, 0.08, put), away_m)),
         ]
-        rest = relaxed("left", domain)
-        return [Waypoint(time_s, rest, pose) for time_s, pose in path]
+        return with_right_hand(path, domain)
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Turned by 60° or more, at rest, untouched."""
-        return bool(
-            _turned_rad(simulation) > _TURNED_RAD
-            and simulation.object_speeds()[_LEVER] < REST_SPEED
-            and not simulation.hand_touches_object()
-        )
+        return _turned_rad(simulation) > _TURNED_RAD and is_left(simulation, _LEVER)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """Lever touched by a hand; turned by 10°; turned by 60°; released and at rest."""

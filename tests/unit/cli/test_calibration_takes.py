@@ -17,7 +17,7 @@ from services.acquisition.devices import load_calibration
 from services.alignment.calibration.motion import DegenerateMotionError
 from services.alignment.station_calibration.judgement import load
 from services.cli import main as command_line
-from services.pipelines.calibrate.command import main
+from services.pipelines.calibrate import main
 from services.pipelines.calibrate.show import show
 from tests.accuracy.test_robot_base import pairs
 from tests.accuracy.test_time_offset import taps

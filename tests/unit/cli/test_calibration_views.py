@@ -22,7 +22,7 @@ from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector
 from services.alignment.station_calibration import boards
 from services.alignment.station_calibration import camera_views as camera
-from services.pipelines.calibrate.command import main
+from services.pipelines.calibrate import main
 from tests.unit.cli.rendered_boards import (
     BOARD,
     SIZE,

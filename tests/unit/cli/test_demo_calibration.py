@@ -11,8 +11,8 @@ from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.gloves import GloveCalibration
 from services.acquisition.mocks.pattern import pattern_streams
 from services.alignment.settings import AlignmentOptions
+from services.pipelines import demo_takes as recording
 from services.pipelines import mock_takes
-from services.pipelines.demo import recording
 from tests.unit.bridges.takes import write_episode
 
 SEED = 3

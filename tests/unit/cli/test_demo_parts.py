@@ -14,12 +14,12 @@ from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas import LineageEntry
 from services.evaluation.scores import REAL, RolloutScore
-from services.pipelines.demo.command import Stages, show, worst_errors
-from services.pipelines.demo.recording import align, forget_take
-from services.pipelines.demo.scoring import LADDER, MODEL, ladder, mistake_comment, mistake_rows
-from services.pipelines.demo.settings import FIRST_HELD_OUT_SEED, parse
+from services.pipelines.demo import Stages, show, worst_errors
+from services.pipelines.demo_scoring import LADDER, MODEL, ladder, mistake_comment, mistake_rows
+from services.pipelines.demo_takes import align, forget_take
+from services.pipelines.parsers import FIRST_HELD_OUT_SEED, demo_plan
 from services.pipelines.servers import bind, served
-from services.pipelines.study.command import refuse_trained
+from services.pipelines.study import refuse_trained
 from services.twin.mistakes import DEVELOPMENT
 from services.twin.scripted_actions import mistake_of
 from services.world_model.state_checkpoints import write_state_checkpoint
@@ -125,12 +125,12 @@ def test_a_service_that_cannot_start_is_an_error():
 
 
 def test_held_out_seeds_are_never_training_seeds():
-    plan = parse(["--seeds", "3", "--output", "somewhere"])
+    plan = demo_plan(["--seeds", "3", "--output", "somewhere"])
     assert plan.output == Path("somewhere")
     assert min(plan.seeds) >= FIRST_HELD_OUT_SEED
     assert plan.take_seed not in plan.seeds
     with pytest.raises(SystemExit):
-        parse(["--seeds", "0"])
+        demo_plan(["--seeds", "0"])
 
 
 def test_the_table_shows_undefined_agreement(capsys):
@@ -191,7 +191,7 @@ def test_the_table_shows_undefined_agreement(capsys):
 
 
 def test_policies_that_do_not_look_are_good_and_bad_ones():
-    plan = replace(parse(["--seeds", "1"]), levels_mm=(0.0, 30.0), mistakes=("tilt 0.5",))
+    plan = replace(demo_plan(["--seeds", "1"]), levels_mm=(0.0, 30.0), mistakes=("tilt 0.5",))
     policies = ladder(plan)
     assert list(policies) == [
         "script 0 mm", "script 30 mm", "tilt 0.5", "hold", "retreat", "another scene's actions",
@@ -211,12 +211,12 @@ def test_policies_that_do_not_look_are_good_and_bad_ones():
 
 
 def test_the_demo_shows_three_kinds_of_mistakes_that_no_training_data_contain():
-    mistakes = [mistake_of(name) for name in parse(["--seeds", "1"]).mistakes]
+    mistakes = [mistake_of(name) for name in demo_plan(["--seeds", "1"]).mistakes]
     assert len({mistake.kind for mistake in mistakes} & set(DEVELOPMENT)) >= 3
 
 
 def test_rollouts_are_counted_by_kind_of_mistake():
-    plan = replace(parse(["--seeds", "2"]), levels_mm=(0.0, 30.0), mistakes=("tilt 0.5",))
+    plan = replace(demo_plan(["--seeds", "2"]), levels_mm=(0.0, 30.0), mistakes=("tilt 0.5",))
     # Real and imagined success of the first and the second seed.
     outcomes = {"script 0 mm": "1111", "script 30 mm": "0001", "tilt 0.5": "0101"}
     scores = [

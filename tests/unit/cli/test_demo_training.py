@@ -3,7 +3,7 @@
 import pytest
 
 from dextouch.serving import load_settings
-from services.pipelines.demo import scoring
+from services.pipelines import demo_scoring as scoring
 from services.world_model.settings import TrainStateCommand
 
 
@@ -21,7 +21,7 @@ def test_a_small_state_model_is_trained_before_its_endings_are_judged(tmp_path, 
         "data": (scoring.training_data, "main"),
         "world-model": (scoring, "run_train"),
         "policy": (scoring, "run_train_policy"),
-        "imagined": (scoring.imagined_data, "main"),
+        "imagined": (scoring.imagined_data, "imagined_main"),
         "judge": (scoring, "run_train_judge"),
     }.items():
         monkeypatch.setattr(

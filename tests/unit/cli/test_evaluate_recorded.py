@@ -6,7 +6,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from services.cli import main
 from services.evaluation.recorded_takes import REPLAY
-from services.pipelines import evaluate_recorded
+from services.pipelines import evaluate
 from services.pipelines.parsers import recorded_parser
 
 HOLD = "services.evaluation.policies.replay:HoldPolicy"
@@ -14,7 +14,7 @@ HOLD = "services.evaluation.policies.replay:HoldPolicy"
 
 def policies(*words):
     parsed = recorded_parser().parse_args(["--episodes", "takes", *words])
-    return evaluate_recorded._policies(parsed)
+    return evaluate._policies(parsed)
 
 
 def test_policies_have_the_names_that_they_are_given():
@@ -42,6 +42,6 @@ def test_malformed_words_are_refused(wrong, capsys):
 def test_a_store_without_takes_is_refused(tmp_path, capsys):
     EpisodeStore(tmp_path)
     with pytest.raises(NotFoundError, match=r"store 1 of 1, .* has none"):
-        evaluate_recorded.main(["--episodes", str(tmp_path)])
+        evaluate.recorded_main(["--episodes", str(tmp_path)])
     assert main.main(["evaluate", "recorded", "--episodes", str(tmp_path)]) == 3
     assert "has none; check its path" in capsys.readouterr().err

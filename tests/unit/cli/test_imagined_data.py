@@ -16,8 +16,8 @@ from services.generation import imagine_episode
 from services.pipelines.imagined_data import (
     WORLD,
     chosen_episodes,
+    imagined_main,
     judged_steps,
-    main,
 )
 from services.pipelines.parsers import seed_range
 from services.pipelines.servers import served
@@ -55,7 +55,7 @@ def test_judged_steps_are_three_at_every_end(truth):
 def test_a_judge_sees_what_it_would_have_seen_of_all_images(truth, checkpoint, tmp_path):
     report = tmp_path / "counts.json"
     flags = ["--episodes", truth.root, "--store", tmp_path / "few", "--checkpoint", checkpoint]
-    assert main([*map(str, flags), "--json", str(report), "--jobs", "2"]) == 0
+    assert imagined_main([*map(str, flags), "--json", str(report), "--jobs", "2"]) == 0
     assert json.loads(report.read_text()) == {"imagined": 1}
     few, every = EpisodeStore(tmp_path / "few"), EpisodeStore(tmp_path / "every")
     world = open_world(checkpoint)

@@ -6,10 +6,10 @@ from dextouch.episodes import TRASH_KINDS
 from services.episode_store.parser import store_parser
 from services.evaluation.prediction import all_metrics
 from services.evaluation.prediction_names import METRIC_NAMES
-from services.twin.data_mix import MIXES
 from services.twin.mistakes import KINDS
 from services.twin.names import DEFAULT_MIX, MISTAKE_KINDS, MIX_NAMES, TASK_NAMES, TASK_SETS
-from services.twin.tasks.registry import _TASKS
+from services.twin.take_options import MIXES
+from services.twin.tasks import _TASKS
 
 
 def test_tasks_mixes_and_mistakes_of_the_twin():

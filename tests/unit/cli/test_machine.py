@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from services.cli import doctor
-from services.cli.machine import Finding, Machine, is_free
+from services.cli.doctor import Finding, Machine, is_free
 
 MEMINFO = "MemTotal:       16384000 kB\nMemFree:          200000 kB\nMemAvailable:    8192000 kB\n"
 # A service with port 0 takes any free one.

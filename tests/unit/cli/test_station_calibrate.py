@@ -26,7 +26,7 @@ from services.acquisition.devices import load_calibration
 from services.acquisition.mocks.gloves import GloveCalibration
 from services.alignment.station_calibration import record
 from services.cli import main as command_line
-from services.pipelines.calibrate.command import main
+from services.pipelines.calibrate import main
 from services.pipelines.calibrate.show import show
 from tests.unit.cli.rendered_boards import (
     BOARD,

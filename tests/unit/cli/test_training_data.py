@@ -11,8 +11,8 @@ from dextouch.errors import ClockFitError, InvalidInputError, UnknownNameError
 from dextouch.jobs import Workers
 from services.pipelines import training_data
 from services.pipelines.training_data import PolicyChoice, Scope, make_training_data
-from services.twin.data_mix import MIXES, STRENGTHS, Mix, options_of
 from services.twin.mistakes import TRAINING
+from services.twin.take_options import MIXES, STRENGTHS, Mix, options_of
 
 
 def drawn(mix, seeds=2000, task="stand_bottle"):

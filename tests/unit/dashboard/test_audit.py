@@ -14,10 +14,16 @@ from dashboard_fakes import broken_upstream
 
 from dextouch.errors import InvalidInputError
 from services.dashboard.app import create_app
-from services.dashboard.audit import NUM_FILES, AuditEntry, AuditLog, RotatedLines
-from services.dashboard.audit_trail import ACTIONS, ALL_ACTIONS
-from services.dashboard.forwarding import FORWARDED
+from services.dashboard.audit import (
+    ACTIONS,
+    ALL_ACTIONS,
+    NUM_FILES,
+    AuditEntry,
+    AuditLog,
+    RotatedLines,
+)
 from services.dashboard.pages import page_router
+from services.dashboard.routes import FORWARDED
 from services.dashboard.settings import DashboardSettings
 
 KEY = "a-key-of-some-length"

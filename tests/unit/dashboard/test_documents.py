@@ -5,8 +5,7 @@ import pytest
 
 from dextouch.errors import NotFoundError
 from services.dashboard.app import create_app
-from services.dashboard.documents import Documents, find_documents
-from services.dashboard.pages import SCREENS
+from services.dashboard.pages import SCREENS, Documents, find_documents
 from services.dashboard.settings import DashboardSettings
 
 TEXT = """# First & last

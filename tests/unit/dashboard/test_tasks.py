@@ -3,9 +3,9 @@
 import pytest
 
 from dextouch.errors import InvalidInputError
-from services.dashboard.documents import load_tasks
+from services.dashboard.pages import load_tasks
 from services.twin.names import TASK_NAMES
-from services.twin.tasks.registry import get_task
+from services.twin.tasks import get_task
 
 
 def test_the_default_tasks_are_those_of_the_twin():

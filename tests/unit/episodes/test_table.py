@@ -17,9 +17,9 @@ from dextouch.episodes import (
 )
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import Review
+from services.twin.demonstrators import Motion
 from services.twin.episodes import record
 from services.twin.episodes import write_episode as write_truth
-from services.twin.motions import Motion
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions

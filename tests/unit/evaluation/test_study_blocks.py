@@ -12,7 +12,7 @@ from services.evaluation.scores import RolloutScore
 from services.evaluation.studies.definition import StudyDefinition
 from services.evaluation.studies.results import StudyResults, cells_of
 from services.evaluation.trained_networks import save_checkpoint
-from services.pipelines.study.command import blocks_of, main, run_block
+from services.pipelines.study import blocks_of, main, run_block
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
 

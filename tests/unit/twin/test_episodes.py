@@ -11,8 +11,8 @@ from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
 from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
 from dextouch.hands.actions import IDENTITY_POSE_9D
 from services.cli.main import main
+from services.twin.demonstrators import Motion
 from services.twin.episodes import record, write_episode
-from services.twin.motions import Motion
 from services.twin.names import MOTION_KINDS
 from services.twin.settings import TwinSettings
 from services.twin.simulation import Simulation

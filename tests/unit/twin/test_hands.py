@@ -10,7 +10,7 @@ from dextouch.tactile.layout import FINGERS
 from services.twin.hands import HumanHand, twin_hand
 from services.twin.names import DOMAINS
 from services.twin.scene import compile_scene
-from services.twin.tactile import TactileReader
+from services.twin.simulation import TactileReader
 
 
 def test_simulated_hands_are_where_forward_kinematics_says():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, UnknownNameError
+from services.twin.demonstrators import MotionScene
 from services.twin.mistakes import DEVELOPMENT, HELD_OUT, KINDS, TRAINING, Mistake, with_mistakes
-from services.twin.motions import MotionScene
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 

@@ -8,9 +8,9 @@ import pytest
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply
 from services.cli.main import main
+from services.twin.demonstrators import Motion, MotionScene, with_motion
 from services.twin.episodes import record
 from services.twin.hands import twin_hand
-from services.twin.motions import Motion, MotionScene, with_motion
 from services.twin.names import MOTION_KINDS
 from services.twin.take_options import TakeOptions
 

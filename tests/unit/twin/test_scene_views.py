@@ -7,8 +7,8 @@ from dextouch.episodes import EpisodeStore
 from dextouch.geometry import apply, invert
 from dextouch.hands.actions import poses_from_actions
 from services.evaluation.prediction_scenes import labelled
+from services.pipelines.twin_geometry import TABLE_LABEL, SceneViews
 from services.twin.episodes import TakeOptions, record, write_episode
-from services.twin.scene_views import TABLE_LABEL, SceneViews
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 
@@ -50,8 +50,8 @@ def test_a_rebuilt_step_looks_like_the_image_that_was_recorded(take):
 
 def test_pixels_have_the_colour_of_what_their_label_says(take):
     _, images, views, seen, *_ = take
-    for image, (_, view) in zip(images, seen, strict=True):
-        agrees = labelled(image[None], views.colours)[0] == view.labels
+    for image, (_, (labels, _)) in zip(images, seen, strict=True):
+        agrees = labelled(image[None], views.colours)[0] == labels
         # The rest are borders, after JPEG, and bodies of nearly one hue.
         assert agrees.mean() > 0.93
 
@@ -60,17 +60,17 @@ def test_every_body_is_seen_where_it_projects_to(take):
     """An object's pixels, back in the world by their depth, lie close to its pose."""
     stage, _, views, seen, poses, objects = take
     rays = stage.rig.rays("camera_head").reshape(PX, PX, 3)
-    for step, view in seen:
+    for step, (labels, depth_m) in seen:
         T_world_camera = poses.Ts_world_camera_head[step]
         for index, name in enumerate(views.names[4:]):
-            mask = view.labels == 4 + index
+            mask = labels == 4 + index
             if mask.sum() < 4:
                 continue
-            points = rays[mask] / rays[mask][:, 2:] * view.depth_m[mask][:, None]
+            points = rays[mask] / rays[mask][:, 2:] * depth_m[mask][:, None]
             world = apply(T_world_camera, points)
             extent_m = np.abs(world.mean(axis=0) - objects[step, index, :3]).max()
             assert extent_m < 0.2, name
-        table = view.labels == TABLE_LABEL
-        points = rays[table] / rays[table][:, 2:] * view.depth_m[table][:, None]
+        table = labels == TABLE_LABEL
+        points = rays[table] / rays[table][:, 2:] * depth_m[table][:, None]
         np.testing.assert_allclose(apply(T_world_camera, points)[:, 2], 0.0, atol=1e-6)
         assert np.isfinite(invert(T_world_camera)).all()

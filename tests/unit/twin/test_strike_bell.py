@@ -53,9 +53,7 @@ def test_a_strike_is_short_and_strong(domain):
 def test_a_slow_push_to_the_stop_does_not_ring():
     stage, exact = Stage("strike_bell", "robot", TwinSettings()), WaypointNoise(np.zeros(3), 0.0)
     poses = stage.plan(0).object_poses
-    script = stage.task.script(
-        poses, domain="robot", generator=np.random.default_rng(0), noise=(exact, exact)
-    )
+    script = stage.task.script(poses, "robot", np.random.default_rng(0), (exact, exact))
     hands = [(one.left, one.right) for one in script]
     slowly = [Waypoint(0.0, *hands[2]), Waypoint(3.0, *hands[3]), Waypoint(4.8, *hands[5])]
     commands = follow(slowly, np.tile(HEAD_HOME, (NUM_GRID_STEPS, 1, 1)))

@@ -6,8 +6,7 @@ import pytest
 
 from dextouch.tactile.layout import taxel_areas_m2
 from services.twin.scene import compile_scene
-from services.twin.simulation import Command, Simulation
-from services.twin.tactile import MAX_RELIEF_M, elastic_layer
+from services.twin.simulation import MAX_RELIEF_M, Command, Simulation, elastic_layer
 from services.twin.tasks.task import PALM_DOWN, flat, relaxed
 
 BALL = '<body name="ball"><geom class="object" type="sphere" size="0.03" pos="0 0 0.05"/></body>'

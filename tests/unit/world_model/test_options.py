@@ -9,7 +9,7 @@ import torch
 
 from dextouch.errors import InvalidInputError
 from services.twin.names import TASK_NAMES
-from services.twin.tasks.registry import get_task
+from services.twin.tasks import get_task
 from services.world_model.checkpoints import CheckpointMetadata, write_checkpoint
 from services.world_model.network.flow_matching import sample
 from services.world_model.network.inputs import build_inputs

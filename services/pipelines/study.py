@@ -33,12 +33,7 @@ from services.evaluation.studies.engine import (
     run_rollouts,
     run_study,
 )
-from services.evaluation.studies.results import (
-    PlannedRollout,
-    StudyHeader,
-    StudyResults,
-    cells_of,
-)
+from services.evaluation.studies.results import PlannedRollout, StudyHeader, StudyResults, cells_of
 from services.evaluation.studies.study_figures import REPORT_FILE, write_reports
 from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines.parsers import study_parser
@@ -49,7 +44,7 @@ from services.world_model.state_checkpoints import is_state_checkpoint, read_sta
 
 # Chosen: a block opens its worlds anew, in some ten seconds, and plays all policies from these.
 _STARTS_IN_A_BLOCK = 10
-_CHILD = "services.pipelines.study.world_process"
+_CHILD = "services.pipelines.study_world"
 
 
 def main(arguments: list[str]) -> int:
@@ -59,7 +54,9 @@ def main(arguments: list[str]) -> int:
         0, or 1 if a rollout failed or has no result yet.
     """
     options = study_parser().parse_args(arguments)
-    return _report(options) if options.word == "report" else _run(options)
+    if options.word == "report":
+        return _finish(StudyResults.read(options.folder), options.json)
+    return _run(options)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -210,10 +207,6 @@ def _own_probes(
                 f"expected {expected_px} as the study's; train both with the same --image-px"
             )
     return own
-
-
-def _report(options: argparse.Namespace) -> int:
-    return _finish(StudyResults.read(options.folder), options.json)
 
 
 def _finish(results: StudyResults, json_path: Path | None) -> int:

@@ -31,8 +31,8 @@ from services.alignment.schemas import AlignmentJob
 from services.alignment.settings import AlignmentOptions
 from services.episode_store.committing import commit_spool
 from services.evaluation.progress import Progress
-from services.pipelines.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan
 from services.pipelines.mock_takes import TakePlan, measure_gloves, origin_in_truth_ns, play_take
+from services.pipelines.parsers import FIRST_HELD_OUT_SEED, TASKS, DemoPlan
 from services.pipelines.training_data import Order, log_warnings, make_episode
 from services.twin.names import CAMERAS, Domain
 from services.twin.take_options import TakeOptions

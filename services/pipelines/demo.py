@@ -26,12 +26,7 @@ from services.alignment.settings import AlignmentSettings
 from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.command_line import print_scores
-from services.evaluation.prediction import (
-    ALL_TASKS,
-    all_metrics,
-    described,
-    measure_prediction,
-)
+from services.evaluation.prediction import ALL_TASKS, all_metrics, described, measure_prediction
 from services.evaluation.prediction_scenes import read_rollout
 from services.evaluation.reporting import (
     ActionPicture,
@@ -41,10 +36,11 @@ from services.evaluation.reporting import (
     write_report,
 )
 from services.evaluation.reporting.sections import comparison_bars, error_rows, figure
-from services.pipelines.demo import recording, scoring
-from services.pipelines.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan, parse
+from services.pipelines import demo_scoring as scoring
+from services.pipelines import demo_takes as recording
+from services.pipelines.parsers import FIRST_HELD_OUT_SEED, TASKS, DemoPlan, demo_plan
 from services.pipelines.servers import served
-from services.pipelines.study.command import refuse_trained
+from services.pipelines.study import refuse_trained
 from services.pipelines.twin_geometry import TwinGeometry
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
@@ -83,7 +79,7 @@ def main(argv: Sequence[str]) -> int:
     Returns:
         0 if every stage ran, whatever the figures in the report.
     """
-    plan = parse(argv)
+    plan = demo_plan(argv)
     configure_logging(service="demo", log_format="auto", level="warning")
     # More threads slow down small networks beside busy services.
     torch.set_num_threads(1)

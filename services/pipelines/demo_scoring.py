@@ -17,8 +17,8 @@ from services.evaluation.scores import REAL, RolloutScore
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines import imagined_data, training_data
-from services.pipelines.demo.settings import TASKS, DemoPlan
-from services.pipelines.study.command import demonstrator
+from services.pipelines.parsers import TASKS, DemoPlan
+from services.pipelines.study import demonstrator
 from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name
 from services.twin.tasks import get_task
 from services.world_model.command_line import run_train
@@ -81,7 +81,7 @@ def train_models(folder: Path) -> Models:
         (run_train, [*_stores(episodes, endings, to=world_model), scenes, *SMALL_STATE_MODEL]),
         (run_train_policy, _stores(exact, episodes, to=policy)),
         (
-            imagined_data.main,
+            imagined_data.imagined_main,
             [*_stores(endings), "--store", imagined, "--checkpoint", str(world_model)],
         ),
         (run_train_judge, ["--held-out", unseen, *_stores(endings, imagined, to=probe)]),

@@ -1,4 +1,8 @@
-"""Commands `hand-eye` and `robot-base` of `dextouch station calibrate`: transforms from poses."""
+"""Commands `camera`, `hand-eye` and `robot-base` of `dextouch station calibrate`.
+
+Intrinsics come from photos of a board, which lie in a folder or are collected first, from a watched
+folder or a running station; transforms come from pairs of poses.
+"""
 
 import argparse
 from dataclasses import dataclass, replace
@@ -6,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float64
 
+from dextouch.clients import HttpLink
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import invert
 from services.alignment.calibration.hand_eye import BoardViews, solve_hand_eye, solve_robot_base
@@ -16,7 +21,14 @@ from services.alignment.station_calibration.boards import (
     read_photos,
     turn_coverage,
 )
-from services.alignment.station_calibration.camera_views import read_lens, turns_picture
+from services.alignment.station_calibration.camera_views import (
+    Session,
+    calibrate_photos,
+    folder_arrivals,
+    read_lens,
+    station_arrivals,
+    turns_picture,
+)
 from services.alignment.station_calibration.record import (
     TRACKERS,
     poses_of_photos,
@@ -31,6 +43,32 @@ POSES_HELP = (
 )
 PAIRS_HELP = "JSON: [[T_world_tracker, T_base_effector], …], each 4x4, both of the same moment"
 BASE_NAME = "T_world_base"
+
+
+def calibrate(options: argparse.Namespace) -> dict[str, object]:
+    """Calibrate from the photos of a folder; coverage and advice are written in any case.
+
+    With `--url` or `--watch` photos are collected first.
+    """
+    if options.watch and options.url is not None:
+        raise InvalidInputError("got --watch and --url, expected one of the two")
+    if options.watch or options.url is not None:
+        _collect(options)
+    return calibrate_photos(options)
+
+
+def _collect(options: argparse.Namespace) -> None:
+    """Collect until coverage is sufficient, or Ctrl-C."""
+    session = Session(options, None if options.url is None else options.photos)
+    print("Ctrl-C ends the collection and calibrates with the photos so far")
+    try:
+        if options.url is None:
+            session.collect(folder_arrivals(options.photos))
+            return
+        link = HttpLink(options.url, api_key=options.key)
+        session.collect(station_arrivals(link, options.camera))
+    except KeyboardInterrupt:
+        print(f"stopped with {len(session.views)} views")
 
 
 @dataclass(frozen=True)

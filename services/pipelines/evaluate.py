@@ -1,0 +1,177 @@
+"""Commands that judge world models and policies by episodes of a store.
+
+`dextouch evaluate prediction` measures predicted images and touch on held-out episodes,
+`dextouch evaluate recorded` scores policies from recorded first observations.
+"""
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+
+from dextouch.clients import Policy
+from dextouch.command_line import write_result
+from dextouch.episodes import EpisodeReader, EpisodeStore, needs, select_episodes
+from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.serving import configure_logging
+from services.evaluation.matched_starts import WorldAddress
+from services.evaluation.perceptual_networks import Metric
+from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
+from services.evaluation.policies.outside import PolicySource
+from services.evaluation.policies.replay import HoldPolicy
+from services.evaluation.prediction import (
+    ALL_TASKS,
+    GEOMETRY,
+    MODEL,
+    PredictionResult,
+    all_metrics,
+    described,
+    measure_prediction,
+)
+from services.evaluation.prediction_names import BASELINES
+from services.evaluation.prediction_scenes import Scene, read_rollout, read_windows
+from services.evaluation.recorded_takes import REPLAY, read_takes, score_lines, score_recorded
+from services.evaluation.success_classifier import SuccessClassifier
+from services.pipelines.imagined_data import WORLD, refuse_trained_episodes, served_world
+from services.pipelines.parsers import prediction_parser, recorded_parser
+from services.pipelines.twin_geometry import TwinGeometry
+from services.world_model.shipped_checkpoints import default_checkpoint
+from services.world_model.world import open_world
+
+_HORIZONS: dict[str, Callable[[EpisodeReader], list[Scene]]] = {
+    "windows": read_windows,
+    "rollouts": lambda reader: [read_rollout(reader)],
+}
+EXIT_FAILED = 1
+
+
+def prediction_main(arguments: Sequence[str]) -> int:
+    """Run `dextouch evaluate prediction`."""
+    options = prediction_parser().parse_args(list(arguments))
+    metrics = all_metrics(options.weights)
+    chosen = options.metrics or tuple(metrics)
+    for kind, names, known in (
+        ("metric", chosen, metrics),
+        ("baseline", options.baselines, BASELINES),
+    ):
+        if unknown := sorted(set(names) - set(known)):
+            raise UnknownNameError(kind, unknown[0], list(known))
+    store, path = EpisodeStore(options.episodes), options.checkpoint or default_checkpoint()
+    world = open_world(path, sampling_steps=options.sampling_steps, needs_touch=False)
+    tasks = options.tasks or world.description.tasks
+    readers = select_episodes([store], domain="robot", tasks=tasks, needs=(needs.IMAGES,))
+    wanted = [reader.item_id for reader in readers]
+    refuse_trained_episodes(store, wanted, path, command="evaluate prediction")
+    result: dict[str, Any] = {"checkpoint": path.name, "digest": world.description.digest}
+    measured = [metrics[name] for name in chosen]
+    result["metrics"] = described(measured)
+    result["baselines"] = {name: BASELINES[name] for name in options.baselines}
+    result["missing_baselines"] = {}
+    for horizon in [options.horizon] if options.horizon else _HORIZONS:
+        scenes = [scene for one in wanted for scene in _HORIZONS[horizon](store.open(one))]
+        if set(chosen) & set(GEOMETRY):
+            geometry = TwinGeometry()
+            scenes = [geometry.added_to(one, store.open(one.episode_id)) for one in scenes]
+        found = measure_prediction(world, scenes, metrics=measured, baselines=options.baselines)
+        result[horizon] = dict(found.by_task)
+        result[f"num_{horizon}"] = found.num_scenes
+        result["missing_baselines"][horizon] = dict(found.missing)
+        print(f"\n{horizon}: {found.num_scenes} from {len(wanted)} episodes")
+        print(_prediction_table(found, metrics))
+    write_result(options.json, result, allow_nan=False)
+    return 0
+
+
+def _prediction_table(found: PredictionResult, metrics: Mapping[str, Metric]) -> str:
+    """Figures of all tasks: a row for each metric, a column for the model and each baseline."""
+    figures = found.by_task[ALL_TASKS]
+    sources = list(figures)
+    rows = [["", *sources]]
+    for name in figures[MODEL]:
+        metric = metrics[name]
+        if metric.missing:
+            continue
+        arrow = {"higher": "↑", "lower": "↓"}[metric.better]
+        unit = f" ({metric.unit})" if metric.unit else ""
+        values = [figures[source][name] for source in sources]
+        cells = ["-" if value is None else f"{value:.3f}" for value in values]
+        rows.append([f"{metric.title}{unit} {arrow}", *cells])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows
+    ]
+    about = [
+        f"{metrics[n].title}: {metrics[n].missing}" for n in figures[MODEL] if metrics[n].missing
+    ]
+    about += [f"{name}: {BASELINES[name]}" for name in sources if name != MODEL]
+    about += [f"{name} is missing: {reason}" for name, reason in found.missing.items()]
+    return "\n".join([*lines, "", *about])
+
+
+def recorded_main(arguments: Sequence[str]) -> int:
+    """Run `dextouch evaluate recorded`; returns 1 if a rollout failed."""
+    options = recorded_parser().parse_args(list(arguments))
+    stores = [EpisodeStore(url) for url in options.episodes]
+    splits = (options.split,) if options.split else ()
+    takes = read_takes(stores, tasks=options.tasks, splits=splits, most=options.count)
+    wanted = {take.episode_id for take in takes}
+    for store in stores:
+        own = sorted(wanted & set(store.list()))
+        refuse_trained_episodes(store, own, options.checkpoint, command="evaluate recorded")
+    policies = _policies(options)
+    probe = SuccessClassifier.load(options.probe)
+    torch.set_num_threads(1)
+    configure_logging(service="evaluate_recorded", log_format="auto", level="warning")
+    with served_world(open_world(options.checkpoint)) as client:
+        (description,) = [one for one in client.worlds() if one.name == WORLD]
+        scores = score_recorded(
+            takes,
+            policies,
+            WorldAddress(client, WORLD),
+            description,
+            probe,
+            trained_on={
+                f"policy {name!r}": policy.metadata.training_starts
+                for name, policy in policies.items()
+                if isinstance(policy, BehaviourCloningPolicy)
+            },
+        )
+    print("\n".join(score_lines(scores)))
+    for failure in scores.failures:
+        print(f"failed: {failure.policy}, take {failure.seed}: {failure.message}")
+    about = {
+        "checkpoint": options.checkpoint.name,
+        "digest": description.digest,
+        "probe": options.probe.name,
+        "split": options.split,
+    }
+    write_result(options.json, {**about, **scores.to_report()}, allow_nan=False)
+    return EXIT_FAILED if scores.failures else 0
+
+
+def _policies(options: argparse.Namespace) -> dict[str, Policy]:
+    """All requested policies by name.
+
+    Raises:
+        InvalidInputError: two policies of one name, or one that does not load.
+        UnknownNameError: arguments of a policy that is not given.
+    """
+    policies: dict[str, Policy] = {}
+
+    def add(name: str, policy: Policy) -> None:
+        if name in policies or name == REPLAY:
+            raise InvalidInputError(f"policies: {name!r} is given twice; rename one, NAME=…")
+        policies[name] = policy
+
+    sources = [PolicySource.parse(text) for text in options.policy]
+    names = [source.name for source in sources]
+    if unknown := sorted(set(options.policy_arguments) - set(names)):
+        raise UnknownNameError("policy of --policy-arguments", unknown[0], names)
+    for source in sources:
+        add(source.name, source.load(options.policy_arguments.get(source.name, {})))
+    for name, path in options.cloned:
+        add(name, BehaviourCloningPolicy.load(path))
+    if options.hold:
+        add("hold", HoldPolicy())
+    return policies
