@@ -46,15 +46,22 @@ from services.episode_store.filters import (
     Entry,
     EpisodeFilter,
     ItemFilter,
+    ItemsKind,
     Page,
     S,
     cursor_of,
     place_of,
     sort_key,
 )
-from services.episode_store.hours import HoursField, HoursFilter, hours_by, hours_of
-from services.episode_store.items import ItemLists, item_of
-from services.episode_store.lineage import lineage_of
+from services.episode_store.items import (
+    HoursField,
+    HoursFilter,
+    ItemLists,
+    hours_by,
+    hours_of,
+    item_of,
+    lineage_of,
+)
 
 logger = structlog.get_logger(__name__)
 
@@ -214,19 +221,15 @@ class Catalog:
 
     def values(self) -> CatalogValues:
         """Tasks, operators and stations that occur, at most MAX_VALUES of each."""
-        rows: list[EpisodeSummary | RecordingSummary] = [
-            *(entry.summary for entry in self._recordings.entries().values()),
-            *(entry.summary for entry in self._episodes.entries().values()),
+        rows: list[Entry[Any]] = [
+            *self._recordings.entries().values(),
+            *self._episodes.entries().values(),
         ]
-        found = {
-            name: sorted({value for row in rows if (value := getattr(row, name)) is not None})
-            for name in ("task", "operator", "station")
-        }
-        return CatalogValues(
-            tasks=tuple(found["task"][:MAX_VALUES]),
-            operators=tuple(found["operator"][:MAX_VALUES]),
-            stations=tuple(found["station"][:MAX_VALUES]),
-        )
+        found: dict[str, tuple[str, ...]] = {}
+        for name in ("task", "operator", "station"):
+            values = {getattr(row.summary, name) for row in rows} - {None}
+            found[f"{name}s"] = tuple(sorted(values)[:MAX_VALUES])
+        return CatalogValues(**found)
 
     def lineage(self, kind: Kind, item_id: str) -> Lineage:
         """Everything that an item was made from and that was made from it; as `lineage_of`."""
@@ -238,10 +241,7 @@ class Catalog:
 
     def items(self, wanted: ItemFilter, *, limit: int, page: Page = FIRST_PAGE) -> CatalogItems:
         """One page of matching recordings, episodes or takes in the order of the page."""
-        found = self._items.entries(
-            wanted.kind, self._recordings.entries(), self._episodes.entries()
-        )
-        rows, facts = _page(found, wanted, limit, page)
+        rows, facts = _page(self._listed(wanted.kind), wanted, limit, page)
         return CatalogItems.model_construct(items=tuple(row.item for row in rows), **facts)
 
     def groups(self) -> ComparedGroups:
@@ -260,12 +260,9 @@ class Catalog:
 
     def clickable(self) -> dict[str, Entry[Any]]:
         """Episodes by id that training would take if their objects were clicked."""
-        entries = self._items.entries(
-            "episode", self._recordings.entries(), self._episodes.entries()
-        )
         return {
             one.item.id: one
-            for one in entries.values()
+            for one in self._listed("episode").values()
             if one.is_clickable and not (one.item.review and one.item.review.verdict == "rejected")
         }
 
@@ -280,11 +277,12 @@ class Catalog:
 
     def hours_by(self, field: HoursField, wanted: HoursFilter) -> HoursByField:
         """Total duration of matching episodes by the values of a field, and by their reviews."""
-        entries = self._items.entries(
-            "episode", self._recordings.entries(), self._episodes.entries()
-        )
-        items = [entry.item for entry in _matching(entries, wanted).values()]
+        entries = _matching(self._listed("episode"), wanted)
+        items = [entry.item for entry in entries.values()]
         return hours_by(field, items, utc_offset_min=wanted.utc_offset_min)
+
+    def _listed(self, kind: ItemsKind) -> Mapping[str, Entry[Any]]:
+        return self._items.entries(kind, self._recordings.entries(), self._episodes.entries())
 
     def bytes_by_station(self) -> dict[str, int]:
         """Disk usage of finished recordings by station."""

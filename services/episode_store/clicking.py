@@ -11,12 +11,10 @@ from dextouch.errors import DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import box_pixels, transform_from_pose
 from dextouch.schemas import EpisodeClicks, ObjectClicks, SceneObject
-from dextouch.serving import JSON, KIB, JsonBody, RequireScope, takes
+from dextouch.serving import JSON, KIB, JsonBody, takes
 from dextouch.streams import HEAD_CAMERA
 from services.episode_store.catalog import Catalog
-
-MAY_READ = Depends(RequireScope("store_read"))
-MAY_DELETE = Depends(RequireScope("store_delete"))
+from services.episode_store.keys import MAY_DELETE, MAY_READ
 
 
 class ClickableEpisode(FrozenModel):

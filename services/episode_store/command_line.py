@@ -6,8 +6,7 @@ from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.free_text import printable
 from dextouch.serving import configure_logging, load_settings
-from services.episode_store.commands import clicks, delete, inspect, repair
-from services.episode_store.commands.context import Context, Outcome
+from services.episode_store.commands import Context, Outcome, change, inspect
 from services.episode_store.parser import store_parser
 from services.episode_store.settings import EpisodeStoreSettings
 
@@ -35,10 +34,10 @@ _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
     "list": inspect.list_items,
     "show": inspect.show,
     "verify": inspect.verify,
-    "clicks": clicks.clicks,
-    "delete": delete.delete,
-    "deletions": delete.deletions,
-    "restore": delete.restore,
-    "purge": delete.purge,
-    "repair": repair.repair,
+    "clicks": inspect.clicks,
+    "delete": change.delete,
+    "deletions": change.deletions,
+    "restore": change.restore,
+    "purge": change.purge,
+    "repair": change.repair,
 }

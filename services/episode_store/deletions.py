@@ -28,16 +28,14 @@ from dextouch.schemas import (
     RecordingAttributes,
     SpooledTake,
 )
-from dextouch.serving import JSON, KIB, JsonBody, RequireScope, takes
-from services.episode_store.senders import Writer
+from dextouch.serving import JSON, KIB, JsonBody, takes
+from services.episode_store.keys import MAY_DELETE, MAY_WRITE, Writer
 
 logger = structlog.get_logger(__name__)
 
 # How soon a deletion reaches an upload that nobody continues.
 WATCH_PERIOD_S: Final = 1.0
 MAX_CHECK_BYTES: Final = 512 * KIB
-MAY_WRITE: Final = Depends(RequireScope("store_write"))
-MAY_DELETE: Final = Depends(RequireScope("store_delete"))
 Checked = Annotated[CheckTakes, Depends(JsonBody(CheckTakes))]
 
 
@@ -101,8 +99,7 @@ def deletions_router(records: DeletionRecords) -> APIRouter:
     @router.post("/confirm", dependencies=[MAY_WRITE])
     @takes({JSON: MAX_CHECK_BYTES})
     def confirm(
-        removed: Annotated[ConfirmRemoval, Depends(JsonBody(ConfirmRemoval))],
-        sender: Writer,
+        removed: Annotated[ConfirmRemoval, Depends(JsonBody(ConfirmRemoval))], sender: Writer
     ) -> DeletionsRevision:
         """Note that a station holds none of the deleted takes, except those that it names."""
         sender.check_station(removed.station)
@@ -160,10 +157,7 @@ class DeletionWatch:
     """
 
     def __init__(
-        self,
-        records: DeletionRecords,
-        drop: Callable[[], list[str]],
-        ended: Callable[[str], None],
+        self, records: DeletionRecords, drop: Callable[[], list[str]], ended: Callable[[str], None]
     ) -> None:
         self._records, self._drop, self._ended = records, drop, ended
         self._revision = ""

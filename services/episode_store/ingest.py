@@ -32,14 +32,9 @@ from dextouch.schemas import (
 )
 from dextouch.streams import read_batch
 from dextouch.tracing import current_trace_id
-from services.episode_store.committing import (
-    Commit,
-    CommitProcess,
-    check_content,
-    commit_spool,
-)
+from services.episode_store.committing import Commit, CommitProcess, check_content, commit_spool
 from services.episode_store.deletions import refuse_deleted
-from services.episode_store.senders import ANYONE, Sender, owner_of
+from services.episode_store.keys import ANYONE, Sender, owner_of
 from services.episode_store.settings import EpisodeStoreSettings
 
 logger = structlog.get_logger(__name__)
@@ -169,12 +164,7 @@ class Ingest:
         return self._store.exists(recording_id, kind="recording")
 
     def put_batch(
-        self,
-        recording_id: str,
-        stream: str,
-        number: int,
-        data: bytes,
-        sender: Sender = ANYONE,
+        self, recording_id: str, stream: str, number: int, data: bytes, sender: Sender = ANYONE
     ) -> BatchReceipt:
         """Store a batch; it is durable when this returns.
 

@@ -1,28 +1,37 @@
-"""Items of a store in one list: recordings, episodes, or takes, with the findings of comparisons.
+"""What a catalog makes of its entries: items in one list, hours of episodes, and lineage.
 
-A take is a recording together with the episodes that were made from it, or an episode without a
-stored recording.
+Items are recordings, episodes, or takes, with the findings of comparisons. A take is a recording
+together with the episodes that were made from it, or an episode without a stored recording.
 """
 
 import threading
-from collections import defaultdict
-from collections.abc import Mapping
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import Any, Final
+from datetime import timedelta, timezone
+from typing import Any, Final, Literal
+
+from pydantic import Field
 
 from dextouch.episodes import EpisodeReader, RecordingReader
+from dextouch.errors import NotFoundError
 from dextouch.schemas import (
+    CatalogHours,
     CatalogItem,
     ComparedGroup,
     EpisodeAttributes,
     EpisodeSummary,
     Finding,
+    HoursByField,
+    HoursOf,
+    HoursRow,
+    Lineage,
+    LineageNode,
     RecordingSummary,
     Review,
 )
-from services.episode_store.filters import Entry, ItemsKind
-from services.episode_store.limits import beyond_limits
-from services.episode_store.signals import MIN_ITEMS, figures_of, find_outliers
+from services.episode_store.filters import Entry, EpisodeFilter, ItemsKind
+from services.episode_store.findings import MIN_ITEMS, beyond_limits, figures_of, find_outliers
 
 AnyEntry = Entry[Any]
 Entries = Mapping[str, AnyEntry]
@@ -31,6 +40,10 @@ _SHARED: Final = (
     "task", "instruction", "domain", "station", "operator", "success", "recovered", "trace_id",
     "complete", "incomplete_cause",
 )  # fmt: skip
+MAX_NODES = 200
+Name = tuple[str, str]
+SECONDS_AN_HOUR = 3600.0
+HoursField = Literal["task", "operator", "station", "day"]
 
 
 def item_of(
@@ -210,3 +223,115 @@ def _other(item: CatalogItem) -> list[Finding]:
     if item.success is None and item.origin == "recorded":
         found.append(Finding(code="not_judged", message="outcome not judged"))
     return found
+
+
+class HoursFilter(EpisodeFilter):
+    """Filter of episodes; days begin at midnight of the zone `utc_offset_min` ahead of UTC."""
+
+    utc_offset_min: int = Field(default=0, ge=-14 * 60, le=14 * 60)
+
+
+def hours_of(entries: Iterable[Entry[EpisodeSummary]]) -> CatalogHours:
+    """Total duration of episodes by task, domain and origin."""
+    groups: defaultdict[tuple[str, str, str], list[EpisodeSummary]] = defaultdict(list)
+    for episode in (entry.summary for entry in entries):
+        groups[episode.task, episode.domain, episode.origin].append(episode)
+    rows = [
+        HoursRow(
+            task=task,
+            domain=group[0].domain,
+            origin=group[0].origin,
+            num_episodes=len(group),
+            num_successes=sum(episode.success is True for episode in group),
+            hours=sum(episode.duration_s for episode in group) / SECONDS_AN_HOUR,
+        )
+        for (task, *_), group in sorted(groups.items())
+    ]
+    return CatalogHours(
+        rows=tuple(rows),
+        num_episodes=sum(row.num_episodes for row in rows),
+        hours=sum(row.hours for row in rows),
+    )
+
+
+def hours_by(
+    field: HoursField, episodes: Iterable[CatalogItem], *, utc_offset_min: int
+) -> HoursByField:
+    """Total duration of episodes by the values of a field, in their order, and by their reviews."""
+    groups: defaultdict[str | None, list[CatalogItem]] = defaultdict(list)
+    for item in episodes:
+        groups[_value(field, item, utc_offset_min)].append(item)
+    ordered = sorted(groups, key=lambda value: (value is None, value or ""))
+    return HoursByField(rows=tuple(_hours(value, groups[value]) for value in ordered))
+
+
+def _value(field: HoursField, item: CatalogItem, utc_offset_min: int) -> str | None:
+    if field != "day":
+        value: str | None = getattr(item, field)
+        return value
+    if item.at is None:
+        return None
+    zone = timezone(timedelta(minutes=utc_offset_min))
+    return item.at.astimezone(zone).date().isoformat()
+
+
+def _hours(value: str | None, items: list[CatalogItem]) -> HoursOf:
+    seconds = {"accepted": 0.0, "rejected": 0.0, "not_reviewed": 0.0}
+    for item in items:
+        seconds[item.review.verdict if item.review else "not_reviewed"] += item.duration_s
+    return HoursOf(
+        value=value,
+        num_episodes=len(items),
+        **{f"{name}_h": total_s / SECONDS_AN_HOUR for name, total_s in seconds.items()},
+    )
+
+
+def lineage_of(entries: Mapping[Name, AnyEntry], start: Name) -> Lineage:
+    """Everything that an item was made from and that was made from it, nearest first.
+
+    Raises:
+        NotFoundError: no such item.
+    """
+    kind, item_id = start
+    if start not in entries:
+        raise NotFoundError(f"{kind} {item_id!r}: not in the catalog")
+    sources = {
+        name: tuple((one.kind, one.id) for one in entry.lineage) for name, entry in entries.items()
+    }
+    products: defaultdict[Name, list[Name]] = defaultdict(list)
+    for name, above in sources.items():
+        for one in above:
+            products[one].append(name)
+    nodes = {start: "self"}
+    _walk(nodes, start, lambda name: sources.get(name, ()), "source")
+    _walk(nodes, start, lambda name: products[name], "product")
+    rows = [
+        LineageNode.model_validate(
+            {
+                "kind": name[0],
+                "id": name[1],
+                "relation": relation,
+                "is_stored": name in entries,
+                "made_from": [one for _, one in sources.get(name, ())],
+                "summary": _brief(entries[name].item) if name in entries else "",
+            }
+        )
+        for name, relation in nodes.items()
+    ]
+    return Lineage(nodes=tuple(rows))
+
+
+def _walk(
+    nodes: dict[Name, str], start: Name, neighbours: Callable[[Name], Iterable[Name]], relation: str
+) -> None:
+    """Add everything that can be reached from an item, breadth first, until MAX_NODES."""
+    waiting = deque([start])
+    while waiting and len(nodes) < MAX_NODES:
+        for name in neighbours(waiting.popleft()):
+            if name not in nodes and len(nodes) < MAX_NODES:
+                nodes[name] = relation
+                waiting.append(name)
+
+
+def _brief(item: CatalogItem) -> str:
+    return f"{item.task}, {item.domain}, {item.origin}, {item.duration_s:.1f} s"

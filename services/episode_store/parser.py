@@ -53,11 +53,7 @@ def store_parser() -> argparse.ArgumentParser:
         help="objects of the tasks, with or without clicks on them; those in the store are added",
     )
     repairing = _command(
-        commands,
-        kind,
-        "repair",
-        "repair or salvage damaged items",
-        "take-7 --from /mnt/copy",
+        commands, kind, "repair", "repair or salvage damaged items", "take-7 --from /mnt/copy"
     )
     _add_ids(repairing)
     repairing.add_argument(

@@ -1,13 +1,18 @@
-"""HTTP routes of single items: attributes, and windows and samples as msgpack with ETags."""
+"""HTTP routes of single items: attributes, windows and samples, and what players show.
+
+Answers with samples are msgpack with ETags. Signals are reduced to the lowest and highest value per
+bin of time, for plots.
+"""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from math import prod
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Depends, Header, Query, Response
+from fastapi import APIRouter, Header, Query, Response
+from jaxtyping import Float64
 from pydantic import BaseModel, Field
 
 from dextouch.episodes import EpisodeReader, EpisodeStore, ImageForm, RecordingReader, encode_window
@@ -24,31 +29,36 @@ from dextouch.schemas import (
     PlayedStream,
     RecordingAttributes,
 )
-from dextouch.serving import MSGPACK, RequireScope
+from dextouch.serving import MSGPACK
 from dextouch.streams import JPEG_UNIT, StreamDescriptor, pack
+from services.episode_store.keys import MAY_READ
 from services.episode_store.settings import EpisodeStoreSettings
-from services.episode_store.signals import SignalsQuery, reduce_signals
 
 # To be incremented whenever the same query gives other bytes.
 ANSWER_VERSION = 1
 
-
-# HTTP routes for players: extents and gaps of an item, JPEG images of a span, reduced signals.
-
-MAY_READ = Depends(RequireScope("store_read"))
 WINDOW_MSGPACK = "application/vnd.dextouch.window+msgpack"
 # Committed content is immutable but may be deleted: clients must revalidate.
 CACHE_CONTROL = "private, no-cache"
-# Responses of these routes besides the problems that all routes can give.
-SAMPLES: dict[str, Any] = {
-    "response_class": Response,
-    "responses": {200: {"content": {MSGPACK: {}}}, 304: {}},
-}
-WINDOW: dict[str, Any] = {
-    "response_class": Response,
-    "responses": {200: {"content": {WINDOW_MSGPACK: {}}}, 304: {}},
-}
 IfNoneMatch = Annotated[str | None, Header(alias="if-none-match")]
+STREAMS: dict[ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
+MAX_STEPS = 10_000
+GAP_PERIODS = 1.5
+MAX_GAPS = 50
+MAX_IMAGES = 240
+QUALITY = 85
+Reader = EpisodeReader | RecordingReader
+# Limits of one request: signals, and bytes of samples that are read for it.
+MAX_SIGNALS = 16
+MAX_READ_BYTES = 256 * 2**20
+BLOCK_BYTES = 4 * 2**20
+INTERVAL = "interval_ms"
+MAX = "max"
+
+
+def _answers(media_type: str) -> dict[str, Any]:
+    """Responses of a route besides the problems that all routes can give."""
+    return {"response_class": Response, "responses": {200: {"content": {media_type: {}}}, 304: {}}}
 
 
 class WindowQuery(FrozenModel):
@@ -82,7 +92,9 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         """Attributes of a finished recording."""
         return store.recording(recording_id).attributes
 
-    @router.get("/recordings/{recording_id}/streams/{stream}", tags=["recordings"], **SAMPLES)
+    @router.get(
+        "/recordings/{recording_id}/streams/{stream}", tags=["recordings"], **_answers(MSGPACK)
+    )
     def recording_samples(
         recording_id: str,
         stream: str,
@@ -104,11 +116,9 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
             content_sha256=reader.content_sha256,
         )
 
-    @router.get("/episodes/{episode_id}/windows", tags=["episodes"], **WINDOW)
+    @router.get("/episodes/{episode_id}/windows", tags=["episodes"], **_answers(WINDOW_MSGPACK))
     def window(
-        episode_id: str,
-        query: Annotated[WindowQuery, Query()],
-        if_none_match: IfNoneMatch = None,
+        episode_id: str, query: Annotated[WindowQuery, Query()], if_none_match: IfNoneMatch = None
     ) -> Response:
         """Window of the model grid as msgpack (`dextouch.episodes.decode_window`)."""
         if query.num_steps > max_steps:
@@ -121,7 +131,7 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         read = partial(_window, reader, query, max_bytes)
         return response(etag_of(reader, "window", query), if_none_match, read, WINDOW_MSGPACK)
 
-    @router.get("/episodes/{episode_id}/streams/{stream}", tags=["episodes"], **SAMPLES)
+    @router.get("/episodes/{episode_id}/streams/{stream}", tags=["episodes"], **_answers(MSGPACK))
     def episode_samples(
         episode_id: str,
         stream: str,
@@ -198,12 +208,6 @@ def is_known(etag: str, known: str | None) -> bool:
     return etag in tags or "*" in tags
 
 
-# Robot hands of an episode's actions as points in the world, for 3-D views.
-
-STREAMS: dict[ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
-MAX_STEPS = 10_000
-
-
 class RobotHandsQuery(FrozenModel):
     """Query of robot hands: start_ns ≤ t < stop_ns, and which actions."""
 
@@ -268,17 +272,23 @@ def _points(
     return arrays | {"T_world_camera_head": hands.Ts_world_camera_head}
 
 
-GAP_PERIODS = 1.5
-MAX_GAPS = 50
-MAX_IMAGES = 240
-QUALITY = 85
-Reader = EpisodeReader | RecordingReader
-
-
 class ImagesQuery(SpanQuery):
     """Query of images: start_ns ≤ t < stop_ns, optionally at half size in both axes."""
 
     half_size: bool = False
+
+
+class SignalsQuery(FrozenModel):
+    """Query of signals, a comma-separated list, in `points` bins of [start_ns, stop_ns).
+
+    `STREAM` is the sum of a sample's values, `STREAM.max` the largest of them, `STREAM.K` its value
+    K, `STREAM.interval_ms` the time since the sample before.
+    """
+
+    names: str = Field(min_length=1, max_length=2000)
+    start_ns: int
+    stop_ns: int
+    points: int = Field(default=600, ge=1, le=4000)
 
 
 def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRouter:
@@ -293,7 +303,7 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
         """What can be played of an item: its streams with their extents and longest gaps."""
         return playback_of(opened(kind, item_id))
 
-    @router.get("/{kind}/{item_id}/images/{camera}", **SAMPLES)
+    @router.get("/{kind}/{item_id}/images/{camera}", **_answers(MSGPACK))
     def images(
         kind: ItemKind,
         item_id: str,
@@ -306,7 +316,7 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
         read = partial(_images, reader, camera, query, settings.max_answer_bytes)
         return response(etag_of(reader, f"jpeg {camera}", query), if_none_match, read, MSGPACK)
 
-    @router.get("/{kind}/{item_id}/signals", **SAMPLES)
+    @router.get("/{kind}/{item_id}/signals", **_answers(MSGPACK))
     def signals(
         kind: ItemKind,
         item_id: str,
@@ -318,11 +328,9 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
         read: Callable[[], bytes] = partial(reduce_signals, reader, query)
         return response(etag_of(reader, "signals", query), if_none_match, read, MSGPACK)
 
-    @router.get("/episode/{item_id}/robot_hands", **SAMPLES)
+    @router.get("/episode/{item_id}/robot_hands", **_answers(MSGPACK))
     def hands(
-        item_id: str,
-        query: Annotated[RobotHandsQuery, Query()],
-        if_none_match: IfNoneMatch = None,
+        item_id: str, query: Annotated[RobotHandsQuery, Query()], if_none_match: IfNoneMatch = None
     ) -> Response:
         """Points of both robot hands in the world, from the actions of a span."""
         reader = store.open(item_id)
@@ -416,3 +424,97 @@ def _images(reader: Reader, camera: str, query: ImagesQuery, max_bytes: int) -> 
             "data": np.frombuffer(b"".join(encoded), dtype=np.uint8),
         },
     )
+
+
+def reduce_signals(reader: Reader, query: SignalsQuery) -> bytes:
+    """Lowest and highest values of every signal, float32 [points] as msgpack; NaN without samples.
+
+    Raises:
+        UnknownNameError: no such stream.
+        InvalidInputError: no such value, an image stream, or an empty span.
+        LimitExceededError: too many signals or samples.
+    """
+    names = list(dict.fromkeys(query.names.split(",")))
+    if len(names) > MAX_SIGNALS:
+        raise LimitExceededError(
+            f"signals: got {len(names)}, expected at most {MAX_SIGNALS}",
+            got=len(names),
+            expected=MAX_SIGNALS,
+        )
+    if query.stop_ns <= query.start_ns:
+        raise InvalidInputError(
+            f"signals: got the span {query.start_ns} … {query.stop_ns}, expected start < stop"
+        )
+    arrays = {}
+    left_bytes = MAX_READ_BYTES
+    for name in names:
+        stream, _, what = name.partition(".")
+        # Refuses unknown streams.
+        count = reader.count(stream, query.start_ns, query.stop_ns)
+        left_bytes -= 0 if what == INTERVAL else count * reader.streams[stream].sample_bytes()
+        if left_bytes < 0:
+            raise LimitExceededError(
+                f"signals: the span holds more than {MAX_READ_BYTES} bytes of samples; "
+                "ask for a shorter time or fewer signals",
+                expected=MAX_READ_BYTES,
+            )
+        low, high = _reduced(reader, stream, what, query)
+        arrays[f"{name}/low"], arrays[f"{name}/high"] = low, high
+    return pack({"start_ns": query.start_ns, "stop_ns": query.stop_ns}, arrays)
+
+
+def _reduced(
+    reader: Reader, stream: str, what: str, query: SignalsQuery
+) -> tuple[np.ndarray, np.ndarray]:
+    low = np.full(query.points, np.inf)
+    high = np.full(query.points, -np.inf)
+    span_ns = query.stop_ns - query.start_ns
+    for t_ns, values in _blocks(reader, stream, what, query):
+        is_known = np.isfinite(values)
+        bins = ((t_ns - query.start_ns)[is_known] * (query.points / span_ns)).astype(np.int64)
+        bins = np.minimum(bins, query.points - 1)
+        np.minimum.at(low, bins, values[is_known])
+        np.maximum.at(high, bins, values[is_known])
+    is_empty = low > high
+    low[is_empty] = high[is_empty] = np.nan
+    return low.astype(np.float32), high.astype(np.float32)
+
+
+def _blocks(
+    reader: Reader, stream: str, what: str, query: SignalsQuery
+) -> Iterator[tuple[np.ndarray, Float64[np.ndarray, " n"]]]:
+    """Stamps and values of a signal in the span, a few MiB of samples at a time."""
+    stamps_ns = reader.stamps_ns(stream)
+    first, stop = (int(stamps_ns.searchsorted(t)) for t in (query.start_ns, query.stop_ns))
+    if what == INTERVAL:
+        before = max(first, 1)
+        yield stamps_ns[before:stop], np.diff(stamps_ns[before - 1 : stop]) / 1e6
+        return
+    descriptor = reader.streams[stream]
+    reduced = _reduction(descriptor, what)
+    rows = max(1, BLOCK_BYTES // descriptor.sample_bytes())
+    for low in range(first, stop, rows):
+        high = min(low + rows, stop)
+        samples = reader.values(stream, low, high).reshape(high - low, -1).astype(np.float64)
+        yield stamps_ns[low:high], reduced(samples)
+
+
+def _reduction(descriptor: StreamDescriptor, what: str) -> Callable[[np.ndarray], np.ndarray]:
+    """The signal of flat samples [n, size]."""
+    size = int(np.prod(descriptor.shape))
+    if descriptor.kind == "image":
+        raise InvalidInputError(
+            f"signal {descriptor.name}: is an image stream, whose only signal is "
+            f"{descriptor.name}.{INTERVAL}"
+        )
+    if not what:
+        return lambda samples: samples.sum(axis=1)
+    if what == MAX:
+        return lambda samples: samples.max(axis=1)
+    if not (what.isdecimal() and what.isascii() and len(what) < 7 and int(what) < size):
+        raise InvalidInputError(
+            f"signal {descriptor.name}: got {what[:40]!r}, expected {INTERVAL}, {MAX} or an index "
+            f"in 0 … {size - 1}"
+        )
+    index = int(what)
+    return lambda samples: samples[:, index]

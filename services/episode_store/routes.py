@@ -1,16 +1,19 @@
-"""HTTP routes of the store: uploads by stations, and lists of recordings and episodes."""
+"""HTTP routes of the store: uploads by stations, lists, and changes of many items at once."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime
 from functools import partial
 from typing import Annotated
 
 import anyio
 import anyio.to_thread
+import structlog
 from fastapi import APIRouter, Depends, Path, Query, Request
 
-from dextouch.errors import StorageFullError
+from dextouch.episodes import KINDS, EpisodeStore
+from dextouch.errors import DexTouchError, StorageFullError
 from dextouch.schemas import (
     BatchReceipt,
     CatalogHours,
@@ -23,42 +26,33 @@ from dextouch.schemas import (
     HoursByField,
     ItemKind,
     Lineage,
+    MovedItems,
+    MoveItems,
     NewRecording,
     RecordingList,
     RecordingStatus,
+    RefusedItem,
+    Review,
     ReviewedItems,
     ReviewItems,
+    StoredItem,
+    TrashContents,
+    TrashedItem,
     UploadList,
 )
-from dextouch.serving import (
-    AS_SET,
-    JSON,
-    KIB,
-    OCTETS,
-    JsonBody,
-    RequireScope,
-    takes,
-)
+from dextouch.serving import AS_SET, JSON, KIB, OCTETS, JsonBody, takes
 from dextouch.streams import MAX_BATCH_BYTES
 from services.episode_store.catalog import Catalog
-from services.episode_store.filters import (
-    EpisodeFilter,
-    EpisodeQuery,
-    ItemQuery,
-    RecordingQuery,
-)
-from services.episode_store.hours import HoursField, HoursFilter
+from services.episode_store.filters import EpisodeFilter, EpisodeQuery, ItemQuery, RecordingQuery
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
-from services.episode_store.reviewing import review_items
-from services.episode_store.senders import Reader, Writer
+from services.episode_store.items import HoursField, HoursFilter
+from services.episode_store.keys import MAY_DELETE, MAY_EXPIRE, MAY_READ, MAY_WRITE, Reader, Writer
+
+logger = structlog.get_logger(__name__)
 
 Attributes = Annotated[NewRecording, Depends(JsonBody(NewRecording))]
 Finish = Annotated[FinishRecording, Depends(JsonBody(FinishRecording))]
-MAY_READ = Depends(RequireScope("store_read"))
-MAY_DELETE = Depends(RequireScope("store_delete"))
-MAY_WRITE = Depends(RequireScope("store_write"))
-MAY_EXPIRE = Depends(RequireScope("store_expire"))
 # Room for the calibration and descriptors of a station, or the ledger of a take.
 MAX_ATTRIBUTES_BYTES = 256 * KIB
 
@@ -75,8 +69,9 @@ def uploads_router(
         """Begin an upload, or return the status of an existing one."""
         attributes = given.attributes()
         sender.check_station(attributes.station)
-        with metrics.counting_refusals():
-            _check_begin(ingest, limits, attributes.recording_id, attributes.station)
+        is_begun = partial(ingest.is_begun, attributes.recording_id)
+        with metrics.counting_refusals(), _unless(is_begun):
+            limits.check_new(attributes.station)
         status = ingest.create(attributes, sender)
         if status.state == "open":
             limits.begin(attributes)
@@ -139,11 +134,6 @@ def uploads_router(
     return router
 
 
-def _check_begin(ingest: Ingest, limits: StorageLimits, recording_id: str, station: str) -> None:
-    with _unless(partial(ingest.is_begun, recording_id)):
-        limits.check_new(station)
-
-
 def idle_uploads_router(ingest: Ingest, limits: StorageLimits) -> APIRouter:
     """Create the routes of unfinished uploads, below /v1/uploads."""
     router = APIRouter(prefix="/v1")
@@ -156,7 +146,12 @@ def idle_uploads_router(ingest: Ingest, limits: StorageLimits) -> APIRouter:
     @router.post("/uploads/expire", tags=["uploads"], dependencies=[MAY_EXPIRE])
     def expire(wanted: ExpireUploads) -> UploadList:
         """Drop such uploads with their data; the response lists them."""
-        return _expire(ingest, limits, wanted.idle_s)
+        gone = []
+        for upload in limits.idle(idle_s=wanted.idle_s).uploads:
+            if ingest.expire(upload.recording_id, idle_s=wanted.idle_s):
+                limits.end(upload.recording_id)
+                gone.append(upload)
+        return UploadList(uploads=tuple(gone))
 
     return router
 
@@ -192,15 +187,6 @@ def _announced_bytes(request: Request) -> int:
     announced = request.headers.get("content-length", "")
     # A body of unknown length may be as large as the largest batch.
     return int(announced) if announced.isdecimal() else MAX_BATCH_BYTES
-
-
-def _expire(ingest: Ingest, limits: StorageLimits, idle_s: float) -> UploadList:
-    gone = []
-    for upload in limits.idle(idle_s=idle_s).uploads:
-        if ingest.expire(upload.recording_id, idle_s=idle_s):
-            limits.end(upload.recording_id)
-            gone.append(upload)
-    return UploadList(uploads=tuple(gone))
 
 
 def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
@@ -258,6 +244,74 @@ def reviews_router(catalog: Catalog) -> APIRouter:
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
     def review(wanted: Annotated[ReviewItems, Depends(JsonBody(ReviewItems))]) -> ReviewedItems:
         """Accept or reject items, or remove their reviews; rejected ones are not trained on."""
-        return review_items(catalog, wanted)
+        review = None
+        if wanted.verdict is not None:
+            review = Review(
+                verdict=wanted.verdict,
+                reason=wanted.reason,
+                reviewer=wanted.reviewer,
+                reviewed_at=datetime.now(UTC),
+            )
+        reviewed, refused = _each(wanted.items, lambda item: catalog.review(item, review))
+        logger.info("items_reviewed", verdict=wanted.verdict, ids=[item.id for item in reviewed])
+        return ReviewedItems(reviewed=reviewed, refused=refused)
 
     return router
+
+
+def trash_router(store: EpisodeStore, *, max_page: int) -> APIRouter:
+    """Create the routes below /v1/trash."""
+    router = APIRouter(prefix="/v1/trash", tags=["trash"])
+
+    @router.get("", dependencies=[MAY_READ])
+    def contents(limit: Annotated[int, Query(ge=1)] = 100) -> TrashContents:
+        """Deleted episodes and recordings, newest first; refused for a store in a bucket."""
+        entries = [entry for entry in store.trash_list() if entry.kind in KINDS]
+        newest = entries[::-1][: min(limit, max_page)]
+        items = [
+            TrashedItem.model_validate(
+                {
+                    "kind": entry.kind,
+                    "id": entry.item_id,
+                    "deleted_at": datetime.fromtimestamp(entry.deleted_at_ns / 1_000_000_000, UTC),
+                    "num_bytes": entry.num_bytes,
+                }
+            )
+            for entry in newest
+        ]
+        return TrashContents(items=tuple(items), num_items=len(entries))
+
+    @router.post("", dependencies=[MAY_DELETE])
+    def delete(wanted: MoveItems) -> MovedItems:
+        """Move items to the trash; refused for a store in a bucket, which has none."""
+        store.require_trash()
+        return _move(wanted, lambda item: store.delete(item.id, kind=item.kind))
+
+    @router.post("/restore", dependencies=[MAY_DELETE])
+    def restore(wanted: MoveItems) -> MovedItems:
+        """Restore items from the trash, each the one that was deleted last."""
+        store.require_trash()
+        return _move(wanted, lambda item: store.restore(item.id, kind=item.kind))
+
+    return router
+
+
+def _move(wanted: MoveItems, move: Callable[[StoredItem], None]) -> MovedItems:
+    moved, refused = _each(wanted.items, move)
+    logger.info("items_moved", moved=[item.id for item in moved], num_refused=len(refused))
+    return MovedItems(moved=moved, refused=refused)
+
+
+def _each(
+    items: Iterable[StoredItem], change: Callable[[StoredItem], None]
+) -> tuple[tuple[StoredItem, ...], tuple[RefusedItem, ...]]:
+    """Change items, each on its own; those that were changed, and those that were refused."""
+    changed, refused = [], []
+    for item in items:
+        try:
+            change(item)
+        except DexTouchError as error:
+            refused.append(RefusedItem(kind=item.kind, id=item.id, reason=error.message))
+        else:
+            changed.append(item)
+    return tuple(changed), tuple(refused)

@@ -1,4 +1,4 @@
-"""Commands `list`, `show` and `verify`."""
+"""Commands that look into a store: `list`, `show`, `verify`, and `clicks` on objects."""
 
 import importlib.util
 import sys
@@ -13,11 +13,13 @@ import numpy as np
 
 from dextouch.episodes import (
     KINDS,
+    ClickedPoses,
     EpisodeReader,
     GroupFiles,
     Kind,
     LocalGroup,
     RecordingReader,
+    clicked_poses,
     shard_path,
     stream_arrays,
 )
@@ -32,21 +34,18 @@ from dextouch.episodes.care import (
     unfinished_folders,
 )
 from dextouch.errors import InvalidInputError, NotFoundError, StorageError
+from dextouch.geometry import transform_from_pose
 from dextouch.schemas import (
     EpisodeAttributes,
+    EpisodeClicks,
     EpisodeSummary,
     RecordingAttributes,
     RecordingSummary,
     json_ready,
+    load_object_clicks,
 )
 from services.episode_store.catalog import Catalog
-from services.episode_store.commands.context import (
-    EXIT_DAMAGED,
-    Context,
-    Outcome,
-    readable_size,
-    table,
-)
+from services.episode_store.commands import EXIT_DAMAGED, Context, Outcome, readable_size, table
 from services.episode_store.filters import EpisodeFilter
 
 _OUTCOMES = {True: "success", False: "failure", None: "not judged"}
@@ -102,15 +101,12 @@ def _outcome(
 def _list_trash(context: Context) -> Outcome:
     rows = []
     for entry in context.store.trash_list():
-        date, size = _date(entry.deleted_at_ns), readable_size(entry.num_bytes)
+        deleted_at = datetime.fromtimestamp(entry.deleted_at_ns / 1e9, UTC)
+        date, size = deleted_at.isoformat(timespec="seconds"), readable_size(entry.num_bytes)
         context.say(f"{entry.item_id}  {entry.kind}  deleted {date}  {size}")
         known = {"kind": entry.kind, "id": entry.item_id}
         rows.append(known | {"deleted_at": date, "num_bytes": entry.num_bytes})
     return {"trash": rows}, 0
-
-
-def _date(time_ns: int) -> str:
-    return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="seconds")
 
 
 def show(context: Context) -> Outcome:
@@ -241,3 +237,43 @@ def _progress_bar(context: Context, items: list[tuple[Kind, str]]) -> Iterator[P
     with Bar(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("verify", total=total)
         yield lambda num_bytes: bar.advance(task, num_bytes)
+
+
+def clicks(context: Context) -> Outcome:
+    """Check the clicks of a file and of the store, and list the places that they give.
+
+    The result is a file of all of them.
+    """
+    given = load_object_clicks(context.options.clicks)
+    names = sorted({*given.episodes, *context.store.list()})
+    found = {name: given.episodes.get(name) or context.store.clicks(name) for name in names}
+    episodes = {name: one for name, one in found.items() if one is not None}
+    rows: list[tuple[str, ...]] = [("episode", "object", "x mm", "y mm", "heading", "± mm")]
+    for name, one in episodes.items():
+        is_lenient = name not in given.episodes
+        about = context.store.open(name).attributes
+        rows += _rows(name, one, clicked_poses(about, given, one, may_lack_headings=is_lenient))
+    for line in table(rows):
+        context.say(line)
+    return json_ready(given.model_copy(update={"episodes": episodes})), 0
+
+
+def _rows(name: str, clicked: EpisodeClicks, found: ClickedPoses) -> list[tuple[str, ...]]:
+    rows = []
+    for index, one in enumerate(found.objects):
+        click = clicked.objects.get(one.name)
+        if click is None or click.state != "seen":
+            rows.append(
+                (name, one.name, "not clicked" if click is None else click.state, *[""] * 3)
+            )
+        elif not found.known[index]:
+            rows.append((name, one.name, "no heading", *[""] * 3))
+        else:
+            axis = one.click.heading
+            T = transform_from_pose(found.poses[index])
+            x, y = T[:2, "xyz".index(axis[-1])] * (-1 if axis[0] == "-" else 1)
+            heading = f"{np.rad2deg(np.arctan2(y, x)):.0f}°"
+            place = (f"{1e3 * value:.0f}" for value in found.poses[index, :2])
+            heading = "symmetric" if one.click.symmetric else heading
+            rows.append((name, one.name, *place, heading, f"{1e3 * found.sd_m[index]:.1f}"))
+    return rows

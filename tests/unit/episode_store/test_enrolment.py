@@ -15,7 +15,7 @@ from dextouch.errors import AccessDeniedError, ConflictError, NotFoundError, Sto
 from dextouch.serving import AccessControl
 from dextouch.serving.keys import ApiKey
 from services.episode_store.app import create_app
-from services.episode_store.enrolment import Enrolments
+from services.episode_store.keys import Enrolments
 
 ADMIN = ApiKey(name="admin", key=SecretStr("key-of-an-administrator"), scopes=("enrol",))
 READER = ApiKey(name="reader", key=SecretStr("key-of-some-reader"), scopes=("store_read",))

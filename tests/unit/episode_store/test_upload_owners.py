@@ -14,7 +14,7 @@ from dextouch.schemas import status_of
 from dextouch.serving import AccessControl
 from dextouch.serving.keys import ApiKey
 from services.episode_store.app import create_app
-from services.episode_store.enrolment import Enrolments
+from services.episode_store.keys import Enrolments
 from tests.unit.episode_store.conftest import InProcess
 
 COUNTS = {"glove_left": 1, "wrist_left": 0}

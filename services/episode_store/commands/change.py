@@ -1,4 +1,4 @@
-"""Commands `delete`, `deletions`, `restore` and `purge`."""
+"""Commands that change a store: `delete`, `deletions`, `restore`, `purge` and `repair`."""
 
 import json
 import sys
@@ -7,16 +7,20 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
-from dextouch.episodes import TrashKind
+from dextouch.episodes import EpisodeStore, GroupFiles, Kind, TrashKind
 from dextouch.episodes.care import (
+    LEFT,
     DeletionRecords,
     DeletionRequest,
+    RepairReport,
     delete_for_good,
     plan_deletion,
+    repair_group,
+    repair_uploads,
     reviews_by,
 )
 from dextouch.errors import InvalidInputError, NotFoundError
-from services.episode_store.commands.context import EXIT_DAMAGED, Context, Outcome, readable_size
+from services.episode_store.commands import EXIT_DAMAGED, Context, Outcome, readable_size
 from services.episode_store.deletions import deletion_statuses
 
 
@@ -144,3 +148,35 @@ def purge(context: Context) -> Outcome:
     num_bytes = sum(entry.num_bytes for entry in gone)
     context.say(f"{len(gone)} purged, {readable_size(num_bytes)} freed")
     return {"purged": [entry.item_id for entry in gone], "num_bytes": num_bytes}, 0
+
+
+def repair(context: Context) -> Outcome:
+    """Repair damaged items from a copy, and salvage the rest."""
+    root, options = context.need_local_root(), context.options
+    copies = EpisodeStore(options.source) if options.source else None
+    reports = [] if options.ids else repair_uploads(root)
+    for kind, item_id in context.items():
+        reports.append(repair_group(root, kind, item_id, copy=_copy(copies, kind, item_id)))
+    for report in reports:
+        _say_report(context, report)
+    left = any(report.action == LEFT for report in reports)
+    return {"reports": [asdict(r) for r in reports]}, EXIT_DAMAGED if left else 0
+
+
+def _copy(copies: EpisodeStore | None, kind: Kind, item_id: str) -> GroupFiles | None:
+    if copies is None:
+        return None
+    try:
+        return copies.files(item_id, kind=kind)
+    except NotFoundError:
+        return None
+
+
+def _say_report(context: Context, report: RepairReport) -> None:
+    context.say(
+        f"{report.item_id}  {report.action}" + f"  as {report.new_id}" * bool(report.new_id)
+    )
+    for name, count in report.lost.items():
+        context.say(f"  {name}: {count} samples lost")
+    for note in report.notes:
+        context.say(f"  {note}")

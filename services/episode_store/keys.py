@@ -1,14 +1,15 @@
-"""Enrolment of stations: one-time tokens, exchanged for keys that upload for one station.
+"""Keys: what they may do, which uploads they may continue, and how stations get theirs.
 
-Only hashes of tokens and keys are kept: of tokens in memory, so that a restart invalidates them, of
-keys in a file.
+An upload may be continued by the key that began it, and by a key that is bound to its station.
+Stations exchange one-time tokens for such keys. Only hashes of tokens and keys are kept: of tokens
+in memory, so that a restart invalidates them, of keys in a file.
 """
 
 import hmac
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -43,12 +44,108 @@ from dextouch.serving import (
 
 logger = structlog.get_logger(__name__)
 
+# Dependencies of routes on the scope of a key.
+MAY_READ: Final = Depends(RequireScope("store_read"))
+MAY_WRITE: Final = Depends(RequireScope("store_write"))
+MAY_DELETE: Final = Depends(RequireScope("store_delete"))
+MAY_EXPIRE: Final = Depends(RequireScope("store_expire"))
+MAY_ENROL: Final = Depends(RequireScope("enrol"))
+# In the folder of an upload; without it, the upload was begun without keys or by a release that
+# did not keep the name.
+SENDER_FILE: Final = "sender.json"
 STATION_SCOPES: Final = ("store_write",)
 TOKEN_LIFETIME_S: Final = 15 * 60
 NUM_SECRET_BYTES: Final = 32
 # Used and expired tokens are remembered, so that a refusal can give the reason.
 MAX_TOKENS: Final = 256
 ASK_AGAIN: Final = "ask an administrator for a new one"
+
+
+class Sender(FrozenModel):
+    """Who sends an upload: the name of the key (None in a store without keys), and its station.
+
+    `station` is None unless the key is bound to one.
+    """
+
+    name: str | None = None
+    station: str | None = None
+
+    def check_station(self, station: str) -> None:
+        """Raise AccessDeniedError unless the key may upload and ask for this station."""
+        if self.station not in {None, station}:
+            raise AccessDeniedError(
+                f"key {self.name!r} is of station {self.station!r} only, got takes of station "
+                f"{station!r}; name the station {self.station!r} in its settings, or enrol it as "
+                f"{station!r}",
+                reason="other_station",
+                station=station,
+            )
+
+    def may_continue(self, owner: str | None, station: str) -> bool:
+        """Whether an upload of a station that the key `owner` began may be continued.
+
+        A key that is bound to the station may, whatever key the station had before.
+        """
+        if self.station is not None:
+            return self.station == station
+        return self.name is None or owner is None or self.name == owner
+
+    def check_upload(self, folder: Path, station: str) -> None:
+        """Raise AccessDeniedError unless the upload in a folder may be continued."""
+        self.check_station(station)
+        if not self.may_continue(owner_of(folder), station):
+            raise AccessDeniedError(
+                f"upload {folder.name!r}: it was begun by another key than {self.name!r}; only the "
+                "key that begins an upload may continue it, and one that is bound to its station",
+                reason="other_key",
+            )
+
+    def as_files(self) -> dict[str, bytes]:
+        """What the folder of a new upload keeps; nothing without keys."""
+        if self.name is None:
+            return {}
+        return {SENDER_FILE: self.model_dump_json(include={"name"}).encode()}
+
+
+# In a store without keys, and for callers in this process.
+ANYONE: Final = Sender()
+
+
+def _sender(scope: str) -> Callable[[Request], Awaitable[Sender]]:
+    """Dependency that tells who sends a request that needs a scope."""
+
+    async def sender(request: Request) -> Sender:
+        access: AccessControl = request.app.state.access
+        if not access.has_keys:
+            return ANYONE
+        grant = access.granted(request.headers.get("authorization"), scope)
+        return Sender(name=grant.name, station=grant.station)
+
+    return sender
+
+
+Writer = Annotated[Sender, Depends(_sender("store_write"))]
+Reader = Annotated[Sender, Depends(_sender("store_read"))]
+
+
+def owner_of(folder: Path) -> str | None:
+    """Name of the key that began an upload; None if none is kept.
+
+    Raises:
+        StorageError: the file is damaged.
+    """
+    with disk_errors(f"read the sender of upload {folder.name!r}"):
+        try:
+            text = (folder / SENDER_FILE).read_bytes()
+        except FileNotFoundError:
+            return None
+    try:
+        return Sender.model_validate_json(text).name
+    except ValidationError as error:
+        raise StorageError(
+            f"upload {folder.name!r}: {SENDER_FILE} is damaged; expire the upload, so that its "
+            "station sends it again"
+        ) from error
 
 
 class StoredEnrolment(StationEnrolment):
@@ -265,24 +362,18 @@ def _read(path: Path) -> tuple[StoredEnrolment, ...]:
         ) from error
 
 
-# HTTP routes of the enrolment of stations: tokens, keys for them, and revocation.
-
-SCOPE: Final = "enrol"
-
-
 def enrolment_router(enrolments: Enrolments) -> APIRouter:
     """Create the routes below /v1/enrolments; the exchange of a token needs no key."""
     router = APIRouter(prefix="/v1/enrolments", tags=["enrolments"])
-    may_enrol = Depends(RequireScope(SCOPE))
 
-    @router.get("", dependencies=[may_enrol])
+    @router.get("", dependencies=[MAY_ENROL])
     def listing() -> StationEnrolments:
         """List enrolled, waiting and revoked stations."""
         return enrolments.listing()
 
     @router.post("", status_code=201)
     def issue(
-        wanted: EnrolStation, by: Annotated[str, may_enrol], response: Response
+        wanted: EnrolStation, by: Annotated[str, MAY_ENROL], response: Response
     ) -> EnrolmentToken:
         """Issue a one-time token for a station, valid for 15 minutes."""
         response.headers["cache-control"] = "no-store"
@@ -303,7 +394,7 @@ def enrolment_router(enrolments: Enrolments) -> APIRouter:
             raise
 
     @router.post("/{station}/revoke")
-    def revoke(station: str, by: Annotated[str, may_enrol]) -> StationEnrolments:
+    def revoke(station: str, by: Annotated[str, MAY_ENROL]) -> StationEnrolments:
         """Refuse the key of a station from now on, or its unused token."""
         enrolments.revoke(station, by=by)
         return enrolments.listing()
