@@ -28,7 +28,6 @@ from services.evaluation.studies.definition import StudyDefinition, WorldChoice,
 from services.evaluation.studies.engine import (
     PolicyFactory,
     StudyParts,
-    file_digest,
     missing_rollouts,
     run_rollouts,
     run_study,
@@ -36,6 +35,7 @@ from services.evaluation.studies.engine import (
 from services.evaluation.studies.results import PlannedRollout, StudyHeader, StudyResults, cells_of
 from services.evaluation.studies.study_figures import REPORT_FILE, write_reports
 from services.evaluation.success_classifier import SuccessClassifier
+from services.networks.weight_files import digest_of
 from services.pipelines.parsers import study_parser
 from services.pipelines.training_data import stage_of
 from services.twin.scripted_actions import scripted_actions
@@ -98,8 +98,8 @@ def _parts(
     probe = SuccessClassifier.load(probe_path)
     policies = PolicyFactory(definition, partial(demonstrator, definition.tasks, definition.seeds))
     policies.load()
-    digests = {"probe": file_digest(probe_path), **policies.digests()}
-    digests |= {f"probe of {name}": file_digest(path) for name, path in _own_paths(definition)}
+    digests = {"probe": digest_of(probe_path), **policies.digests()}
+    digests |= {f"probe of {name}": digest_of(path) for name, path in _own_paths(definition)}
     parts = StudyParts(
         partial(connect, addresses),
         policies.load,

@@ -7,7 +7,6 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from copy import copy
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from dextouch.clients import Policy
 from dextouch.episodes import EpisodeStore, select_episodes
@@ -29,6 +28,7 @@ from services.evaluation.studies.results import (
     study_report,
 )
 from services.evaluation.success_classifier import SuccessClassifier
+from services.networks.weight_files import digest_of
 
 Start = MatchedStart | FailedStart
 
@@ -221,11 +221,6 @@ class _Workers:
         return runner, policies
 
 
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 class PolicyFactory:
     """Creates the policies of a study; data that all share is read once.
 
@@ -276,7 +271,7 @@ class PolicyFactory:
     def _digest(self, choice: PolicyChoice) -> str | None:
         if choice.builtin is not None:
             path = checkpoint_of(choice.builtin, choice.checkpoint)
-            return None if path is None else file_digest(path)
+            return None if path is None else digest_of(path)
         if choice.replay is None:
             return None
         store = EpisodeStore(choice.replay)
