@@ -65,12 +65,12 @@ from services.world_model.dynamics.features import (
     rotations,
     slot_features,
 )
-from services.world_model.dynamics.members import combined, mapped
 from services.world_model.dynamics.model import first_steps
 from services.world_model.dynamics.start_reader import TASK_WIDTH, FirstStep, Reading, StartReader
+from services.world_model.dynamics.trees import combined, mapped
 from services.world_model.settings import ReaderSettings
 from services.world_model.starts import observed_start
-from services.world_model.training.core_training import read_step, train_reader
+from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 
 KIND: Final = "direct-judge-2"

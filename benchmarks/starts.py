@@ -28,8 +28,8 @@ from services.twin.scripted_actions import Actions, script_name, scripted_action
 from services.twin.settings import TwinSettings
 from services.twin.tasks import EVALUATED, named_tasks
 from services.twin.world import TwinState, TwinWorld
+from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.shipped_checkpoints import default_checkpoint
-from services.world_model.state_checkpoints import read_state_checkpoint
 from services.world_model.state_world import StateWorld
 
 PACKAGES: Final = ("numpy", "mujoco", "torch")

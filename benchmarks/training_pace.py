@@ -6,7 +6,7 @@ from itertools import islice
 
 import torch
 
-from services.world_model.settings import TrainSettings
+from services.world_model.paper_settings import TrainSettings
 from services.world_model.training.dataset import WindowBatch, index_episodes, read_batches
 from services.world_model.training.trainer import TrainingRun
 

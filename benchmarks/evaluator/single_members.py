@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.shipped_checkpoints import default_checkpoint
-from services.world_model.state_checkpoints import (
+from services.world_model.checkpoints import (
     StateCheckpoint,
     read_state_checkpoint,
     write_state_checkpoint,
 )
+from services.world_model.dynamics.model import DynamicsModel
+from services.world_model.shipped_checkpoints import default_checkpoint
 
 
 def write_single_members(world: Path | None, folder: Path) -> list[Path]:

@@ -14,16 +14,16 @@ from benchmarks.stress import worlds
 from benchmarks.stress.cells import Check, StageCells
 from benchmarks.stress.worlds import TASK, Subject
 from dextouch.errors import EndedError, InvalidInputError
-from services.world_model.dynamics.features import DynamicsConfig
-from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.rendering.configuration import RendererConfig
-from services.world_model.rendering.network import RendererNetwork
-from services.world_model.state_checkpoints import (
+from services.world_model.checkpoints import (
     StateCheckpoint,
     StateMetadata,
     read_state_checkpoint,
     write_state_checkpoint,
 )
+from services.world_model.dynamics.features import DynamicsConfig
+from services.world_model.dynamics.model import DynamicsModel
+from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.network import RendererNetwork
 from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
 

@@ -14,11 +14,10 @@ from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFinit
 from services.world_model.network.configuration import NetworkConfig, Precision
 from services.world_model.network.flow_matching import MIN_TIME, training_times
 from services.world_model.network.inputs import build_inputs
-from services.world_model.settings import OptimizerSettings, TrainSettings, WindowSettings
+from services.world_model.paper_settings import OptimizerSettings, TrainSettings, WindowSettings
 from services.world_model.training.dataset import EpisodeArrays, WindowBatch, WindowSampler
 from services.world_model.training.objective import LossOptions, losses
-from services.world_model.training.splits import check_disjoint
-from services.world_model.training.trainer import TrainingRun
+from services.world_model.training.trainer import TrainingRun, check_disjoint
 
 STAGE = StageCells("training")
 _PX = 32

@@ -147,8 +147,8 @@ def _times(
 
 
 def _state_world(path: Path | None) -> "StateWorld":
+    from services.world_model.checkpoints import read_state_checkpoint
     from services.world_model.shipped_checkpoints import PRETRAINED, STATE_MODEL
-    from services.world_model.state_checkpoints import read_state_checkpoint
     from services.world_model.state_world import StateWorld
 
     return StateWorld(read_state_checkpoint(path or PRETRAINED / STATE_MODEL))

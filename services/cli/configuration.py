@@ -43,11 +43,11 @@ SECTIONS: Final = {
     "evaluation_train_policy": "evaluation.settings:TrainPolicySettings",
     "evaluation_train_probe": "evaluation.settings:TrainJudgeSettings",
     "world_model_show": "world_model.settings:ShowCommand",
-    "world_model_train": "world_model.settings:TrainCommand",
+    "world_model_train": "world_model.paper_settings:TrainCommand",
     "world_model_train_state": "world_model.settings:TrainStateCommand",
-    "world_model_train_tokenizer": "world_model.tokenizer_settings:TrainTokenizerCommand",
-    "world_model_distill": "world_model.distillation_settings:DistillCommand",
-    "world_model_adapt": "world_model.settings:AdaptCommand",
+    "world_model_train_tokenizer": "world_model.paper_settings:TrainTokenizerCommand",
+    "world_model_distill": "world_model.paper_settings:DistillCommand",
+    "world_model_adapt": "world_model.paper_settings:AdaptCommand",
     "world_model_adapt_state": "world_model.settings:AdaptStateCommand",
 }
 # Those of `config example` unless others are named.

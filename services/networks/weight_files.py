@@ -1,4 +1,4 @@
-"""Safetensors files of weights with metadata: written atomically, read strictly."""
+"""Safetensors files of weights, written atomically and read strictly, and the memory they need."""
 
 import hashlib
 import json
@@ -19,10 +19,12 @@ from dextouch.errors import (
     LimitExceededError,
     NonFiniteError,
     NotFoundError,
+    UnavailableError,
 )
 
 MAX_FILE_BYTES = 64 * 2**20
 History = TypeVar("History", bound=BaseModel)
+Network = TypeVar("Network", bound=nn.Module)
 
 
 def half_weights(model: nn.Module, *, prefix: str = "") -> dict[str, Tensor]:
@@ -215,3 +217,57 @@ def refuse_non_finite(tensors: Mapping[str, Tensor], where: str) -> None:
     bad = [name for name, tensor in tensors.items() if not torch.isfinite(tensor).all()]
     if bad:
         raise NonFiniteError(f"{where}: NaN or infinity in {bad[:3]} ({len(bad)} tensors)")
+
+
+def on_device(network: Network, device: str) -> Network:
+    """Move a network to a device, in place.
+
+    Raises:
+        UnavailableError: torch has no such device here.
+        LimitExceededError: a CUDA device with less free memory than the weights need.
+    """
+    try:
+        place = torch.device(device)
+        torch.empty(0, device=place)
+    except (RuntimeError, AssertionError) as error:
+        raise UnavailableError(
+            f"device {device!r}: not available ({error}); use cpu, or a device that "
+            "torch.cuda.is_available() confirms"
+        ) from error
+    if place.type == "cuda":
+        free, _ = torch.cuda.mem_get_info(place)
+        check_memory(memory_of(network.state_dict()), where=f"device {device}", max_bytes=free)
+    return network.to(place)
+
+
+def memory_of(tensors: Mapping[str, Tensor]) -> int:
+    """Bytes of tensors, which may be on the meta device."""
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
+
+
+def check_memory(num_bytes: int, *, where: str, max_bytes: int | None = None) -> None:
+    """Refuse weights that do not fit.
+
+    Args:
+        num_bytes: memory that the weights need.
+        where: context for the error message.
+        max_bytes: limit; None for the memory that is available.
+
+    Raises:
+        LimitExceededError: more than the limit.
+    """
+    limit = available_memory() if max_bytes is None else max_bytes
+    if limit is not None and num_bytes > limit:
+        raise LimitExceededError(
+            f"{where}: needs {num_bytes / 1e9:.2f} GB of memory, expected at most "
+            f"{limit / 1e9:.2f} GB; free some, use a machine with more, or precision bfloat16"
+        )
+
+
+def available_memory() -> int | None:
+    """Bytes that new processes can use without swapping; None where Linux does not tell."""
+    table = Path("/proc/meminfo")
+    if not table.is_file():
+        return None
+    rows = dict(line.split(":", 1) for line in table.read_text().splitlines())
+    return int(rows["MemAvailable"].split()[0]) * 1024 if "MemAvailable" in rows else None

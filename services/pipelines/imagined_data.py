@@ -25,8 +25,11 @@ from services.evaluation.reporting import PredictionPicture, ReportPictures, wri
 from services.generation import SHORT_CHUNK_STEPS, imagine_episode, whole_steps
 from services.pipelines.parsers import generate_parser, imagined_parser
 from services.pipelines.servers import served
-from services.world_model.checkpoints import read_checkpoint
-from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
+from services.world_model.checkpoints import (
+    is_state_checkpoint,
+    read_checkpoint,
+    read_state_checkpoint,
+)
 from services.world_model.state_world import StateWorld
 from services.world_model.training.dataset import fingerprint, read_episode
 from services.world_model.world import open_world

@@ -9,8 +9,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from dextouch.command_line import ProgressLines, write_result
 from dextouch.serving import load_settings
 from services.evaluation.reporting.pictures import Line, line_chart, stand_alone
-from services.world_model.tokenizer_files import Reconstruction, TokenizerMetadata, read_tokenizer
-from services.world_model.tokenizer_settings import TrainTokenizerCommand
+from services.world_model.checkpoints import Reconstruction, TokenizerMetadata, read_tokenizer
+from services.world_model.paper_settings import TrainTokenizerCommand
 from services.world_model.training.tokenizer_trainer import TokenizerReport, train_tokenizer
 
 

@@ -9,24 +9,27 @@ from typing import Any
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dextouch.command_line import ProgressLines, write_result
-from dextouch.serving import (
-    load_settings,
-)
+from dextouch.serving import load_settings
 from dextouch.worlds import World, serve_worlds
 from services.networks.weight_files import digest_of
-from services.world_model.checkpoints import list_checkpoints, read_checkpoint, read_metadata
-from services.world_model.distillation_settings import DistillCommand
+from services.world_model.checkpoints import (
+    is_state_checkpoint,
+    is_tokenizer,
+    list_checkpoints,
+    read_checkpoint,
+    read_metadata,
+    read_state_checkpoint,
+    read_tokenizer,
+)
 from services.world_model.forms import adapt_settings, train_settings
+from services.world_model.paper_settings import DistillCommand, TrainSettings
 from services.world_model.plan import plan_table
 from services.world_model.settings import (
     AdaptStateCommand,
     ShowCommand,
-    TrainSettings,
     TrainStateCommand,
     WorldModelSettings,
 )
-from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
-from services.world_model.tokenizer_files import is_tokenizer, read_tokenizer
 from services.world_model.training.distribution import Processes, joined_processes
 from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
 from services.world_model.world import open_world
@@ -131,30 +134,25 @@ def open_worlds(settings: WorldModelSettings) -> dict[str, World[Any]]:
     import torch
 
     torch.set_num_threads(settings.num_threads)
-    world = open_world(
-        settings.checkpoint,
-        sampling_steps=settings.sampling_steps,
-        sampler=settings.sampler,
-        objects=settings.objects,
-        placement=settings.placement,
-    )
-    return {settings.world_name: world}
+    return {settings.world_name: _open(settings.checkpoint, settings)}
 
 
 def open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> World[Any] | None:
     """The world of the checkpoint with this digest beside the one that is served."""
     for path, found in list_checkpoints(settings.checkpoint.parent).items():
         if found == digest:
-            if is_state_checkpoint(path):
-                return open_world(path)
-            return open_world(
-                path,
-                sampling_steps=settings.sampling_steps,
-                sampler=settings.sampler,
-                objects=settings.objects,
-                placement=settings.placement,
-            )
+            return open_world(path) if is_state_checkpoint(path) else _open(path, settings)
     return None
+
+
+def _open(path: Path, settings: WorldModelSettings) -> World[Any]:
+    return open_world(
+        path,
+        sampling_steps=settings.sampling_steps,
+        sampler=settings.sampler,
+        objects=settings.objects,
+        placement=settings.placement,
+    )
 
 
 def run_show(arguments: list[str]) -> int:

@@ -7,13 +7,9 @@ from typing import Final
 from dextouch.command_line import CommandParser
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.serving import CommandSettings, configuration_path, read_configuration, section_of
+from services.world_model.paper_settings import AdaptCommand, TrainCommand
 from services.world_model.presets import PRESETS
-from services.world_model.settings import (
-    AdaptCommand,
-    AdaptStateCommand,
-    TrainCommand,
-    TrainStateCommand,
-)
+from services.world_model.settings import AdaptStateCommand, TrainStateCommand
 
 STATE: Final = "state"
 
@@ -39,7 +35,7 @@ def adapt_settings(arguments: list[str]) -> type[AdaptStateCommand] | type[Adapt
     init = _value(arguments, "init", AdaptStateCommand, AdaptCommand)
     if init is None:
         return AdaptStateCommand
-    from services.world_model.state_checkpoints import is_state_checkpoint
+    from services.world_model.checkpoints import is_state_checkpoint
 
     return AdaptStateCommand if is_state_checkpoint(Path(init)) else AdaptCommand
 

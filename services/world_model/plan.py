@@ -10,7 +10,7 @@ which depends on the library, is not counted.
 import weakref
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, is_dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
@@ -19,15 +19,19 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
 from dextouch.tactile.layout import NUM_TAXELS
-from services.networks.memory import memory_of
+from services.networks.weight_files import memory_of
 from services.world_model.network.attention import CAMERA_DIM, HAND_DIM
-from services.world_model.network.configuration import NetworkConfig, num_latents
+from services.world_model.network.configuration import (
+    NetworkConfig,
+    Precision,
+    WanConfig,
+    num_latents,
+)
 from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs
-from services.world_model.network.instruction import MAX_WORDS
+from services.world_model.network.instruction import MAX_WORDS, key_of
 from services.world_model.network.model import FirstLatents, JointLatents, JointWorldModel
-from services.world_model.wan.configuration import WanConfig
-from services.world_model.wan.text import key_of
 
+_PRECISIONS: Final[tuple[Precision, ...]] = ("float32", "bfloat16")
 # Text encoder of the published model, UMT5-XXL.
 _TEXT_ENCODER: Final = {
     "vocab_size": 256384, "d_model": 4096, "d_kv": 64, "d_ff": 10240, "num_layers": 24,
@@ -127,17 +131,10 @@ class PeakMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 def plan_table(config: NetworkConfig) -> str:
     """Plan as a text; for the full size in both precisions."""
-    choices: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
     plans = {"float32": plan_of(config)}
     if config.wan is not None:
-        plans = {
-            precision: plan_of(
-                config.model_copy(
-                    update={"wan": config.wan.model_copy(update={"precision": precision})}
-                )
-            )
-            for precision in choices
-        }
+        sizes = {one: config.wan.model_copy(update={"precision": one}) for one in _PRECISIONS}
+        plans = {one: plan_of(config.model_copy(update={"wan": wan})) for one, wan in sizes.items()}
     first, *_ = plans.values()
 
     def row(name: str, amount: str, sizes: Iterable[int]) -> str:
@@ -173,14 +170,9 @@ def plan_table(config: NetworkConfig) -> str:
     )
 
 
-def plan_of(config: NetworkConfig, *, num_steps: int | None = None) -> Plan:
-    """Plan of one action chunk.
-
-    Args:
-        config: network to plan.
-        num_steps: steps of the chunk, 4k; None for the longest.
-    """
-    steps = (config.max_steps if num_steps is None else 1 + num_steps) - 1
+def plan_of(config: NetworkConfig) -> Plan:
+    """Plan of one action chunk of the greatest length."""
+    steps = config.max_steps - 1
     with torch.device("meta"), torch.no_grad():
         model = JointWorldModel(config).eval()
         work, kept_bytes = _work(model, 1 + steps)

@@ -1,85 +1,33 @@
-"""Settings of world model training and serving, from flags and environment variables."""
+"""Settings of the state model and of serving, from flags and environment variables."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
-from pydantic_settings import (
-    BaseSettings,
-    CliImplicitFlag,
-    PydanticBaseSettingsSource,
-)
+from pydantic_settings import CliImplicitFlag
 
 from dextouch.command_line import JSON_HELP
 from dextouch.frozen_model import FrozenModel
-from dextouch.serving import CommandSettings, file_source, service_config
+from dextouch.serving import CommandSettings, service_config
 from dextouch.worlds import WorldServiceSettings
 from services.networks.training_settings import (
     USUAL_IMAGE_PX,
     AverageDecay,
     Batch,
-    CpuBudget,
     Device,
     ImagePx,
     LearningRate,
-    MaxGradientNorm,
-    MaxSteps,
     NumSteps,
     Splits,
     Stores,
     Tasks,
-    WarmupSteps,
     WeightDecay,
 )
-from services.world_model.network.configuration import NetworkConfig, Precision, Sampler
-from services.world_model.placement import Placement
-from services.world_model.presets import PRESETS, PresetSource
+from services.world_model.network.configuration import Precision, Sampler, WanFiles
+from services.world_model.presets import PRESETS
 from services.world_model.rendering.configuration import RendererConfig, RendererTraining
 from services.world_model.shipped_checkpoints import PRETRAINED, default_checkpoint
-from services.world_model.wan.configuration import WanFiles
-
-
-class OptimizerSettings(FrozenModel):
-    """Settings of the optimizer."""
-
-    batch: Batch = 8
-    learning_rate: LearningRate = 2e-3
-    warmup_steps: WarmupSteps = 100
-    weight_decay: WeightDecay = 0.02
-    max_gradient_norm: MaxGradientNorm = 1.0
-    ema_decay: AverageDecay = 0.995
-    tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac (equation 5)")
-    precision: Precision = Field(
-        default="float32", description="of matrix products in training; weights keep theirs"
-    )
-    touch_loss: Literal["all", "contact_or_changing"] = Field(
-        default="all",
-        description="tactile tokens that count in the loss: all, or those in contact or changing",
-    )
-
-
-class AdaptOptimizerSettings(OptimizerSettings):
-    """Settings of the optimizer with a tenth of the learning rate from random weights."""
-
-    learning_rate: LearningRate = 2e-4
-    warmup_steps: WarmupSteps = 20
-
-
-class WindowSettings(FrozenModel):
-    """Sampling of training windows."""
-
-    commanded_fraction: float = Field(
-        default=0.5,
-        ge=0,
-        le=1,
-        description="share of windows with commanded actions, where available",
-    )
-    chained_fraction: float = Field(
-        default=0.3, ge=0, le=1, description="share of commanded windows anchored like later chunks"
-    )
-    short_fraction: float = Field(default=0.25, ge=0, le=1, description="share of short windows")
-    context_noise: float = Field(default=0.05, ge=0, le=1, description="noise on the first latents")
-    fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
 
 
 class DataSettings(FrozenModel):
@@ -118,101 +66,6 @@ class DataSettings(FrozenModel):
     def share_of_human(self) -> float | None:
         """Share of examples from human episodes; None where domains are not told apart."""
         return self.human_share if self.human else None
-
-
-class RunSettings(DataSettings):
-    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
-
-    episodes: str = Field(description="URL or folder of the episode store to train on")
-    output: Path = Field(
-        default=Path("runs/world_model/tiny.safetensors"), description="checkpoint to write"
-    )
-    name: str = Field(default="tiny", description="model name in the checkpoint")
-    preset: str = Field(
-        default="tiny",
-        description=f"named settings that other flags override: {', '.join(PRESETS)}",
-    )
-    seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
-    cpu_budget_s: CpuBudget = 1000.0
-    max_steps: MaxSteps = None
-    num_threads: int = Field(default=1, ge=1, description="threads of torch")
-    device: Device = "cpu"
-    wan: WanFiles = Field(default=WanFiles(), description="files of the pretrained networks")
-    heldout_percent: int = Field(
-        default=10,
-        ge=1,
-        le=50,
-        description="percentage of episodes to evaluate on if no --heldout is given",
-    )
-    evaluation_stride: int = Field(
-        default=8, ge=1, description="evaluate on every n-th window of held-out episodes"
-    )
-    streaming: CliImplicitFlag[bool] = Field(
-        default=False, description="stream episodes from disk, for data larger than memory"
-    )
-    loader_workers: int = Field(
-        default=0, ge=0, le=64, description="reader processes of --streaming; 0: this process"
-    )
-    resume: CliImplicitFlag[bool] = Field(
-        default=False,
-        description="resume an interrupted run of this output, if there is one",
-    )
-    state_every_cpu_s: float = Field(
-        default=60.0, ge=0, description="CPU seconds between states saved for --resume"
-    )
-    optimizer: OptimizerSettings = Field(
-        default=OptimizerSettings(), description="settings of the optimizer"
-    )
-    windows: WindowSettings = Field(
-        default=WindowSettings(), description="sampling of training windows"
-    )
-
-
-class TrainSettings(RunSettings):
-    """Training of a network, from random weights or from those of a checkpoint."""
-
-    init: Path | None = Field(
-        default=None,
-        description="checkpoint to initialize from; its network settings must be equal, except "
-        "those of sampling",
-    )
-    tokenizer: Path | None = Field(
-        default=None, description="tactile tokenizer of `dextouch train tokenizer`, kept frozen"
-    )
-    self_forcing: CliImplicitFlag[bool] = Field(
-        default=False, description="train on own contexts and samples (see dextouch train distill)"
-    )
-    network: NetworkConfig = Field(default=NetworkConfig(), description="shape of the network")
-
-
-class AdaptSettings(RunSettings):
-    """Adaptation of a trained model to new tasks.
-
-    The network, its codecs and its normalizers are those of the checkpoint; human and robot
-    episodes may be of the same tasks, but not of those that the checkpoint was trained on.
-    """
-
-    init: Path = Field(description="checkpoint to adapt")
-    output: Path = Field(
-        default=Path("runs/world_model/adapted.safetensors"), description="checkpoint to write"
-    )
-    name: str = Field(default="adapted", description="model name in the checkpoint")
-    cpu_budget_s: CpuBudget = 300.0
-    disjoint_tasks: CliImplicitFlag[bool] = Field(
-        default=False, description="refuse human episodes of tasks that robots have, too"
-    )
-    new_tasks: CliImplicitFlag[bool] = Field(
-        default=True, description="refuse tasks that the initial checkpoint was trained on"
-    )
-    optimizer: AdaptOptimizerSettings = Field(
-        default=AdaptOptimizerSettings(), description="settings of the optimizer"
-    )
-
-    def training(self, network: NetworkConfig) -> TrainSettings:
-        """The same run as training of a network from its checkpoint."""
-        given = {name: getattr(self, name) for name in RunSettings.model_fields}
-        given |= {"optimizer": OptimizerSettings(**self.optimizer.model_dump())}
-        return TrainSettings(**given, init=self.init, network=network)
 
 
 class ReaderSettings(FrozenModel):
@@ -386,53 +239,22 @@ class AdaptStateCommand(CommandSettings, StateAdaptSettings):
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
-class TrainCommand(CommandSettings, TrainSettings):
-    r"""Train the paper's form: a joint visuo-tactile flow-matching model of windows of episodes.
+class Placement(FrozenModel):
+    """Where a flow-matching model computes, and in which precision."""
 
-    Example:
-      dextouch train world-model --preset tiny --episodes runs/data --output runs/tiny.safetensors
-
-    In the paper's design, whose tokenizer is trained first:
-      dextouch train tokenizer --episodes runs/episodes --output runs/tokenizer.safetensors
-      dextouch train world-model --preset paper --tokenizer runs/tokenizer.safetensors \
-        --episodes runs/episodes --output runs/paper.safetensors
-
-    At full size, from a local copy of Wan2.2-TI2V-5B; with --plan to see what it needs:
-      dextouch train world-model --preset wan22-5b --wan.folder models/Wan2.2-TI2V-5B-Diffusers \
-        --tokenizer runs/tokenizer.safetensors --episodes runs/episodes --plan
-    """
-
-    model_config = service_config("world_model_train", "dextouch train world-model")
-
-    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
-    plan: CliImplicitFlag[bool] = Field(
-        default=False, description="print memory and FLOPs of the network, and do not train"
+    device: Device = "cpu"
+    precision: Precision = Field(
+        default="float32", description="of the experts' weights; codecs and norms keep theirs"
     )
-
-    @classmethod
-    def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Flags, the environment, the file, then the preset that one of them names."""
-        given = init_settings, env_settings, *file_source(settings_cls)
-        return (*given, PresetSource(settings_cls))
-
-
-class AdaptCommand(CommandSettings, AdaptSettings):
-    """Adapt a world model of the paper's form to new tasks, from robot and human episodes.
-
-    Example:
-      dextouch train adapt --init runs/paper.safetensors --episodes runs/new --robot-episodes 200
-    """
-
-    model_config = service_config("world_model_adapt", "dextouch train adapt")
-
-    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
+    text: WanFiles = Field(
+        default=WanFiles(),
+        description="files of the text encoder, for instructions that a checkpoint does not know",
+    )
+    max_file_gb: float | None = Field(
+        default=None,
+        gt=0,
+        description="largest checkpoint; default: 64 MiB, for the full size the available memory",
+    )
 
 
 class ShowCommand(CommandSettings):
@@ -483,3 +305,23 @@ class WorldModelSettings(WorldServiceSettings):
         default=Placement(), description="device and precision of a flow-matching model"
     )
     num_threads: int = Field(default=1, ge=1, description="threads of torch")
+
+
+def flags_of(given: Mapping[str, object], prefix: str = "") -> list[str]:
+    """Flags of a command for these settings; names of nested ones are joined by dots."""
+    flags: list[str] = []
+    for name, value in given.items():
+        flag = prefix + name.replace("_", "-")
+        if isinstance(value, Mapping):
+            flags += flags_of(value, f"{flag}.")
+        elif isinstance(value, bool):
+            flags.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            values = value if isinstance(value, list) else [value]
+            flags += [f"--{flag}={one}" for one in values]
+    return flags
+
+
+def last_name(url: str) -> str:
+    """Last component of a path or URL."""
+    return url.rstrip("/").rsplit("/", 1)[-1]

@@ -1,22 +1,23 @@
-"""Validated rollout starts, one observed step each, for both kinds of world model."""
+"""Validated rollout starts, action chunks and snapshots, for both kinds of world model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
-from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
+from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses, check_actions
 from dextouch.images import scaled_square
-from dextouch.schemas import Observation, RolloutStart
-from dextouch.streams import HEAD_CAMERA
+from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
+from dextouch.streams import HEAD_CAMERA, unpack
+from services.world_model.checkpoints import StateCheckpoint
 from services.world_model.dynamics.features import BOX_AXES, hand_motion, poses_from_objects
-from services.world_model.dynamics.members import stacked
 from services.world_model.dynamics.model import first_steps, mean_poses
+from services.world_model.dynamics.trees import stacked
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
-from services.world_model.state_checkpoints import StateCheckpoint
 
 # Larger values are mistakes of units or frames.
 MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
@@ -120,7 +121,61 @@ def check_geometry(anchor: AnchorPoses, K_head: Float64[np.ndarray, "3 3"]) -> N
         )
 
 
-# Objects of an observed or imagined step, as the start readers of a state model see them.
+def checked_selectors(
+    states: Sequence[object],
+    actions: np.ndarray,
+    seeds: Sequence[int],
+    selectors: Sequence[ReturnSelector] | None,
+) -> list[ReturnSelector]:
+    """The selector of every rollout of a batch; by default everything is returned.
+
+    Raises:
+        ShapeError: no rollout, or not one action chunk, seed and selector for each.
+    """
+    requested = [EVERYTHING] * len(states) if selectors is None else list(selectors)
+    counts = (len(states), len(actions), len(seeds), len(requested))
+    if len(set(counts)) != 1 or len(states) == 0:
+        raise ShapeError(
+            f"chunks: got {counts[0]} states, {counts[1]} action chunks, {counts[2]} seeds and "
+            f"{counts[3]} selectors, expected one of each for every rollout"
+        )
+    return requested
+
+
+def checked_chunk(
+    actions: np.ndarray, description: WorldDescription
+) -> Float64[np.ndarray, "steps 67"]:
+    """Actions that a world accepts as one chunk.
+
+    Raises:
+        ShapeError: a chunk of another length.
+        InvalidInputError: physically impossible actions.
+    """
+    chunk = check_actions(actions, where="action chunk")
+    multiple, longest = description.chunk_multiple, description.max_chunk_steps
+    if len(chunk) % multiple or len(chunk) > longest:
+        raise ShapeError(
+            f"action chunk: got {len(chunk)} rows, expected a multiple of {multiple} up to "
+            f"{longest}"
+        )
+    return chunk
+
+
+def opened_snapshot(
+    data: bytes, digest: str, *, max_bytes: int
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Fields and arrays of a snapshot of the world with this digest.
+
+    Raises:
+        InvalidInputError: not a snapshot of this world.
+    """
+    fields, arrays = unpack(data, max_bytes=max_bytes)
+    if fields.get("digest") != digest:
+        raise InvalidInputError(
+            f"snapshot: made by world {str(fields.get('digest'))[:12]!r}, expected "
+            f"{digest[:12]!r}; restore it in the world that made it"
+        )
+    return fields, arrays
 
 
 class SceneReader:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.errors import EndedError, InvalidInputError, ShapeError, UnavailableError
+from dextouch.errors import EndedError, InvalidInputError, UnavailableError
 from dextouch.hands.actions import (
     JOINTS_LEFT,
     JOINTS_RIGHT,
@@ -24,8 +24,9 @@ from dextouch.schemas import (
     RolloutStart,
     WorldDescription,
 )
-from dextouch.streams import HEAD_CAMERA, pack, unpack
+from dextouch.streams import HEAD_CAMERA, pack
 from dextouch.worlds import StartedRollout, SteppedRollout
+from services.world_model.checkpoints import StateCheckpoint, StateMetadata
 from services.world_model.dynamics.features import (
     BOX_AXES,
     STEPS_PER_LATENT,
@@ -34,19 +35,17 @@ from services.world_model.dynamics.features import (
     hand_motion,
     poses_from_objects,
 )
-from services.world_model.dynamics.memory import (
-    memory_arrays,
-    memory_from_arrays,
-    memory_of,
-    stack_memories,
-)
 from services.world_model.dynamics.model import (
     PRESENCE_THRESHOLD,
     ImaginedSteps,
     SceneMemory,
+    batched,
     first_steps,
     mean_size,
     mean_start,
+    memory_arrays,
+    memory_from_arrays,
+    memory_of,
 )
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import (
@@ -55,14 +54,24 @@ from services.world_model.network.inputs import (
     build_inputs,
     check_reach,
 )
+from services.world_model.rendering.rasters import SceneState
 from services.world_model.rendering.renderer import Drawing, Renderer
-from services.world_model.rendering.scene_states import SceneState
-from services.world_model.starts import ObservedStart, check_geometry, observed_start
-from services.world_model.state_checkpoints import StateCheckpoint, StateMetadata
-
-# Rollout state of a state model, and its snapshot.
+from services.world_model.starts import (
+    ObservedStart,
+    check_geometry,
+    checked_chunk,
+    checked_selectors,
+    observed_start,
+    opened_snapshot,
+)
 
 MAX_SNAPSHOT_BYTES = 2**20
+MAX_CHUNK_STEPS = 64
+# Pose reported for objects believed absent: below the table, where no task places one.
+ABSENT_POSE = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0, 0.0], dtype=np.float32)
+# A rollout is flagged once its hands have moved 1.5 times the length of a training episode and ends
+# at four times that length, since no longer ones were trained on.
+DOUBTED_HORIZONS, LAST_HORIZONS = 1.5, 4.0
 
 
 @dataclass(frozen=True)
@@ -109,12 +118,7 @@ def rollout_from_bytes(data: bytes, metadata: StateMetadata, digest: str) -> Sta
         InvalidInputError: not a snapshot of this world.
         NonFiniteError: NaN or infinity.
     """
-    fields, arrays = unpack(data, max_bytes=MAX_SNAPSHOT_BYTES)
-    if fields.get("digest") != digest:
-        raise InvalidInputError(
-            f"snapshot: made by world {str(fields.get('digest'))[:12]!r}, expected "
-            f"{digest[:12]!r}; restore it in the world that made it"
-        )
+    fields, arrays = opened_snapshot(data, digest, max_bytes=MAX_SNAPSHOT_BYTES)
     config, name = metadata.dynamics, fields.get("task")
     step, moving = fields.get("step"), fields.get("num_moving")
     size = (config.image_px, config.image_px, 3)
@@ -150,14 +154,6 @@ def rollout_from_bytes(data: bytes, metadata: StateMetadata, digest: str) -> Sta
         step=step,
         num_moving=moving,
     )
-
-
-MAX_CHUNK_STEPS = 64
-# Pose reported for objects believed absent: below the table, where no task places one.
-ABSENT_POSE = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0, 0.0], dtype=np.float32)
-# A rollout is flagged once its hands have moved 1.5 times the length of a training episode and ends
-# at four times that length, since no longer ones were trained on.
-DOUBTED_HORIZONS, LAST_HORIZONS = 1.5, 4.0
 
 
 class StateWorld:
@@ -215,9 +211,7 @@ class StateWorld:
             InvalidInputError: missing or invalid observation, anchor or K_head.
         """
         first = observed_start(
-            start,
-            tasks=self._description.tasks,
-            image_px=self._metadata.dynamics.image_px,
+            start, tasks=self._description.tasks, image_px=self._metadata.dynamics.image_px
         )
         self._check_start(start, first)
         motion = hand_motion(first.reached[None], first.anchor)
@@ -287,13 +281,7 @@ class StateWorld:
         selectors: Sequence[ReturnSelector] | None = None,
     ) -> list[SteppedRollout[StateRollout]]:
         """`step` for several rollouts; results differ from single calls by rounding only."""
-        requested = [EVERYTHING] * len(states) if selectors is None else list(selectors)
-        counts = (len(states), len(actions), len(seeds), len(requested))
-        if len(set(counts)) != 1 or len(states) == 0:
-            raise ShapeError(
-                f"chunks: got {counts[0]} states, {counts[1]} action chunks, {counts[2]} seeds and "
-                f"{counts[3]} selectors, expected one of each for every rollout"
-            )
+        requested = checked_selectors(states, actions, seeds, selectors)
         for state in states:
             self._refuse_ended(state)
         chunks = [self._checked_chunk(chunk) for chunk in actions]
@@ -301,7 +289,7 @@ class StateWorld:
             hand_motion(chunk, state.anchor, validated=True)
             for chunk, state in zip(chunks, states, strict=True)
         ]
-        memory = stack_memories([state.memory for state in states])
+        memory = batched([state.memory for state in states])
         following, imagined = self._dynamics.advance(memory, Commands.of(motions))
         _refuse_non_finite(imagined)
         answers = [
@@ -331,12 +319,7 @@ class StateWorld:
             raise EndedError(f"world {self._metadata.name}: {reason}", reason=reason)
 
     def _checked_chunk(self, actions: np.ndarray) -> Float64[np.ndarray, "steps 67"]:
-        chunk = check_actions(actions, where="action chunk")
-        if len(chunk) % STEPS_PER_LATENT or len(chunk) > MAX_CHUNK_STEPS:
-            raise ShapeError(
-                f"action chunk: got {len(chunk)} rows, expected a multiple of {STEPS_PER_LATENT} "
-                f"up to {MAX_CHUNK_STEPS}"
-            )
+        chunk = checked_chunk(actions, self._description)
         check_reach(chunk)
         return chunk
 
@@ -349,10 +332,7 @@ class StateWorld:
     ) -> tuple[SteppedRollout[StateRollout], Drawing | None]:
         """The chunk's observation without images, and what to draw if images are requested."""
         steps, index = imagined
-        one = ObjectPoses(
-            steps.poses.position_m[index], steps.poses.axes[index], steps.poses.present[index]
-        )
-        poses = self._poses(one, state.task)
+        poses = self._poses(steps.poses[index], state.task)
         observation = Observation(
             first_step=state.step - len(chunk) + 1,
             images={},

@@ -8,17 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.errors import (
-    InvalidInputError,
-    ShapeError,
-    UnavailableError,
-)
-from dextouch.hands.actions import (
-    AnchorPoses,
-    check_actions,
-    poses_from_actions,
-    reanchor,
-)
+from dextouch.errors import InvalidInputError, UnavailableError
+from dextouch.hands.actions import AnchorPoses, check_actions, poses_from_actions, reanchor
 from dextouch.schemas import (
     EVERYTHING,
     ActionKind,
@@ -27,18 +18,28 @@ from dextouch.schemas import (
     RolloutStart,
     WorldDescription,
 )
-from dextouch.streams import HEAD_CAMERA, pack, unpack
+from dextouch.streams import HEAD_CAMERA, pack
 from dextouch.worlds import StartedRollout, SteppedRollout
-from services.networks.memory import on_device
-from services.world_model.checkpoints import Checkpoint, read_checkpoint
+from services.networks.weight_files import on_device
+from services.world_model.checkpoints import (
+    Checkpoint,
+    is_state_checkpoint,
+    read_checkpoint,
+    read_state_checkpoint,
+)
 from services.world_model.network.configuration import Precision, Sampler
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Prediction, Sampling, stack_noise
 from services.world_model.network.video import to_uint8, to_unit
-from services.world_model.placement import Placement
+from services.world_model.settings import Placement
 from services.world_model.shipped_checkpoints import default_checkpoint
-from services.world_model.starts import SceneReader, observed_start
-from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
+from services.world_model.starts import (
+    SceneReader,
+    checked_chunk,
+    checked_selectors,
+    observed_start,
+    opened_snapshot,
+)
 from services.world_model.state_world import StateWorld
 
 MAX_SNAPSHOT_BYTES = 4 * 2**20
@@ -173,26 +174,19 @@ class ModelWorld:
         Images of the last latent are always decoded, since the next chunk starts from the last of
         them; the others only on request.
         """
-        requested = [EVERYTHING] * len(states) if selectors is None else list(selectors)
-        counts = (len(states), len(actions), len(seeds), len(requested))
-        if len(set(counts)) != 1 or len(states) == 0:
-            raise ShapeError(
-                f"chunks: got {counts[0]} states, {counts[1]} action chunks, {counts[2]} seeds and "
-                f"{counts[3]} selectors, expected one of each for every rollout"
-            )
-        chunks = [self._checked_chunk(chunk) for chunk in actions]
+        requested = checked_selectors(states, actions, seeds, selectors)
+        chunks = [checked_chunk(chunk, self._description) for chunk in actions]
         requests = self._requests(states, chunks)
         inputs = build_inputs(requests, self._model.config)
         noise = stack_noise(
-            [self._model.noise(inputs.num_steps, _generator(seed)) for seed in seeds]
+            [
+                self._model.noise(inputs.num_steps, torch.Generator().manual_seed(seed))
+                for seed in seeds
+            ]
         )
         wanted = any(one.steps == "all" and one.wants(HEAD_CAMERA) for one in requested)
         future = self._model.predict(
-            inputs,
-            noise,
-            sampling=self._sampling,
-            all_images=wanted,
-            precision=self._precision,
+            inputs, noise, sampling=self._sampling, all_images=wanted, precision=self._precision
         )
         _refuse_non_finite(future)
         images, touches = to_uint8(future.images).cpu().numpy(), future.tactile_kpa.cpu().numpy()
@@ -252,12 +246,7 @@ class ModelWorld:
         Raises:
             InvalidInputError: not a snapshot of this checkpoint.
         """
-        fields, arrays = unpack(data, max_bytes=MAX_SNAPSHOT_BYTES)
-        if fields.get("digest") != self._digest:
-            raise InvalidInputError(
-                f"snapshot: made by world {str(fields.get('digest'))[:12]!r}, expected "
-                f"{self._digest[:12]!r}; restore it in the world that made it"
-            )
+        fields, arrays = opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
         step, words, task = fields.get("step"), fields.get("instruction"), fields.get("task")
         if (
             set(arrays) != set(_SNAPSHOT_ARRAYS)
@@ -285,16 +274,6 @@ class ModelWorld:
         standing = np.repeat(state.reached[None], self._description.chunk_multiple, axis=0)
         build_inputs(self._requests([state], [standing]), self._model.config)
         return state
-
-    def _checked_chunk(self, actions: np.ndarray) -> Float64[np.ndarray, "steps 67"]:
-        chunk = check_actions(actions, where="action chunk")
-        multiple, longest = self._description.chunk_multiple, self._description.max_chunk_steps
-        if len(chunk) % multiple or len(chunk) > longest:
-            raise ShapeError(
-                f"action chunk: got {len(chunk)} rows, expected a multiple of {multiple} up to "
-                f"{longest}"
-            )
-        return chunk
 
 
 def open_world(
@@ -395,10 +374,6 @@ def _advance(
         step=state.step + len(chunk),
     )
     return SteppedRollout(following, observation)
-
-
-def _generator(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def _refuse_non_finite(future: Prediction) -> None:

@@ -22,8 +22,12 @@ from services.twin.world import TwinWorld
 from services.world_model.checkpoints import (
     Checkpoint,
     CheckpointMetadata,
+    StateCheckpoint,
+    StateMetadata,
     read_checkpoint,
+    read_state_checkpoint,
     write_checkpoint,
+    write_state_checkpoint,
 )
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
@@ -31,12 +35,6 @@ from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.network import RendererNetwork
-from services.world_model.state_checkpoints import (
-    StateCheckpoint,
-    StateMetadata,
-    read_state_checkpoint,
-    write_state_checkpoint,
-)
 from services.world_model.state_world import StateWorld
 from services.world_model.world import ModelWorld
 from tests.unit.worlds.fakes import K_HEAD, BatchSumWorld, anchor, observation

@@ -13,9 +13,9 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.tasks import EVALUATED
 from services.twin.world import TwinWorld
+from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.dynamics.model import REST_LATENTS
 from services.world_model.shipped_checkpoints import PRETRAINED
-from services.world_model.state_checkpoints import read_state_checkpoint
 from services.world_model.state_world import StateWorld
 
 CAMERA = "camera_head"

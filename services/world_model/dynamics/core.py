@@ -7,13 +7,18 @@ moves with the left hand, with the right hand, or by itself, as three gates say.
 
 Hidden units stay within −1 … 1 by construction, and predicted positions within reach, so that what
 a rollout carries from one chunk to the next is bounded.
+
+Layers have separate weights for every member of an ensemble, computed for all members at once.
+Inputs and outputs have one batch axis in which each member's entries follow each other, all members
+with equally many. At the sizes of a single rollout a small network takes as long as its number of
+operations, so that an ensemble costs about as much as one of its members.
 """
 
 from dataclasses import dataclass
 from itertools import combinations
 
 import torch
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Float32, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -33,7 +38,6 @@ from services.world_model.dynamics.features import (
     rotations,
     slot_features,
 )
-from services.world_model.dynamics.members import MemberGRU, MemberLinear, MemberNorm, combined
 
 NUM_PADS = 12
 # The contact of a hand's taxels is modelled as a mixture of this many patterns.
@@ -94,13 +98,6 @@ class CoreState:
     wrist_m: Float32[Tensor, "*batch 2 3"]
     wrist_axes: Float32[Tensor, "*batch 2 6"]
 
-    def where(self, chosen: Bool[Tensor, " batch"], other: "CoreState") -> "CoreState":
-        """This state where chosen, another one elsewhere."""
-        return combined(
-            [self, other],
-            lambda pair: torch.where(chosen.view(-1, *[1] * (pair[0].ndim - 1)), pair[0], pair[1]),
-        )
-
 
 @dataclass(frozen=True)
 class SceneFuture:
@@ -116,6 +113,72 @@ class SceneFuture:
     contact: Float32[Tensor, "*batch latents 4 12"]
     pattern: Float32[Tensor, "*batch latents 4 2 patterns"]
     success: Float32[Tensor, "*batch latents"]
+
+
+class MemberLinear(nn.Module):
+    """A linear layer; initialized as `nn.Linear`.
+
+    Args:
+        members: number of members.
+        inputs: size of the input's last axis.
+        outputs: size of the output's last axis.
+    """
+
+    def __init__(self, members: int, inputs: int, outputs: int) -> None:
+        super().__init__()
+        bound = inputs**-0.5
+        self.weight = nn.Parameter(torch.empty(members, inputs, outputs).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(members, outputs).uniform_(-bound, bound))
+
+    def forward(self, x: Float32[Tensor, "entries *shape inputs"]) -> Tensor:
+        """The outputs [entries, *shape, outputs]."""
+        members, inputs, outputs = self.weight.shape
+        rows = x.reshape(members, -1, inputs)
+        return torch.baddbmm(self.bias[:, None], rows, self.weight).view(*x.shape[:-1], outputs)
+
+
+class MemberNorm(nn.Module):
+    """A layer normalization of the last axis (Ba et al. 2016).
+
+    Args:
+        members: number of members.
+        width: size of the last axis.
+    """
+
+    def __init__(self, members: int, width: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(members, width))
+        self.bias = nn.Parameter(torch.zeros(members, width))
+
+    def forward(self, x: Float32[Tensor, "entries width"]) -> Float32[Tensor, "entries width"]:
+        """The normalized entries."""
+        rows = functional.layer_norm(x, x.shape[-1:]).view(len(self.weight), -1, x.shape[-1])
+        return torch.addcmul(self.bias[:, None], rows, self.weight[:, None]).view(x.shape)
+
+
+class MemberGRU(nn.Module):
+    """A gated recurrent cell (Cho et al. 2014), as `nn.GRUCell`.
+
+    Args:
+        members: number of members.
+        inputs: size of an input.
+        width: size of the state.
+    """
+
+    def __init__(self, members: int, inputs: int, width: int) -> None:
+        super().__init__()
+        self.input = MemberLinear(members, inputs, 3 * width)
+        self.recurrent = MemberLinear(members, width, 3 * width)
+
+    def forward(
+        self, x: Float32[Tensor, "entries inputs"], state: Float32[Tensor, "entries width"]
+    ) -> Float32[Tensor, "entries width"]:
+        """The next state."""
+        width = state.shape[-1]
+        fresh, kept = self.input(x), self.recurrent(state)
+        reset, update = (fresh[:, : 2 * width] + kept[:, : 2 * width]).sigmoid().chunk(2, dim=1)
+        new = torch.addcmul(fresh[:, 2 * width :], reset, kept[:, 2 * width :]).tanh()
+        return torch.lerp(new, state, update)
 
 
 class RecurrentCore(nn.Module):
@@ -220,10 +283,7 @@ class RecurrentCore(nn.Module):
         return torch.stack(flags, dim=1)
 
     def first_state(
-        self,
-        start: SceneStart,
-        standing: Commands,
-        human: Float32[Tensor, " batch"] | None = None,
+        self, start: SceneStart, standing: Commands, human: Float32[Tensor, " batch"] | None = None
     ) -> CoreState:
         """The state before the first step, with the measured hands as one latent step.
 

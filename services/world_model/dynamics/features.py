@@ -17,12 +17,31 @@ from dextouch.hands.robot_hand import chain_points_of_both_m
 from dextouch.schemas import MAX_OBJECTS, Domain
 from dextouch.tactile.layout import NUM_TAXELS
 from services.networks.principal_axes import principal_axes, root_pressure
-from services.world_model.dynamics.members import mapped
-
-# Hand and head camera motion in the world for given actions; the input of the core.
+from services.world_model.dynamics.trees import mapped
 
 # Of each hand: the wrist, five fingertips, five PIP joints, and the middle of the palm.
 NUM_POINTS: Final = 12
+NEAR_M = 0.01
+# Features are computed at these of the four steps of a latent: hands may shake within one.
+LOOKS = (1, 2, 3, 4)
+# The wrist is left out: it touches nothing.
+_FIRST_POINT = 1
+_PER_POINT = 7
+SLOT_SIZE = len(LOOKS) * (NUM_POINTS - _FIRST_POINT) * _PER_POINT
+# The core runs once every four steps of the model grid, the rate of video latents.
+STEPS_PER_LATENT: Final = 4
+# What models of older releases know.
+_ROBOT_ALONE: Final[tuple[Domain, ...]] = ("robot",)
+# Objects farther than this from the world's origin count as absent.
+MAX_DISTANCE_M = 1.0
+# Factors of the usual size that an object may have.
+SIZE_RANGE = (0.5, 2.0)
+# Which factor, width or height, each number of a box has: middle, half sizes; x, y, z.
+BOX_AXES = [0, 0, 1, 0, 0, 1]
+# Shorter axes have no direction.
+_SHORTEST = 1e-3
+# Pads with a lower peak pressure count as free when contact is learned.
+FREE_KPA = 2.0
 
 
 @dataclass(frozen=True)
@@ -44,12 +63,7 @@ class HandMotion:
 
     def __getitem__(self, steps: slice | np.ndarray) -> "HandMotion":
         """Select steps."""
-        return HandMotion(
-            self.points_m[steps],
-            self.axes[steps],
-            self.joints_rad[steps],
-            self.Ts_world_camera[steps],
-        )
+        return HandMotion(*(values[steps] for values in vars(self).values()))
 
 
 def hand_motion(
@@ -83,23 +97,13 @@ def hand_motion(
     )
 
 
-# Contact geometry: hand points relative to the surface of every object at its present pose.
-#
-# Success is decided within millimetres, which a wrist pose relative to its own start does not
-# resolve. Distances are compressed by asinh(d / 1 cm), so that a millimetre near an object and a
-# decimetre far from it both change a feature by about a tenth. The scale is the same for all tasks.
-
-NEAR_M = 0.01
-# Features are computed at these of the four steps of a latent: hands may shake within one.
-LOOKS = (1, 2, 3, 4)
-# The wrist is left out: it touches nothing.
-_FIRST_POINT = 1
-_PER_POINT = 7
-SLOT_SIZE = len(LOOKS) * (NUM_POINTS - _FIRST_POINT) * _PER_POINT
-
-
 def compressed(distance_m: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:
-    """asinh(d / 1 cm) / 2: linear near zero, logarithmic far away."""
+    """asinh(d / 1 cm) / 2: linear near zero, logarithmic far away.
+
+    Success is decided within millimetres, which a wrist pose relative to its own start does not
+    resolve. A millimetre near an object and a decimetre far from it both change a feature by about
+    a tenth. The scale is the same for all tasks.
+    """
     return torch.asinh(distance_m / NEAR_M) / 2
 
 
@@ -132,17 +136,8 @@ def slot_features(
     return each.permute(0, 2, 4, 1, 3, 5).flatten(3)
 
 
-# Configuration of start readers and recurrent cores; stored in every checkpoint of them.
-
-# Largest number of objects of a task; unused slots are masked.
-# What models of older releases know.
-_ROBOT_ALONE: Final[tuple[Domain, ...]] = ("robot",)
-# The core runs once every four steps of the model grid, the rate of video latents.
-STEPS_PER_LATENT: Final = 4
-
-
 class DynamicsConfig(FrozenModel):
-    """Architecture of a dynamics model.
+    """Architecture of a dynamics model, stored in its checkpoints.
 
     `tasks` and `num_objects` form its vocabulary: a task's index selects its embedding, and its
     objects fill the first slots in the order of the episode's `object_names`. With the domain
@@ -179,9 +174,6 @@ class DynamicsConfig(FrozenModel):
         return self
 
 
-# Commanded motion of both hands, sampled for the recurrent core.
-
-
 @dataclass(frozen=True)
 class Commands:
     """Motion of both hands at the sampled steps of each latent.
@@ -200,9 +192,7 @@ class Commands:
 
     def __getitem__(self, latents: slice) -> "Commands":
         """Select latent steps."""
-        return Commands(
-            self.points_m[:, latents], self.axes[:, latents], self.joints_rad[:, latents]
-        )
+        return mapped(self, lambda values: values[:, latents])
 
     def repeated(self, times: int) -> "Commands":
         """The same commands for each of several members, whose entries follow each other."""
@@ -225,18 +215,6 @@ class Commands:
         return cls.of([motion[np.zeros(STEPS_PER_LATENT, dtype=np.int64)] for motion in motions])
 
 
-# Object poses of a scene as network tensors: a position and two axes per slot.
-
-# Objects farther than this from the world's origin count as absent.
-MAX_DISTANCE_M = 1.0
-# Factors of the usual size that an object may have.
-SIZE_RANGE = (0.5, 2.0)
-# Which factor, width or height, each number of a box has: middle, half sizes; x, y, z.
-BOX_AXES = [0, 0, 1, 0, 0, 1]
-# Shorter axes have no direction.
-_SHORTEST = 1e-3
-
-
 @dataclass(frozen=True)
 class ObjectPoses:
     """Objects in the world frame.
@@ -253,14 +231,12 @@ class ObjectPoses:
 
     def __getitem__(self, index: Tensor | int | slice | tuple[slice, int]) -> "ObjectPoses":
         """Index the batch."""
-        return ObjectPoses(self.position_m[index], self.axes[index], self.present[index])
+        return mapped(self, lambda values: values[index])
 
     def slots(self, count: int) -> "ObjectPoses":
         """The first slots."""
         return ObjectPoses(
-            self.position_m[..., :count, :],
-            self.axes[..., :count, :, :],
-            self.present[..., :count],
+            self.position_m[..., :count, :], self.axes[..., :count, :, :], self.present[..., :count]
         )
 
 
@@ -320,12 +296,6 @@ def _direction(vectors: Tensor, otherwise: Tensor) -> Tensor:
 def _unit(vectors: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > _SHORTEST, vectors / np.maximum(length, _SHORTEST), otherwise)
-
-
-# Linear codec of a hand's taxels for the core: principal axes of the root of pressure.
-
-# Pads with a lower peak pressure count as free when contact is learned.
-FREE_KPA = 2.0
 
 
 class TouchCodec(nn.Module):

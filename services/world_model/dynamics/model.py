@@ -1,19 +1,22 @@
 """Dynamics model: an ensemble of start readers and recurrent cores that share a touch codec.
 
 `begin` estimates object poses from one observed step; `advance` predicts object motion and touch
-for the next commands. The only state kept between chunks is a `SceneMemory`.
+for the next commands. The only state kept between chunks is a `SceneMemory`, which is batched,
+unbatched and serialized here, too.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from torch import Tensor, nn
 
+from dextouch.errors import InvalidInputError, NonFiniteError
+from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
-from dextouch.tactile.layout import split_pads
+from dextouch.tactile.layout import NUM_TAXELS, split_pads
 from services.world_model.dynamics.core import (
     NUM_PADS,
     CoreState,
@@ -23,6 +26,8 @@ from services.world_model.dynamics.core import (
 )
 from services.world_model.dynamics.features import (
     FREE_KPA,
+    NUM_POINTS,
+    SIZE_RANGE,
     STEPS_PER_LATENT,
     Commands,
     DynamicsConfig,
@@ -30,19 +35,41 @@ from services.world_model.dynamics.features import (
     ObjectPoses,
     TouchCodec,
 )
-from services.world_model.dynamics.members import folded, stacked, unfolded
 from services.world_model.dynamics.start_reader import FirstStep, Reading, StartReader
-from services.world_model.dynamics.traces import Traced
+from services.world_model.dynamics.trees import (
+    Part,
+    Traced,
+    by_name,
+    chosen,
+    folded,
+    mapped,
+    named,
+    stacked,
+    unfolded,
+)
 
-# Detection of resting hands and resting scenes, per latent step.
-#
-# Counting latent steps instead of chunks makes the result independent of how a client splits its
-# commands into chunks.
-
+# Objects with a lower presence probability count as absent.
+PRESENCE_THRESHOLD = 0.5
+# Contact threshold of a taxel: probability 0.35. Where contact cannot be predicted with certainty,
+# the threshold with the best F1 is half of that F1 (Lipton et al. 2014).
+CONTACT_LOG_ODDS = -0.62
 # Hands that move less than this between latent steps count as still.
 STILL_M = 1e-4
 # After this many still latent steps (2 s) the scene counts as settled.
 REST_LATENTS = 8
+# Bound on metres, kilopascals and latents; this world never writes larger values.
+_LARGEST = 1e6
+# What every member knows has the axes members, batch, …; all else begins with the batch.
+_OF_MEMBERS = ("start", "state", "success")
+# Ranges within which this world writes values.
+_RANGES = {
+    "start.size": SIZE_RANGE,
+    "state.hidden": (-1.0, 1.0),
+    "state.position_m": (-1.0, 1.0),
+    "state.axes": (-1.0, 1.0),
+    "state.wrist_axes": (-1.0, 1.0),
+    "success": (0.0, 1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -75,7 +102,8 @@ def stillness(
     """Track hands that have stood at `points_m` for `num_still` latent steps.
 
     Hands move when they leave that position, however slowly. A scene is at rest in latent steps
-    without hand motion that follow at least `REST_LATENTS` such steps.
+    without hand motion that follow at least `REST_LATENTS` such steps. Latent steps are counted,
+    not chunks, so that it does not matter how a client splits its commands into chunks.
     """
     moved, rested = [], []
     for looks_m in commanded_m.unbind(1):
@@ -88,18 +116,18 @@ def stillness(
     return Stillness(points_m, num_still, torch.stack(moved, 1), torch.stack(rested, 1))
 
 
-# Objects with a lower presence probability count as absent.
-PRESENCE_THRESHOLD = 0.5
-# Contact threshold of a taxel: probability 0.35. Where contact cannot be predicted with certainty,
-# the threshold with the best F1 is half of that F1 (Lipton et al. 2014).
-CONTACT_LOG_ODDS = -0.62
+def by_pad(
+    tactile_kpa: Float[np.ndarray, "*batch 2 320"], reduce: Callable[..., np.ndarray]
+) -> Float[np.ndarray, "*batch 12"]:
+    """One pressure a pad: thumb … little fingertip and palm of the left hand, then of the right.
 
-
-def pad_means_kpa(tactile_kpa: Float32[np.ndarray, "*batch 2 320"]) -> np.ndarray:
-    """Mean pressure [..., 12] of thumb … little fingertip and palm, left hand, then right."""
+    Args:
+        tactile_kpa: of all taxels.
+        reduce: such as `np.mean`, called with an axis.
+    """
     tips, palm = split_pads(tactile_kpa)
-    pads = np.concatenate([tips.mean((-1, -2)), palm.mean((-1, -2))[..., None]], axis=-1)
-    return pads.reshape(*pads.shape[:-2], NUM_PADS)
+    pads = [reduce(tips, axis=(-1, -2)), reduce(palm, axis=(-1, -2))[..., None]]
+    return np.concatenate(pads, axis=-1).reshape(*tactile_kpa.shape[:-2], NUM_PADS)
 
 
 def first_steps(
@@ -115,7 +143,7 @@ def first_steps(
         torch.from_numpy(np.stack(Ks_head)).float(),
         torch.from_numpy(np.concatenate([one.Ts_world_camera for one in hands])).float(),
         torch.from_numpy(np.concatenate([one.points_m for one in hands])),
-        torch.from_numpy(pad_means_kpa(np.stack(tactile_kpa))),
+        torch.from_numpy(by_pad(np.stack(tactile_kpa), np.mean)),
         torch.tensor(tasks),
     )
 
@@ -143,7 +171,18 @@ class SceneMemory:
 
 
 @dataclass(frozen=True)
-class ImaginedSteps:
+class _Run:
+    """Predictions for a run of latent steps; as `ImaginedSteps`."""
+
+    poses: ObjectPoses
+    tactile_kpa: Float32[Tensor, "batch steps 2 320"]
+    disagreement_m: Float32[Tensor, "batch latents"]
+    distance: Float32[Tensor, "batch latents"]
+    success: Float32[Tensor, "members batch latents"]
+
+
+@dataclass(frozen=True)
+class ImaginedSteps(_Run):
     """Predictions of the ensemble for the next 4k steps and the k latent steps they form.
 
     `disagreement_m` is the largest standard deviation over members of an object's position;
@@ -152,11 +191,6 @@ class ImaginedSteps:
     latents in which hands move, `at_rest` those in which nothing moves any more.
     """
 
-    poses: ObjectPoses
-    tactile_kpa: Float32[Tensor, "batch steps 2 320"]
-    disagreement_m: Float32[Tensor, "batch latents"]
-    distance: Float32[Tensor, "batch latents"]
-    success: Float32[Tensor, "members batch latents"]
     moves: Bool[Tensor, "batch latents"]
     at_rest: Bool[Tensor, "batch latents"]
 
@@ -228,20 +262,8 @@ class DynamicsModel(nn.Module):
             memory, part = self._advance_run(memory, commands[latents], at_rest)
             parts.append(part)
         following = replace(memory, points_m=still.points_m, num_still=still.num_still)
-        imagined = ImaginedSteps(
-            ObjectPoses(
-                torch.cat([part.poses.position_m for part in parts], dim=1),
-                torch.cat([part.poses.axes for part in parts], dim=1),
-                torch.cat([part.poses.present for part in parts], dim=1),
-            ),
-            torch.cat([part.tactile_kpa for part in parts], dim=1),
-            torch.cat([part.disagreement_m for part in parts], dim=1),
-            torch.cat([part.distance for part in parts], dim=1),
-            torch.cat([part.success for part in parts], dim=2),
-            still.moves,
-            still.at_rest,
-        )
-        return following, imagined
+        whole = named(parts, lambda name, each: torch.cat(each, dim=1 + _batch_axis(name)))
+        return following, ImaginedSteps(**vars(whole), moves=still.moves, at_rest=still.at_rest)
 
     def _advance_run(
         self, memory: SceneMemory, commands: Commands, at_rest: Bool[Tensor, " batch"]
@@ -252,10 +274,17 @@ class DynamicsModel(nn.Module):
             return memory, _resting(memory, self.core.distance(commands, memory.state.wrist_m[0]))
         state, run = self._predict(commands, memory.start, memory.state, memory.poses)
         if bool(at_rest.any()):
-            run = _chosen(at_rest, _resting(memory, run.distance), run)
-            members, before = self.core.members, folded(memory.state)
-            changed = folded(state).where(~at_rest.repeat(members), before)
-            state = unfolded(changed, members)
+            run = named(
+                [_resting(memory, run.distance), run],
+                lambda name, pair: torch.where(
+                    at_rest.view(-1, *[1] * (pair[0].ndim - 1 - _batch_axis(name))),
+                    pair[0],
+                    pair[1],
+                ),
+            )
+            members = self.core.members
+            kept = chosen(at_rest.repeat(members), folded(memory.state), folded(state))
+            state = unfolded(kept, members)
         following = replace(
             memory,
             state=state,
@@ -299,9 +328,7 @@ class DynamicsModel(nn.Module):
         )
 
     def decode_touch(
-        self,
-        touch: Float32[Tensor, "*batch 2 channels"],
-        taxels: Float32[Tensor, "*batch 2 320"],
+        self, touch: Float32[Tensor, "*batch 2 channels"], taxels: Float32[Tensor, "*batch 2 320"]
     ) -> Float32[Tensor, "*batch 2 320"]:
         """Pressures in kPa from latents and from contact log odds of each taxel.
 
@@ -309,17 +336,6 @@ class DynamicsModel(nn.Module):
         """
         touches = taxels > CONTACT_LOG_ODDS
         return self.codec.decode(touch).clamp_min(CONTACT_THRESHOLD_KPA) * touches
-
-
-@dataclass(frozen=True)
-class _Run:
-    """Predictions for a run of latent steps."""
-
-    poses: ObjectPoses
-    tactile_kpa: Float32[Tensor, "batch steps 2 320"]
-    disagreement_m: Float32[Tensor, "batch latents"]
-    distance: Float32[Tensor, "batch latents"]
-    success: Float32[Tensor, "members batch latents"]
 
 
 def _spread_m(poses: ObjectPoses) -> Float32[Tensor, "*batch"]:
@@ -372,31 +388,113 @@ def _resting(memory: SceneMemory, distance: Float32[Tensor, "batch latents"]) ->
         return now[:, None].expand(-1, count, *now.shape[1:])
 
     steps = num_latents * STEPS_PER_LATENT
-    poses = memory.poses
     return _Run(
-        ObjectPoses(held(poses.position_m, steps), held(poses.axes, steps),
-            held(poses.present, steps)),
+        mapped(memory.poses, lambda now: held(now, steps)),
         held(memory.tactile_kpa, steps),
         held(memory.disagreement_m, num_latents),
         distance,
         memory.success[..., None].expand(-1, -1, num_latents),
-    )  # fmt: skip
-
-
-def _chosen(at_rest: Bool[Tensor, " batch"], resting: _Run, moving: _Run) -> _Run:
-    """Predictions of `resting` for entries at rest and of `moving` for all others."""
-
-    def chosen(held: Tensor, steps: Tensor) -> Tensor:
-        return torch.where(at_rest.view(-1, *[1] * (steps.ndim - 1)), held, steps)
-
-    return _Run(
-        ObjectPoses(
-            chosen(resting.poses.position_m, moving.poses.position_m),
-            chosen(resting.poses.axes, moving.poses.axes),
-            chosen(resting.poses.present, moving.poses.present),
-        ),
-        chosen(resting.tactile_kpa, moving.tactile_kpa),
-        chosen(resting.disagreement_m, moving.disagreement_m),
-        moving.distance,
-        torch.where(at_rest[:, None], resting.success, moving.success),
     )
+
+
+def batched(parts: Sequence[Part]) -> Part:
+    """One batch of several memories, or of what was imagined with them."""
+    return named(parts, lambda name, each: torch.cat(each, dim=_batch_axis(name)))
+
+
+def memory_of(memory: SceneMemory, index: int) -> SceneMemory:
+    """Memory of one rollout of a batch."""
+    # Copies: a slice would keep the whole batch alive and share it with other rollouts.
+    one = torch.tensor([index])
+    return named([memory], lambda name, parts: parts[0].index_select(_batch_axis(name), one))
+
+
+def _batch_axis(name: str) -> int:
+    return int(name.partition(".")[0] in _OF_MEMBERS)
+
+
+def memory_arrays(memory: SceneMemory) -> dict[str, np.ndarray]:
+    """Arrays of a single rollout's memory, for a snapshot."""
+    return {name: value.contiguous().numpy() for name, value in by_name(memory).items()}
+
+
+def memory_from_arrays(
+    arrays: Mapping[str, np.ndarray], config: DynamicsConfig, num_members: int
+) -> SceneMemory:
+    """Inverse of `memory_arrays`; validates untrusted arrays.
+
+    Raises:
+        InvalidInputError: missing arrays, wrong shapes or dtypes, or a task that the model does
+            not have.
+        NonFiniteError: NaN or infinity.
+    """
+    memory = named(
+        [_empty(config, num_members)], lambda name, parts: _checked(name, arrays, parts[0])
+    )
+    task = memory.start.task
+    if not bool(((task >= 0) & (task < len(config.tasks)) & (task == task[0, 0])).all()):
+        raise InvalidInputError(
+            f"snapshot: got task numbers {task.flatten().tolist()}, expected one of 0 … "
+            f"{len(config.tasks) - 1} for all members"
+        )
+    return memory
+
+
+def _empty(config: DynamicsConfig, members: int) -> SceneMemory:
+    """The memory of one rollout with zeros: names, shapes and types of a snapshot."""
+    objects = MAX_OBJECTS
+
+    def zeros(*shape: int) -> Tensor:
+        return torch.zeros(shape)
+
+    def poses(*batch: int) -> ObjectPoses:
+        return ObjectPoses(
+            zeros(*batch, objects, 3), zeros(*batch, objects, 2, 3), zeros(*batch, objects)
+        )
+
+    start = SceneStart(
+        objects=poses(members, 1),
+        sd_m=zeros(members, 1, objects),
+        size=zeros(members, 1, objects, 2),
+        touch=zeros(members, 1, 2, config.touch_channels),
+        pads_kpa=zeros(members, 1, NUM_PADS),
+        task=torch.zeros((members, 1), dtype=torch.int64),
+        commanded=zeros(members, 1),
+    )
+    state = CoreState(
+        hidden=zeros(members, 1, config.width),
+        position_m=zeros(members, 1, objects, 3),
+        axes=zeros(members, 1, objects, 2, 3),
+        wrist_m=zeros(members, 1, 2, 3),
+        wrist_axes=zeros(members, 1, 2, 6),
+    )
+    return SceneMemory(
+        start=start,
+        state=state,
+        poses=poses(1),
+        disagreement_m=zeros(1),
+        tactile_kpa=zeros(1, 2, NUM_TAXELS),
+        success=zeros(members, 1),
+        points_m=zeros(1, 2, NUM_POINTS, 3),
+        num_still=torch.zeros(1, dtype=torch.int64),
+    )
+
+
+def _checked(name: str, arrays: Mapping[str, np.ndarray], expected: Tensor) -> Tensor:
+    """One array of a snapshot as a tensor, within the range of what this world writes."""
+    array, like = arrays.get(name), expected.numpy()
+    if array is None or array.shape != like.shape or array.dtype != like.dtype:
+        got = "nothing" if array is None else f"{array.dtype.name} {array.shape}"
+        raise InvalidInputError(
+            f"snapshot: {name} is {got}, expected {like.dtype.name} {like.shape} of this world's "
+            "own snapshot"
+        )
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise NonFiniteError(f"snapshot: {name} contains NaN or infinity")
+    if array.dtype.kind == "f" and np.abs(array).max() > _LARGEST:
+        raise InvalidInputError(
+            f"snapshot: {name} has values up to {np.abs(array).max():.3g}, expected at most "
+            f"{_LARGEST:.0e}"
+        )
+    found = torch.from_numpy(np.array(array))
+    return found.clamp(*_RANGES[name]) if name in _RANGES else found

@@ -126,11 +126,7 @@ class StartReader(nn.Module):
         return self.read(first.image.permute(0, 3, 1, 2).float() / 255, first)[-1]
 
     def read(
-        self,
-        image: Float32[Tensor, "batch 3 px px"],
-        first: FirstStep,
-        *,
-        bfloat16: bool = False,
+        self, image: Float32[Tensor, "batch 3 px px"], first: FirstStep, *, bfloat16: bool = False
     ) -> tuple[Reading, Reading]:
         """First and corrected reading of an image in 0 … 1; optionally in bfloat16."""
         contrast = image.std((2, 3), keepdim=True) + _LEAST_CONTRAST

@@ -14,17 +14,20 @@ from torch.nn import functional
 
 from dextouch.hands.actions import unpack_action
 from dextouch.hands.robot_hand import RobotHand
-from services.world_model.network.configuration import FRAMES_PER_LATENT
-
-# Per-hand features of 67-D actions, with the left hand mirrored into the right-hand frame.
-#
-# In the wrist frame fingers point along -z, the thumb along +x; the right palm faces +y, the left
-# -y. So the mirror image of a left hand is y → -y; in the head camera's optical frame it is x → -x.
+from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
 
 HAND_DIM = 29
 CAMERA_DIM = 9
+# In the wrist frame fingers point along -z, the thumb along +x; the right palm faces +y, the left
+# -y. So the mirror image of a left hand is y → -y; in the head camera's optical frame it is x → -x.
 MIRROR_WRIST = np.array([1.0, -1.0, 1.0])
 MIRROR_CAMERA = np.array([-1.0, 1.0, 1.0])
+# Of the parts of an action: own hand, other hand, camera.
+PART_DIMS = [HAND_DIM, HAND_DIM, CAMERA_DIM]
+# Base of the rotary positions.
+_THETA = 1e4
+NUM_MODULATIONS = 6
+Heads = Float[Tensor, "batch heads tokens head_width"]
 
 
 @cache
@@ -68,22 +71,10 @@ def camera_features(actions: np.ndarray) -> Float64[np.ndarray, "*batch 2 9"]:
     return np.stack([mirrored, camera], axis=-2)
 
 
-# Splitting one axis of a tensor into several.
-
-
 def split_axis(tensor: Tensor, axis: int, sizes: tuple[int, ...]) -> Tensor:
     """Split one axis into several; one size may be -1. Typed, unlike `Tensor.unflatten`."""
     axis = axis % tensor.ndim
     return tensor.reshape(*tensor.shape[:axis], *sizes, *tensor.shape[axis + 1 :])
-
-
-# Rotary positions in three dimensions, as in Wan2.2: latent time, row and column.
-#
-# Tactile tokens lie on the time axis of the video, at a quarter of a latent per step, so that step
-# 4j has the time of latent j, which ends with it. They have no place in the image; their row and
-# column are 0.
-
-_THETA = 1e4
 
 
 def video_positions(num_latents: int, side: int) -> Float32[Tensor, "tokens 3"]:
@@ -93,7 +84,11 @@ def video_positions(num_latents: int, side: int) -> Float32[Tensor, "tokens 3"]:
 
 
 def tactile_positions(num_steps: int, tokens_per_step: int) -> Float32[Tensor, "tokens 3"]:
-    """Positions of tactile tokens, step by step."""
+    """Positions of tactile tokens, step by step.
+
+    They lie on the time axis of the video, at a quarter of a latent per step, so that step 4j has
+    the time of latent j, which ends with it. They have no place in the image: row and column are 0.
+    """
     positions = torch.zeros(num_steps, tokens_per_step, 3)
     positions[..., 0] = torch.arange(num_steps)[:, None] / FRAMES_PER_LATENT
     return positions.flatten(0, 1)
@@ -122,15 +117,6 @@ def rotate(
     return turned.flatten(-2).to(heads.dtype)
 
 
-# Cross-attention from tokens to the actions that they depend on, an alternative to AdaLN.
-#
-# Dual rate (equation 4 of the paper): tokens of video latent j attend to the actions 4j-3 … 4j,
-# those of tactile step t to action t, and those of index 0 to nothing. Every action is three
-# tokens: own hand, other hand and camera.
-
-PART_DIMS = [HAND_DIM, HAND_DIM, CAMERA_DIM]
-
-
 class ActionTokens(nn.Module):
     """Tokens of the actions of one latent frame or step."""
 
@@ -152,9 +138,12 @@ class ActionTokens(nn.Module):
 
 
 class ActionAttention(nn.Module):
-    """Attention of each group of tokens to the action tokens of that group.
+    """Attention of each group of tokens to the action tokens of that group, instead of AdaLN.
 
-    Without biases, so that action tokens of zero (index 0) change nothing.
+    Dual rate (equation 4 of the paper): tokens of video latent j attend to the actions 4j-3 … 4j,
+    those of tactile step t to action t, and those of index 0 to nothing. Every action is three
+    tokens: own hand, other hand and camera. There are no biases, so that action tokens of zero
+    (index 0) change nothing.
     """
 
     def __init__(self, *, width: int, num_heads: int, head_width: int) -> None:
@@ -185,20 +174,12 @@ class ActionAttention(nn.Module):
         return self.to_out(attended.transpose(1, 2).flatten(2)).reshape(tokens.shape)
 
 
-# Joint transformer layer of both experts.
-#
-# Mixture-of-Transformers: each stream has its own projections, norms, modulation and feed-forward
-# network; only the attention is shared, over the tokens of both.
-
-NUM_MODULATIONS = 6
-
-
 @dataclass(frozen=True)
 class KeysValues:
     """Keys and values of tokens in one layer."""
 
-    keys: Float[Tensor, "batch heads tokens head_width"]
-    values: Float[Tensor, "batch heads tokens head_width"]
+    keys: Heads
+    values: Heads
 
 
 @dataclass(frozen=True)
@@ -253,9 +234,7 @@ class Stream:
         return first, others
 
 
-def clean_mask(
-    is_clean: Bool[Tensor, " tokens"],
-) -> Bool[Tensor, "tokens tokens"]:
+def clean_mask(is_clean: Bool[Tensor, " tokens"]) -> Bool[Tensor, "tokens tokens"]:
     """Attention mask: clean queries attend to clean keys only, noisy queries to all keys.
 
     Clean context therefore never depends on noise. Every query attends at least to itself.
@@ -267,13 +246,7 @@ class Block(nn.Module, ABC):
     """One expert's part of a layer, before and after the shared attention."""
 
     @abstractmethod
-    def queries_keys_values(
-        self, stream: Stream
-    ) -> tuple[
-        Float[Tensor, "batch heads tokens head_width"],
-        Float[Tensor, "batch heads tokens head_width"],
-        Float[Tensor, "batch heads tokens head_width"],
-    ]:
+    def queries_keys_values(self, stream: Stream) -> tuple[Heads, Heads, Heads]:
         """Queries, keys and values for the shared attention."""
 
     @abstractmethod
@@ -282,18 +255,11 @@ class Block(nn.Module, ABC):
 
 
 class ExpertBlock(Block):
-    """Block of an expert that is trained from scratch."""
+    """Block of an expert of some width that is trained from scratch."""
 
-    def __init__(
-        self,
-        *,
-        width: int,
-        num_heads: int,
-        head_width: int,
-        ffn_ratio: int,
-        attends_to_actions: bool = False,
-    ) -> None:
+    def __init__(self, config: NetworkConfig, width: int) -> None:
         super().__init__()
+        num_heads, head_width = config.num_heads, config.head_width
         inner = num_heads * head_width
         self.num_heads, self.head_width = num_heads, head_width
         self.to_qkv = nn.Linear(width, 3 * inner)
@@ -302,24 +268,18 @@ class ExpertBlock(Block):
         self.query_norm = nn.RMSNorm(head_width, eps=1e-6)
         self.key_norm = nn.RMSNorm(head_width, eps=1e-6)
         self.ffn = nn.Sequential(
-            nn.Linear(width, ffn_ratio * width),
+            nn.Linear(width, config.ffn_ratio * width),
             nn.GELU(approximate="tanh"),
-            nn.Linear(ffn_ratio * width, width),
+            nn.Linear(config.ffn_ratio * width, width),
         )
         self.modulation = nn.Parameter(torch.zeros(NUM_MODULATIONS, width))
         self.action_attention = (
             ActionAttention(width=width, num_heads=num_heads, head_width=head_width)
-            if attends_to_actions
+            if config.action_conditioning == "cross_attention"
             else None
         )
 
-    def queries_keys_values(
-        self, stream: Stream
-    ) -> tuple[
-        Float[Tensor, "batch heads tokens head_width"],
-        Float[Tensor, "batch heads tokens head_width"],
-        Float[Tensor, "batch heads tokens head_width"],
-    ]:
+    def queries_keys_values(self, stream: Stream) -> tuple[Heads, Heads, Heads]:
         """Queries, keys and values for the shared attention."""
         shift, scale, *_ = (stream.modulation + self.modulation).unbind(dim=2)
         normed = modulated_norm(stream.tokens, shift, scale)
@@ -342,7 +302,11 @@ class ExpertBlock(Block):
 
 
 class JointLayer(nn.Module):
-    """One layer: two expert blocks around one attention, or the video block alone."""
+    """One layer: two expert blocks around one attention, or the video block alone.
+
+    Mixture-of-Transformers: each stream has its own projections, norms, modulation and feed-forward
+    network; only the attention is shared, over the tokens of both.
+    """
 
     def __init__(self, video: Block, tactile: Block | None) -> None:
         super().__init__()

@@ -137,15 +137,6 @@ class VideoCondition(nn.Module):
         self.time = TimeEmbedding(width)
         self.static = StaticCondition(config, width)
 
-    def forward(
-        self,
-        inputs: ModelInputs,
-        features: ActionFeatures,
-        t: Float32[Tensor, "batch latents"],
-    ) -> Condition:
-        """Conditions; t is zero where the latent is clean."""
-        return self.at(self.constants(inputs, features), t)
-
     def constants(self, inputs: ModelInputs, features: ActionFeatures) -> Constants:
         """What does not depend on the flow time."""
         terms, tokens, actions = [], None, _of_latents(features)
@@ -159,7 +150,7 @@ class VideoCondition(nn.Module):
         return Constants((*terms, self.static(inputs)[:, None]), tokens)
 
     def at(self, constants: Constants, t: Float32[Tensor, "batch latents"]) -> Condition:
-        """Conditions at these times."""
+        """Conditions at these times; t is zero where tokens are clean."""
         return constants.at(self.time(t))
 
 
@@ -186,15 +177,6 @@ class TactileCondition(nn.Module):
         self.time = TimeEmbedding(width)
         self.static = StaticCondition(config, width)
 
-    def forward(
-        self,
-        inputs: ModelInputs,
-        features: ActionFeatures,
-        t: Float32[Tensor, "batch time"],
-    ) -> Condition:
-        """Conditions; t is zero where the step is clean."""
-        return self.at(self.constants(inputs, features), t)
-
     def constants(self, inputs: ModelInputs, features: ActionFeatures) -> Constants:
         """What does not depend on the flow time."""
         terms, tokens = [], None
@@ -211,7 +193,7 @@ class TactileCondition(nn.Module):
         return Constants((*terms, self.static(inputs)[:, None, None]), tokens)
 
     def at(self, constants: Constants, t: Float32[Tensor, "batch time"]) -> Condition:
-        """Conditions at these times."""
+        """Conditions at these times; t is zero where tokens are clean."""
         return constants.at(self.time(t)[:, :, None].expand(-1, -1, 2, -1))
 
 
@@ -272,9 +254,7 @@ def two_layers(in_width: int, hidden_width: int, out_width: int) -> nn.Sequentia
     )
 
 
-def after_first(
-    condition: Float32[Tensor, "batch later ..."],
-) -> Float32[Tensor, "batch time ..."]:
+def after_first(condition: Float32[Tensor, "batch later ..."]) -> Float32[Tensor, "batch time ..."]:
     """Prepend zeros for index 0, which has no action (c_0 = 0)."""
     return torch.cat([torch.zeros_like(condition[:, :1]), condition], dim=1)
 

@@ -1,19 +1,135 @@
-"""Network configuration: shape and sampling of the joint model, stored in its checkpoint."""
+"""Shape and sampling of the joint model, stored in its checkpoint, and of the Wan2.2 networks."""
 
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
 
 from pydantic import Field, model_validator
 
 from dextouch.frozen_model import FrozenModel
-from services.world_model.wan.configuration import (
-    LATENT_CHANNELS,
-    SPATIAL_FACTOR,
-    WanConfig,
-)
+
+if TYPE_CHECKING:
+    import torch
+
 
 Sampler = Literal["euler", "unipc"]
 Precision = Literal["float32", "bfloat16"]
 TokenizerName = Literal["principal_axes", "split_hands", "grid"]
+FRAMES_PER_LATENT = 4
+RASTER_CELLS_PER_TOKEN = 4
+# Fixed by the published autoencoder: it maps 1 + 4k images to 1 + k latents at a sixteenth of the
+# resolution, and the transformer takes two by two of them as one token.
+SPATIAL_FACTOR: Final = 16
+LATENT_CHANNELS: Final = 48
+PATCH: Final = (1, 2, 2)
+# Mean and deviation of the latents by channel (`vae2_2.py` of Wan2.2).
+LATENT_MEAN: Final = (
+    -0.2289, -0.0052, -0.1323, -0.2339, -0.2799, 0.0174, 0.1838, 0.1557, -0.1382, 0.0542,
+    0.2813, 0.0891, 0.1570, -0.0098, 0.0375, -0.1825, -0.2246, -0.1207, -0.0698, 0.5109,
+    0.2665, -0.2108, -0.2158, 0.2502, -0.2055, -0.0322, 0.1109, 0.1567, -0.0729, 0.0899,
+    -0.2799, -0.1230, -0.0313, -0.1649, 0.0117, 0.0723, -0.2839, -0.2083, -0.0520, 0.3748,
+    0.0152, 0.1957, 0.1433, -0.2944, 0.3573, -0.0548, -0.1681, -0.0667,
+)  # fmt: skip
+LATENT_STD: Final = (
+    0.4765, 1.0364, 0.4514, 1.1677, 0.5313, 0.4990, 0.4818, 0.5013, 0.8158, 1.0344,
+    0.5894, 1.0901, 0.6885, 0.6165, 0.8454, 0.4978, 0.5759, 0.3523, 0.7135, 0.6804,
+    0.5833, 1.4146, 0.8986, 0.5659, 0.7069, 0.5338, 0.4889, 0.4917, 0.4069, 0.4999,
+    0.6866, 0.4093, 0.5709, 0.6065, 0.6415, 0.4944, 0.5726, 1.2042, 0.5458, 1.6887,
+    0.3971, 1.0600, 0.3943, 0.5537, 0.5444, 0.4089, 0.7468, 0.7744,
+)  # fmt: skip
+# Parts of the transformer that stay in float32 whatever the precision of the others.
+FLOAT32_PARTS: Final = ("time_embedder", "scale_shift_table", "norm1", "norm2", "norm3")
+
+
+class WanFiles(FrozenModel):
+    """Where the pretrained networks are; they are never downloaded."""
+
+    folder: Path | None = Field(
+        default=None, description="local folder of Wan2.2-TI2V-5B, for --network.video-expert wan"
+    )
+    text_cache: Path | None = Field(
+        default=None, description="folder in which text features of instructions are kept"
+    )
+    max_memory_gb: float | None = Field(
+        default=None,
+        gt=0,
+        description="limit of memory for the weights of one network; default: what is available",
+    )
+
+    @property
+    def max_bytes(self) -> int | None:
+        """The limit in bytes."""
+        return None if self.max_memory_gb is None else int(self.max_memory_gb * 1e9)
+
+
+class WanConfig(FrozenModel):
+    """Sizes of the Wan2.2 networks beyond layers, heads and width, which `NetworkConfig` has."""
+
+    ffn_width: int = Field(default=14336, ge=1, description="feed-forward width of a layer")
+    time_width: int = Field(default=256, ge=2, description="sines and cosines of the time")
+    text_width: int = Field(default=4096, ge=1, description="width of the text features")
+    text_tokens: int = Field(default=512, ge=1, description="length that texts are padded to")
+    vae_width: int = Field(default=160, ge=1, description="first width of the video encoder")
+    vae_decoder_width: int = Field(default=256, ge=1, description="last width of the decoder")
+    vae_blocks: int = Field(default=2, ge=1, description="residual blocks per resolution")
+    precision: Precision = Field(
+        default="bfloat16",
+        description="of the weights; norms, time embedding and modulation are always float32",
+    )
+
+    @property
+    def dtype(self) -> "torch.dtype":
+        """Kind of number of the weights."""
+        # Settings can be read and shown without torch.
+        import torch
+
+        return torch.float32 if self.precision == "float32" else torch.bfloat16
+
+    def transformer_sizes(
+        self, *, num_layers: int, num_heads: int, head_width: int
+    ) -> dict[str, object]:
+        """Arguments of `diffusers.WanTransformer3DModel`."""
+        return {
+            "patch_size": PATCH,
+            "num_attention_heads": num_heads,
+            "attention_head_dim": head_width,
+            "in_channels": LATENT_CHANNELS,
+            "out_channels": LATENT_CHANNELS,
+            "text_dim": self.text_width,
+            "freq_dim": self.time_width,
+            "ffn_dim": self.ffn_width,
+            "num_layers": num_layers,
+            "cross_attn_norm": True,
+            "qk_norm": "rms_norm_across_heads",
+            "eps": 1e-6,
+        }
+
+    def autoencoder_sizes(self) -> dict[str, object]:
+        """Arguments of `diffusers.AutoencoderKLWan`."""
+        return {
+            "base_dim": self.vae_width,
+            "decoder_base_dim": self.vae_decoder_width,
+            "z_dim": LATENT_CHANNELS,
+            "dim_mult": [1, 2, 4, 4],
+            "num_res_blocks": self.vae_blocks,
+            "attn_scales": [],
+            "temperal_downsample": [False, True, True],
+            "latents_mean": list(LATENT_MEAN),
+            "latents_std": list(LATENT_STD),
+            "is_residual": True,
+            # The images are cut into two by two pixels first.
+            "in_channels": 12,
+            "out_channels": 12,
+            "patch_size": 2,
+            "scale_factor_temporal": 4,
+            "scale_factor_spatial": SPATIAL_FACTOR,
+        }
+
+
+def dtype_of(name: str, dtype: "torch.dtype") -> "torch.dtype":
+    """Kind of number of one tensor of the transformer."""
+    import torch
+
+    return torch.float32 if any(part in name for part in FLOAT32_PARTS) else dtype
 
 
 class NetworkConfig(FrozenModel):
@@ -28,8 +144,7 @@ class NetworkConfig(FrozenModel):
     max_steps: int = Field(default=17, ge=5, description="longest window: 1 + 4k steps")
     codec_channels: int = Field(default=48, ge=1, le=768, description="latents per visual patch")
     tokenizer: TokenizerName = Field(
-        default="principal_axes",
-        description="tactile tokenizer; the learned ones need --tokenizer",
+        default="principal_axes", description="tactile tokenizer; the learned ones need --tokenizer"
     )
     tactile_tokens: Literal["hand", "pad"] = Field(
         default="hand", description="tactile tokens: one per hand, or with split_hands one per pad"
@@ -172,10 +287,6 @@ class NetworkConfig(FrozenModel):
     def max_latents(self) -> int:
         """Latent frames of the longest window."""
         return num_latents(self.max_steps)
-
-
-FRAMES_PER_LATENT = 4
-RASTER_CELLS_PER_TOKEN = 4
 
 
 def num_latents(num_steps: int) -> int:

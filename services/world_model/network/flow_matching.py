@@ -2,14 +2,15 @@
 
 Straight paths: x_t = (1 - t) x_0 + t ε, t from 0 (data) to 1 (noise). The network predicts x_0, or
 the velocity v = ε - x_0 = (x_t - x_0) / t, whose squared error is that of x_0 over t². The last
-step of either solver returns the predicted x_0 exactly.
+step of either solver returns the predicted x_0 exactly. Both write a step with the share `keep` =
+t' / t of the noisy sample that remains. For straight paths that is the exact solution for a
+constant prediction, without a logarithm, so that t = 1 and t' = 0 are exact.
 """
 
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
-from typing import Protocol
 
 import torch
 from jaxtyping import Float32
@@ -19,28 +20,11 @@ from dextouch.errors import InvalidInputError
 from services.world_model.network.attention import JointLayer, KeysValues, Stream
 from services.world_model.network.configuration import Sampler
 
-# Solvers of the flow: how a sample moves from one time to the next, given predictions of x_0.
-#
-# Both write a step with the share `keep` = t' / t of the noisy sample that remains. For straight
-# paths that is the exact solution for a constant prediction, without a logarithm, so that t = 1 and
-# t' = 0 are exact.
-
+# Lower bound of training times: velocities divide by them.
+MIN_TIME = 1e-3
+Denoiser = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 # UniPC's half log-odds of data are infinite at t = 1; the same bound as in diffusers.
 _MAX_TIME = 1.0 - 1e-6
-
-
-class Solver(Protocol):
-    """Solver of one stream; it may remember earlier predictions of the same sample."""
-
-    def step(
-        self,
-        noisy: Float32[Tensor, "batch ..."],
-        guess: Float32[Tensor, "batch ..."],
-        t: float,
-        t_next: float,
-    ) -> Float32[Tensor, "batch ..."]:
-        """Move `noisy` from t to t_next with the prediction of x_0 at t."""
-        ...
 
 
 class Euler:
@@ -120,11 +104,6 @@ def _log_odds(t: float) -> float:
     """Half the logarithm of the signal-to-noise ratio, log((1 - t) / t)."""
     t = min(t, _MAX_TIME)
     return math.log1p(-t) - math.log(t)
-
-
-# Lower bound of training times: velocities divide by them.
-MIN_TIME = 1e-3
-Denoiser = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def shift_time(t: Float32[Tensor, " n"], shift: float) -> Float32[Tensor, " n"]:
@@ -212,16 +191,14 @@ def sample(
     return video, tactile
 
 
-# Clean tokens of a chunk, computed once for all steps of the sampler.
-#
-# Clean tokens (first latent frame and first touch) attend to each other only and have flow time 0,
-# so that in every layer their keys and values are the same at every step. Noisy tokens attend to
-# these and to each other, which needs no mask.
-
-
 @dataclass(frozen=True)
 class CleanTokens:
-    """Clean tokens of both streams after the last layer, and the keys and values of each layer."""
+    """Clean tokens of both streams after the last layer, and the keys and values of each layer.
+
+    Clean tokens (first latent frame and first touch) attend to each other only and have flow time
+    0, so that in every layer their keys and values are the same at every step of the sampler. Noisy
+    tokens attend to these and to each other, which needs no mask.
+    """
 
     video: Stream
     tactile: Stream | None

@@ -43,16 +43,20 @@ from services.world_model.network.attention import (
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
 from services.world_model.network.instruction import instruction_ids
 
-# Contact geometry as a condition of the joint model: hand points relative to the objects' boxes.
-#
-# The same features that the state model's core receives (`services.world_model.dynamics.features`),
-# for the objects as they lie at the first step of a window: millimetres decide contact, which
-# pixels of a centimetre and actions relative to each hand's own start do not show.
-
 _PER_SLOT = SLOT_SIZE // len(LOOKS) + 6 + 1
 # Of a hand: every slot's features, its box and whether it holds an object; and the side.
 GEOMETRY_SIZE = MAX_OBJECTS * _PER_SLOT + 1
 _PER_M = 10.0
+# Standard deviation of a point's Gaussian blot, in raster cells.
+BLOT_CELLS = 1.0
+_WRIST_AND_SIDES = (("left", WRIST_LEFT, JOINTS_LEFT), ("right", WRIST_RIGHT, JOINTS_RIGHT))
+MAX_TRANSLATION_M = 2.0
+MAX_JOINT_RAD = 2.0 * np.pi
+MAX_PRESSURE_KPA = 1e5
+# Poses and angles are rounded to 1e-9 m and 1e-9 rad: finer differences only depend on how often a
+# pose was re-anchored.
+DECIMALS = 9
+ACTION_KINDS: tuple[ActionKind, ActionKind] = ("measured", "commanded")
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,12 @@ class ObjectsAtStart:
 def contact_geometry(
     actions: Float64[np.ndarray, "time 67"], anchor: AnchorPoses, objects: ObjectsAtStart | None
 ) -> Float32[np.ndarray, "time 2 size"]:
-    """Features [time, hand, `GEOMETRY_SIZE`] of every step; zero in slots without an object."""
+    """Features [time, hand, `GEOMETRY_SIZE`] of every step; zero in slots without an object.
+
+    They are those of the state model's core, for the objects as they lie at the first step of a
+    window: millimetres decide contact, which pixels of a centimetre and actions relative to each
+    hand's own start do not show.
+    """
     points_m = torch.from_numpy(hand_motion(actions, anchor).points_m)[:, None]
     steps = len(points_m)
     slots = torch.zeros(steps, 2, MAX_OBJECTS, _PER_SLOT)
@@ -96,16 +105,6 @@ def contact_geometry(
         slots[:, :, :count] = torch.cat([each, known.expand(steps, 2, -1, -1)], dim=-1)
     side = torch.tensor([-1.0, 1.0])[None, :, None].expand(steps, -1, -1)
     return torch.cat([slots.flatten(2), side], dim=-1).numpy()
-
-
-# Raster of both hands in the head image, drawn from the poses and joint angles of a window.
-#
-# The paper conditions by AdaLN alone; the raster of the projected hands is an addition. It shows
-# the network, to within about one cell, where in the image the hands will be.
-
-# Standard deviation of a point's Gaussian blot, in raster cells.
-BLOT_CELLS = 1.0
-_WRIST_AND_SIDES = (("left", WRIST_LEFT, JOINTS_LEFT), ("right", WRIST_RIGHT, JOINTS_RIGHT))
 
 
 @cache
@@ -139,6 +138,9 @@ def pose_raster(
 ) -> Float32[np.ndarray, "batch time 2 cells cells"]:
     """Rasters of both hands at the poses of the actions, seen by the moving head camera.
 
+    The paper conditions by AdaLN alone; this is an addition. It shows the network, to within about
+    one cell, where in the image the hands will be.
+
     Args:
         actions: [B, T, 67] relative to the anchors.
         anchors: [B, 3, 4, 4] T_world of left wrist, right wrist and head camera at step 0.
@@ -167,15 +169,6 @@ def pose_raster(
 def _project_each(K_head: np.ndarray, points_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     pairs = [project(K, points) for K, points in zip(K_head, points_camera, strict=True)]
     return np.stack([pixels for pixels, _ in pairs]), np.stack([front for _, front in pairs])
-
-
-MAX_TRANSLATION_M = 2.0
-MAX_JOINT_RAD = 2.0 * np.pi
-MAX_PRESSURE_KPA = 1e5
-# Poses and angles are rounded to 1e-9 m and 1e-9 rad: finer differences only depend on how often a
-# pose was re-anchored.
-DECIMALS = 9
-ACTION_KINDS: tuple[ActionKind, ActionKind] = ("measured", "commanded")
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,26 @@
-"""Embedding of a text instruction as one vector.
+"""Text instructions as inputs of the network: words in a hashed table, or features of UMT5.
 
-Words, or their parts, are hashed into a table, so that any text is accepted without a vocabulary.
-Entries start at zero: words that were not trained on have no effect.
+Words, or their parts, are hashed, so that any text is accepted without a vocabulary. Entries start
+at zero: words that were not trained on have no effect. The full size takes the features of a text
+encoder, which are computed once for each instruction and kept in memory, in the checkpoint and, if
+a folder is given, on disk, so that serving known instructions needs no text encoder.
 """
 
+import hashlib
+import html
 import re
 import zlib
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, Literal
 
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Float, Float32, Int64
 from torch import Tensor, nn
+
+from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
+from services.networks.weight_files import read_tensors, write_tensors
+from services.world_model.network.configuration import WanConfig
 
 InstructionKind = Literal["hashed_words", "subwords"]
 MAX_WORDS = 16
@@ -19,6 +29,11 @@ NO_WORD = 0
 MAX_SUBWORDS = 160
 NUM_SUBWORD_BUCKETS = 4096
 _WORD = re.compile(r"\w+")
+ENCODER_FOLDER: Final = "text_encoder"
+TOKENIZER_FOLDER: Final = "tokenizer"
+_KEY: Final = "features"
+# Texts kept in memory; the oldest makes room.
+_MAX_TEXTS: Final = 1024
 
 
 def instruction_ids(
@@ -96,3 +111,151 @@ class SubwordEncoder(nn.Module):
         weights = (5.0 * torch.tanh(self.scores(ids)[..., 0])).exp() * present
         total = weights.sum(dim=1, keepdim=True).clamp_min(1e-9)
         return self.project((weights / total)[:, None] @ self.table(ids)).squeeze(1)
+
+
+class TextEncoder:
+    """UMT5 encoder and its tokenizer from a local folder in diffusers' layout.
+
+    Raises:
+        NotFoundError: the folder lacks one of the two.
+    """
+
+    def __init__(self, folder: Path, config: WanConfig) -> None:
+        from transformers import AutoTokenizer, UMT5EncoderModel
+
+        for name in (ENCODER_FOLDER, TOKENIZER_FOLDER):
+            if not (folder / name).is_dir():
+                raise NotFoundError(
+                    f"text encoder: no folder {name} in {folder}; copy the whole model in the "
+                    "diffusers layout"
+                )
+        self._config = config
+        self._tokenizer: Any = AutoTokenizer.from_pretrained(
+            str(folder / TOKENIZER_FOLDER), local_files_only=True
+        )
+        self._encoder: Any = UMT5EncoderModel.from_pretrained(
+            str(folder / ENCODER_FOLDER),
+            local_files_only=True,
+            use_safetensors=True,
+            dtype=config.dtype,
+        ).eval()
+
+    @torch.no_grad()
+    def encode(self, text: str) -> Float[Tensor, "words width"]:
+        """Features of the text's words and end mark, at most `text_tokens` of them."""
+        words = self._tokenizer(
+            [text],
+            max_length=self._config.text_tokens,
+            truncation=True,
+            return_attention_mask=True,
+            return_tensors="pt",
+        )
+        features: Tensor = self._encoder(words.input_ids, words.attention_mask).last_hidden_state
+        return features[0]
+
+
+class TextFeatures:
+    """Features by instruction, from memory, from disk or from the encoder, in this order."""
+
+    def __init__(self, config: WanConfig) -> None:
+        self._config = config
+        self._folder: Path | None = None
+        self._cache: Path | None = None
+        self._encoder: TextEncoder | None = None
+        self._known: dict[str, Tensor] = {}
+
+    def use(self, folder: Path | None, cache: Path | None = None) -> None:
+        """Choose where unknown texts are looked up.
+
+        Args:
+            folder: folder of the pretrained model with its text encoder.
+            cache: folder in which features are kept as safetensors; None for memory only.
+        """
+        self._folder, self._cache, self._encoder = folder, cache, None
+
+    def stack(self, texts: Sequence[str]) -> Float[Tensor, "batch words width"]:
+        """Features of several texts, padded with zeros to `text_tokens`, as Wan2.2 expects.
+
+        Raises:
+            InvalidInputError: an unknown text and no encoder.
+        """
+        padded = torch.zeros(
+            len(texts), self._config.text_tokens, self._config.text_width, dtype=self._config.dtype
+        )
+        for row, text in zip(padded, texts, strict=True):
+            features = self.of(text)
+            row[: len(features)] = features
+        return padded
+
+    def of(self, text: str) -> Float[Tensor, "words width"]:
+        """Features of one text.
+
+        Raises:
+            InvalidInputError: an unknown text and no encoder.
+            CorruptDataError: a damaged file in the cache.
+        """
+        key = key_of(text)
+        if key not in self._known:
+            if len(self._known) >= _MAX_TEXTS:
+                self._known.pop(next(iter(self._known)))
+            self._known[key] = self._stored(key, text).to(self._config.dtype)
+        return self._known[key]
+
+    def __deepcopy__(self, _: object) -> "TextFeatures":
+        """Itself: copies of a model share their features."""
+        return self
+
+    @property
+    def known(self) -> Mapping[str, Tensor]:
+        """Features in memory, by the key of their text."""
+        return self._known
+
+    def learn(self, known: Mapping[str, Tensor]) -> None:
+        """Add features, such as those of a checkpoint.
+
+        Raises:
+            CorruptDataError: features of another width.
+        """
+        for key, features in known.items():
+            self._known[key] = self._checked(features, f"text features {key}")
+
+    def _stored(self, key: str, text: str) -> Tensor:
+        file = None if self._cache is None else self._cache / f"{key}.safetensors"
+        if file is not None and file.is_file():
+            where = f"text features {file.name}"
+            tensors, _ = read_tensors(file, where)
+            return self._checked(tensors.get(_KEY, torch.empty(0)), where)
+        features = self._encode(text)
+        if file is not None:
+            write_tensors(file, {_KEY: features}, {})
+        return features
+
+    def _encode(self, text: str) -> Tensor:
+        if self._encoder is None:
+            if self._folder is None:
+                raise InvalidInputError(
+                    f"instruction {text!r}: the checkpoint has no text features of it; use one of "
+                    "training, or give the folder of the text encoder (--wan.folder of training, "
+                    "--placement.text.folder of serving)"
+                )
+            self._encoder = TextEncoder(self._folder, self._config)
+        return self._encoder.encode(cleaned(text))
+
+    def _checked(self, features: Tensor, where: str) -> Tensor:
+        width, longest = self._config.text_width, self._config.text_tokens
+        if features.ndim != 2 or features.shape[1] != width or len(features) > longest:
+            raise CorruptDataError(
+                f"{where}: got shape {tuple(features.shape)}, expected at most {longest} rows of "
+                f"{width}; remove the file, or use the cache of this model"
+            )
+        return features.to(self._config.dtype)
+
+
+def cleaned(text: str) -> str:
+    """Text without HTML entities and repeated spaces, as Wan2.2 is given it."""
+    return " ".join(html.unescape(html.unescape(text)).split())
+
+
+def key_of(text: str) -> str:
+    """Key of a text's features: SHA-256 of the cleaned text."""
+    return hashlib.sha256(cleaned(text).encode()).hexdigest()

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor, nn
 
 from services.world_model.network import flow_matching
-from services.world_model.network.attention import JointLayer, Stream, clean_mask
+from services.world_model.network.attention import ExpertBlock, JointLayer, Stream, clean_mask
 from services.world_model.network.conditioning import (
     ActionNormalizer,
     Condition,
@@ -19,6 +19,7 @@ from services.world_model.network.conditioning import (
     TactileCondition,
 )
 from services.world_model.network.configuration import (
+    FLOAT32_PARTS,
     NetworkConfig,
     Precision,
     Sampler,
@@ -26,11 +27,9 @@ from services.world_model.network.configuration import (
 )
 from services.world_model.network.flow_matching import CleanTokens
 from services.world_model.network.inputs import ModelInputs
-from services.world_model.network.tactile_expert import TactileExpert
-from services.world_model.network.tactile_tokenizers import build_tokenizer
+from services.world_model.network.instruction import TextFeatures
+from services.world_model.network.tactile import TactileExpert, build_tokenizer
 from services.world_model.network.video import WanVideoCondition, to_unit, video_side
-from services.world_model.wan.configuration import FLOAT32_PARTS
-from services.world_model.wan.text import TextFeatures
 
 _EXACT_PARTS = (
     "codec.", "tokenizer.", "normalizer.", "video_condition.", "tactile_condition.",
@@ -127,7 +126,10 @@ class JointWorldModel(nn.Module):
                 config, num_tokens=self.tokenizer.num_tokens, channels=self.tokenizer.channels
             )
         self.layers = nn.ModuleList(
-            JointLayer(side.block(index), TactileExpert.block(config) if config.use_touch else None)
+            JointLayer(
+                side.block(index),
+                ExpertBlock(config, config.tactile_width) if config.use_touch else None,
+            )
             for index in range(config.num_layers)
         )
 

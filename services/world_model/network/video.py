@@ -1,6 +1,9 @@
-"""The video side of the joint model: codec, expert and Wan's network."""
+"""The video side of the joint model: codec and expert, small ones or Wan2.2's."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,6 +16,7 @@ from services.world_model.network.attention import (
     NUM_MODULATIONS,
     Block,
     ExpertBlock,
+    Heads,
     KeysValues,
     Stream,
     Text,
@@ -34,24 +38,18 @@ from services.world_model.network.conditioning import (
 )
 from services.world_model.network.configuration import (
     FRAMES_PER_LATENT,
-    RASTER_CELLS_PER_TOKEN,
-    NetworkConfig,
-)
-from services.world_model.network.inputs import ModelInputs
-from services.world_model.wan.configuration import (
-    LATENT_CHANNELS,
     LATENT_MEAN,
     LATENT_STD,
+    RASTER_CELLS_PER_TOKEN,
+    NetworkConfig,
     WanConfig,
+    dtype_of,
 )
-from services.world_model.wan.loading import empty_autoencoder, empty_transformer
-from services.world_model.wan.text import TextFeatures
+from services.world_model.network.inputs import ModelInputs
+from services.world_model.network.instruction import TextFeatures
 
 if TYPE_CHECKING:
-    from diffusers import WanTransformer3DModel
-
-
-# Video expert: embeds video latents for the joint layers and predicts clean ones.
+    from diffusers import AutoencoderKLWan, WanTransformer3DModel
 
 
 class VideoExpert(nn.Module):
@@ -73,17 +71,6 @@ class VideoExpert(nn.Module):
         self.modulate = nn.Sequential(nn.SiLU(), zero_linear(width, NUM_MODULATIONS * width))
         self.modulate_out = nn.Sequential(nn.SiLU(), zero_linear(width, 2 * width))
         self.predict = zero_linear(width, config.video_channels)
-
-    @staticmethod
-    def block(config: NetworkConfig) -> ExpertBlock:
-        """This expert's block of one joint layer."""
-        return ExpertBlock(
-            width=config.video_width,
-            num_heads=config.num_heads,
-            head_width=config.head_width,
-            ffn_ratio=config.ffn_ratio,
-            attends_to_actions=config.action_conditioning == "cross_attention",
-        )
 
     def start(
         self,
@@ -126,24 +113,20 @@ class VideoExpert(nn.Module):
         self, raster: Float32[Tensor, "batch time 2 cells cells"]
     ) -> Float32[Tensor, "batch latents tokens values"]:
         """The raster cut into image tokens: four steps, four by four cells and two hands each."""
-        first = raster[:, :1].expand(-1, FRAMES_PER_LATENT, -1, -1, -1)
-        padded = torch.cat([first, raster[:, 1:]], dim=1)
-        groups = split_axis(padded, 1, (-1, FRAMES_PER_LATENT))
+        groups = _by_latent(raster)
         cells = (self.tokens_across, RASTER_CELLS_PER_TOKEN)
         grid = split_axis(split_axis(groups, 5, cells), 4, cells)
         # [B, L, 4, 2, rows, 4, cols, 4] -> [B, L, rows, cols, 4, 2, 4, 4]
         return grid.permute(0, 1, 4, 6, 2, 3, 5, 7).flatten(4).flatten(2, 3)
 
 
-# Visual codec: latent tokens of 1 + 4k images by principal axes of 8×8×4 patches.
-#
-# The first image forms a group of its own (repeated four times), followed by groups of four, as in
-# causal video autoencoders. Closed form: fitted once on training images, then frozen in the
-# checkpoint.
-
-
 class VisualCodec(nn.Module):
-    """Linear tokenizer; a token covers two by two patches of one latent frame."""
+    """Linear tokenizer of 1 + 4k images by principal axes of 8×8×4 patches, in closed form.
+
+    The first image forms a group of its own (repeated four times), followed by groups of four, as
+    in causal video autoencoders. A token covers two by two patches of one latent frame. It is
+    fitted once on training images, then frozen in the checkpoint.
+    """
 
     mean: Tensor
     basis: Tensor
@@ -152,7 +135,6 @@ class VisualCodec(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.patch_px = config.patch_px
-        self.tokens_across = config.tokens_across
         self.channels = config.codec_channels
         values = FRAMES_PER_LATENT * config.patch_px**2 * 3
         self.register_buffer("mean", torch.zeros(values))
@@ -181,18 +163,13 @@ class VisualCodec(nn.Module):
     ) -> Float32[Tensor, "batch latents tokens channels"]:
         """Latents of images in 0 … 1; time is 1 + 4k."""
         coded = ((self._patches(images) - self.mean) @ self.basis) / self.scale
-        # [B, L, rows, cols, 2, 2, C]: two by two patches become one token.
-        across = self.tokens_across
-        grid = split_axis(split_axis(coded, 3, (across, 2)), 2, (across, 2)).transpose(3, 4)
-        return grid.flatten(4).flatten(2, 3)
+        return _tokens_of(coded)
 
     def decode(
         self, latents: Float32[Tensor, "batch latents tokens channels"]
     ) -> Float32[Tensor, "batch time px px 3"]:
         """Images in 0 … 1; the first latent gives one image, the others four each."""
-        across = self.tokens_across
-        grid = split_axis(split_axis(latents, 2, (across, across)), 4, (2, 2, self.channels))
-        coded = grid.transpose(3, 4).flatten(2, 3).flatten(3, 4)
+        coded = _patches_of(latents)
         patches = (coded * self.scale) @ self.basis.T + self.mean
         groups = split_axis(patches, 4, (FRAMES_PER_LATENT, self.patch_px, self.patch_px, 3))
         # [B, L, rows, cols, 4, p, p, 3] -> [B, L, 4, rows, p, cols, p, 3]
@@ -216,12 +193,34 @@ class VisualCodec(nn.Module):
     def _patches(
         self, images: Float32[Tensor, "batch time px px 3"]
     ) -> Float32[Tensor, "batch latents rows cols values"]:
-        first = images[:, :1].expand(-1, FRAMES_PER_LATENT, -1, -1, -1)
-        padded = torch.cat([first, images[:, 1:]], dim=1)
-        groups = split_axis(padded, 1, (-1, FRAMES_PER_LATENT))
+        groups = _by_latent(images)
         grid = split_axis(split_axis(groups, 4, (-1, self.patch_px)), 3, (-1, self.patch_px))
         # [B, L, 4, rows, p, cols, p, 3] -> [B, L, rows, cols, 4, p, p, 3]
         return grid.permute(0, 1, 3, 5, 2, 4, 6, 7).flatten(4)
+
+
+def _by_latent(steps: Float32[Tensor, "batch time ..."]) -> Float32[Tensor, "batch latents 4 ..."]:
+    """Four steps for each latent frame: the first step four times, then groups of four."""
+    first = steps[:, :1].expand(-1, FRAMES_PER_LATENT, *steps.shape[2:])
+    return split_axis(torch.cat([first, steps[:, 1:]], dim=1), 1, (-1, FRAMES_PER_LATENT))
+
+
+def _tokens_of(
+    patches: Float32[Tensor, "batch latents rows cols channels"],
+) -> Float32[Tensor, "batch latents tokens values"]:
+    """Two by two patches as one token, row by row."""
+    across = (patches.shape[2] // 2, 2)
+    grid = split_axis(split_axis(patches, 3, across), 2, across).transpose(3, 4)
+    return grid.flatten(4).flatten(2, 3)
+
+
+def _patches_of(
+    tokens: Float32[Tensor, "batch latents tokens values"],
+) -> Float32[Tensor, "batch latents rows cols channels"]:
+    """Inverse of `_tokens_of`."""
+    across = math.isqrt(tokens.shape[2])
+    grid = split_axis(split_axis(tokens, 2, (across, across)), 4, (2, 2, -1))
+    return grid.transpose(3, 4).flatten(2, 3).flatten(3, 4)
 
 
 def to_unit(images: UInt8[Tensor, "..."]) -> Float32[Tensor, "..."]:
@@ -234,18 +233,15 @@ def to_uint8(images: Float32[Tensor, "..."]) -> UInt8[Tensor, "..."]:
     return (images * 255.0).round().clamp(0, 255).to(torch.uint8)
 
 
-# Visual codec of the full-size model: the video autoencoder of Wan2.2, frozen.
-#
-# It maps 1 + 4k images to 1 + k latent frames of 48 channels at a sixteenth of the resolution. It
-# is causal: a latent frame depends on earlier images only, and an image on earlier latents only.
-
-
 class WanVideoCodec(nn.Module):
-    """Latent tokens, two by two latents each, with mean 0 and deviation 1 by channel."""
+    """The video autoencoder of Wan2.2, frozen; tokens are two by two normalized latents each.
 
-    def __init__(self, config: NetworkConfig, wan: WanConfig) -> None:
+    It maps 1 + 4k images to 1 + k latent frames of 48 channels at a sixteenth of the resolution. It
+    is causal: a latent frame depends on earlier images only, and an image on earlier latents only.
+    """
+
+    def __init__(self, wan: WanConfig) -> None:
         super().__init__()
-        self._tokens_across = config.tokens_across
         self.autoencoder = empty_autoencoder(wan).requires_grad_(requires_grad=False)
 
     def fit(self, windows: UInt8[Tensor, "n time px px 3"]) -> None:
@@ -260,19 +256,14 @@ class WanVideoCodec(nn.Module):
         # The mean of the encoder's distribution, not a sample of it.
         latents = self.autoencoder.encode(pixels).latent_dist.mode()
         mean, std = _statistics(latents)
-        grid = ((latents - mean) / std).permute(0, 2, 3, 4, 1)
-        across = self._tokens_across
-        tokens = split_axis(split_axis(grid, 3, (across, 2)), 2, (across, 2)).transpose(3, 4)
-        return tokens.flatten(4).flatten(2, 3)
+        return _tokens_of(((latents - mean) / std).permute(0, 2, 3, 4, 1))
 
     @torch.no_grad()
     def decode(
         self, tokens: Float32[Tensor, "batch latents tokens channels"]
     ) -> Float32[Tensor, "batch time px px 3"]:
         """Images in 0 … 1; the first latent gives one image, the others four each."""
-        across = self._tokens_across
-        grid = split_axis(split_axis(tokens, 2, (across, across)), 4, (2, 2, LATENT_CHANNELS))
-        latents = grid.transpose(3, 4).flatten(2, 3).flatten(3, 4).permute(0, 4, 1, 2, 3)
+        latents = _patches_of(tokens).permute(0, 4, 1, 2, 3)
         mean, std = _statistics(latents)
         pixels = self.autoencoder.decode(latents * std + mean).sample
         return (pixels.permute(0, 2, 3, 4, 1) + 1.0) / 2.0
@@ -293,14 +284,6 @@ def _statistics(
     return mean, std
 
 
-# Video side of the full-size model: the transformer of Wan2.2 around the shared attention.
-#
-# Equal to diffusers' `WanTransformer3DModel` if there are no tactile tokens and no actions. Each
-# latent frame has its own time, 0 for the clean first one, so modulations are computed per latent
-# frame, not per token. Actions are added to the embedding of the time, with an effect of zero
-# before training.
-
-
 @dataclass(frozen=True)
 class WanCondition:
     """Condition of the video tokens: `time` has the actions, too; `text` is shared by all."""
@@ -319,7 +302,13 @@ class WanConstants:
 
 
 class WanVideoCondition(nn.Module):
-    """Times, actions and instructions as the transformer of Wan2.2 takes them."""
+    """Times, actions and instructions as the transformer of Wan2.2 takes them.
+
+    Each latent frame has its own time, 0 for the clean first one, so modulations are computed per
+    latent frame, not per token. Actions are added to the embedding of the time, with an effect of
+    zero before training. Without them and without tactile tokens, the video side equals diffusers'
+    `WanTransformer3DModel`.
+    """
 
     def __init__(self, config: NetworkConfig, wan: WanConfig, embedder: nn.Module) -> None:
         super().__init__()
@@ -330,37 +319,24 @@ class WanVideoCondition(nn.Module):
         self.commanded = nn.Parameter(torch.zeros(width))
         self.text_features = TextFeatures(wan)
 
-    def forward(
-        self,
-        inputs: ModelInputs,
-        features: ActionFeatures,
-        t: Float32[Tensor, "batch latents"],
-    ) -> WanCondition:
-        """Conditions; t is zero where the latent is clean."""
-        return self.at(self.constants(inputs, features), t)
-
     def constants(self, inputs: ModelInputs, features: ActionFeatures) -> WanConstants:
         """What does not depend on the flow time."""
         groups = split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT)).flatten(2)
         actions = after_first(self.actions(groups.to(self.commanded.dtype))).float()
         kind = inputs.commanded[:, None, None] * self.commanded.float()
-        return self._constants(actions + kind, self.text_features.stack(inputs.instructions))
+        return self.of(actions + kind, self.text_features.stack(inputs.instructions))
 
     def of(
         self,
-        t: Float32[Tensor, "batch latents"],
         actions: Float32[Tensor, "batch latents width"],
         text: Float[Tensor, "batch words features"],
-    ) -> WanCondition:
-        """Conditions from embedded actions and text features."""
-        return self.at(self._constants(actions, text), t)
-
-    def _constants(self, actions: Tensor, text: Tensor) -> WanConstants:
+    ) -> WanConstants:
+        """What embedded actions and text features contribute."""
         weight = self.embedder.time_proj.weight
         return WanConstants(actions, Text(self.embedder.text_embedder(text.to(weight))))
 
     def at(self, constants: WanConstants, t: Float32[Tensor, "batch latents"]) -> WanCondition:
-        """Conditions at these times."""
+        """Conditions at these times; t is zero where tokens are clean."""
         waves = self.embedder.timesteps_proj(TIME_RANGE * t.flatten())
         time = split_axis(self.embedder.time_embedder(waves), 0, tuple(t.shape)) + constants.actions
         project = self.embedder.time_proj
@@ -375,13 +351,7 @@ class WanBlock(Block):
         super().__init__()
         self.block: Any = block
 
-    def queries_keys_values(
-        self, stream: Stream
-    ) -> tuple[
-        Float[Tensor, "batch heads tokens head_width"],
-        Float[Tensor, "batch heads tokens head_width"],
-        Float[Tensor, "batch heads tokens head_width"],
-    ]:
+    def queries_keys_values(self, stream: Stream) -> tuple[Heads, Heads, Heads]:
         """Queries, keys and values for the shared attention."""
         attention = self.block.attn1
         shift, scale, *_ = self._modulation(stream)
@@ -489,64 +459,63 @@ class WanVideoExpert(nn.Module):
         return predicted
 
 
-# Video side of the joint model by its configuration: a small one, or the transformer of Wan2.2.
-#
-# Both give a codec, a condition, an expert and the expert's blocks with the same methods, so that
-# the joint model and its training know only one.
+@dataclass(frozen=True)
+class VideoSide:
+    """Makes the parts of the video side, each when it is called; `block` takes the layer's number.
+
+    Small parts and those of Wan2.2 have the same methods, so that the joint model and its training
+    know only one. Those of Wan2.2 are on the meta device until their weights are loaded.
+    """
+
+    codec: Callable[[], VisualCodec | WanVideoCodec]
+    condition: Callable[[], VideoCondition | WanVideoCondition]
+    expert: Callable[[], VideoExpert | WanVideoExpert]
+    block: Callable[[int], Block]
 
 
-class TinyVideoSide:
-    """Small expert, trained from scratch, on the latents of a linear codec."""
-
-    def __init__(self, config: NetworkConfig) -> None:
-        self._config = config
-
-    def codec(self) -> VisualCodec:
-        """Principal axes of patches."""
-        return VisualCodec(self._config)
-
-    def condition(self) -> VideoCondition:
-        """Time, actions, instruction and kind of action."""
-        return VideoCondition(self._config)
-
-    def expert(self) -> VideoExpert:
-        """Embedding and prediction."""
-        return VideoExpert(self._config)
-
-    def block(self, _: int) -> Block:
-        """A new block."""
-        return VideoExpert.block(self._config)
-
-
-class WanVideoSide:
-    """Parts of the networks of Wan2.2, on the meta device until their weights are loaded."""
-
-    def __init__(self, config: NetworkConfig, wan: WanConfig) -> None:
-        self._config, self._wan = config, wan
-        self._transformer = empty_transformer(
-            wan,
-            num_layers=config.num_layers,
-            num_heads=config.num_heads,
-            head_width=config.head_width,
-        )
-
-    def codec(self) -> WanVideoCodec:
-        """Video autoencoder."""
-        return WanVideoCodec(self._config, self._wan)
-
-    def condition(self) -> WanVideoCondition:
-        """Time, actions and text features."""
-        return WanVideoCondition(self._config, self._wan, self._transformer.condition_embedder)
-
-    def expert(self) -> WanVideoExpert:
-        """Embedding and prediction."""
-        return WanVideoExpert(self._config, self._transformer)
-
-    def block(self, index: int) -> Block:
-        """A block of the transformer."""
-        return WanBlock(self._transformer.blocks[index])
-
-
-def video_side(config: NetworkConfig) -> TinyVideoSide | WanVideoSide:
+def video_side(config: NetworkConfig) -> VideoSide:
     """The video side that the configuration names."""
-    return TinyVideoSide(config) if config.wan is None else WanVideoSide(config, config.wan)
+    if config.wan is None:
+        return VideoSide(
+            partial(VisualCodec, config),
+            partial(VideoCondition, config),
+            partial(VideoExpert, config),
+            lambda _: ExpertBlock(config, config.video_width),
+        )
+    transformer = empty_transformer(
+        config.wan,
+        num_layers=config.num_layers,
+        num_heads=config.num_heads,
+        head_width=config.head_width,
+    )
+    return VideoSide(
+        partial(WanVideoCodec, config.wan),
+        partial(WanVideoCondition, config, config.wan, transformer.condition_embedder),
+        partial(WanVideoExpert, config, transformer),
+        lambda index: WanBlock(transformer.blocks[index]),
+    )
+
+
+def empty_transformer(
+    config: WanConfig, *, num_layers: int, num_heads: int, head_width: int
+) -> "WanTransformer3DModel":
+    """Transformer on the meta device, in the precision of the configuration."""
+    from diffusers import WanTransformer3DModel
+
+    sizes = config.transformer_sizes(
+        num_layers=num_layers, num_heads=num_heads, head_width=head_width
+    )
+    with torch.device("meta"):
+        transformer = WanTransformer3DModel(**sizes)
+    for name, parameter in transformer.named_parameters():
+        parameter.data = parameter.data.to(dtype_of(name, config.dtype))
+    return transformer.eval()
+
+
+def empty_autoencoder(config: WanConfig) -> "AutoencoderKLWan":
+    """Video autoencoder on the meta device; always float32, as it is published."""
+    from diffusers import AutoencoderKLWan
+
+    with torch.device("meta"):
+        autoencoder = AutoencoderKLWan(**config.autoencoder_sizes())
+    return autoencoder.eval()

@@ -2,38 +2,47 @@
 
 All requested images are computed at once. `change` masks where the network may draw: it is zero,
 and the image therefore exactly the warped start image, where no body moved relative to the table
-and the camera stood still.
+and the camera stood still. Pixels of the table plane (z = 0 in the world) move by a homography;
+rays that meet the plane beyond `FAR_M`, or never, move as if they came from infinity.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from torch import Tensor
+from torch.nn import functional
 
-from dextouch.errors import ShapeError
-from services.world_model.rendering.configuration import RendererConfig
+from dextouch.geometry import apply, invert
+from services.world_model.rendering.configuration import Interpolation, RendererConfig
 from services.world_model.rendering.rasters import (
-    Bodies,
+    MIN_DEPTH_M,
     BoxHits,
-    CameraMotion,
+    SceneStates,
+    base_points_world,
+    box_corners,
     cast_boxes,
     colours_at,
     colours_at_positions,
-    is_inside,
-    motion_shares,
+    joined,
     object_transforms,
-    pixel_centres,
     positions_at_start,
     project_hands,
-    sample_images,
     splat_hands,
 )
-from services.world_model.rendering.scene_states import SceneStates
 
+FAR_M = 20.0
+# A camera nearer to the plane than this sees it edge-on.
+MIN_HEIGHT_M = 1e-3
+# Positions farther outside than this many image sides all sample the border.
+_MAX_SIDES = 4.0
+_MIN_DEPTH = 1e-9
+# A body shifted less than the first against the warped image is still, one shifted more than the
+# second has moved; in between its motion share is interpolated.
+STILL_PX, MOVED_PX = 0.05, 0.3
 FINE_CHANNELS: Final = 15
 COARSE_CHANNELS: Final = 13
 # Margin around a moved body in which the network may draw.
@@ -43,6 +52,104 @@ _COVERED = 0.05
 _CAMERA_MOVED_PX = 0.25
 # Scale lengths of held objects, and nearness at arm's length, to about one.
 _PER_M, _NEARNESS_M = 10.0, 0.5
+
+
+@dataclass(frozen=True)
+class CameraMotion:
+    """Maps from pixels of later images to pixels of start images.
+
+    Attributes:
+        table: homogeneous pixels of a later image to those of the start, on the table.
+        infinity: the same for points at infinity.
+        inverse_depth: row vectors whose product with a homogeneous pixel is 1 / (depth of the
+            table there), in 1/m; zero for a camera that sees the table as a line.
+    """
+
+    table: Float64[np.ndarray, "n 3 3"]
+    infinity: Float64[np.ndarray, "n 3 3"]
+    inverse_depth: Float64[np.ndarray, "n 1 3"]
+
+    @classmethod
+    def between(
+        cls, K: np.ndarray, T_world_start: np.ndarray, T_world_camera: np.ndarray
+    ) -> "CameraMotion":
+        """Motion between the start and later cameras [n, 4, 4], with equal K [n, 3, 3]."""
+        R_start_camera = np.swapaxes(T_world_start[:, :3, :3], -1, -2) @ T_world_camera[:, :3, :3]
+        infinity = K @ R_start_camera @ np.linalg.inv(K)
+        is_above = (np.abs(T_world_camera[:, 2, 3]) > MIN_HEIGHT_M)[:, None, None]
+        plane = np.where(is_above, _plane_projection(K, T_world_camera), np.eye(3))
+        camera_to_table = np.linalg.inv(plane)
+        table = _plane_projection(K, T_world_start) @ camera_to_table
+        same = (T_world_start == T_world_camera).all(axis=(1, 2))[:, None, None]
+        return cls(
+            np.where(same, np.eye(3), table),
+            np.where(same, np.eye(3), infinity),
+            np.where(is_above, camera_to_table[:, 2:], 0.0),
+        )
+
+    def to_start(
+        self, pixels: Float64[np.ndarray, "n points 2"]
+    ) -> Float64[np.ndarray, "n points 2"]:
+        """Start image positions of the table or the far background at these pixels."""
+        homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=2)
+        return np.swapaxes(self._to_start(np.swapaxes(homogeneous, 1, 2)), 1, 2)
+
+    def image_positions(self, shape_px: tuple[int, int]) -> Float32[np.ndarray, "n h w 2"]:
+        """Start image position of each pixel of the later image, at most four sides away."""
+        height, width = shape_px
+        centres = pixel_centres(height, width)
+        homogeneous = np.ones((3, height * width), dtype=np.float32)
+        homogeneous[:2] = centres.T
+        limit = _MAX_SIDES * max(shape_px)
+        positions = self._to_start(homogeneous).clip(-limit, limit)
+        return np.ascontiguousarray(np.swapaxes(positions, 1, 2)).reshape(-1, height, width, 2)
+
+    def _to_start(self, homogeneous: np.ndarray) -> np.ndarray:
+        """Positions [n, 2, points] of homogeneous pixels [3, points] or [n, 3, points]."""
+        kind = homogeneous.dtype
+        chosen = self.table.astype(kind) @ homogeneous
+        is_near = self.inverse_depth.astype(kind) @ homogeneous > 1.0 / FAR_M
+        is_near &= chosen[:, 2:] > _MIN_DEPTH
+        if not is_near.all():
+            chosen = np.where(is_near, chosen, self.infinity.astype(kind) @ homogeneous)
+        # Points behind the start camera were not in its image: move them far to the left and top.
+        seen = chosen[:, 2:] > _MIN_DEPTH
+        positions = chosen[:, :2] / np.where(seen, chosen[:, 2:], 1.0)
+        return positions if seen.all() else np.where(seen, positions, kind.type(-1e6))
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Hands and object boxes in one camera per state.
+
+    `pixels` and `in_front` cover 22 points of each hand, then the eight corners of each box.
+    """
+
+    Ts_camera_box: Float64[np.ndarray, "n k 4 4"]
+    hands_world: Float64[np.ndarray, "n 2 22 3"]
+    pixels: Float64[np.ndarray, "n points 2"]
+    in_front: Bool[np.ndarray, "n points"]
+
+    @classmethod
+    def seen(cls, states: SceneStates, boxes_m: np.ndarray, K: np.ndarray) -> "Bodies":
+        """Bodies of states with object boxes [n, k, 6], seen by cameras [n, 3, 3]."""
+        T_camera_world = invert(states.Ts_world_camera)
+        Ts_object_box = np.tile(np.eye(4), (*boxes_m.shape[:2], 1, 1))
+        Ts_object_box[..., :3, 3] = boxes_m[..., :3]
+        Ts_world_box = object_transforms(states.object_poses) @ Ts_object_box
+        Ts_camera_box = T_camera_world[:, None] @ Ts_world_box
+        hands_world = base_points_world(states)
+        corners = box_corners(Ts_camera_box, boxes_m[..., 3:])
+        points = np.concatenate(
+            [
+                apply(T_camera_world, hands_world.reshape(len(states), -1, 3)),
+                corners.reshape(len(states), -1, 3),
+            ],
+            axis=1,
+        )
+        depth = points[..., 2:]
+        pixels = (points @ np.swapaxes(K, -1, -2))[..., :2] / np.maximum(depth, MIN_DEPTH_M)
+        return cls(Ts_camera_box, hands_world, pixels, depth[..., 0] > MIN_DEPTH_M)
 
 
 @dataclass(frozen=True)
@@ -106,19 +213,7 @@ class PreparedScenes:
     @classmethod
     def joined(cls, parts: "Sequence[PreparedScenes]") -> "PreparedScenes":
         """All scenes of the parts, with equal image sizes and numbers of object slots."""
-        return parts[0] if len(parts) == 1 else cls(*_joined_fields(parts))
-
-
-def _joined_fields(parts: Sequence[Any]) -> list[Any]:
-    """Concatenated arrays of dataclasses of arrays, in the order of the fields."""
-    joined: list[Any] = []
-    for field in fields(parts[0]):
-        values = [getattr(part, field.name) for part in parts]
-        if isinstance(values[0], np.ndarray):
-            joined.append(np.concatenate(values))
-        else:
-            joined.append(type(values[0])(*_joined_fields(values)))
-    return joined
+        return parts[0] if len(parts) == 1 else joined(parts)
 
 
 @dataclass(frozen=True)
@@ -312,55 +407,56 @@ def _camera_change(positions: Float32[np.ndarray, "n h w 2"]) -> Float64[np.ndar
     return np.asarray((farthest / _CAMERA_MOVED_PX).clip(0, 1)[:, None, None, None])
 
 
-# Training clips of the renderer: images of an episode with the states they show.
+def _plane_projection(K: np.ndarray, T_world_camera: np.ndarray) -> Float64[np.ndarray, "*b 3 3"]:
+    """Matrices that project points (x, y, 1) of the table to pixels times depth."""
+    return np.asarray(K @ invert(T_world_camera)[..., :3, [0, 1, 3]])
 
 
-@dataclass(frozen=True)
-class SceneClip:
-    """Images of one episode at `steps`, with the ground-truth state at each of them.
-
-    `boxes_m` holds centre and half sizes (x y z, x y z) of each object's box in the object frame.
-    """
-
-    steps: Int64[np.ndarray, " images"]
-    images: UInt8[np.ndarray, "images h w 3"]
-    states: SceneStates
-    K_head: Float64[np.ndarray, "3 3"]
-    boxes_m: Float64[np.ndarray, "k 6"]
-
-    def __post_init__(self) -> None:
-        lengths = {len(self.steps), len(self.images), len(self.states)}
-        if len(lengths) > 1 or len(self.steps) < 2:
-            raise ShapeError(
-                f"scene clip: got {len(self.steps)} steps, {len(self.images)} images and "
-                f"{len(self.states)} states, expected equal numbers of at least two"
-            )
-
-    def __len__(self) -> int:
-        return len(self.steps)
+def pixel_centres(height_px: int, width_px: int) -> Float64[np.ndarray, "pixels 2"]:
+    """Positions of all pixel centres, row by row; the first is (0.5, 0.5)."""
+    u, v = np.meshgrid(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
+    return np.stack([u.ravel(), v.ravel()], axis=1)
 
 
-def gather(
-    clips: Sequence[SceneClip], rows: Int64[np.ndarray, "b 2"]
-) -> tuple[Scenes, UInt8[np.ndarray, "b h w 3"]]:
-    """Images and states at rows (clip, image), as scenes; missing object slots are empty."""
-    num_slots = max(len(clips[clip].boxes_m) for clip, _ in rows)
-    boxes_m = np.zeros((len(rows), num_slots, 6))
-    poses = np.zeros((len(rows), num_slots, 7))
-    poses[..., 3] = 1.0
-    present = np.zeros((len(rows), num_slots), dtype=np.bool_)
-    for row, (clip, image) in enumerate(rows):
-        known = clips[clip]
-        slots = slice(0, len(known.boxes_m))
-        boxes_m[row, slots] = known.boxes_m
-        poses[row, slots] = known.states.object_poses[image]
-        present[row, slots] = known.states.object_present[image]
-    states = SceneStates(
-        np.stack([clips[c].states.Ts_world_camera[i] for c, i in rows]),
-        np.stack([clips[c].states.Ts_world_wrist[i] for c, i in rows]),
-        np.stack([clips[c].states.joints_rad[i] for c, i in rows]),
-        poses,
-        present,
+def sample_images(
+    images: Float32[Tensor, "n c h w"],
+    positions: Float32[Tensor, "n rows cols 2"],
+    *,
+    interpolation: Interpolation,
+) -> Float32[Tensor, "n c rows cols"]:
+    """Sample images at positions in pixels; outside, the nearest border pixel."""
+    sides = torch.tensor([images.shape[3], images.shape[2]], dtype=torch.float32)
+    return functional.grid_sample(
+        images,
+        positions * (2.0 / sides) - 1.0,
+        mode=interpolation,
+        padding_mode="border",
+        align_corners=False,
     )
-    images = np.stack([clips[c].images[i] for c, i in rows])
-    return Scenes(images, np.stack([clips[c].K_head for c, _ in rows]), states, boxes_m), images
+
+
+def is_inside(
+    positions: Float[np.ndarray, "*b 2"], shape_px: tuple[int, int]
+) -> Bool[np.ndarray, "*b"]:
+    """Whether positions in pixels lie inside an image."""
+    height, width = shape_px
+    u, v = positions[..., 0], positions[..., 1]
+    return np.asarray((u >= 0) & (u <= width) & (v >= 0) & (v <= height))
+
+
+def motion_shares(
+    before: Bodies, now: Bodies, owner: Int64[np.ndarray, " n"], motion: CameraMotion
+) -> Float64[np.ndarray, "n bodies"]:
+    """Motion share, from 0 (still) to 1 (moved), of left hand, right hand and each object.
+
+    A body moves when any of its points leaves its position in the warped start image.
+    """
+    there = before.pixels[owner]
+    shift = np.linalg.norm(motion.to_start(now.pixels) - there, axis=-1)
+    both = before.in_front[owner] & now.in_front
+    shift = np.where(both, shift, 0.0)
+    # Points that crossed the camera plane have moved.
+    shift[before.in_front[owner] != now.in_front] = np.inf
+    hands, boxes = shift[:, :44].reshape(-1, 2, 22), shift[:, 44:].reshape(len(owner), -1, 8)
+    largest = np.concatenate([hands.max(axis=-1), boxes.max(axis=-1)], axis=1)
+    return np.asarray(((largest - STILL_PX) / (MOVED_PX - STILL_PX)).clip(0.0, 1.0))

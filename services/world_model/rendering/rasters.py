@@ -1,29 +1,136 @@
-"""Rasters of boxes and hands in an image, and how its pixels move."""
+"""Scene states, and rasters of their objects and hands in an image.
 
-from dataclasses import dataclass
+Objects are bounding boxes found by casting rays; the nearest box wins. A hit takes its colour from
+the start image: the point moves with its object back to its pose at the start and is projected
+there. Hands are coloured bones, by splatting points of the kinematic chains: each bone is a ribbon
+of points that faces the camera, and a point keeps the colour of its position in the start image. A
+soft depth test resolves occlusion.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cache
+from typing import Any, TypeVar
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64
-from torch import Tensor
-from torch.nn import functional
 
+from dextouch.errors import NonFiniteError, ShapeError
 from dextouch.geometry import apply, invert, transform_from_pose
 from dextouch.hands.robot_hand import chain_points_of_both_m
-from services.world_model.rendering.configuration import Interpolation
-from services.world_model.rendering.scene_states import SceneStates
 
-# Ray casting of objects as bounding boxes; the nearest box wins.
-#
-# Hits take their colour from the start image: the point moves with its object back to its pose at
-# the start and is projected there.
-
+Arrays = TypeVar("Arrays")
+# Slots of the renderer's inputs, which its weights are trained with; one more than tasks may have.
+MAX_DRAWN_OBJECTS = 4
 # Minimum half size of a box; thinner boxes are drawn this thick.
 MIN_HALF_M = 1e-3
 # Points nearer along the optical axis are neither hit nor visible.
 NEAR_M = 0.02
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+MIN_DEPTH_M = 0.05
+# Radii of drawn bones and forearms, and the length of the forearm drawn behind the wrist.
+_BONE_RADIUS_M, _FOREARM_RADIUS_M, _FOREARM_M = 0.008, 0.024, 0.06
+# Depth scale of the soft depth test.
+_SOFT_DEPTH_M = 0.012
+# A single centred splat covers 1 − exp(−this) of a pixel.
+_OPACITY = 1.6
+_PALM_ROWS, _PALM_COLUMNS = 7, 9
+_WRIST, _FOREARM_END = 0, 21
+_KNUCKLES = (5, 9, 13, 17)
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """Poses at one step; slots of absent objects hold arbitrary finite numbers."""
+
+    T_world_camera: Float64[np.ndarray, "4 4"]
+    Ts_world_wrist: Float64[np.ndarray, "2 4 4"]
+    joints_rad: Float64[np.ndarray, "2 20"]
+    object_poses: Float64[np.ndarray, "k 7"]
+    object_present: Bool[np.ndarray, " k"]
+
+
+@dataclass(frozen=True)
+class SceneStates:
+    """Many states as arrays; poses are x y z (m), then the quaternion w x y z, in the world."""
+
+    Ts_world_camera: Float64[np.ndarray, "n 4 4"]
+    Ts_world_wrist: Float64[np.ndarray, "n 2 4 4"]
+    joints_rad: Float64[np.ndarray, "n 2 20"]
+    object_poses: Float64[np.ndarray, "n k 7"]
+    object_present: Bool[np.ndarray, "n k"]
+
+    @classmethod
+    def stack(cls, states: Sequence[SceneState]) -> "SceneStates":
+        """Stack states with the same number of object slots.
+
+        Raises:
+            ShapeError: no state, arrays of another shape, or more than four slots.
+            NonFiniteError: NaN or infinity.
+        """
+        if not states:
+            raise ShapeError("scene states: got none, expected at least one to draw")
+        shapes = {(np.shape(s.object_poses), np.shape(s.object_present)) for s in states}
+        num_slots = len(states[0].object_present)
+        if shapes != {((num_slots, 7), (num_slots,))} or num_slots > MAX_DRAWN_OBJECTS:
+            raise ShapeError(
+                f"scene states: got object poses and presences of shapes {sorted(shapes)}, "
+                f"expected [K, 7] and [K] with one K ≤ {MAX_DRAWN_OBJECTS} in all of them"
+            )
+        made = cls(
+            np.stack([np.asarray(s.T_world_camera, dtype=np.float64) for s in states]),
+            np.stack([np.asarray(s.Ts_world_wrist, dtype=np.float64) for s in states]),
+            np.stack([np.asarray(s.joints_rad, dtype=np.float64) for s in states]),
+            np.stack([np.asarray(s.object_poses, dtype=np.float64) for s in states]),
+            np.stack([np.asarray(s.object_present, dtype=np.bool_) for s in states]),
+        )
+        made._check()
+        return made
+
+    def __len__(self) -> int:
+        return len(self.Ts_world_camera)
+
+    def padded(self, num_slots: int) -> "SceneStates":
+        """The same states with absent objects in further slots, `num_slots` in all."""
+        count = self.object_present.shape[1]
+        poses = np.zeros((len(self), num_slots, 7))
+        poses[..., 3] = 1.0
+        poses[:, :count] = self.object_poses
+        present = np.zeros((len(self), num_slots), dtype=np.bool_)
+        present[:, :count] = self.object_present
+        return replace(self, object_poses=poses, object_present=present)
+
+    def take(self, rows: Int64[np.ndarray, " m"]) -> "SceneStates":
+        """Select states, in the order of `rows`."""
+        return SceneStates(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def _check(self) -> None:
+        expected = {
+            "T_world_camera": (self.Ts_world_camera, (4, 4)),
+            "Ts_world_wrist": (self.Ts_world_wrist, (2, 4, 4)),
+            "joints_rad": (self.joints_rad, (2, 20)),
+            "object_poses": (self.object_poses, self.object_poses.shape[1:]),
+        }
+        for name, (array, shape) in expected.items():
+            if array.shape[1:] != shape:
+                raise ShapeError(f"scene state: {name} is {array.shape[1:]}, expected {shape}")
+            bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
+            if len(bad):
+                raise NonFiniteError(
+                    f"scene state {bad[0]}: {name} contains NaN or infinity; expected finite values"
+                )
+
+
+def joined(parts: Sequence[Arrays]) -> Arrays:
+    """One array, or dataclass of arrays, from several of a kind: their first axes concatenated."""
+    first: Any = parts[0]
+    if isinstance(first, np.ndarray):
+        together: Any = np.concatenate(list[Any](parts))
+    else:
+        names = [field.name for field in fields(first)]
+        together = type(first)(*[joined([getattr(part, name) for part in parts]) for name in names])
+    made: Arrays = together
+    return made
 
 
 @dataclass(frozen=True)
@@ -167,23 +274,6 @@ def colours_at_positions(
     lower = layers[owner, :, v_next, u] * (1 - right)[:, None]
     lower += layers[owner, :, v_next, u_next] * right[:, None]
     return np.asarray(upper * (1 - down)[:, None] + lower * down[:, None])
-
-
-# Drawing of both hands as coloured bones, by splatting points of the kinematic chains.
-#
-# Each bone is a ribbon of points that faces the camera; a point keeps the colour of its position in
-# the start image. A soft depth test resolves occlusion.
-
-MIN_DEPTH_M = 0.05
-# Radii of drawn bones and forearms, and the length of the forearm drawn behind the wrist.
-_BONE_RADIUS_M, _FOREARM_RADIUS_M, _FOREARM_M = 0.008, 0.024, 0.06
-# Depth scale of the soft depth test.
-_SOFT_DEPTH_M = 0.012
-# A single centred splat covers 1 − exp(−this) of a pixel.
-_OPACITY = 1.6
-_PALM_ROWS, _PALM_COLUMNS = 7, 9
-_WRIST, _FOREARM_END = 0, 21
-_KNUCKLES = (5, 9, 13, 17)
 
 
 @dataclass(frozen=True)
@@ -356,179 +446,3 @@ def _taps(
             places.append(begin + column)
             weights.append(right * down)
     return np.concatenate(places), np.concatenate(weights), np.tile(source, 4)
-
-
-# Image motion caused by a known motion of the head camera over the table.
-#
-# Pixels of the table plane (z = 0 in the world) move by a homography; rays that meet the plane
-# beyond `FAR_M`, or never, move as if they came from infinity.
-
-FAR_M = 20.0
-# A camera nearer to the plane than this sees it edge-on.
-MIN_HEIGHT_M = 1e-3
-# Positions farther outside than this many image sides all sample the border.
-_MAX_SIDES = 4.0
-_MIN_DEPTH = 1e-9
-
-
-def pixel_centres(height_px: int, width_px: int) -> Float64[np.ndarray, "pixels 2"]:
-    """Positions of all pixel centres, row by row; the first is (0.5, 0.5)."""
-    u, v = np.meshgrid(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
-    return np.stack([u.ravel(), v.ravel()], axis=1)
-
-
-@dataclass(frozen=True)
-class CameraMotion:
-    """Maps from pixels of later images to pixels of start images.
-
-    Attributes:
-        table: homogeneous pixels of a later image to those of the start, on the table.
-        infinity: the same for points at infinity.
-        inverse_depth: row vectors whose product with a homogeneous pixel is 1 / (depth of the
-            table there), in 1/m; zero for a camera that sees the table as a line.
-    """
-
-    table: Float64[np.ndarray, "n 3 3"]
-    infinity: Float64[np.ndarray, "n 3 3"]
-    inverse_depth: Float64[np.ndarray, "n 1 3"]
-
-    @classmethod
-    def between(
-        cls, K: np.ndarray, T_world_start: np.ndarray, T_world_camera: np.ndarray
-    ) -> "CameraMotion":
-        """Motion between the start and later cameras [n, 4, 4], with equal K [n, 3, 3]."""
-        R_start_camera = np.swapaxes(T_world_start[:, :3, :3], -1, -2) @ T_world_camera[:, :3, :3]
-        infinity = K @ R_start_camera @ np.linalg.inv(K)
-        is_above = (np.abs(T_world_camera[:, 2, 3]) > MIN_HEIGHT_M)[:, None, None]
-        plane = np.where(is_above, _plane_projection(K, T_world_camera), np.eye(3))
-        camera_to_table = np.linalg.inv(plane)
-        table = _plane_projection(K, T_world_start) @ camera_to_table
-        same = (T_world_start == T_world_camera).all(axis=(1, 2))[:, None, None]
-        return cls(
-            np.where(same, np.eye(3), table),
-            np.where(same, np.eye(3), infinity),
-            np.where(is_above, camera_to_table[:, 2:], 0.0),
-        )
-
-    def to_start(
-        self, pixels: Float64[np.ndarray, "n points 2"]
-    ) -> Float64[np.ndarray, "n points 2"]:
-        """Start image positions of the table or the far background at these pixels."""
-        homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=2)
-        return np.swapaxes(self._to_start(np.swapaxes(homogeneous, 1, 2)), 1, 2)
-
-    def image_positions(self, shape_px: tuple[int, int]) -> Float32[np.ndarray, "n h w 2"]:
-        """Start image position of each pixel of the later image, at most four sides away."""
-        height, width = shape_px
-        centres = pixel_centres(height, width)
-        homogeneous = np.ones((3, height * width), dtype=np.float32)
-        homogeneous[:2] = centres.T
-        limit = _MAX_SIDES * max(shape_px)
-        positions = self._to_start(homogeneous).clip(-limit, limit)
-        return np.ascontiguousarray(np.swapaxes(positions, 1, 2)).reshape(-1, height, width, 2)
-
-    def _to_start(self, homogeneous: np.ndarray) -> np.ndarray:
-        """Positions [n, 2, points] of homogeneous pixels [3, points] or [n, 3, points]."""
-        kind = homogeneous.dtype
-        chosen = self.table.astype(kind) @ homogeneous
-        is_near = self.inverse_depth.astype(kind) @ homogeneous > 1.0 / FAR_M
-        is_near &= chosen[:, 2:] > _MIN_DEPTH
-        if not is_near.all():
-            chosen = np.where(is_near, chosen, self.infinity.astype(kind) @ homogeneous)
-        # Points behind the start camera were not in its image: move them far to the left and top.
-        seen = chosen[:, 2:] > _MIN_DEPTH
-        positions = chosen[:, :2] / np.where(seen, chosen[:, 2:], 1.0)
-        return positions if seen.all() else np.where(seen, positions, kind.type(-1e6))
-
-
-def _plane_projection(K: np.ndarray, T_world_camera: np.ndarray) -> Float64[np.ndarray, "*b 3 3"]:
-    """Matrices that project points (x, y, 1) of the table to pixels times depth."""
-    return np.asarray(K @ invert(T_world_camera)[..., :3, [0, 1, 3]])
-
-
-def sample_images(
-    images: Float32[Tensor, "n c h w"],
-    positions: Float32[Tensor, "n rows cols 2"],
-    *,
-    interpolation: Interpolation,
-) -> Float32[Tensor, "n c rows cols"]:
-    """Sample images at positions in pixels; outside, the nearest border pixel."""
-    sides = torch.tensor([images.shape[3], images.shape[2]], dtype=torch.float32)
-    return functional.grid_sample(
-        images,
-        positions * (2.0 / sides) - 1.0,
-        mode=interpolation,
-        padding_mode="border",
-        align_corners=False,
-    )
-
-
-def is_inside(
-    positions: Float[np.ndarray, "*b 2"], shape_px: tuple[int, int]
-) -> Bool[np.ndarray, "*b"]:
-    """Whether positions in pixels lie inside an image."""
-    height, width = shape_px
-    u, v = positions[..., 0], positions[..., 1]
-    return np.asarray((u >= 0) & (u <= width) & (v >= 0) & (v <= height))
-
-
-# Image motion of hands and objects relative to the start image warped by the camera motion.
-
-# A body shifted less than the first against the warped image is still, one shifted more than the
-# second has moved; in between its motion share is interpolated.
-STILL_PX, MOVED_PX = 0.05, 0.3
-
-
-@dataclass(frozen=True)
-class Bodies:
-    """Hands and object boxes in one camera per state.
-
-    `pixels` and `in_front` cover 22 points of each hand, then the eight corners of each box.
-    """
-
-    Ts_camera_box: Float64[np.ndarray, "n k 4 4"]
-    hands_world: Float64[np.ndarray, "n 2 22 3"]
-    pixels: Float64[np.ndarray, "n points 2"]
-    in_front: Bool[np.ndarray, "n points"]
-
-    @classmethod
-    def seen(cls, states: SceneStates, boxes_m: np.ndarray, K: np.ndarray) -> "Bodies":
-        """Bodies of states with object boxes [n, k, 6], seen by cameras [n, 3, 3]."""
-        T_camera_world = invert(states.Ts_world_camera)
-        Ts_object_box = np.tile(np.eye(4), (*boxes_m.shape[:2], 1, 1))
-        Ts_object_box[..., :3, 3] = boxes_m[..., :3]
-        Ts_world_box = object_transforms(states.object_poses) @ Ts_object_box
-        Ts_camera_box = T_camera_world[:, None] @ Ts_world_box
-        hands_world = base_points_world(states)
-        corners = box_corners(Ts_camera_box, boxes_m[..., 3:])
-        points = np.concatenate(
-            [
-                apply(T_camera_world, hands_world.reshape(len(states), -1, 3)),
-                corners.reshape(len(states), -1, 3),
-            ],
-            axis=1,
-        )
-        depth = points[..., 2:]
-        pixels = (points @ np.swapaxes(K, -1, -2))[..., :2] / np.maximum(depth, MIN_DEPTH_M)
-        return cls(Ts_camera_box, hands_world, pixels, depth[..., 0] > MIN_DEPTH_M)
-
-
-def motion_shares(
-    before: Bodies,
-    now: Bodies,
-    owner: Int64[np.ndarray, " n"],
-    motion: CameraMotion,
-) -> Float64[np.ndarray, "n bodies"]:
-    """Motion share, from 0 (still) to 1 (moved), of left hand, right hand and each object.
-
-    A body moves when any of its points leaves its position in the warped start image.
-    """
-    there = before.pixels[owner]
-    shift = np.linalg.norm(motion.to_start(now.pixels) - there, axis=-1)
-    both = before.in_front[owner] & now.in_front
-    shift = np.where(both, shift, 0.0)
-    # Points that crossed the camera plane have moved.
-    shift[before.in_front[owner] != now.in_front] = np.inf
-    hands, boxes = shift[:, :44].reshape(-1, 2, 22), shift[:, 44:].reshape(len(owner), -1, 8)
-    largest = np.concatenate([hands.max(axis=-1), boxes.max(axis=-1)], axis=1)
-    return np.asarray(((largest - STILL_PX) / (MOVED_PX - STILL_PX)).clip(0.0, 1.0))

@@ -13,7 +13,7 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from services.world_model.dynamics.traces import Traced
+from services.world_model.dynamics.trees import Traced
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.inputs import (
     DrawingInputs,
@@ -22,8 +22,13 @@ from services.world_model.rendering.inputs import (
     drawing_inputs_from,
 )
 from services.world_model.rendering.network import RendererNetwork
-from services.world_model.rendering.precision import uses_bfloat16 as uses_bfloat16_here
-from services.world_model.rendering.scene_states import MAX_DRAWN_OBJECTS, SceneState, SceneStates
+from services.world_model.rendering.network import uses_bfloat16 as uses_bfloat16_here
+from services.world_model.rendering.rasters import (
+    MAX_DRAWN_OBJECTS,
+    SceneState,
+    SceneStates,
+    joined,
+)
 
 # Chosen: about 1.5 MB of working memory an image; larger blocks are not faster.
 _BLOCK_IMAGES: Final = 32
@@ -111,7 +116,7 @@ class Renderer:
         starts = [self._prepared(drawing) for drawing in drawings]
         stacked = [_stacked(drawing) for drawing in drawings]
         counts = [len(states) for states in stacked]
-        states = SceneStates.joined(stacked)
+        states = joined(stacked)
         owner = np.repeat(np.arange(len(drawings)), counts)
         blocks = [
             self._drawn_block(starts, states.take(rows), owner[rows])

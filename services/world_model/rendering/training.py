@@ -2,16 +2,16 @@
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64, Int64, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from services.networks.optimizer import (
     Budget,
@@ -21,34 +21,39 @@ from services.networks.optimizer import (
     update_average,
 )
 from services.world_model.rendering.configuration import RendererConfig, RendererTraining
-from services.world_model.rendering.inputs import DrawingInputs, SceneClip, drawing_inputs, gather
-from services.world_model.rendering.network import RendererNetwork
-from services.world_model.rendering.precision import has_fast_bfloat16
-from services.world_model.rendering.rasters import object_transforms
-from services.world_model.rendering.scene_states import SceneStates
+from services.world_model.rendering.inputs import DrawingInputs, Scenes, drawing_inputs
+from services.world_model.rendering.network import RendererNetwork, has_fast_bfloat16
+from services.world_model.rendering.rasters import SceneStates, object_transforms
 
 LOG_EVERY_STEPS = 50
 MIN_LEARNING_RATE_SHARE = 0.01
 _EDGE_WINDOW_PX = 7
+OnProgress = Callable[[float, int, float], None]
 
 
 @dataclass(frozen=True)
-class RendererProgress:
-    """Progress of a training run."""
+class SceneClip:
+    """Images of one episode at `steps`, with the ground-truth state at each of them.
 
-    step: int
-    share: float
-    loss: float
+    `boxes_m` holds centre and half sizes (x y z, x y z) of each object's box in the object frame.
+    """
 
+    steps: Int64[np.ndarray, " images"]
+    images: UInt8[np.ndarray, "images h w 3"]
+    states: SceneStates
+    K_head: Float64[np.ndarray, "3 3"]
+    boxes_m: Float64[np.ndarray, "k 6"]
 
-@dataclass(frozen=True)
-class TrainedRenderer:
-    """The averaged network with its training log."""
+    def __post_init__(self) -> None:
+        lengths = {len(self.steps), len(self.images), len(self.states)}
+        if len(lengths) > 1 or len(self.steps) < 2:
+            raise ShapeError(
+                f"scene clip: got {len(self.steps)} steps, {len(self.images)} images and "
+                f"{len(self.states)} states, expected equal numbers of at least two"
+            )
 
-    network: RendererNetwork
-    steps: int
-    cpu_s: float
-    log: list[RendererProgress] = field(default_factory=list)
+    def __len__(self) -> int:
+        return len(self.steps)
 
 
 def train_renderer(
@@ -57,9 +62,9 @@ def train_renderer(
     settings: RendererTraining,
     *,
     rng: np.random.Generator,
-    on_progress: Callable[[RendererProgress], None] | None = None,
+    on_progress: OnProgress | None = None,
     initial: RendererNetwork | None = None,
-) -> TrainedRenderer:
+) -> tuple[RendererNetwork, float]:
     """Train on pairs of images of one clip: a start image and a target image.
 
     Args:
@@ -67,8 +72,11 @@ def train_renderer(
         config: shape of the network.
         settings: how to train.
         rng: source of initial weights, pairs and pose noise.
-        on_progress: called every few steps.
+        on_progress: called every few steps with the completed share, the step and the loss.
         initial: network to start from, of the same shape; default: random weights.
+
+    Returns:
+        The averaged network, and the CPU seconds of training.
 
     Raises:
         InvalidInputError: no clips, or image sides that the network does not support.
@@ -76,7 +84,6 @@ def train_renderer(
     run = RendererRun(clips, config, settings, rng=rng)
     if initial is not None:
         run.network.load_state_dict(initial.state_dict())
-    log: list[RendererProgress] = []
     budget = Budget(settings.cpu_budget_s, settings.max_steps)
     options = OptimizerOptions(
         learning_rate=settings.learning_rate,
@@ -89,11 +96,9 @@ def train_renderer(
     averaged = copy.deepcopy(run.network).eval().requires_grad_(requires_grad=False)
     for loss in OptimizerLoop(run.network, options, budget).run(run.loss):
         update_average(averaged, run.network, decay=settings.ema_decay, num_updates=budget.step - 1)
-        if budget.step % LOG_EVERY_STEPS == 0:
-            log.append(RendererProgress(budget.step, min(budget.share(), 1.0), loss))
-            if on_progress is not None:
-                on_progress(log[-1])
-    return TrainedRenderer(averaged, budget.step, budget.cpu_s, log)
+        if on_progress is not None and budget.step % LOG_EVERY_STEPS == 0:
+            on_progress(min(budget.share(), 1.0), budget.step, loss)
+    return averaged, budget.cpu_s
 
 
 class RendererRun:
@@ -161,9 +166,7 @@ class RendererRun:
 
 
 def drawing_loss(
-    drawn: Float32[Tensor, "n 3 h w"],
-    true: Float32[Tensor, "n 3 h w"],
-    settings: RendererTraining,
+    drawn: Float32[Tensor, "n 3 h w"], true: Float32[Tensor, "n 3 h w"], settings: RendererTraining
 ) -> Float32[Tensor, ""]:
     """Mean absolute error of colours, of image gradients and of edge strength.
 
@@ -205,3 +208,29 @@ def check_clips(clips: Sequence[SceneClip], config: RendererConfig) -> None:
             f"renderer training: got {len(clips)} clips of image sizes {sorted(sizes)}, expected "
             f"at least one clip and one size whose sides are multiples of {multiple}"
         )
+
+
+def gather(
+    clips: Sequence[SceneClip], rows: Int64[np.ndarray, "b 2"]
+) -> tuple[Scenes, UInt8[np.ndarray, "b h w 3"]]:
+    """Images and states at rows (clip, image), as scenes; missing object slots are empty."""
+    num_slots = max(len(clips[clip].boxes_m) for clip, _ in rows)
+    boxes_m = np.zeros((len(rows), num_slots, 6))
+    poses = np.zeros((len(rows), num_slots, 7))
+    poses[..., 3] = 1.0
+    present = np.zeros((len(rows), num_slots), dtype=np.bool_)
+    for row, (clip, image) in enumerate(rows):
+        known = clips[clip]
+        slots = slice(0, len(known.boxes_m))
+        boxes_m[row, slots] = known.boxes_m
+        poses[row, slots] = known.states.object_poses[image]
+        present[row, slots] = known.states.object_present[image]
+    states = SceneStates(
+        np.stack([clips[c].states.Ts_world_camera[i] for c, i in rows]),
+        np.stack([clips[c].states.Ts_world_wrist[i] for c, i in rows]),
+        np.stack([clips[c].states.joints_rad[i] for c, i in rows]),
+        poses,
+        present,
+    )
+    images = np.stack([clips[c].images[i] for c, i in rows])
+    return Scenes(images, np.stack([clips[c].K_head for c, _ in rows]), states, boxes_m), images

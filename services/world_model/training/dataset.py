@@ -1,7 +1,8 @@
 """Random training windows of episodes in memory, as requests and targets.
 
 Episodes are read once and cut with the same re-anchoring as in the store's reader, so that an epoch
-reads nothing from disk; or, for episodes that stay on disk, read by each window.
+reads nothing from disk. For data larger than memory, episodes stay on disk, and a window is read
+through the store's reader, which decodes one camera and only the span of the window.
 """
 
 import hashlib
@@ -30,12 +31,13 @@ from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, Domain
 from dextouch.streams import HEAD_CAMERA
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
+from services.world_model.training.domains import DomainEpisode
 
-# Random training windows of episodes in memory, as requests and targets.
-#
-# Episodes are read once and cut with the same re-anchoring as in the store's reader, so that an
-# epoch reads nothing from disk. `services.world_model.training.streaming` provides the same windows
-# for episodes that stay on disk.
+# What an episode must have for windows to be cut from it.
+CUT: Final = (needs.EVERY_IMAGE,)
+# Open readers per process; each holds an episode's timestamps and actions.
+MAX_OPEN_READERS = 512
+StartMethod = Literal["fork", "spawn", "forkserver"]
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class WindowPosition:
 
 
 @runtime_checkable
-class TrainingEpisode(Protocol):
+class TrainingEpisode(DomainEpisode, Protocol):
     """Episode that windows are cut from, in memory or on disk."""
 
     @property
@@ -62,18 +64,8 @@ class TrainingEpisode(Protocol):
         ...
 
     @property
-    def task(self) -> str:
-        """Task of the episode."""
-        ...
-
-    @property
     def scene(self) -> str:
         """Name of its scene, from `dextouch.episodes.scene_of`."""
-        ...
-
-    @property
-    def domain(self) -> Domain:
-        """Whether a person or a robot acts."""
         ...
 
     @property
@@ -84,11 +76,6 @@ class TrainingEpisode(Protocol):
     @property
     def action_kinds(self) -> tuple[ActionKind, ...]:
         """Available kinds of actions."""
-        ...
-
-    @property
-    def content_sha256(self) -> str:
-        """Digest of what the store holds of it, for `dextouch.episodes.data_hash`."""
         ...
 
     def fingerprint(self) -> str:
@@ -323,12 +310,6 @@ class WindowSampler:
         )
 
 
-# Episodes of a store in memory, and subsets of them by their content.
-
-# What an episode must have for windows to be cut from it.
-CUT: Final = (needs.EVERY_IMAGE,)
-
-
 def load_episodes(
     url: str,
     *,
@@ -380,16 +361,6 @@ def read_episode(reader: EpisodeReader, *, image_px: int | None = None) -> Episo
         object_poses=poses,
         boxes_m=boxes_m,
     )
-
-
-# Streaming dataset: reads windows from disk when they are needed.
-#
-# For data larger than memory. A window is read through the store's reader, which decodes one camera
-# and only the span of the window.
-
-# Open readers per process; each holds an episode's timestamps and actions.
-MAX_OPEN_READERS = 512
-StartMethod = Literal["fork", "spawn", "forkserver"]
 
 
 @lru_cache(maxsize=MAX_OPEN_READERS)

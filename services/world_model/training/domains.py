@@ -12,8 +12,8 @@ from typing import Protocol, TypeVar, runtime_checkable
 from dextouch.episodes import data_hash
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Domain
+from services.world_model.checkpoints import TrainingSet
 from services.world_model.settings import DataSettings
-from services.world_model.training_set import TrainingSet
 
 
 @runtime_checkable
@@ -123,31 +123,20 @@ def training_sets(
         one if one.checkpoint else one.model_copy(update={"checkpoint": ancestor})
         for one in inherited
     ]
-    domains = sorted({episode.domain for episode in trained})
+    domains = {episode.domain for episode in trained}
     shares: dict[Domain, float] = {}
     if human_share is not None and len(domains) > 1:
         shares = {"human": human_share, "robot": 1 - human_share}
-    for domain in domains:
-        mine = [episode for episode in trained if episode.domain == domain]
-        found.append(_set_of(mine, domain, image_px, window_share=shares.get(domain)))
-    for domain in sorted({episode.domain for episode in heldout}):
-        mine = [episode for episode in heldout if episode.domain == domain]
-        found.append(_set_of(mine, domain, image_px, heldout=True))
+    for episodes, is_heldout in ((trained, False), (heldout, True)):
+        for domain in sorted({episode.domain for episode in episodes}):
+            mine = [episode for episode in episodes if episode.domain == domain]
+            found.append(
+                TrainingSet(
+                    domain=domain,
+                    heldout=is_heldout,
+                    tasks=dict(sorted(Counter(episode.task for episode in mine).items())),
+                    data_hash=data_hash((e.content_sha256 for e in mine), image_px=image_px),
+                    window_share=None if is_heldout else shares.get(domain),
+                )
+            )
     return tuple(found)
-
-
-def _set_of(
-    episodes: Sequence[DomainEpisode],
-    domain: Domain,
-    image_px: int | None,
-    *,
-    heldout: bool = False,
-    window_share: float | None = None,
-) -> TrainingSet:
-    return TrainingSet(
-        domain=domain,
-        heldout=heldout,
-        tasks=dict(sorted(Counter(episode.task for episode in episodes).items())),
-        data_hash=data_hash((e.content_sha256 for e in episodes), image_px=image_px),
-        window_share=window_share,
-    )

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,8 +13,6 @@ from dextouch.episodes import EpisodeGrid, ObjectTrack
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
 from dextouch.schemas import MAX_OBJECTS
-from dextouch.tactile.layout import split_pads
-from services.world_model.dynamics.core import NUM_PADS
 from services.world_model.dynamics.features import (
     FREE_KPA,
     LOOKS,
@@ -27,10 +26,11 @@ from services.world_model.dynamics.features import (
     hand_motion,
     objects_from_poses,
 )
-from services.world_model.dynamics.model import pad_means_kpa
+from services.world_model.dynamics.model import by_pad
 from services.world_model.dynamics.start_reader import FirstStep
-from services.world_model.rendering.inputs import SceneClip
-from services.world_model.rendering.scene_states import SceneStates
+from services.world_model.dynamics.trees import by_name, chosen, mapped, stacked
+from services.world_model.rendering.rasters import SceneStates
+from services.world_model.rendering.training import SceneClip
 
 # Objects that never move farther than this are fixed; measured ones by more than their errors.
 _MOVED_M = 2e-3
@@ -139,10 +139,7 @@ class SceneTable:
 
     def objects_at(self, rows: Tensor, steps: Tensor | int) -> ObjectPoses:
         """True objects at one step of each episode."""
-        objects = self.objects
-        return ObjectPoses(
-            objects.position_m[rows, steps], objects.axes[rows, steps], objects.present[rows, steps]
-        )
+        return mapped(self.objects, lambda values: values[rows, steps])
 
     def drawn(
         self, able: Int64[Tensor, " rows"], count: int, generator: torch.Generator
@@ -178,12 +175,7 @@ class SceneTable:
     def objects_of_latents(self, rows: Tensor, start: int) -> ObjectPoses:
         """True objects at the start and at every latent step after it."""
         steps = torch.arange(start, self.num_steps, STEPS_PER_LATENT)
-        objects = self.objects
-        return ObjectPoses(
-            objects.position_m[rows][:, steps],
-            objects.axes[rows][:, steps],
-            objects.present[rows][:, steps],
-        )
+        return mapped(self.objects, lambda values: values[rows][:, steps])
 
     def known_of_latents(self, rows: Tensor, start: int) -> Bool[Tensor, "batch latents objects"]:
         """Whether objects are known at the start and at every latent step after it."""
@@ -196,17 +188,16 @@ class SceneTable:
         looks = latents[:, None] + torch.tensor(LOOKS)
         ends = looks[:, -1]
 
-        def chosen(name: str, steps: Tensor) -> Tensor:
+        def taken(name: str, steps: Tensor) -> Tensor:
             sent: Tensor = getattr(self.sent, name)[rows][:, steps]
-            measured: Tensor = getattr(self.measured, name)[rows][:, steps]
-            return torch.where(use_measured.view(-1, *[1] * (sent.ndim - 1)), measured, sent)
+            return chosen(use_measured, getattr(self.measured, name)[rows][:, steps], sent)
 
         here = self.measured
         standing = here.points_m[rows, start][:, None, None].expand(-1, 1, len(LOOKS), -1, -1, -1)
         return Commands(
-            torch.cat([standing, chosen("points_m", looks)], dim=1),
-            torch.cat([here.axes[rows, start][:, None], chosen("axes", ends)], dim=1),
-            torch.cat([here.joints_rad[rows, start][:, None], chosen("joints_rad", ends)], dim=1),
+            torch.cat([standing, taken("points_m", looks)], dim=1),
+            torch.cat([here.axes[rows, start][:, None], taken("axes", ends)], dim=1),
+            torch.cat([here.joints_rad[rows, start][:, None], taken("joints_rad", ends)], dim=1),
         )
 
     def steps_after(self, start: int) -> Int64[Tensor, "latents 4"]:
@@ -218,36 +209,21 @@ class SceneTable:
         """All data as named tensors, to share with other processes through a file."""
         flat = {"image_steps": torch.tensor(self.image_steps)}
         for name in (one.name for one in fields(self) if one.name != "image_steps"):
-            part = getattr(self, name)
-            if isinstance(part, Tensor):
-                flat[name] = part.contiguous()
-            else:
-                for inner in fields(part):
-                    flat[f"{name}.{inner.name}"] = getattr(part, inner.name).contiguous()
-        return flat
+            flat |= by_name(getattr(self, name), name)
+        return {name: value.contiguous() for name, value in flat.items()}
 
     @classmethod
     def from_tensors(cls, flat: dict[str, Tensor]) -> "SceneTable":
         """Inverse of `tensors`."""
-
-        def group(name: str) -> dict[str, Tensor]:
-            prefix = f"{name}."
-            return {
-                key.removeprefix(prefix): value
-                for key, value in flat.items()
-                if key.startswith(prefix)
-            }
-
-        whole = {
-            key: value for key, value in flat.items() if "." not in key and key != "image_steps"
-        }
-        return cls(
-            sent=HandTable(**group("sent")),
-            measured=HandTable(**group("measured")),
-            objects=ObjectPoses(**group("objects")),
-            image_steps=tuple(flat["image_steps"].tolist()),
-            **whole,
-        )
+        parts: dict[str, Any] = {name: part for name, part in flat.items() if "." not in name}
+        kinds: dict[str, type[Any]] = {
+            "sent": HandTable, "measured": HandTable, "objects": ObjectPoses,
+        }  # fmt: skip
+        for name, kind in kinds.items():
+            start = f"{name}."
+            inner = {key: value for key, value in flat.items() if key.startswith(start)}
+            parts[name] = kind(**{key.removeprefix(start): one for key, one in inner.items()})
+        return cls(**{**parts, "image_steps": tuple(flat["image_steps"].tolist())})
 
 
 def vocabulary(episodes: Sequence[EpisodeGrid]) -> tuple[tuple[str, ...], tuple[int, ...]]:
@@ -311,14 +287,10 @@ def scene_table(
         measured=HandTable.of(measured),
         commanded=torch.tensor([e.action_kind == "commanded" for e in episodes]),
         Ts_world_camera=torch.from_numpy(np.stack([m.Ts_world_camera for m in measured])).float(),
-        objects=ObjectPoses(
-            torch.stack([each.position_m for each in objects]),
-            torch.stack([each.axes for each in objects]),
-            torch.stack([each.present for each in objects]),
-        ),
+        objects=stacked(objects),
         tactile_kpa=torch.from_numpy(tactile),
-        pads_kpa=torch.from_numpy(pad_means_kpa(tactile.astype(np.float32))),
-        in_contact=torch.from_numpy(_pad_peaks_kpa(tactile) >= FREE_KPA),
+        pads_kpa=torch.from_numpy(by_pad(tactile.astype(np.float32), np.mean)),
+        in_contact=torch.from_numpy(by_pad(tactile, np.max) >= FREE_KPA),
         images=torch.from_numpy(np.stack([_images(episode, steps) for episode in episodes])),
         shown=torch.from_numpy(np.stack([np.isin(steps, e.image_steps) for e in episodes])),
         image_steps=tuple(steps),
@@ -431,12 +403,6 @@ def _padded(
     return boxes
 
 
-def _pad_peaks_kpa(tactile_kpa: np.ndarray) -> np.ndarray:
-    tips, palm = split_pads(tactile_kpa)
-    peaks = np.concatenate([tips.max((-1, -2)), palm.max((-1, -2))[..., None]], axis=-1)
-    return peaks.reshape(*peaks.shape[:-2], NUM_PADS)
-
-
 def _checked_tracks(episodes: Sequence[EpisodeGrid], config: DynamicsConfig) -> list[ObjectTrack]:
     """Object poses of the episodes, if these fit the configuration."""
     if not episodes:
@@ -461,9 +427,6 @@ def _checked_tracks(episodes: Sequence[EpisodeGrid], config: DynamicsConfig) -> 
     return tracks
 
 
-# Conversion of episodes with object poses to training clips of the renderer.
-
-
 def scene_clips(episodes: Sequence[EpisodeGrid]) -> list[SceneClip]:
     """Clips of the images of which all objects are known, where an episode has two or more."""
     clips = []
@@ -477,9 +440,7 @@ def scene_clips(episodes: Sequence[EpisodeGrid]) -> list[SceneClip]:
 
 
 def _clip(
-    episode: EpisodeGrid,
-    steps: Int64[np.ndarray, " n"],
-    poses: Float64[np.ndarray, "n objects 7"],
+    episode: EpisodeGrid, steps: Int64[np.ndarray, " n"], poses: Float64[np.ndarray, "n objects 7"]
 ) -> SceneClip:
     actions = episode.measured[steps]
     hands = poses_from_actions(actions, episode.anchor)

@@ -11,8 +11,8 @@ from dextouch.errors import InvalidInputError
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import CHUNK_STEPS
 from services.world_model.dynamics.features import STEPS_PER_LATENT
-from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.training.core_training import reader_errors
+from services.world_model.dynamics.model import DynamicsModel, ImaginedSteps, batched
+from services.world_model.training.reader_training import reader_errors
 from services.world_model.training.scene_table import SceneTable
 
 # Start steps of rollouts, as far as they have images.
@@ -38,16 +38,6 @@ class StateFigures:
     disagreement_m: float
     distance: float
     num_latents: int
-
-
-@dataclass(frozen=True)
-class _Imagined:
-    """Predictions of whole episodes from one start; the last two are uncertainty measures."""
-
-    tactile_kpa: Float32[Tensor, "episodes steps 2 320"]
-    position_m: Float32[Tensor, "episodes steps objects 3"]
-    disagreement_m: Float32[Tensor, "episodes latents"]
-    distance: Float32[Tensor, "episodes latents"]
 
 
 def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigures:
@@ -88,7 +78,7 @@ def chunk_peaks(
     return torch.cat([chunk.amax(1)[inside.all(1)] for chunk, inside in pairs])
 
 
-def _chunk_figures(imagined: _Imagined, table: SceneTable, start: int) -> dict[str, float]:
+def _chunk_figures(imagined: ImaginedSteps, table: SceneTable, start: int) -> dict[str, float]:
     figures: dict[str, float] = {}
     place = "" if start == 0 else f"from_{start}_"
     for index, first in enumerate(range(start, table.num_steps - 1, CHUNK_STEPS)):
@@ -109,20 +99,22 @@ def _chunk_figures(imagined: _Imagined, table: SceneTable, start: int) -> dict[s
             pair = {"predicted_kpa": guess, "true_kpa": true}
             figures[f"contact_f1_{chunk}"] = tactile_metrics.contact_f1(**pair)
             figures[f"tactile_mse_{chunk}"] = tactile_metrics.mse(**pair)
-        off_mm, there = _object_errors(imagined.position_m[:, end - start - 1], table, start, end)
+        off_mm, there = _object_errors(
+            imagined.poses.position_m[:, end - start - 1], table, start, end
+        )
         if there.any():
             figures[f"object_mm_{place}chunk_{index + 1}"] = float(off_mm[there].median())
     return figures
 
 
 def _episode_figures(
-    imagined: _Imagined, table: SceneTable, dynamics: DynamicsModel
+    imagined: ImaginedSteps, table: SceneTable, dynamics: DynamicsModel
 ) -> dict[str, float]:
     """Errors of objects at the end and of readers at the start, by task."""
     figures: dict[str, float] = {}
     rows = torch.arange(len(table))
     last = table.length - 1
-    off_mm, there = _object_errors(imagined.position_m[rows, last - 1], table, 0, last)
+    off_mm, there = _object_errors(imagined.poses.position_m[rows, last - 1], table, 0, last)
     for index, task in enumerate(dynamics.config.tasks):
         found = there & (table.task == index)[:, None]
         if found.any():
@@ -148,7 +140,8 @@ def _object_errors(
 
 
 @torch.no_grad()
-def _imagined(dynamics: DynamicsModel, table: SceneTable, start: int) -> _Imagined:
+def _imagined(dynamics: DynamicsModel, table: SceneTable, start: int) -> ImaginedSteps:
+    """Predictions of whole episodes from one start."""
     parts = []
     for rows in torch.split(torch.arange(len(table)), _BATCH):
         first = table.first_steps(rows, torch.full_like(rows, start))
@@ -157,9 +150,4 @@ def _imagined(dynamics: DynamicsModel, table: SceneTable, start: int) -> _Imagin
         sent = table.commanded[rows].float()
         memory = dynamics.begin(first, touch, commands[:1], sent)
         parts.append(dynamics.advance(memory, commands[1:])[1])
-    return _Imagined(
-        torch.cat([part.tactile_kpa for part in parts]),
-        torch.cat([part.poses.position_m for part in parts]),
-        torch.cat([part.disagreement_m for part in parts]),
-        torch.cat([part.distance for part in parts]),
-    )
+    return batched(parts)

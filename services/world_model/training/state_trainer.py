@@ -19,37 +19,32 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from dextouch.command_line import ProgressLines
-from dextouch.episodes import (
-    data_hash,
-)
+from dextouch.episodes import data_hash
 from dextouch.errors import InvalidInputError
 from dextouch.jobs import worker_pool
 from services.networks.training_settings import USUAL_IMAGE_PX
 from services.networks.weight_files import read_tensors, write_tensors
+from services.world_model.checkpoints import StateBounds, StateMetadata, write_state_checkpoint
 from services.world_model.dynamics.core import RecurrentCore
 from services.world_model.dynamics.features import STEPS_PER_LATENT, DynamicsConfig, TouchCodec
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.start_reader import Reading, StartReader
-from services.world_model.recorded_commands import flags_of, last_name
-from services.world_model.rendering.network import RendererNetwork
-from services.world_model.rendering.precision import uses_bfloat16
-from services.world_model.rendering.training import RendererProgress, train_renderer
-from services.world_model.settings import StateAdaptSettings, StateTrainSettings
-from services.world_model.state_checkpoints import (
-    StateBounds,
-    StateMetadata,
-    write_state_checkpoint,
+from services.world_model.rendering.network import RendererNetwork, uses_bfloat16
+from services.world_model.rendering.training import train_renderer
+from services.world_model.settings import (
+    StateAdaptSettings,
+    StateTrainSettings,
+    flags_of,
+    last_name,
 )
-from services.world_model.training.averaging import OnStep
 from services.world_model.training.core_training import (
     CoreData,
-    read_step,
     start_steps,
     touch_latents,
     train_core,
-    train_reader,
 )
 from services.world_model.training.domains import training_sets
+from services.world_model.training.reader_training import OnStep, read_step, train_reader
 from services.world_model.training.scene_table import (
     SceneTable,
     scene_clips,
@@ -348,10 +343,10 @@ def _train_renderer(work: _Work) -> None:
     clips = scene_clips([episodes[index] for index in sorted(chosen)])
     lines = ProgressLines("train renderer", has_bar=False)
 
-    def on_progress(now: RendererProgress) -> None:
-        lines.show(f"{now.share:.0%}  step {now.step}  loss {now.loss:.4f}")
+    def on_progress(share: float, step: int, loss: float) -> None:
+        lines.show(f"{share:.0%}  step {step}  loss {loss:.4f}")
 
-    trained = train_renderer(
+    network, cpu_s = train_renderer(
         clips,
         settings.renderer,
         settings.drawing,
@@ -359,7 +354,7 @@ def _train_renderer(work: _Work) -> None:
         on_progress=on_progress,
         initial=None if work.base is None else work.base.checkpoint.renderer,
     )
-    _keep(trained.network, work.renderer_file, trained.cpu_s)
+    _keep(network, work.renderer_file, cpu_s)
 
 
 def _keep(model: nn.Module, path: Path, cpu_s: float) -> None:
@@ -395,12 +390,7 @@ def _train_reader(work: _Work, member: int) -> None:
     settings, base = work.settings.reader, work.base
     initial = None if base is None else base.reader(work.config, member, seed=seed)
     trained = train_reader(
-        table,
-        work.config,
-        settings,
-        seed=seed,
-        on_step=on_step,
-        initial=initial,
+        table, work.config, settings, seed=seed, on_step=on_step, initial=initial
     )
     _keep(trained, work.reader_file(member), time.process_time() - started_s)
 

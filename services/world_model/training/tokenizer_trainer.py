@@ -33,24 +33,21 @@ from services.networks.optimizer import (
     update_average,
 )
 from services.networks.principal_axes import root_pressure
-from services.world_model.network.tactile_tokenizers import (
-    LearnedTokenizer,
-    TactileTokenizer,
-    build_tokenizer,
-)
-from services.world_model.settings import TrainSettings
-from services.world_model.tokenizer_files import (
+from services.world_model.checkpoints import (
     Reconstruction,
     StoredTokenizer,
     TokenizerMetadata,
     read_tokenizer,
     write_tokenizer,
 )
-from services.world_model.tokenizer_settings import TrainTokenizerSettings
+from services.world_model.network.tactile import LearnedTokenizer, TactileTokenizer, build_tokenizer
+from services.world_model.paper_settings import TrainSettings, TrainTokenizerSettings
 from services.world_model.training.dataset import E, TrainingEpisode
 
-# Touch of single hands from episode stores, to train and evaluate tactile tokenizers.
-
+MIN_LEARNING_RATE_SHARE = 0.01
+_EVALUATION_BATCH = 1000
+_TIMING_ROUNDS = 5
+OnEvaluation = Callable[[float, Reconstruction], None]
 # By scene: the touch of each episode, and its content.
 _Side = dict[str, list[tuple[np.ndarray, str]]]
 
@@ -96,12 +93,6 @@ def load_hands(
 def _hands(side: _Side) -> TactileHands:
     touch_kpa, contents = zip(*chain(*side.values()), strict=True)
     return TactileHands(np.concatenate(touch_kpa), tuple(sorted(side)), data_hash(contents))
-
-
-MIN_LEARNING_RATE_SHARE = 0.01
-_EVALUATION_BATCH = 1000
-_TIMING_ROUNDS = 5
-OnEvaluation = Callable[[float, Reconstruction], None]
 
 
 @dataclass(frozen=True)
@@ -218,10 +209,7 @@ def _learn(
 
 
 def reconstruction_loss(
-    tokenizer: LearnedTokenizer,
-    tactile_kpa: Float32[Tensor, "hands 320"],
-    *,
-    contact_weight: float,
+    tokenizer: LearnedTokenizer, tactile_kpa: Float32[Tensor, "hands 320"], *, contact_weight: float
 ) -> Float32[Tensor, ""]:
     """Weighted mean squared error of root pressures (kPa).
 
@@ -268,9 +256,6 @@ def _ms_per_1000_hands(tokenizer: TactileTokenizer, hands: TactileHands) -> floa
         _through(tokenizer, batch)
         times_ms.append(1000 * (time.process_time() - begin_s))
     return float(np.median(times_ms))
-
-
-# Pretrained tactile tokenizer of a training run, which stays frozen while the experts train.
 
 
 def with_tokenizer(settings: TrainSettings) -> tuple[TrainSettings, StoredTokenizer | None]:

@@ -2,7 +2,7 @@
 
 import copy
 import json
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
 from functools import partial
@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dextouch.episodes import data_hash
-from dextouch.errors import ConflictError
-from services.networks.memory import on_device
+from dextouch.episodes import data_hash, split_by_scene
+from dextouch.errors import ConflictError, InvalidInputError
+from dextouch.schemas import Domain
 from services.networks.optimizer import (
     Budget,
     OptimizerLoop,
@@ -23,37 +23,45 @@ from services.networks.optimizer import (
     half_cosine,
     update_average,
 )
+from services.networks.weight_files import on_device
 from services.world_model.checkpoints import (
     Checkpoint,
     CheckpointMetadata,
+    StoredTokenizer,
+    learned_tasks,
     read_checkpoint,
+    read_tokenizer,
     write_checkpoint,
 )
+from services.world_model.network.configuration import WanFiles
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
-from services.world_model.network.tactile_tokenizers import TactileTokenizer
+from services.world_model.network.tactile import TactileTokenizer
+from services.world_model.paper_settings import TrainSettings, command_line
 from services.world_model.pretrained_video import initial_model, share_texts
-from services.world_model.recorded_commands import command_line
-from services.world_model.settings import TrainSettings
-from services.world_model.tokenizer_files import StoredTokenizer
 from services.world_model.training.dataset import (
+    E,
     EpisodeArrays,
     TrainingEpisode,
     WindowBatch,
     WindowPosition,
     WindowSampler,
+    index_episodes,
+    load_episodes,
     read_batches,
 )
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
-from services.world_model.training.domains import check_tasks, training_sets
+from services.world_model.training.domains import check_tasks, subset_by_hash, training_sets
 from services.world_model.training.evaluation import evaluate_prediction
-from services.world_model.training.objective import LossOptions, losses
-from services.world_model.training.self_forcing import own_context
-from services.world_model.training.splits import check_disjoint, check_not_learned, load_split
-from services.world_model.training.state_files import StateFiles
-from services.world_model.training.tokenizer_trainer import check_unseen, with_tokenizer
+from services.world_model.training.objective import LossOptions, losses, own_context
+from services.world_model.training.tokenizer_trainer import (
+    check_unseen,
+    split_unseen,
+    with_tokenizer,
+)
 from services.world_model.training.training_state import (
     RunFacts,
+    StateFiles,
     TrainingState,
     identity_of,
     moments_like,
@@ -61,10 +69,6 @@ from services.world_model.training.training_state import (
     part_of,
     restore_optimizer,
 )
-from services.world_model.training_set import learned_tasks
-from services.world_model.wan.configuration import WanFiles
-
-# One training run of the joint model: its network, weight average, optimizer and clock.
 
 LOG_EVERY_STEPS = 20
 MIN_LEARNING_RATE_SHARE = 0.01
@@ -331,9 +335,7 @@ class TrainingReport:
 
 
 def train(
-    settings: TrainSettings,
-    on_progress: OnProgress | None = None,
-    processes: Processes = ALONE,
+    settings: TrainSettings, on_progress: OnProgress | None = None, processes: Processes = ALONE
 ) -> TrainingReport | None:
     """Load episodes, train, write and evaluate the checkpoint.
 
@@ -399,11 +401,9 @@ def train_on(
     write_checkpoint(settings.output, averaged, metadata)
     # Evaluate the weights as stored, then store them again with the results.
     stored = on_device(read_checkpoint(settings.output).model, settings.device)
-    metrics = {
-        **evaluate_prediction(
-            stored, heldout, train_fingerprints=sorted(prints), stride=settings.evaluation_stride
-        )
-    }
+    metrics = evaluate_prediction(
+        stored, heldout, train_fingerprints=sorted(prints), stride=settings.evaluation_stride
+    )
     digest = write_checkpoint(
         settings.output, stored, metadata.model_copy(update={"metrics": metrics})
     )
@@ -476,3 +476,86 @@ def _run_or_resume(
             kept_cpu_s = now.budget.cpu_s
 
     return run.run(on_progress, keep)
+
+
+def load_split(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
+    """Training and held-out episodes of the settings' stores; held-out ones are in memory.
+
+    Robot episodes are split before a subset of them is taken, so that every subset has the same
+    held-out episodes. These are never human if human stores are given.
+    """
+    trained, heldout = _load_robot(settings)
+    trained = subset_by_hash(trained, settings.robot_episodes, what="robot")
+    together = [*trained, *_load_human(settings)]
+    rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
+    counts = Counter(episode.episode_id for episode in together)
+    if len(rates_hz) > 1 or len(counts) < len(together):
+        twice = [name for name, count in counts.items() if count > 1]
+        raise ConflictError(
+            f"training: the episodes of {', '.join([settings.episodes, *settings.human])} have "
+            f"model rates of {sorted(rates_hz)} Hz, and {twice[:3]} are in two stores; expected "
+            "one rate, and each episode once"
+        )
+    return together, heldout
+
+
+def _load_robot(settings: TrainSettings) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
+    domain: Domain | None = "robot" if settings.human else None
+    url, splits, px = settings.episodes, settings.splits, settings.network.image_px
+    if settings.streaming:
+        stored = index_episodes(url, splits=splits, domain=domain, image_px=px)
+        if settings.heldout is not None:
+            return stored, load_episodes(settings.heldout, domain=domain, image_px=px)
+        trained, heldout = _split(stored, settings)
+        return trained, [episode.load() for episode in heldout]
+    episodes = load_episodes(url, splits=splits, domain=domain, image_px=px)
+    if settings.heldout is not None:
+        return episodes, load_episodes(settings.heldout, domain=domain, image_px=px)
+    return _split(episodes, settings)
+
+
+def _split(episodes: Sequence[E], settings: TrainSettings) -> tuple[list[E], list[E]]:
+    if settings.tokenizer is None:
+        return split_by_scene(episodes, held_out_share=settings.heldout_percent / 100)
+    stored = read_tokenizer(settings.tokenizer)
+    return split_unseen(episodes, stored, heldout_percent=settings.heldout_percent)
+
+
+def _load_human(settings: TrainSettings) -> Sequence[TrainingEpisode]:
+    if settings.human_episodes == 0:
+        return []
+    read = index_episodes if settings.streaming else load_episodes
+    found: list[TrainingEpisode] = []
+    for url in settings.human:
+        px = settings.network.image_px
+        found += read(url, splits=settings.splits, domain="human", image_px=px)
+    return subset_by_hash(found, settings.human_episodes, what="human")
+
+
+def check_not_learned(heldout: Sequence[TrainingEpisode], ancestor: Checkpoint) -> None:
+    """Raise if the initial checkpoint was trained on a held-out episode."""
+    learned = set(ancestor.metadata.train_fingerprints)
+    both = [episode.episode_id for episode in heldout if episode.fingerprint() in learned]
+    if both:
+        raise InvalidInputError(
+            f"training: the initial checkpoint was trained on {len(both)} of the held-out "
+            f"episodes {both[:3]}; use a held-out store that it has not seen",
+            episodes=both,
+        )
+
+
+def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode]) -> None:
+    """Raise if a held-out episode, or its scene, is also trained on."""
+    prints = {episode.fingerprint() for episode in trained}
+    scenes = {episode.scene for episode in trained}
+    both = [
+        episode.episode_id
+        for episode in heldout
+        if episode.fingerprint() in prints or episode.scene in scenes
+    ]
+    if both:
+        raise InvalidInputError(
+            f"training: {len(both)} held-out episodes are also trained on {both[:3]} (same content "
+            "or same scene); expected disjoint sets",
+            episodes=both,
+        )

@@ -1,11 +1,16 @@
 """State of a training run, saved beside its output so that an interrupted run can resume.
 
-One safetensors file holds the weights, their moving average, the optimizer and the random state;
-its metadata holds the counters as JSON. The file is replaced atomically, so that a crash at any
-time leaves the last complete state. It is removed when the run has ended.
+It is one safetensors file of the weights, their moving average, the optimizer and the random state,
+with the counters as JSON in its metadata. Under torchrun it is a folder with a folder for each
+state, in which every process has a file; the counters, in a JSON file beside them, name the newest
+complete one, and any number of processes can resume. A crash at any time leaves the last complete
+state, which is removed when the run has ended.
 """
 
 import json
+import os
+import shutil
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,16 +18,24 @@ from typing import Any, Final
 
 import torch
 from pydantic import JsonValue, ValidationError
-from torch import Tensor
+from torch import Tensor, distributed
+from torch.distributed.checkpoint.hf_storage import (
+    HuggingFaceStorageReader,
+    HuggingFaceStorageWriter,
+)
+from torch.distributed.checkpoint.state_dict_loader import load
+from torch.distributed.checkpoint.state_dict_saver import save
 
 from dextouch.errors import ConflictError, CorruptDataError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
 from services.networks.weight_files import read_tensors, write_tensors
-from services.world_model.settings import TrainSettings
+from services.world_model.paper_settings import TrainSettings
+from services.world_model.training.distribution import Processes
 
 METADATA_KEY: Final = "dextouch_training_state"
 SUFFIX: Final = ".resume"
+FACTS: Final = "newest.json"
 # Settings that may change when a run resumes.
 _FREE_SETTINGS: Final = {
     "episodes", "human", "heldout", "output", "json_path", "resume", "state_every_cpu_s", "init",
@@ -56,6 +69,98 @@ class TrainingState:
 
     tensors: dict[str, Tensor]
     facts: RunFacts
+
+
+class StateFiles:
+    """State of the run with this output; all its processes must call each method.
+
+    Args:
+        output: checkpoint that the run will write.
+        processes: processes of the run.
+    """
+
+    def __init__(self, output: Path, processes: Processes) -> None:
+        self._file = state_path(output)
+        self._folder = self._file.with_name(self._file.name + ".shards")
+        self._processes = processes
+        self._is_sharded = processes.mesh is not None
+
+    def exists(self) -> bool:
+        """Whether there is a state to resume.
+
+        Raises:
+            ConflictError: there is only one of a run that was started otherwise.
+        """
+        single, sharded = self._file.is_file(), (self._folder / FACTS).is_file()
+        own, other = (sharded, single) if self._is_sharded else (single, sharded)
+        if other and not own:
+            raise ConflictError(
+                f"training state {self._file.name}: saved by a run "
+                f"{'without' if self._is_sharded else 'under'} torchrun; resume it "
+                f"{'without it' if self._is_sharded else 'with it, with any number of processes'}"
+            )
+        return own
+
+    def read(self, identity: Mapping[str, JsonValue], own: Mapping[str, Tensor]) -> TrainingState:
+        """Read the state of a run with these settings and data.
+
+        Args:
+            identity: from `identity_of`.
+            own: a tensor of the same name, shape and sharding for every tensor of the state.
+
+        Raises:
+            ConflictError: the state has other settings or data; they are named.
+            CorruptDataError: not a training state, or a damaged one.
+        """
+        if not self._is_sharded:
+            return read_state(self._file, identity)
+        where = f"training state {self._folder.name}"
+        facts = checked_facts((self._folder / FACTS).read_text(), identity, where)
+        reader = HuggingFaceStorageReader(str(self._of_step(facts.step)))
+        stored = reader.read_metadata().state_dict_metadata
+        if not stored or stored.keys() - own.keys():
+            raise CorruptDataError(f"{where}: incomplete; remove it to start over")
+        tensors = {name: torch.zeros_like(own[name]) for name in stored}
+        load(tensors, storage_reader=reader)
+        return TrainingState(tensors, facts)
+
+    def write(self, state: TrainingState) -> None:
+        """Replace the state."""
+        if not self._is_sharded:
+            write_state(self._file, state)
+            return
+        target = self._of_step(state.facts.step)
+        if self._processes.is_first:
+            # Left by a run that was killed while it wrote.
+            shutil.rmtree(target, ignore_errors=True)
+        distributed.barrier()
+        writer = HuggingFaceStorageWriter(str(target), save_distributed=True)
+        with warnings.catch_warnings():
+            # torch warns of its own use of a deprecated storage.
+            warnings.simplefilter("ignore")
+            save(state.tensors, storage_writer=writer)
+        if self._processes.is_first:
+            self._name_newest(state)
+
+    def _name_newest(self, state: TrainingState) -> None:
+        partial = self._folder / (FACTS + ".partial")
+        with partial.open("w") as file:
+            file.write(state.facts.model_dump_json())
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(self._folder / FACTS)
+        newest = self._of_step(state.facts.step)
+        for other in self._folder.iterdir():
+            if other.is_dir() and other != newest:
+                shutil.rmtree(other)
+
+    def remove(self) -> None:
+        """Remove the state of a run that has ended."""
+        self._file.unlink(missing_ok=True)
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _of_step(self, step: int) -> Path:
+        return self._folder / f"step-{step:08d}"
 
 
 def state_path(output: Path) -> Path:

@@ -9,10 +9,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
+from services.world_model.checkpoints import StateCheckpoint, read_state_checkpoint
 from services.world_model.dynamics.core import RecurrentCore, direction_free_inputs
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.start_reader import StartReader
-from services.world_model.state_checkpoints import StateCheckpoint, read_state_checkpoint
 
 # Tensors of a reader or a core with a row for every task.
 _OF_TASKS = {"task.weight", "height_mean", "boxes_m", "movable"}

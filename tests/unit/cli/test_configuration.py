@@ -17,7 +17,7 @@ from services.cli import configuration
 from services.cli.main import main
 from services.dashboard.settings import DashboardSettings
 from services.twin.settings import TwinServiceSettings
-from services.world_model.settings import TrainCommand
+from services.world_model.paper_settings import TrainCommand
 
 KEY = "a-key-of-some-length"
 FILE = f"""\

@@ -12,7 +12,7 @@ from services.evaluation.policies.cloning_training import read_cloning_episodes
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
-from services.world_model.state_checkpoints import write_state_checkpoint
+from services.world_model.checkpoints import write_state_checkpoint
 from services.world_model.training.dataset import load_episodes
 from tests.contracts.test_world import untrained_state_checkpoint
 

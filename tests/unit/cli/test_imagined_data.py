@@ -24,7 +24,7 @@ from services.pipelines.servers import served
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
-from services.world_model.state_checkpoints import write_state_checkpoint
+from services.world_model.checkpoints import write_state_checkpoint
 from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
 from tests.contracts.test_world import untrained_state_checkpoint

@@ -9,7 +9,7 @@ import pytest
 from dextouch.errors import NotFoundError
 from services.pipelines import train_tokenizer
 from services.world_model import command_line
-from services.world_model.tokenizer_files import read_tokenizer
+from services.world_model.checkpoints import read_tokenizer
 from services.world_model.training.tokenizer_trainer import TactileHands
 
 SVG = "{http://www.w3.org/2000/svg}"

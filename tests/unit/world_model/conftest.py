@@ -22,7 +22,7 @@ from services.world_model.checkpoints import (
 )
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel
-from services.world_model.settings import OptimizerSettings, TrainSettings, WindowSettings
+from services.world_model.paper_settings import OptimizerSettings, TrainSettings, WindowSettings
 from services.world_model.training.dataset import EpisodeArrays, WindowSampler
 
 PX = 32

@@ -6,7 +6,7 @@ import signal
 import sys
 from pathlib import Path
 
-from services.world_model.settings import TrainSettings
+from services.world_model.paper_settings import TrainSettings
 from services.world_model.training.distribution import joined_processes
 from services.world_model.training.trainer import TrainingProgress, train
 

@@ -5,7 +5,7 @@ import signal
 import sys
 from pathlib import Path
 
-from services.world_model.settings import TrainSettings
+from services.world_model.paper_settings import TrainSettings
 from services.world_model.training.trainer import TrainingProgress, train
 
 

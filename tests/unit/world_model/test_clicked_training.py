@@ -16,22 +16,17 @@ from services.twin.episodes import record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
+from services.world_model.checkpoints import read_state_checkpoint, write_state_checkpoint
 from services.world_model.dynamics.features import TouchCodec
 from services.world_model.settings import CoreSettings, ReaderSettings, StateTrainSettings
-from services.world_model.state_checkpoints import read_state_checkpoint, write_state_checkpoint
-from services.world_model.training.core_training import (
-    CoreData,
-    _read_start,
-    read_step,
-    start_steps,
-    train_reader,
-)
-from services.world_model.training.scene_episodes import load_scene_episodes
+from services.world_model.training.core_training import CoreData, _read_start, start_steps
+from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_table import SceneTable, scene_table
 from services.world_model.training.state_data import (
     check_drawable,
     has_poses,
     labelled_episodes,
+    load_scene_episodes,
     load_state_data,
 )
 from services.world_model.training.state_trainer import train_state

@@ -6,7 +6,7 @@ import torch
 
 from services.networks.principal_axes import principal_axes, root_scale
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.network.tactile_tokenizers import PrincipalAxesTokenizer
+from services.world_model.network.tactile import PrincipalAxesTokenizer
 from services.world_model.network.video import VisualCodec, to_uint8, to_unit
 
 

@@ -21,7 +21,7 @@ from services.world_model.network.model import JointWorldModel, stack_noise
 from services.world_model.starts import SceneReader
 from services.world_model.training.dataset import WindowSampler, cut_window
 from services.world_model.training.distribution import Processes
-from services.world_model.training.self_forcing import own_context
+from services.world_model.training.objective import own_context
 from services.world_model.world import ModelWorld
 from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.world_model.conftest import make_metadata

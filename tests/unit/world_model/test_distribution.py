@@ -16,9 +16,8 @@ from services.world_model.checkpoints import read_checkpoint
 from services.world_model.training.dataset import cut_window, stack_windows
 from services.world_model.training.distribution import Processes
 from services.world_model.training.objective import losses
-from services.world_model.training.state_files import StateFiles
 from services.world_model.training.trainer import TrainingRun, train, train_on
-from services.world_model.training.training_state import state_path
+from services.world_model.training.training_state import StateFiles, state_path
 
 CHILD = Path(__file__).with_name("distributed_training.py")
 ROOT = Path(__file__).parents[3]

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from dextouch.schemas import ReturnSelector
+from services.world_model.checkpoints import StateBounds
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.state_checkpoints import StateBounds
 from services.world_model.state_world import StateWorld
 from services.world_model.training.scene_table import scene_table
 from services.world_model.training.state_evaluation import evaluate_dynamics

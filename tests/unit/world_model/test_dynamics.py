@@ -32,19 +32,17 @@ from services.world_model.dynamics.features import (
     rotations,
     slot_features,
 )
-from services.world_model.dynamics.members import mapped, stacked
-from services.world_model.dynamics.memory import (
-    memory_arrays,
-    memory_from_arrays,
-    memory_of,
-    stack_memories,
-)
 from services.world_model.dynamics.model import (
     REST_LATENTS,
     DynamicsModel,
+    batched,
     mean_start,
+    memory_arrays,
+    memory_from_arrays,
+    memory_of,
 )
 from services.world_model.dynamics.start_reader import FirstStep, ray_at_height
+from services.world_model.dynamics.trees import mapped, stacked
 
 CONFIG = DynamicsConfig(tasks=("one", "two"), num_objects=(1, 2), image_px=32, width=16)
 
@@ -491,7 +489,7 @@ def test_a_memory_survives_its_arrays(model):
     command = Commands.of([lifted(4)])
     expected, got = model.advance(one, command)[1], model.advance(back, command)[1]
     assert (expected.tactile_kpa == got.tactile_kpa).all()
-    both = stack_memories([memory_of(memory, 0), one])
+    both = batched([memory_of(memory, 0), one])
     assert same_state(both.state, memory.state)
 
 

@@ -5,9 +5,8 @@ import json
 import pytest
 
 from dextouch.errors import InvalidInputError
-from services.world_model.checkpoints import write_checkpoint
+from services.world_model.checkpoints import write_checkpoint, write_state_checkpoint
 from services.world_model.command_line import run_show, run_train
-from services.world_model.state_checkpoints import write_state_checkpoint
 from tests.contracts.test_world import untrained_state_checkpoint
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from services.world_model.dynamics.members import MemberGRU, MemberLinear, MemberNorm
+from services.world_model.dynamics.core import MemberGRU, MemberLinear, MemberNorm
 
 MEMBERS, BATCH = 3, 4
 

@@ -13,12 +13,15 @@ from dextouch.serving import load_settings
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.command_line import run_adapt
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.recorded_commands import command_line
-from services.world_model.settings import AdaptCommand, TrainCommand, TrainSettings
+from services.world_model.paper_settings import (
+    AdaptCommand,
+    TrainCommand,
+    TrainSettings,
+    command_line,
+)
 from services.world_model.training.dataset import WindowSampler
 from services.world_model.training.domains import check_tasks, subset_by_hash
-from services.world_model.training.splits import load_split
-from services.world_model.training.trainer import train
+from services.world_model.training.trainer import load_split, train
 from tests.unit.world_model.conftest import PX, human_episode, make_episode, write_episode
 
 

@@ -112,22 +112,28 @@ def test_silent_and_saturated_touch_give_finite_futures(model, inputs, noisy, pr
     assert torch.isfinite(future.images).all()
 
 
+def condition_of(side, inputs, features, times):
+    return side.at(side.constants(inputs, features), times)
+
+
 @pytest.mark.parametrize("part", ["hands", "camera"])
 def test_each_step_conditions_its_own_latent_and_its_own_touch(model, inputs, part):
     # Equation 4 of the paper: video latent j sees a[4j-3 … 4j], touch at step t sees a_t, index 0
     # sees no action. Step s therefore moves latent ceil(s / 4), touch s, and nothing else.
     times_video, times_tactile = torch.full((3, 5), 0.5), torch.full((3, 17), 0.5)
     before = model.normalizer(inputs)
-    video = model.video_condition(inputs, before, times_video).vector
-    tactile = model.tactile_condition(inputs, before, times_tactile).vector
+    video = condition_of(model.video_condition, inputs, before, times_video).vector
+    tactile = condition_of(model.tactile_condition, inputs, before, times_tactile).vector
     for step in range(17):
         changed = getattr(inputs, part).clone()
         changed[:, step] += 0.3
         after = model.normalizer(replace(inputs, **{part: changed}))
-        moved_video = (model.video_condition(inputs, after, times_video).vector - video).abs()
-        moved_tactile = (
-            model.tactile_condition(inputs, after, times_tactile).vector - tactile
-        ).abs()
+        changed_video = condition_of(model.video_condition, inputs, after, times_video).vector
+        changed_tactile = condition_of(model.tactile_condition, inputs, after, times_tactile).vector
+        moved_video, moved_tactile = (
+            (changed_video - video).abs(),
+            (changed_tactile - tactile).abs(),
+        )
         latents = [] if step == 0 else [-(-step // 4)]
         assert moved_video.amax((0, 2)).gt(1e-4).nonzero().flatten().tolist() == latents
         steps = [] if step == 0 else [step]
@@ -139,9 +145,10 @@ def test_the_condition_of_index_zero_holds_no_action_term(model, inputs):
     features = model.normalizer(inputs)
     for condition, steps in ((model.video_condition, 5), (model.tactile_condition, 17)):
         t = torch.full((3, steps), 0.5)
-        before = condition(inputs, features, t).vector
+        before = condition_of(condition, inputs, features, t).vector
         condition.actions[-1].bias += 1.0
-        change = (condition(inputs, features, t).vector - before).flatten(2).abs().amax((0, 2))
+        after = condition_of(condition, inputs, features, t).vector
+        change = (after - before).flatten(2).abs().amax((0, 2))
         assert change[0] == 0.0
         assert change[1:].min() > 0.5
 

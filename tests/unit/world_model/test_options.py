@@ -99,7 +99,8 @@ def test_each_latent_depends_on_its_own_actions_first(tiny_config, batch, condit
 def test_the_first_tokens_take_nothing_from_actions(tiny_config, batch):
     model = model_with(tiny_config, **CROSS)
     inputs = build_inputs(batch.requests, model.config)
-    condition = model.video_condition(inputs, model.normalizer(inputs), torch.full((2, 5), 0.5))
+    parts = model.video_condition.constants(inputs, model.normalizer(inputs))
+    condition = model.video_condition.at(parts, torch.full((2, 5), 0.5))
     actions = condition.actions
     tokens = torch.randn(2, 5 * model.config.tokens_per_latent, 32)
     taken = model.layers[0].video.action_attention(tokens, actions)

@@ -5,13 +5,8 @@ import pytest
 from dextouch.errors import UnknownNameError
 from dextouch.serving import load_settings
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.recorded_commands import command_line
-from services.world_model.settings import (
-    StateTrainSettings,
-    TrainCommand,
-    TrainSettings,
-    TrainStateCommand,
-)
+from services.world_model.paper_settings import TrainCommand, TrainSettings, command_line
+from services.world_model.settings import StateTrainSettings, TrainStateCommand
 from services.world_model.training.state_trainer import _command
 
 

@@ -15,21 +15,20 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
 from services.world_model import command_line
+from services.world_model.checkpoints import (
+    StateMetadata,
+    read_state_checkpoint,
+    write_state_checkpoint,
+)
 from services.world_model.dynamics.core import RecurrentCore
 from services.world_model.dynamics.features import DynamicsConfig, TouchCodec
+from services.world_model.paper_settings import AdaptCommand, TrainCommand
 from services.world_model.settings import (
-    AdaptCommand,
     AdaptStateCommand,
     CoreSettings,
     ReaderSettings,
     StateTrainSettings,
-    TrainCommand,
     TrainStateCommand,
-)
-from services.world_model.state_checkpoints import (
-    StateMetadata,
-    read_state_checkpoint,
-    write_state_checkpoint,
 )
 from services.world_model.training.core_training import CoreData, _draw, core_loss, touch_latents
 from services.world_model.training.scene_table import scene_table

@@ -14,6 +14,7 @@ from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.schemas import MAX_OBJECTS, EpisodeAttributes, StoredAnchor, matrix_rows
 from dextouch.serving import load_settings
+from services.world_model.checkpoints import StateBounds
 from services.world_model.dynamics.core import RecurrentCore, SceneStart
 from services.world_model.dynamics.features import SLOT_SIZE, DynamicsConfig, TouchCodec
 from services.world_model.dynamics.model import DynamicsModel
@@ -24,7 +25,6 @@ from services.world_model.settings import (
     ReaderSettings,
     TrainStateCommand,
 )
-from services.world_model.state_checkpoints import StateBounds
 from services.world_model.training.core_training import (
     CoreData,
     _draw,
@@ -33,13 +33,11 @@ from services.world_model.training.core_training import (
     _read_start,
     core_loss,
     describe,
-    read_step,
-    reader_errors,
     start_steps,
     touch_latents,
     train_core,
-    train_reader,
 )
+from services.world_model.training.reader_training import read_step, reader_errors, train_reader
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 from services.world_model.training.state_data import labelled_episodes
 from services.world_model.training.state_evaluation import evaluate_dynamics

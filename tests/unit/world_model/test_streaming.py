@@ -20,8 +20,7 @@ from services.world_model.training.dataset import (
     read_batches,
     read_episode,
 )
-from services.world_model.training.splits import load_split
-from services.world_model.training.trainer import TrainingRun, train
+from services.world_model.training.trainer import TrainingRun, load_split, train
 from tests.unit.world_model.conftest import write_episode
 
 PLACES = [

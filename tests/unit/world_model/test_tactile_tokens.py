@@ -12,7 +12,7 @@ from services.world_model.network.conditioning import Condition
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents, JointWorldModel, stack_noise
-from services.world_model.network.tactile_tokenizers import build_tokenizer
+from services.world_model.network.tactile import build_tokenizer
 from services.world_model.shipped_checkpoints import paper_form_checkpoint
 from services.world_model.training.dataset import WindowSampler, cut_window
 from services.world_model.training.objective import losses

@@ -6,12 +6,10 @@ import torch
 from dextouch.episodes import EpisodeReader
 from dextouch.errors import ConflictError, InvalidInputError
 from services.networks.optimizer import Budget
-from services.world_model.checkpoints import read_checkpoint
+from services.world_model.checkpoints import read_checkpoint, read_tokenizer
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.network.tactile_tokenizers import build_tokenizer
-from services.world_model.tokenizer_files import read_tokenizer
-from services.world_model.tokenizer_settings import TrainTokenizerSettings
-from services.world_model.training.splits import load_split
+from services.world_model.network.tactile import build_tokenizer
+from services.world_model.paper_settings import TrainTokenizerSettings
 from services.world_model.training.tokenizer_trainer import (
     TactileHands,
     load_hands,
@@ -19,7 +17,7 @@ from services.world_model.training.tokenizer_trainer import (
     reconstruction_loss,
     train_tokenizer,
 )
-from services.world_model.training.trainer import train_on
+from services.world_model.training.trainer import load_split, train_on
 
 
 @pytest.fixture

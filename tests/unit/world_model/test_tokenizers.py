@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.network.tactile_tokenizers import build_tokenizer, canvas_cells
+from services.world_model.network.tactile import build_tokenizer, canvas_cells
 
 LEARNED = ["split_hands", "grid"]
 

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from dextouch.schemas import MAX_OBJECTS
-from services.world_model.dynamics import traces
+from services.world_model.dynamics import trees
 from services.world_model.dynamics.core import NUM_PADS, CoreState, SceneStart
 from services.world_model.dynamics.features import LOOKS, Commands, DynamicsConfig, ObjectPoses
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.dynamics.traces import Traced
+from services.world_model.dynamics.trees import Traced
 from services.world_model.state_world import StateWorld
 from tests.contracts.test_world import untrained_state_checkpoint
 
@@ -60,7 +60,7 @@ def inputs(model, seed, *, batch=1, latents=4, task=0):
 
 
 def tensors(outputs):
-    return list(traces._tensors(outputs))
+    return list(trees._tensors(outputs))
 
 
 @torch.no_grad()
@@ -87,7 +87,7 @@ def test_rare_shapes_and_too_many_of_them_are_not_traced(model, monkeypatch):
     assert not traced._traces
     traced(*inputs(model, 0))
     assert len(traced._traces) == 1
-    monkeypatch.setattr(traces, "_MOST_TRACES", 1)
+    monkeypatch.setattr(trees, "_MOST_TRACES", 1)
     for _ in range(6):
         traced(*inputs(model, 0, batch=2))
     assert len(traced._traces) == 1

@@ -14,8 +14,7 @@ from services.world_model.training import evaluation
 from services.world_model.training.dataset import cut_window, fingerprint, stack_windows
 from services.world_model.training.evaluation import evaluate_prediction, predict_all
 from services.world_model.training.objective import losses
-from services.world_model.training.splits import check_disjoint
-from services.world_model.training.trainer import TrainingRun, train, train_on
+from services.world_model.training.trainer import TrainingRun, check_disjoint, train, train_on
 
 
 @pytest.fixture

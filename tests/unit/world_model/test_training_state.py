@@ -11,7 +11,7 @@ import torch
 
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError
 from services.world_model.checkpoints import read_checkpoint
-from services.world_model.training import state_files
+from services.world_model.training import training_state
 from services.world_model.training.trainer import TrainingRun, train, train_on
 from services.world_model.training.training_state import read_state, state_path
 
@@ -141,7 +141,7 @@ def test_a_run_can_start_from_a_checkpoint(toy_episodes, toy_episode, settings, 
 def test_a_state_is_kept_now_and_then(toy_episodes, toy_episode, settings, monkeypatch):
     kept = []
     monkeypatch.setattr(
-        state_files, "write_state", lambda path, state: kept.append(state.facts.step)
+        training_state, "write_state", lambda path, state: kept.append(state.facts.step)
     )
     train_on(toy_episodes, [toy_episode(9, 25)], settings.model_copy(update={"max_steps": 3}))
     assert kept == []

@@ -7,8 +7,9 @@ import pytest
 
 from dextouch.geometry import transform
 from services.world_model.rendering.configuration import RendererConfig
-from services.world_model.rendering.inputs import SceneClip, Scenes
-from services.world_model.rendering.scene_states import SceneState, SceneStates
+from services.world_model.rendering.inputs import Scenes
+from services.world_model.rendering.rasters import SceneState, SceneStates
+from services.world_model.rendering.training import SceneClip
 from tests.unit.world_model.rendering.scene_by_hand import BOXES_M, DOWN, K, shifted
 
 

@@ -16,9 +16,10 @@ from benchmarks.evaluator.measuring import sharpness
 from dextouch.errors import InvalidInputError
 from dextouch.metrics.image import PEAK, decibels
 from dextouch.schemas import CHUNK_STEPS
-from services.world_model.rendering.inputs import SceneClip, Scenes, drawing_inputs, gather
+from services.world_model.rendering.inputs import Scenes, drawing_inputs
 from services.world_model.rendering.network import RendererNetwork
-from services.world_model.rendering.scene_states import SceneStates
+from services.world_model.rendering.rasters import SceneStates
+from services.world_model.rendering.training import SceneClip, gather
 
 _REACH_PX = 5
 _BATCH = 32

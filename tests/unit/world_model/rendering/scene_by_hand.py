@@ -6,7 +6,7 @@ import numpy as np
 
 from dextouch.geometry import pinhole_matrix, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.world_model.rendering.scene_states import SceneState
+from services.world_model.rendering.rasters import SceneState
 
 # Looks straight down: x of the image is x of the world, y of the image is -y.
 DOWN = np.diag([1.0, -1.0, -1.0])

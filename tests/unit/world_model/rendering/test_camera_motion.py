@@ -7,7 +7,7 @@ import torch
 
 from dextouch.geometry import apply, invert, project, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.world_model.rendering.rasters import CameraMotion, is_inside, sample_images
+from services.world_model.rendering.inputs import CameraMotion, is_inside, sample_images
 from tests.unit.world_model.rendering.scene_by_hand import DOWN, K
 
 

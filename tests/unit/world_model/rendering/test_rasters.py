@@ -10,6 +10,7 @@ from services.world_model.rendering.inputs import grown
 from services.world_model.rendering.rasters import (
     BoxHits,
     HandPoints,
+    SceneStates,
     base_points_world,
     cast_boxes,
     colours_at_positions,
@@ -18,7 +19,6 @@ from services.world_model.rendering.rasters import (
     project_hands,
     splat_hands,
 )
-from services.world_model.rendering.scene_states import SceneStates
 from tests.unit.world_model.rendering.scene_by_hand import K
 
 SHAPE = (64, 64)

@@ -10,11 +10,15 @@ from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from services.world_model.rendering.configuration import RendererConfig
-from services.world_model.rendering.inputs import Scenes, drawing_inputs
+from services.world_model.rendering.inputs import (
+    CameraMotion,
+    Scenes,
+    drawing_inputs,
+    sample_images,
+)
 from services.world_model.rendering.network import RendererNetwork
-from services.world_model.rendering.rasters import CameraMotion, sample_images
+from services.world_model.rendering.rasters import SceneState, SceneStates
 from services.world_model.rendering.renderer import Renderer
-from services.world_model.rendering.scene_states import SceneState, SceneStates
 from tests.unit.world_model.rendering.scene_by_hand import BOXES_M, DOWN, K, shifted, turned
 
 

@@ -11,8 +11,7 @@ from tokenizers.pre_tokenizers import Whitespace
 from tokenizers.processors import TemplateProcessing
 from transformers import PreTrainedTokenizerFast, UMT5Config, UMT5EncoderModel
 
-from services.world_model.network.configuration import NetworkConfig
-from services.world_model.wan.configuration import WanConfig
+from services.world_model.network.configuration import NetworkConfig, WanConfig
 
 LAYERS, HEADS, HEAD_WIDTH = 2, 2, 12
 

@@ -12,18 +12,17 @@ from dextouch.schemas import StartRequest, decode_answer, encode_start
 from dextouch.worlds import create_world_app
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.command_line import open_worlds, run_show, run_train
-from services.world_model.placement import Placement
-from services.world_model.pretrained_video import initial_model
-from services.world_model.settings import (
+from services.world_model.network.configuration import WanFiles
+from services.world_model.paper_settings import (
     OptimizerSettings,
     TrainCommand,
     TrainSettings,
     WindowSettings,
-    WorldModelSettings,
 )
+from services.world_model.pretrained_video import initial_model
+from services.world_model.settings import Placement, WorldModelSettings
 from services.world_model.training.distribution import Processes
 from services.world_model.training.trainer import TrainingRun, train_on
-from services.world_model.wan.configuration import WanFiles
 from tests.unit.world_model.test_world import make_start
 
 INSTRUCTION = "push the box with both hands"

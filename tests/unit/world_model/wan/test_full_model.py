@@ -8,17 +8,16 @@ from safetensors.torch import save_file
 
 from dextouch.errors import InvalidInputError, LimitExceededError
 from services.world_model.checkpoints import read_checkpoint, write_checkpoint
-from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.configuration import NetworkConfig, WanConfig
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
-from services.world_model.pretrained_video import load_pretrained
-from services.world_model.training.dataset import cut_window
-from services.world_model.wan.configuration import WanConfig
-from services.world_model.wan.loading import (
+from services.world_model.pretrained_video import (
     TRANSFORMER_RULES,
     autoencoder_rules,
+    load_pretrained,
     renamed,
 )
+from services.world_model.training.dataset import cut_window
 from tests.unit.world_model.test_clean_tokens import assert_kept_tokens_change_nothing
 
 

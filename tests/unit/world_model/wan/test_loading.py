@@ -13,13 +13,12 @@ from dextouch.errors import (
     NonFiniteError,
     NotFoundError,
 )
-from services.networks import memory
-from services.world_model.wan.configuration import WanConfig
-from services.world_model.wan.loading import (
+from services.networks import weight_files
+from services.world_model.network.configuration import WanConfig
+from services.world_model.network.video import empty_autoencoder, empty_transformer
+from services.world_model.pretrained_video import (
     TRANSFORMER_RULES,
     autoencoder_rules,
-    empty_autoencoder,
-    empty_transformer,
     find_weights,
     load_weights,
     renamed,
@@ -117,7 +116,7 @@ def test_weights_that_do_not_fit_are_refused_before_they_are_read(
     with pytest.raises(LimitExceededError, match="GB of memory"):
         _load(empty, tmp_path, max_bytes=needed - 1)
     assert empty.proj_out.weight.is_meta
-    monkeypatch.setattr(memory, "available_memory", lambda: needed - 1)
+    monkeypatch.setattr(weight_files, "available_memory", lambda: needed - 1)
     with pytest.raises(LimitExceededError, match="GB of memory"):
         _load(empty, tmp_path)
     _load(empty, tmp_path, max_bytes=needed)
@@ -129,7 +128,7 @@ def test_the_full_size_needs_ten_gigabytes():
     # Two bytes each, and two more for time embedding (256 + 3072 + 2) x 3072, thirty affine norms
     # 2 x 3072, thirty tables 6 x 3072 and the last 2 x 3072.
     kept = (256 + 3072 + 2 + 30 * 2 + 30 * 6 + 2) * 3072
-    assert memory.memory_of(network.state_dict()) == 2 * 4_999_787_712 + 2 * kept
+    assert weight_files.memory_of(network.state_dict()) == 2 * 4_999_787_712 + 2 * kept
 
 
 def test_damaged_pickled_and_absent_files_are_told_apart(tmp_path, transformer, empty):

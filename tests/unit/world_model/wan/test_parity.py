@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from services.world_model.network.attention import (
+    ExpertBlock,
     JointLayer,
     Stream,
     Text,
@@ -15,14 +16,13 @@ from services.world_model.network.attention import (
     tactile_positions,
     video_positions,
 )
-from services.world_model.network.tactile_expert import TactileExpert
+from services.world_model.network.configuration import LATENT_MEAN, LATENT_STD
 from services.world_model.network.video import (
     WanBlock,
     WanVideoCodec,
     WanVideoCondition,
     WanVideoExpert,
 )
-from services.world_model.wan.configuration import LATENT_MEAN, LATENT_STD
 
 
 @pytest.fixture
@@ -53,13 +53,13 @@ def velocity(config, transformer, latents, t, text):
     condition = WanVideoCondition(config, config.wan, transformer.condition_embedder)
     expert = WanVideoExpert(config, transformer)
     tokens = tokens_of(latents)
-    conditions = condition.of(t, torch.zeros(*t.shape, config.video_width), text)
+    conditions = condition.at(condition.of(torch.zeros(*t.shape, config.video_width), text), t)
     stream = expert.start(tokens, tokens[:, 0], conditions, torch.zeros(2, 9, 2, 8, 8))
     width = config.tactile_width
     nothing = Stream(torch.zeros(2, 0, width), torch.zeros(2, 0, 6, width))
     everything = torch.ones(stream.tokens.shape[1], stream.tokens.shape[1], dtype=torch.bool)
     for block in transformer.blocks:
-        layer = JointLayer(WanBlock(block), TactileExpert.block(config))
+        layer = JointLayer(WanBlock(block), ExpertBlock(config, config.tactile_width))
         stream, nothing = layer(stream, nothing, everything)
     return expert.finish(stream, conditions)
 
@@ -107,9 +107,9 @@ def test_an_action_moves_its_own_latent_before_attention_spreads_it(
     condition = WanVideoCondition(full_config, full_config.wan, transformer.condition_embedder)
     t = torch.full((2, 3), 0.5)
     actions = torch.zeros(2, 3, full_config.video_width)
-    before = condition.of(t, actions, text)
+    before = condition.at(condition.of(actions, text), t)
     actions[:, 1] += 0.1
-    after = condition.of(t, actions, text)
+    after = condition.at(condition.of(actions, text), t)
     moved = (after.modulation - before.modulation).abs().amax((0, 2, 3))
     assert moved[1] > 1e-3
     assert moved[[0, 2]].max() == 0.0
@@ -139,7 +139,7 @@ def test_attention_between_touch_and_video_depends_on_their_distance_in_time():
 
 @pytest.fixture
 def codec(full_config, autoencoder):
-    codec = WanVideoCodec(full_config, full_config.wan)
+    codec = WanVideoCodec(full_config.wan)
     codec.autoencoder = autoencoder
     return codec
 

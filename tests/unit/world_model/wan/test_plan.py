@@ -6,13 +6,12 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
-from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.configuration import NetworkConfig, WanConfig
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
 from services.world_model.plan import PeakMemory, plan_of, plan_table
 from services.world_model.pretrained_video import load_pretrained
 from services.world_model.training.dataset import cut_window
-from services.world_model.wan.configuration import WanConfig
 
 KIB = 1024
 

@@ -4,12 +4,11 @@ import pytest
 from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffusers
 
 from dextouch.errors import InvalidInputError
-from services.world_model.wan.configuration import WanConfig
-from services.world_model.wan.loading import (
+from services.world_model.network.configuration import WanConfig
+from services.world_model.network.video import empty_autoencoder, empty_transformer
+from services.world_model.pretrained_video import (
     TRANSFORMER_RULES,
     autoencoder_rules,
-    empty_autoencoder,
-    empty_transformer,
     renamed,
 )
 

@@ -5,7 +5,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
-from services.world_model.wan.text import TextFeatures, cleaned, key_of
+from services.world_model.network.instruction import TextFeatures, cleaned, key_of
 
 # "push the box </s>" by the tokenizer of the fixture.
 IDS = torch.tensor([[3, 4, 5, 1]])

@@ -1,4 +1,4 @@
-"""Traces of a model's operations, for worlds that are asked for many chunks.
+"""Operations on all tensors of nested dataclasses, and traces of functions that take such trees.
 
 A chunk of one rollout has a thousand small operations, and calling them from Python takes as
 long as computing them. A trace (torch.jit) has the same operations in the same order, so that its
@@ -7,19 +7,66 @@ numbers are those of the model, bit for bit.
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import fields
+from functools import cache
 from typing import Any, Final, Generic, TypeVar
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor, nn
 
 # Tracing takes about a second: worth it for shapes that come again and again.
 _CALLS_BEFORE: Final = 4
 _MOST_TRACES: Final = 16
 _WARM_UP_CALLS: Final = 3
-
+Part = TypeVar("Part")
 Outputs = TypeVar("Outputs")
+
+
+def combined(parts: Sequence[Part], change: Callable[[list[Tensor]], Tensor]) -> Part:
+    """One tensor or dataclass from several of a kind: each tensor from theirs of the same name."""
+    return named(parts, lambda _, tensors: change(tensors))
+
+
+def named(parts: Sequence[Part], change: Callable[[str, list[Tensor]], Tensor]) -> Part:
+    """`combined` with names such as `start.objects.axes`."""
+    each = zip(_names(parts[0]), *map(_tensors, parts), strict=True)
+    made: Part = _rebuilt(parts[0], (change(name, tensors) for name, *tensors in each))
+    return made
+
+
+def by_name(part: object, name: str = "") -> dict[str, Tensor]:
+    """All tensors of a dataclass by names as those of `named`, below a name."""
+    return dict(zip(_names(part, name), _tensors(part), strict=True))
+
+
+def mapped(part: Part, change: Callable[[Tensor], Tensor]) -> Part:
+    """A copy with every tensor changed."""
+    return combined([part], lambda tensors: change(tensors[0]))
+
+
+def chosen(rows: Bool[Tensor, " batch"], these: Part, others: Part) -> Part:
+    """Some rows of these, the other ones of others."""
+    return combined(
+        [these, others],
+        lambda pair: torch.where(rows.view(-1, *[1] * (pair[0].ndim - 1)), pair[0], pair[1]),
+    )
+
+
+def folded(part: Part) -> Part:
+    """[members, batch, …] as [members · batch, …]."""
+    return mapped(part, lambda tensor: tensor.flatten(0, 1))
+
+
+def unfolded(part: Part, members: int) -> Part:
+    """Inverse of `folded`."""
+    return mapped(part, lambda tensor: tensor.reshape(members, -1, *tensor.shape[1:]))
+
+
+def stacked(parts: Sequence[Part]) -> Part:
+    """Parts stacked along a new first axis."""
+    return combined(parts, torch.stack)
 
 
 class Traced(Generic[Outputs]):
@@ -36,10 +83,7 @@ class Traced(Generic[Outputs]):
     """
 
     def __init__(
-        self,
-        model: nn.Module,
-        function: Callable[..., Outputs],
-        kind_of: Callable[..., Hashable],
+        self, model: nn.Module, function: Callable[..., Outputs], kind_of: Callable[..., Hashable]
     ) -> None:
         self._model, self._function, self._kind_of = model, function, kind_of
         self._calls: Counter[Hashable] = Counter()
@@ -89,18 +133,34 @@ def _tensors(part: Any) -> Iterator[Tensor]:  # noqa: ANN401 - any nesting of da
     """All tensors of dataclasses and tuples of these, in the order of their fields."""
     if isinstance(part, Tensor):
         yield part
-    elif isinstance(part, tuple):
-        for one in part:
-            yield from _tensors(one)
     else:
-        for field in fields(part):
-            yield from _tensors(getattr(part, field.name))
+        for one in _parts(part):
+            yield from _tensors(one)
 
 
 def _rebuilt(form: Any, tensors: Iterator[Tensor]) -> Any:  # noqa: ANN401 - any nesting of dataclasses
     """The form with other tensors."""
     if isinstance(form, Tensor):
         return next(tensors)
-    if isinstance(form, tuple):
-        return tuple(_rebuilt(one, tensors) for one in form)
-    return type(form)(*[_rebuilt(getattr(form, field.name), tensors) for field in fields(form)])
+    parts = [_rebuilt(one, tensors) for one in _parts(form)]
+    return tuple(parts) if isinstance(form, tuple) else type(form)(*parts)
+
+
+def _names(part: Any, name: str = "") -> Iterator[str]:  # noqa: ANN401 - as above
+    """Names of the tensors of dataclasses, in the order of `_tensors`."""
+    if isinstance(part, Tensor):
+        yield name
+    else:
+        for field in _fields(part.__class__):
+            yield from _names(getattr(part, field), f"{name}.{field}" if name else field)
+
+
+def _parts(part: Any) -> Sequence[Any]:  # noqa: ANN401 - as above
+    if isinstance(part, tuple):
+        return part
+    return [getattr(part, field) for field in _fields(part.__class__)]
+
+
+@cache
+def _fields(kind: type) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))

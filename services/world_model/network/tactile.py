@@ -1,11 +1,11 @@
-"""Tactile tokenizers: pressure of hands to latent tokens and back."""
+"""The tactile side of the joint model: tokenizers of pressure, and the expert on their latents."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -19,14 +19,23 @@ from dextouch.tactile.layout import (
     join_pads,
 )
 from services.networks.principal_axes import principal_axes, root_pressure, root_scale
-from services.world_model.network.attention import split_axis
+from services.world_model.network.attention import (
+    NUM_MODULATIONS,
+    Stream,
+    angles,
+    modulated_norm,
+    split_axis,
+    tactile_positions,
+    zero_linear,
+)
+from services.world_model.network.conditioning import Condition
 from services.world_model.network.configuration import NetworkConfig
 
-# Interface of tactile tokenizers, which turn the pressures of a hand into tokens and back.
-#
-# All of them work on the square root of pressure, which gives light touch more weight, and are
-# frozen while a world model is trained on their latents. `NetworkConfig.tokenizer` chooses one.
-
+NUM_PADS = 6
+# Amplitude of palms relative to that of tips; the best value in an ablation on touch.
+PALM_SCALE = 0.7
+CANVAS_SHAPE = (20, 20)
+_PALM_COLUMN = 2
 # For checkpoints without a stored training peak: twice the peak of eight demonstrations of the
 # twin's first two tasks.
 UNKNOWN_PEAK_KPA = 200.0
@@ -35,7 +44,8 @@ UNKNOWN_PEAK_KPA = 200.0
 class TactileTokenizer(nn.Module, ABC):
     """Encoder and decoder of the taxels of one hand; zero pressure is the zero latent.
 
-    `peak_kpa` is the highest pressure in training.
+    All work on the square root of pressure, which gives light touch more weight, and are frozen
+    while a world model is trained on their latents. `peak_kpa` is the highest pressure in training.
 
     Args:
         num_tokens: tokens per hand.
@@ -75,16 +85,11 @@ class TactileTokenizer(nn.Module, ABC):
         return torch.minimum(tactile_kpa, highest_kpa[:, None, None, None])
 
 
-# Learned tactile tokenizers: what Split-Hands and Grid share.
-#
-# `dextouch train tokenizer` trains one, and the paper's form of the world model uses it
-# (`dextouch train world-model --preset paper --tokenizer PATH`).
-
-NUM_PADS = 6
-
-
 class LearnedTokenizer(TactileTokenizer):
-    """Autoencoder of root pressures in units of their root mean square."""
+    """Autoencoder of root pressures in units of their root mean square.
+
+    `dextouch train tokenizer` trains one.
+    """
 
     root_scale: Tensor
 
@@ -128,15 +133,12 @@ class LearnedTokenizer(TactileTokenizer):
         return split_axis(self.decode_roots(flat), 0, latents.shape[:-2]) * self.root_scale
 
 
-# Convolutional autoencoder of pressure maps, the building block of learned tokenizers.
-#
-# Layers have no biases and embeddings multiply features instead of being added, so that an
-# untouched map is the zero latent and the zero latent an untouched map, whatever the weights are.
-
-
 @dataclass(frozen=True)
 class MapShape:
-    """Shape of the maps that one autoencoder handles, and its size.
+    """Shape of the maps that one convolutional autoencoder handles, and its size.
+
+    Layers have no biases and embeddings multiply features instead of being added, so that an
+    untouched map is the zero latent and the zero latent an untouched map, whatever the weights are.
 
     Args:
         rows: rows of a map.
@@ -242,19 +244,13 @@ def _convolution(in_width: int, out_width: int, *, stride: int = 1) -> nn.Conv2d
     return nn.Conv2d(in_width, out_width, 3, stride=stride, padding=1, bias=False)
 
 
-# Grid tokenizer: palm and fingertips on one canvas under one network, the paper's baseline.
-#
-# On the canvas of 20 by 20 cells, rows 0 to 3 hold the fingertips side by side, thumb to little
-# finger in columns 0 to 19. Rows 4 to 18 hold the palm in columns 2 to 17. The other 80 cells are
-# empty. Inside every pad rows run from distal to proximal and columns from radial to ulnar. The
-# canvas makes neighbours of taxels that are far apart on the hand.
-
-CANVAS_SHAPE = (20, 20)
-_PALM_COLUMN = 2
-
-
 def canvas_cells() -> np.ndarray:
-    """Cell of the canvas, counted row by row, of each of the 320 taxels."""
+    """Cell of the canvas, counted row by row, of each of the 320 taxels.
+
+    Rows 0 to 3 hold the fingertips side by side, thumb to little finger in columns 0 to 19. Rows 4
+    to 18 hold the palm in columns 2 to 17. The other 80 cells are empty. Inside every pad rows run
+    from distal to proximal and columns from radial to ulnar.
+    """
     cells = np.arange(CANVAS_SHAPE[0] * CANVAS_SHAPE[1]).reshape(CANVAS_SHAPE)
     rows, columns = TIP_SHAPE
     tips = [cells[:rows, columns * finger :][:, :columns] for finger in range(NUM_FINGERTIPS)]
@@ -263,7 +259,11 @@ def canvas_cells() -> np.ndarray:
 
 
 class GridTokenizer(LearnedTokenizer):
-    """One autoencoder for the canvas, with as many weights and latents as Split-Hands."""
+    """One autoencoder for palm and fingertips on one canvas, the paper's baseline.
+
+    It has as many weights and latents as Split-Hands. The canvas makes neighbours of taxels that
+    are far apart on the hand.
+    """
 
     _cells: Tensor
 
@@ -288,16 +288,13 @@ class GridTokenizer(LearnedTokenizer):
         return self.decoder(latents[:, None]).flatten(1)[:, self._cells]
 
 
-# Split-Hands tokenizer of the paper: fingertips and palm apart, by their physical topology.
-#
-# All ten fingertips share one encoder and both palms another. An identity embedding tells the pads
-# apart, and an embedding of the position the taxels of a pad. A hand is one token per pad
-# (`tactile_tokens` "pad", as in the paper) or all of them in one token ("hand", several times
-# cheaper in the world model); the weights are the same.
-
-
 class SplitHandsTokenizer(LearnedTokenizer):
-    """One autoencoder for fingertips, one for palms."""
+    """One autoencoder for fingertips, one for palms, as in the paper.
+
+    An identity embedding tells the pads apart, and an embedding of the position the taxels of a
+    pad. A hand is one token per pad (`tactile_tokens` "pad", as in the paper) or all of them in one
+    token ("hand", several times cheaper in the world model); the weights are the same.
+    """
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
@@ -325,17 +322,11 @@ class SplitHandsTokenizer(LearnedTokenizer):
         return torch.cat([tips, self.palm_decoder(pads[:, NUM_FINGERTIPS:]).flatten(1)], dim=1)
 
 
-# Principal-axes tokenizer: one token per hand in closed form, the default of the world model.
-#
-# Tips keep all sixteen values, palms their strongest axes. It is fitted in a second and loses
-# little touch, but learns nothing about the hand; `services.world_model.network.split_hands` does.
-
-# Amplitude of palms relative to that of tips; the best value in an ablation on touch.
-PALM_SCALE = 0.7
-
-
 class PrincipalAxesTokenizer(TactileTokenizer):
-    """Tips as they are and palms along their principal axes, as one token."""
+    """Tips as they are and palms along their principal axes, as one token, in closed form.
+
+    Fitted in a second, it loses little touch, but learns nothing about the hand.
+    """
 
     tip_scale: Tensor
     palm_basis: Tensor
@@ -378,9 +369,6 @@ class PrincipalAxesTokenizer(TactileTokenizer):
         return torch.cat([tips, palm], dim=-1).clamp_min(0.0).square()
 
 
-# Tactile tokenizer of a network configuration.
-
-
 def build_tokenizer(config: NetworkConfig) -> TactileTokenizer:
     """The tokenizer that the configuration names, with initial weights.
 
@@ -397,3 +385,70 @@ def build_tokenizer(config: NetworkConfig) -> TactileTokenizer:
     if config.tokenizer == "grid":
         return GridTokenizer(config)
     return PrincipalAxesTokenizer(config)
+
+
+class TactileExpert(nn.Module):
+    """Tactile stream: the tokens of each step and hand, one or one per pad; the first is clean."""
+
+    def __init__(self, config: NetworkConfig, *, num_tokens: int, channels: int) -> None:
+        super().__init__()
+        width = config.tactile_width
+        self._num_tokens = num_tokens
+        # Rotary positions in the time of the pretrained video expert, which has them.
+        self._head_width = None if config.wan is None else config.head_width
+        self._add_condition = config.add_condition_to_tokens
+        self._is_anchored = config.tactile_target == "residual"
+        # Residuals come with the latent that they are relative to.
+        self.embed = nn.Linear((1 + self._is_anchored) * channels, width)
+        self.hands = nn.Parameter(0.02 * torch.randn(2, width))
+        self.steps = nn.Parameter(0.02 * torch.randn(config.max_steps, 1, width))
+        self.modulate = nn.Sequential(nn.SiLU(), zero_linear(width, NUM_MODULATIONS * width))
+        self.modulate_out = nn.Sequential(nn.SiLU(), zero_linear(width, 2 * width))
+        self.predict = zero_linear(width, channels)
+        # A single token per hand needs no embedding of its pad.
+        self.pads = nn.Parameter(0.02 * torch.randn(num_tokens, width)) if num_tokens > 1 else None
+
+    def start(
+        self,
+        noisy: Float32[Tensor, "batch time 2 tokens channels"],
+        first: Float32[Tensor, "batch 2 tokens channels"],
+        condition: Condition,
+    ) -> Stream:
+        """Tokens before the first layer.
+
+        `noisy` are residuals, the first ones zero, or plain latents, the first ones clean.
+        """
+        steps, dtype = self.steps[: noisy.shape[1]], self.steps.dtype
+        condition = condition.to(dtype)
+        if self._is_anchored:
+            noisy = torch.cat([noisy, first[:, None].expand_as(noisy)], dim=-1)
+        # In this order, so that sums with one token per hand are those of older releases.
+        tokens = self.embed(noisy.to(dtype)) + self.hands[:, None] + steps[:, None]
+        if self._add_condition:
+            tokens = tokens + condition.vector[..., None, :]
+        if self.pads is not None:
+            tokens = tokens + self.pads
+        modulation = self._for_each_token(self.modulate(condition.vector))
+        modulation = split_axis(modulation, -1, (NUM_MODULATIONS, -1))
+        turn = None
+        if self._head_width is not None:
+            positions = tactile_positions(noisy.shape[1], 2 * self._num_tokens)
+            turn = angles(positions, self._head_width).to(noisy.device)
+        return Stream(
+            tokens.flatten(1, 3), modulation.flatten(1, 3), turn=turn, actions=condition.actions
+        )
+
+    def finish(
+        self, stream: Stream, condition: Condition
+    ) -> Float32[Tensor, "batch time 2 tokens channels"]:
+        """Predict the clean latents, or the velocity, as the configuration says."""
+        condition = condition.to(self.steps.dtype)
+        tokens = split_axis(stream.tokens, 1, (condition.vector.shape[1], 2, self._num_tokens))
+        shift, scale = self._for_each_token(self.modulate_out(condition.vector)).chunk(2, dim=-1)
+        return self.predict(modulated_norm(tokens, shift, scale)).float()
+
+    def _for_each_token(
+        self, of_hand: Float[Tensor, "batch time 2 width"]
+    ) -> Float[Tensor, "batch time 2 tokens width"]:
+        """Repeat what all tokens of a hand share."""
+        return of_hand[..., None, :].expand(-1, -1, -1, self._num_tokens, -1)

@@ -1,0 +1,365 @@
+"""Settings of the paper's form: its training, adaptation and distillation, and its tokenizer's."""
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, CliImplicitFlag, PydanticBaseSettingsSource
+
+from dextouch.command_line import JSON_HELP
+from dextouch.frozen_model import FrozenModel
+from dextouch.serving import CommandSettings, file_source, service_config
+from services.networks.training_settings import (
+    AverageDecay,
+    Batch,
+    CpuBudget,
+    Device,
+    LearningRate,
+    MaxGradientNorm,
+    MaxSteps,
+    Seed,
+    Splits,
+    Stores,
+    WarmupSteps,
+    WeightDecay,
+)
+from services.world_model.network.configuration import (
+    NetworkConfig,
+    Precision,
+    TokenizerName,
+    WanFiles,
+)
+from services.world_model.presets import PRESETS, PresetSource
+from services.world_model.settings import DataSettings, flags_of, last_name
+
+
+class OptimizerSettings(FrozenModel):
+    """Settings of the optimizer."""
+
+    batch: Batch = 8
+    learning_rate: LearningRate = 2e-3
+    warmup_steps: WarmupSteps = 100
+    weight_decay: WeightDecay = 0.02
+    max_gradient_norm: MaxGradientNorm = 1.0
+    ema_decay: AverageDecay = 0.995
+    tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac (equation 5)")
+    precision: Precision = Field(
+        default="float32", description="of matrix products in training; weights keep theirs"
+    )
+    touch_loss: Literal["all", "contact_or_changing"] = Field(
+        default="all",
+        description="tactile tokens that count in the loss: all, or those in contact or changing",
+    )
+
+
+class AdaptOptimizerSettings(OptimizerSettings):
+    """Settings of the optimizer with a tenth of the learning rate from random weights."""
+
+    learning_rate: LearningRate = 2e-4
+    warmup_steps: WarmupSteps = 20
+
+
+class WindowSettings(FrozenModel):
+    """Sampling of training windows."""
+
+    commanded_fraction: float = Field(
+        default=0.5,
+        ge=0,
+        le=1,
+        description="share of windows with commanded actions, where available",
+    )
+    chained_fraction: float = Field(
+        default=0.3, ge=0, le=1, description="share of commanded windows anchored like later chunks"
+    )
+    short_fraction: float = Field(default=0.25, ge=0, le=1, description="share of short windows")
+    context_noise: float = Field(default=0.05, ge=0, le=1, description="noise on the first latents")
+    fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
+
+
+class RunSettings(DataSettings):
+    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
+
+    episodes: str = Field(description="URL or folder of the episode store to train on")
+    output: Path = Field(
+        default=Path("runs/world_model/tiny.safetensors"), description="checkpoint to write"
+    )
+    name: str = Field(default="tiny", description="model name in the checkpoint")
+    preset: str = Field(
+        default="tiny",
+        description=f"named settings that other flags override: {', '.join(PRESETS)}",
+    )
+    seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
+    cpu_budget_s: CpuBudget = 1000.0
+    max_steps: MaxSteps = None
+    num_threads: int = Field(default=1, ge=1, description="threads of torch")
+    device: Device = "cpu"
+    wan: WanFiles = Field(default=WanFiles(), description="files of the pretrained networks")
+    heldout_percent: int = Field(
+        default=10,
+        ge=1,
+        le=50,
+        description="percentage of episodes to evaluate on if no --heldout is given",
+    )
+    evaluation_stride: int = Field(
+        default=8, ge=1, description="evaluate on every n-th window of held-out episodes"
+    )
+    streaming: CliImplicitFlag[bool] = Field(
+        default=False, description="stream episodes from disk, for data larger than memory"
+    )
+    loader_workers: int = Field(
+        default=0, ge=0, le=64, description="reader processes of --streaming; 0: this process"
+    )
+    resume: CliImplicitFlag[bool] = Field(
+        default=False, description="resume an interrupted run of this output, if there is one"
+    )
+    state_every_cpu_s: float = Field(
+        default=60.0, ge=0, description="CPU seconds between states saved for --resume"
+    )
+    optimizer: OptimizerSettings = Field(
+        default=OptimizerSettings(), description="settings of the optimizer"
+    )
+    windows: WindowSettings = Field(
+        default=WindowSettings(), description="sampling of training windows"
+    )
+
+
+class TrainSettings(RunSettings):
+    """Training of a network, from random weights or from those of a checkpoint."""
+
+    init: Path | None = Field(
+        default=None,
+        description="checkpoint to initialize from; its network settings must be equal, except "
+        "those of sampling",
+    )
+    tokenizer: Path | None = Field(
+        default=None, description="tactile tokenizer of `dextouch train tokenizer`, kept frozen"
+    )
+    self_forcing: CliImplicitFlag[bool] = Field(
+        default=False, description="train on own contexts and samples (see dextouch train distill)"
+    )
+    network: NetworkConfig = Field(default=NetworkConfig(), description="shape of the network")
+
+
+def command_line(settings: TrainSettings) -> str:
+    """Command that repeats a run: every setting that differs from its default.
+
+    Stores are given by their last path component, since folders differ between machines.
+    """
+    given = settings.model_dump(
+        mode="json",
+        exclude_defaults=True,
+        exclude={
+            "output", "json_path", "episodes", "human", "heldout", "init", "tokenizer", "resume",
+            "state_every_cpu_s", "device", "wan", "plan", "preset",
+        },
+    )  # fmt: skip
+    flags = [f"--episodes={last_name(settings.episodes)}"]
+    flags += [f"--human={last_name(url)}" for url in settings.human]
+    if settings.heldout is not None:
+        flags.append(f"--heldout={last_name(settings.heldout)}")
+    if settings.init is not None:
+        flags.append(f"--init={settings.init.name}")
+    if settings.tokenizer is not None:
+        flags.append(f"--tokenizer={settings.tokenizer.name}")
+    form = f"--preset={settings.preset}"
+    return " ".join(["dextouch train world-model", form, *flags, *flags_of(given)])
+
+
+class FromCheckpointSettings(RunSettings):
+    """Training of a checkpoint, whose network, codecs and normalizers are kept."""
+
+    init: Path = Field(description="checkpoint to start from")
+    cpu_budget_s: CpuBudget = 300.0
+    optimizer: AdaptOptimizerSettings = Field(
+        default=AdaptOptimizerSettings(), description="settings of the optimizer"
+    )
+
+    def training(self, network: NetworkConfig) -> TrainSettings:
+        """The same run as training of a network from its checkpoint."""
+        given = {name: getattr(self, name) for name in RunSettings.model_fields}
+        given |= {"optimizer": OptimizerSettings(**self.optimizer.model_dump())}
+        return TrainSettings(**given, init=self.init, network=network)
+
+
+class AdaptSettings(FromCheckpointSettings):
+    """Adaptation of a trained model to new tasks.
+
+    The network, its codecs and its normalizers are those of the checkpoint; human and robot
+    episodes may be of the same tasks, but not of those that the checkpoint was trained on.
+    """
+
+    init: Path = Field(description="checkpoint to adapt")
+    output: Path = Field(
+        default=Path("runs/world_model/adapted.safetensors"), description="checkpoint to write"
+    )
+    name: str = Field(default="adapted", description="model name in the checkpoint")
+    disjoint_tasks: CliImplicitFlag[bool] = Field(
+        default=False, description="refuse human episodes of tasks that robots have, too"
+    )
+    new_tasks: CliImplicitFlag[bool] = Field(
+        default=True, description="refuse tasks that the initial checkpoint was trained on"
+    )
+
+
+class DistillSettings(FromCheckpointSettings):
+    """Training of a checkpoint to sample in few steps, on its own contexts and samples.
+
+    The network, its codecs and its normalizers are those of the checkpoint.
+    """
+
+    steps: int = Field(default=1, ge=1, le=64, description="network calls per chunk")
+    output: Path = Field(
+        default=Path("runs/world_model/distilled.safetensors"), description="checkpoint to write"
+    )
+    name: str = Field(default="distilled", description="model name in the checkpoint")
+
+    def training(self, network: NetworkConfig) -> TrainSettings:
+        """The same run as training of a network from its checkpoint."""
+        few = network.model_copy(update={"sampling_steps": self.steps, "sampler": "euler"})
+        return super().training(few).model_copy(update={"self_forcing": True})
+
+
+class TokenizerOptimizer(FrozenModel):
+    """Settings of the optimizer."""
+
+    batch: Batch = 128
+    learning_rate: LearningRate = 6e-3
+    warmup_steps: WarmupSteps = 50
+    weight_decay: WeightDecay = 0.0
+    max_gradient_norm: MaxGradientNorm = 1.0
+    ema_decay: AverageDecay = 0.99
+
+
+class TrainTokenizerSettings(FrozenModel):
+    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
+
+    episodes: Stores
+    splits: Splits = ()
+    tokenizer: TokenizerName = Field(
+        default="split_hands",
+        description="split_hands (the paper's), grid (its baseline), or principal_axes, which is "
+        "fitted without steps",
+    )
+    output: Path = Field(
+        default=Path("runs/world_model/tokenizer.safetensors"), description="file to write"
+    )
+    seed: Seed = 0
+    cpu_budget_s: CpuBudget = 60.0
+    max_steps: MaxSteps = None
+    num_threads: int = Field(default=1, ge=1, description="threads of torch")
+    heldout_share: float = Field(default=0.1, gt=0, lt=1, description="share of held-out scenes")
+    contact_weight: float = Field(
+        default=10.0, ge=1, description="weight in the loss of a taxel in contact; others have 1"
+    )
+    num_evaluations: int = Field(
+        default=12, ge=1, le=1000, description="evaluations during training, for the curve"
+    )
+    palm_channels: int = Field(
+        default=112, ge=1, le=240, description="latents per palm pad of principal_axes"
+    )
+    tactile_channels: int = Field(
+        default=192,
+        ge=6,
+        le=1920,
+        multiple_of=6,
+        description="latents per hand of split_hands and grid",
+    )
+    optimizer: TokenizerOptimizer = Field(
+        default=TokenizerOptimizer(), description="settings of the optimizer"
+    )
+
+    def network(self) -> NetworkConfig:
+        """Network configuration with this tokenizer and one token per hand."""
+        return NetworkConfig(
+            tokenizer=self.tokenizer,
+            palm_channels=self.palm_channels,
+            tactile_channels=self.tactile_channels,
+        )
+
+    def command(self) -> str:
+        """Command that repeats the run: every setting that differs from its default."""
+        given = self.model_dump(
+            mode="json", exclude_defaults=True, include=set(TrainTokenizerSettings.model_fields)
+        )
+        stores = [f"--episodes={last_name(url)}" for url in given.pop("episodes")]
+        given.pop("output", None)
+        return " ".join(["dextouch train tokenizer", *stores, *flags_of(given)])
+
+
+class TrainCommand(CommandSettings, TrainSettings):
+    r"""Train the paper's form: a joint visuo-tactile flow-matching model of windows of episodes.
+
+    Example:
+      dextouch train world-model --preset tiny --episodes runs/data --output runs/tiny.safetensors
+
+    In the paper's design, whose tokenizer is trained first:
+      dextouch train tokenizer --episodes runs/episodes --output runs/tokenizer.safetensors
+      dextouch train world-model --preset paper --tokenizer runs/tokenizer.safetensors \
+        --episodes runs/episodes --output runs/paper.safetensors
+
+    At full size, from a local copy of Wan2.2-TI2V-5B; with --plan to see what it needs:
+      dextouch train world-model --preset wan22-5b --wan.folder models/Wan2.2-TI2V-5B-Diffusers \
+        --tokenizer runs/tokenizer.safetensors --episodes runs/episodes --plan
+    """
+
+    model_config = service_config("world_model_train", "dextouch train world-model")
+
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
+    plan: CliImplicitFlag[bool] = Field(
+        default=False, description="print memory and FLOPs of the network, and do not train"
+    )
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Flags, the environment, the file, then the preset that one of them names."""
+        given = init_settings, env_settings, *file_source(settings_cls)
+        return (*given, PresetSource(settings_cls))
+
+
+class AdaptCommand(CommandSettings, AdaptSettings):
+    """Adapt a world model of the paper's form to new tasks, from robot and human episodes.
+
+    Example:
+      dextouch train adapt --init runs/paper.safetensors --episodes runs/new --robot-episodes 200
+    """
+
+    model_config = service_config("world_model_adapt", "dextouch train adapt")
+
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
+
+
+class DistillCommand(CommandSettings, DistillSettings):
+    """Train a world model in the paper's form to sample in few steps, by self-forcing.
+
+    Example:
+      dextouch train distill --init runs/paper.safetensors --steps 1 --episodes runs/episodes
+    """
+
+    model_config = service_config("world_model_distill", "dextouch train distill")
+
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
+
+
+class TrainTokenizerCommand(CommandSettings, TrainTokenizerSettings):
+    """Train a tactile tokenizer on the touch of people and robots, for `--tokenizer`.
+
+    Example:
+      dextouch train tokenizer --episodes runs/episodes --output runs/split_hands.safetensors
+    """
+
+    model_config = service_config("world_model_train_tokenizer", "dextouch train tokenizer")
+
+    picture: Path | None = Field(
+        default=None, description="SVG to draw: held-out error and Contact-IoU over training steps"
+    )
+    beside: tuple[Path, ...] = Field(
+        default=(), description="files of other tokenizers to draw in the picture, too"
+    )
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)

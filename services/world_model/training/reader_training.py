@@ -1,0 +1,312 @@
+"""Training of start readers on single steps, with first images as other cameras take them."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dextouch.images import decode_jpeg, encode_jpeg
+from dextouch.schemas import MAX_OBJECTS
+from services.networks.optimizer import (
+    Budget,
+    OptimizerLoop,
+    OptimizerOptions,
+    half_cosine,
+    update_average,
+)
+from services.world_model.dynamics.features import DynamicsConfig, ObjectPoses
+from services.world_model.dynamics.start_reader import FirstStep, Reading, StartReader
+from services.world_model.dynamics.trees import combined
+from services.world_model.rendering.network import uses_bfloat16
+from services.world_model.settings import CoreSettings, ReaderSettings
+from services.world_model.training.scene_table import SceneTable
+
+# Metres that count as one in the errors of positions.
+UNIT_M = 0.05
+_BATCH_OF_READING = 128
+_WEIGHT_DECAY = 1e-3
+_SD_WEIGHT = 0.02
+_SIZE_WEIGHT, _UNIT_LOG = 0.3, 0.1
+# Of the first guess, which the correction starts from.
+_GUESS_WEIGHT = 0.5
+# Standard deviations of the logarithm of gain, of each channel's gain, of contrast and of gamma.
+_GAIN, _TINT, _CONTRAST, _GAMMA = 0.15, 0.08, 0.15, 0.15
+_MOST_NOISE = 0.03
+# Shifts of the image, of which the intrinsics know all but a remainder (standard deviation).
+_MOST_SHIFT_PX, _UNKNOWN_SHIFT_PX = 1.5, 0.15
+_JPEG_SHARE, _JPEG_QUALITY = 0.2, (25, 95)
+_PLAIN_SHARE = 0.15
+_WARMUP_STEPS = 100
+OnStep = Callable[[int, float], None]
+Network = TypeVar("Network", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class ReaderError:
+    """Errors on held-out steps, of present objects: median and 90 % quantile in mm."""
+
+    lateral_mm: float
+    lateral_90_mm: float
+    height_mm: float
+    axis_deg: float
+    presence: float
+
+
+def train_reader(
+    table: SceneTable,
+    config: DynamicsConfig,
+    settings: ReaderSettings,
+    *,
+    seed: int,
+    on_step: OnStep | None = None,
+    initial: StartReader | None = None,
+) -> StartReader:
+    """Train a reader of objects from single steps, both first and later ones.
+
+    Args:
+        table: training episodes; only labelled ones are used.
+        config: of the dynamics model.
+        settings: number of steps and so on.
+        seed: seed of weights and sampling.
+        on_step: called with the step and its loss.
+        initial: reader to start from; its weights are changed.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        reader = initial or StartReader(config)
+    _fit_heights(reader, table, config)
+    later = [step for step in table.image_steps if step % 4 == 0 and step > 0]
+    known = torch.nonzero(table.labelled)[:, 0]
+    is_told = _knows_some(table, config)
+    # Later steps of each episode, in their order; of further ones nothing is known, they have no
+    # image or lie behind its end.
+    reached = (torch.tensor(later) < table.length[:, None]) & table.shown[:, _places(table, later)]
+    reached &= is_told[:, later]
+    counts = reached.sum(1)
+    order = torch.argsort(~reached, dim=1, stable=True)
+
+    def loss() -> Tensor:
+        rows = table.drawn(known, settings.batch, generator)
+        drawn = torch.randint(len(later), rows.shape, generator=generator)
+        amid = torch.tensor(later)[order[rows, drawn % counts[rows].clamp_min(1)]]
+        is_first = torch.rand(rows.shape, generator=generator) < settings.first_fraction
+        is_first &= is_told[rows, 0]
+        steps = torch.where(is_first | (counts[rows] == 0), 0, amid)
+        return _loss(
+            reader,
+            (table, rows, steps),
+            generator,
+            bfloat16=uses_bfloat16(setting=settings.bfloat16),
+        )
+
+    return train_averaged(reader, loss, settings, weight_decay=_WEIGHT_DECAY, on_step=on_step)
+
+
+def _knows_some(table: SceneTable, config: DynamicsConfig) -> Bool[Tensor, "episodes steps"]:
+    """Steps at which the pose of an object is known; all of tasks without objects."""
+    count = torch.tensor(config.num_objects)[table.task]
+    is_slot = torch.arange(MAX_OBJECTS) < count[:, None]
+    return (table.objects_known & is_slot[:, None]).any(-1) | (count == 0)[:, None]
+
+
+def _places(table: SceneTable, steps: list[int]) -> list[int]:
+    """Indices of steps among those with images."""
+    return [table.image_steps.index(step) for step in steps]
+
+
+def _fit_heights(reader: StartReader, table: SceneTable, config: DynamicsConfig) -> None:
+    """Fit resting heights: medians over the first steps of each task's episodes."""
+    for task, count in enumerate(config.num_objects):
+        for slot in range(count):
+            first = table.objects.position_m[:, 0, slot, 2]
+            there = (table.task == task) & (table.objects.present[:, 0, slot] > 0) & table.labelled
+            there &= table.objects_known[:, 0, slot]
+            if there.any():
+                reader.height_mean[task, slot] = first[there].median()
+
+
+def _loss(
+    reader: StartReader,
+    places: tuple[SceneTable, Int64[Tensor, " batch"], Int64[Tensor, " batch"]],
+    generator: torch.Generator,
+    *,
+    bfloat16: bool,
+) -> Float32[Tensor, ""]:
+    table, rows, steps = places
+    first, true = table.first_steps(rows, steps), table.objects_at(rows, steps)
+    image, first = as_another_camera(first, generator)
+    guess, reading = reader.read(image, first, bfloat16=bfloat16)
+    size, known = table.size[rows], table.objects_known[rows, steps]
+    used = torch.arange(MAX_OBJECTS) < torch.tensor(reader.config.num_objects)[first.task][:, None]
+    used &= known
+    there = true.present * known
+    return _error(reading, true, size, used, there) + _GUESS_WEIGHT * _error(
+        guess, true, size, used, there
+    )
+
+
+def _error(
+    reading: Reading,
+    true: ObjectPoses,
+    size: Tensor,
+    used: Bool[Tensor, "batch objects"],
+    there: Float32[Tensor, "batch objects"],
+) -> Float32[Tensor, ""]:
+    """Errors of objects that are `there`, and of the presence of the slots that are `used`."""
+    predicted = reading.objects
+    position = functional.smooth_l1_loss(
+        predicted.position_m / UNIT_M, true.position_m / UNIT_M, beta=0.1, reduction="none"
+    ).sum(-1)
+    axes = (predicted.axes - true.axes).square().sum((-1, -2))
+    presence = functional.binary_cross_entropy(
+        predicted.present.clamp(1e-4, 1 - 1e-4), true.present, reduction="none"
+    )
+    # Of a Gaussian on both axes of the table; the position is not trained by it.
+    lateral_m = (predicted.position_m - true.position_m)[..., :2].detach().square().sum(-1)
+    surprise = 2 * reading.sd_m.log() + lateral_m / (2 * reading.sd_m.square())
+    # Squared: of an unclear size the mean is wanted, not the usual size, which most objects have.
+    grown = ((reading.size.log() - size.log()) / _UNIT_LOG).square().sum(-1)
+    each = position + axes + _SD_WEIGHT * surprise + _SIZE_WEIGHT * grown
+    return (each * there).sum() / there.sum().clamp_min(1.0) + 0.3 * (
+        presence * used
+    ).sum() / used.sum().clamp_min(1)
+
+
+@torch.no_grad()
+def read_step(reader: StartReader, table: SceneTable, step: int) -> Reading:
+    """What the reader makes of one step of every episode."""
+    parts: list[Reading] = [
+        reader(table.first_steps(rows, torch.full_like(rows, step)))
+        for rows in torch.split(torch.arange(len(table)), _BATCH_OF_READING)
+    ]
+    return combined(parts, torch.cat)
+
+
+def reader_errors(reader: StartReader, table: SceneTable, step: int) -> dict[str, ReaderError]:
+    """Errors by task at one step of held-out episodes; tasks without objects are omitted."""
+    predicted, errors = read_step(reader, table, step).objects, {}
+    rows = torch.arange(len(table))
+    true = table.objects_at(rows, step)
+    for index, task in enumerate(reader.config.tasks):
+        of_task = table.task == index
+        known = table.objects_known[:, step] & of_task[:, None]
+        there = (true.present > 0) & known
+        if not there.any():
+            continue
+        off_mm = 1e3 * (predicted.position_m - true.position_m)[there]
+        lateral = off_mm[:, :2].norm(dim=-1)
+        cosine = functional.normalize(predicted.axes[there][:, 0], dim=-1) * true.axes[there][:, 0]
+        used = (torch.arange(MAX_OBJECTS) < reader.config.num_objects[index]) & known
+        right = (predicted.present > 0.5) == (true.present > 0)
+        errors[task] = ReaderError(
+            lateral_mm=float(lateral.median()),
+            lateral_90_mm=float(lateral.quantile(0.9)),
+            height_mm=float(off_mm[:, 2].abs().median()),
+            axis_deg=float(torch.rad2deg(cosine.sum(-1).clamp(-1, 1).acos()).median()),
+            presence=float(right[used].float().mean()),
+        )
+    return errors
+
+
+def as_another_camera(
+    first: FirstStep, generator: torch.Generator
+) -> tuple[Float32[Tensor, "batch 3 px px"], FirstStep]:
+    """Images in 0 … 1 that other cameras might take, and steps with the intrinsics of these.
+
+    A share of the images stays as it is.
+    """
+    count, px = len(first.image), first.image.shape[1]
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn((count, *shape), generator=generator)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand((count, *shape), generator=generator)
+
+    plain = uniform() < _PLAIN_SHARE
+    original = first.image.permute(0, 3, 1, 2).float() / 255
+    shift_px = (2 * uniform(2) - 1) * _MOST_SHIFT_PX
+    image = _shifted(original, shift_px)
+    image = image * (_GAIN * normal(1, 1, 1) + _TINT * normal(3, 1, 1)).exp()
+    mean = image.mean((1, 2, 3), keepdim=True)
+    image = mean + (image - mean) * (_CONTRAST * normal(1, 1, 1)).exp()
+    image = image.clamp(0.0, 1.0).pow((_GAMMA * normal(1, 1, 1)).exp())
+    image = torch.lerp(image, _blurred(image), (2 * uniform(1, 1, 1) - 1).clamp_min(0.0))
+    image = image + normal(3, px, px) * _MOST_NOISE * uniform(1, 1, 1).square()
+    image = _compressed(image.clamp(0.0, 1.0), uniform(2).numpy())
+    K = first.K_head.clone()
+    K[:, :2, 2] += torch.where(plain[:, None], 0.0, shift_px + _UNKNOWN_SHIFT_PX * normal(2))
+    return torch.where(plain[:, None, None, None], original, image), replace(first, K_head=K)
+
+
+def _shifted(
+    image: Float32[Tensor, "batch 3 px px"], shift_px: Float32[Tensor, "batch 2"]
+) -> Float32[Tensor, "batch 3 px px"]:
+    """Content moved right and down, with repeated borders."""
+    count, px = len(image), image.shape[-1]
+    affine = torch.eye(2, 3).repeat(count, 1, 1)
+    affine[:, :, 2] = -2 * shift_px / px
+    grid = functional.affine_grid(affine, list(image.shape), align_corners=False)
+    return functional.grid_sample(image, grid, padding_mode="border", align_corners=False)
+
+
+def _blurred(image: Float32[Tensor, "batch 3 px px"]) -> Float32[Tensor, "batch 3 px px"]:
+    """A binomial kernel of three pixels."""
+    weights = torch.tensor([0.25, 0.5, 0.25])
+    kernel = (weights[:, None] * weights).expand(3, 1, 3, 3)
+    return functional.conv2d(
+        functional.pad(image, (1, 1, 1, 1), mode="replicate"), kernel, groups=3
+    )
+
+
+def _compressed(image: Float32[Tensor, "batch 3 px px"], draw: np.ndarray) -> Tensor:
+    """A share of the images after compression as JPEG."""
+    low, high = _JPEG_QUALITY
+    for index in np.flatnonzero(draw[:, 0] < _JPEG_SHARE):
+        pixels = (image[index].permute(1, 2, 0) * 255).round().byte().numpy()
+        quality = int(low + (high - low) * draw[index, 1])
+        decoded = decode_jpeg(encode_jpeg(pixels, quality=quality)).copy()
+        image[index] = torch.from_numpy(decoded).permute(2, 0, 1).float() / 255
+    return image
+
+
+def train_averaged(
+    network: Network,
+    loss: Callable[[], Tensor],
+    settings: ReaderSettings | CoreSettings,
+    *,
+    weight_decay: float,
+    on_step: OnStep | None = None,
+) -> Network:
+    """Train a network and return it with the moving average of its weights.
+
+    Args:
+        network: its weights are changed.
+        loss: loss of a fresh batch.
+        settings: number of steps, learning rate and decay of the average.
+        weight_decay: AdamW weight decay.
+        on_step: called with the step and its loss.
+    """
+    options = OptimizerOptions(
+        settings.learning_rate, weight_decay, warmup_steps=_WARMUP_STEPS, schedule=_to_a_hundredth
+    )
+    budget = Budget(max_steps=settings.num_steps)
+    averaged = copy.deepcopy(network)
+    for value in OptimizerLoop(network, options, budget).run(loss):
+        # Begins with a longer memory than that of a first update.
+        update_average(averaged, network, decay=settings.ema_decay, num_updates=budget.step)
+        if on_step is not None:
+            on_step(budget.step, value)
+    return averaged.eval()
+
+
+def _to_a_hundredth(share: float) -> float:
+    """Half a cosine from 1 down to 0.01."""
+    return 0.01 + 0.99 * half_cosine(share)
