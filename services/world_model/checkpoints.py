@@ -194,7 +194,8 @@ class StateMetadata(FrozenModel):
 
     `training_seeds` are the first and last seed of every task, of the scenes in `training_splits`
     (all splits if empty) but the share `heldout_share`, by hash; `training_scenes` are
-    `scene_digest` of those without a seed, which a station recorded. `object_sources` are the
+    `scene_digest` of those without a seed, which a station recorded. `task_splits` are the splits
+    by task, of tasks whose splits differ from `training_splits`. `object_sources` are the
     numbers of training episodes whose object poses are from the twin, markers, trackers or clicks,
     and of those without any ("none"). `sets` are the episodes by domain, those of the models that
     it started from included; files of older releases have none.
@@ -215,6 +216,7 @@ class StateMetadata(FrozenModel):
     num_training_episodes: int
     training_seeds: dict[str, tuple[int, int]]
     training_splits: tuple[Split, ...] = ()
+    task_splits: dict[str, tuple[Split, ...]] = Field(default={}, exclude_if=not_)
     heldout_share: float | None = Field(default=None, exclude_if=not_)
     training_scenes: tuple[str, ...] = Field(default=(), exclude_if=not_)
     data_hash: str
@@ -228,10 +230,14 @@ class StateMetadata(FrozenModel):
             return scene_digest(scene_of(about)) in self.training_scenes
         return self.may_have_seen(about.task, about.seed)
 
+    def splits_of(self, task: str) -> tuple[Split, ...]:
+        """Splits of a task's training scenes; none means all."""
+        return self.task_splits.get(task, self.training_splits)
+
     def may_have_seen(self, task: str, seed: int) -> bool:
         """Whether a scene of the twin may be one of the training scenes."""
         low, high = self.training_seeds.get(task, (0, -1))
-        splits = self.training_splits
+        splits = self.splits_of(task)
         is_heldout = scene_fraction(f"{task}/{seed}") < (self.heldout_share or 0.0)
         is_in_splits = not splits or split_of_scene(task, seed) in splits
         return low <= seed <= high and is_in_splits and not is_heldout

@@ -439,7 +439,23 @@ def trained_splits(settings: StateTrainSettings, base: Base | None) -> tuple[Spl
     """Splits that the run and its base were trained on; none means all."""
     if base is None:
         return settings.splits
-    known = base.checkpoint.metadata.training_splits
-    if not (settings.splits and known):
-        return ()
-    return tuple(split for split in SPLITS if split in {*settings.splits, *known})
+    return _together(settings.splits, base.checkpoint.metadata.training_splits)
+
+
+def splits_by_task(
+    episodes: Sequence[EpisodeGrid], settings: StateTrainSettings, base: Base | None
+) -> dict[str, tuple[Split, ...]]:
+    """Splits by task, where a run has other tasks or splits than its base; empty without a base."""
+    if base is None:
+        return {}
+    known, splits = base.checkpoint.metadata, settings.splits
+    found = {task: known.splits_of(task) for task in known.training_seeds}
+    for task in {episode.task for episode in episodes}:
+        found[task] = _together(splits, found[task]) if task in found else splits
+    usual = trained_splits(settings, base)
+    return {task: own for task, own in sorted(found.items()) if own != usual}
+
+
+def _together(some: tuple[Split, ...], others: tuple[Split, ...]) -> tuple[Split, ...]:
+    """Splits that are in either; none means all."""
+    return tuple(one for one in SPLITS if one in {*some, *others}) if some and others else ()

@@ -63,6 +63,7 @@ from services.world_model.training.state_data import (
     object_sources,
     recorded_scenes,
     seed_ranges,
+    splits_by_task,
     trained_splits,
 )
 from services.world_model.training.state_evaluation import StateFigures, evaluate_dynamics
@@ -176,6 +177,7 @@ def _metadata(
         num_training_episodes=len(data.training),
         training_seeds=seed_ranges(data.training, base),
         training_splits=trained_splits(settings, base),
+        task_splits=splits_by_task(data.training, settings, base),
         heldout_share=heldout_share(settings, base),
         training_scenes=recorded_scenes(data.training, base),
         data_hash=work.data_hash,

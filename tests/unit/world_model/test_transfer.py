@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from dextouch.episodes import split_of_scene
 from dextouch.errors import InvalidInputError
 from services.world_model.checkpoints import write_state_checkpoint
 from services.world_model.dynamics.core import direction_free_inputs
@@ -18,7 +19,7 @@ from services.world_model.training.core_training import (
 )
 from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_table import scene_table
-from services.world_model.training.state_data import seed_ranges, trained_splits
+from services.world_model.training.state_data import seed_ranges, splits_by_task, trained_splits
 from services.world_model.training.state_trainer import (
     _assembled,
     _keep,
@@ -142,6 +143,30 @@ def test_seeds_of_the_base_remain_known(base):
     known = known.model_copy(update={"training_splits": ("A",)})
     other.checkpoint = dataclasses.replace(base.checkpoint, metadata=known)
     assert trained_splits(settings, other) == ("A", "C")
+
+
+def test_splits_of_a_new_task_are_those_of_its_own_training(base):
+    def after(seeds, **changes):
+        known = base.checkpoint.metadata.model_copy(update={"training_seeds": seeds, **changes})
+        other = Base(base._path)
+        other.checkpoint = dataclasses.replace(base.checkpoint, metadata=known)
+        found = splits_by_task([episode(20)], settings, other)
+        usual = trained_splits(settings, other)
+        changes = {"task_splits": found, "training_splits": usual, "heldout_share": None}
+        return known.model_copy(update=changes | {"training_seeds": {**seeds, "press": (0, 99)}})
+
+    settings = StateTrainSettings(episodes=("takes",), splits=("A", "B"))
+    assert splits_by_task([episode(20)], settings, None) == {}
+    # The base was trained on all splits of another task.
+    new = after({"push": (0, 99)})
+    assert (new.splits_of("press"), new.splits_of("push")) == (("A", "B"), ())
+    seen = [new.may_have_seen("press", seed) for seed in range(100)]
+    assert seen == [split_of_scene("press", seed) != "C" for seed in range(100)]
+    assert all(new.may_have_seen("push", seed) for seed in range(100))
+    # What it had seen of the same task counts, too.
+    assert after({"press": (0, 9)}).splits_of("press") == ()
+    again = after({"press": (0, 9)}, task_splits={"press": ("C",)}, training_splits=("A",))
+    assert again.splits_of("press") == ("A", "B", "C")
 
 
 def test_the_estimate_alone_is_trained_from_what_a_reader_reads(base, table):
