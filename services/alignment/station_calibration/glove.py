@@ -92,7 +92,16 @@ class PressRow(BaseModel):
         return {n: v for n, v in given.items() if n not in weight} | {"pressure_kpa": pressure_kpa}
 
     def known_to(self, relative_sigma: float) -> "PressRow":
-        """The row with a sigma; without one of its own, a share of the pressure."""
+        """The row with a sigma; without one of its own, a share of the pressure.
+
+        Raises:
+            InvalidInputError: a negative or infinite share.
+        """
+        if not 0 <= relative_sigma < math.inf:
+            raise InvalidInputError(
+                f"pressure sigma: got {relative_sigma:g}, expected a share of the pressure, 0 or "
+                "more, such as 0.02"
+            )
         if self.sigma_kpa is not None:
             return self
         return self.model_copy(update={"sigma_kpa": relative_sigma * self.pressure_kpa})

@@ -286,3 +286,9 @@ def test_a_station_starts_before_its_gloves_are_calibrated(bench):
     assert LiveView(drivers, tare)._gloves == {}
     with pytest.raises(NotFoundError, match=r"tactile_left_gain.*got 3 numbers"):
         LiveView(drivers, tare | {"tactile_left_gain_counts_per_kpa": ((1.0,) * 3,)})
+
+
+@pytest.mark.parametrize("share", [-0.02, float("nan"), float("inf")])
+def test_a_share_that_is_no_sigma_is_refused(share):
+    with pytest.raises(InvalidInputError, match="pressure sigma: got"):
+        glove.PressRow(take="press", pressure_kpa=10).known_to(share)
