@@ -35,7 +35,6 @@ from services.evaluation.recorded_takes import REPLAY, read_takes, score_lines, 
 from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines.imagined_data import WORLD, refuse_trained_episodes, served_world
 from services.pipelines.parsers import prediction_parser, recorded_parser
-from services.pipelines.twin_geometry import TwinGeometry
 from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.world import open_world
 
@@ -71,6 +70,9 @@ def prediction_main(arguments: Sequence[str]) -> int:
     for horizon in [options.horizon] if options.horizon else _HORIZONS:
         scenes = [scene for one in wanted for scene in _HORIZONS[horizon](store.open(one))]
         if set(chosen) & set(GEOMETRY):
+            # Replaying recorded takes, in this module, too, needs no twin.
+            from services.pipelines.twin_geometry import TwinGeometry
+
             geometry = TwinGeometry()
             scenes = [geometry.added_to(one, store.open(one.episode_id)) for one in scenes]
         found = measure_prediction(world, scenes, metrics=measured, baselines=options.baselines)

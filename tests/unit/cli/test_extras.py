@@ -143,6 +143,15 @@ def test_commands_name_the_extra_that_is_missing(tmp_path, installed, refused):
         assert "--without world_model" in answers["up"][1]
 
 
+def test_recorded_takes_are_replayed_without_the_twin(tmp_path):
+    absent = [package for package, extra in EXTRA_OF.items() if extra == "twin"]
+    line = "evaluate recorded --episodes nothing"
+    status, err = run_without(tmp_path, absent, line)[line]
+    assert status != 0
+    assert "nothing" in err
+    assert not NAMED.search(err), err
+
+
 def test_extras_bring_what_is_said_of_them():
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     extras = tomllib.loads(text)["project"]["optional-dependencies"]
