@@ -262,6 +262,8 @@ def test_bad_views_are_named():
     mirrored[:, :3, 0] *= -1
     with pytest.raises(InvalidInputError, match="rigid"):
         solve_hand_eye(mirrored, scene.Ts_camera_board)
+    with pytest.raises(InvalidInputError, match="pixel_px"):
+        HandEyeNoise(pixel_px=0.0)
 
 
 @pytest.mark.skipif(not RECORDED_POSES.is_file(), reason="no recordings in ../shared/data")

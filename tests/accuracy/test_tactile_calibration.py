@@ -249,6 +249,10 @@ def test_weak_saturated_bent_and_missing_presses_are_refused():
     coming = np.concatenate([glove.take(0.0, 300), glove.take(20.0, 300)])
     with pytest.raises(InvalidInputError, match="changed while it lay"):
         calibrate_glove(tare, [TaxelPress(20.0, 0.1, coming, EVERYWHERE)])
+    with pytest.raises(InvalidInputError, match="expected above 0"):
+        TaxelPress(0.0, 0.1, glove.take(0.0), EVERYWHERE)
+    with pytest.raises(NonFiniteError):
+        TaxelPress(np.nan, 0.1, glove.take(0.0), EVERYWHERE)
     with pytest.raises(UnknownNameError, match="palm"):
         pad_taxels("toe")
 

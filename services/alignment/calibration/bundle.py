@@ -57,6 +57,11 @@ class TrackerNoise:
     tracker_rotation_rad: float = 8.7e-4
     tracker_translation_m: float = 5e-4
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value > 0):
+                raise InvalidInputError(f"expected noise {name}: got {value}, expected above zero")
+
 
 @dataclass(frozen=True)
 class PoseEstimate:

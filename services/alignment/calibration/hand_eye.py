@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert
 from services.alignment.calibration.bundle import (
     Bundle,
@@ -43,6 +43,7 @@ from services.alignment.calibration.motion import (
 
 TASK = "hand-eye"
 BASE_TASK = "robot base"
+MIN_CORNERS = 4
 # Expected of a robot that reports its pose: rotation (rad) and translation (m), an axis.
 ROBOT_SIGMA = (3e-4, 2e-4)
 # Where the tracker's place is given, the effector must at least move so far in two directions.
@@ -96,6 +97,28 @@ class BoardViews:
     pixels_px: Sequence[np.ndarray]
     K: Float64[np.ndarray, "3 3"]
     distortion: Float64[np.ndarray, "5"]
+
+    def __post_init__(self) -> None:
+        if len(self.points_board) != len(self.pixels_px) or not self.points_board:
+            raise ShapeError(
+                f"board views: got {len(self.points_board)} and {len(self.pixels_px)} views, "
+                "expected the same number of both, at least one"
+            )
+        for index, (points, pixels) in enumerate(
+            zip(self.points_board, self.pixels_px, strict=True)
+        ):
+            if points.shape != (len(points), 3) or pixels.shape != (len(points), 2):
+                raise ShapeError(
+                    f"board view {index}: got {points.shape} and {pixels.shape}, expected [k, 3] "
+                    "corners in metres and their [k, 2] pixels"
+                )
+            if len(points) < MIN_CORNERS:
+                raise InvalidInputError(
+                    f"board view {index}: got {len(points)} corners, expected at least "
+                    f"{MIN_CORNERS}; leave the view out"
+                )
+            if not (np.isfinite(points).all() and np.isfinite(pixels).all()):
+                raise NonFiniteError(f"board view {index}: NaN or infinity among the corners")
 
     def only(self, views: np.ndarray) -> "BoardViews":
         """A subset of the views."""

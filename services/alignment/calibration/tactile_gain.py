@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.errors import InvalidInputError, NonFiniteError, UnknownNameError
 from dextouch.tactile.layout import (
     FINGERS,
     NUM_RAW_TAXELS,
@@ -69,12 +69,25 @@ class TaxelPress:
         sigma_kpa: one standard deviation of it, 0 or more.
         counts: [T ≥ 60, 360] raw readings during the press.
         taxels: which taxels (anatomical order) were pressed.
+
+    Raises:
+        InvalidInputError: a pressure that is not above 0, or no taxel.
+        NonFiniteError: NaN or infinity in the pressure.
     """
 
     pressure_kpa: float
     sigma_kpa: float
     counts: np.ndarray
     taxels: Bool[np.ndarray, "320"]
+
+    def __post_init__(self) -> None:
+        if not np.isfinite([self.pressure_kpa, self.sigma_kpa]).all():
+            raise NonFiniteError("press: pressure or sigma is not finite")
+        if self.pressure_kpa <= 0 or self.sigma_kpa < 0 or not self.taxels.any():
+            raise InvalidInputError(
+                f"press: got {self.pressure_kpa:g} ± {self.sigma_kpa:g} kPa on "
+                f"{int(self.taxels.sum())} taxels, expected above 0 on at least one"
+            )
 
 
 @dataclass(frozen=True)
@@ -137,7 +150,10 @@ class GloveCalibration:
 
 
 def calibrate_glove(
-    tare: TaxelTare, presses: Sequence[TaxelPress], *, full_scale_counts: float = FULL_SCALE_COUNTS
+    tare: TaxelTare,
+    presses: Sequence[TaxelPress],
+    *,
+    full_scale_counts: float = FULL_SCALE_COUNTS,
 ) -> GloveCalibration:
     """Gain and fault map of a glove, beside its tare; without presses the tare alone.
 
@@ -196,7 +212,10 @@ def pad_taxels(names: str) -> Bool[np.ndarray, "320"]:
 
 
 def fit_gain(
-    tare: TaxelTare, presses: Sequence[TaxelPress], *, full_scale_counts: float = FULL_SCALE_COUNTS
+    tare: TaxelTare,
+    presses: Sequence[TaxelPress],
+    *,
+    full_scale_counts: float = FULL_SCALE_COUNTS,
 ) -> TaxelGain:
     """Weighted straight line of counts over pressure through each taxel's tare.
 

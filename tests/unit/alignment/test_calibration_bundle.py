@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import approx_fprime, least_squares
 
 from benchmarks.simulated.board_scenes import DISTORTION, K, Motion, board_points, make_scene
-from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector, vector_from_rotation
 from services.alignment.calibration.bundle import (
@@ -182,6 +182,23 @@ def test_views_without_spread_stay_near_what_was_declared():
     J = np.random.default_rng(7).normal(size=(10, 6, 12))
     (sigma,) = estimate_sigmas(np.zeros((10, 6)), J, [Component(1.0, shapes)])
     assert 0 < sigma < 1
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        (lambda points, pixels: (points[:3], pixels[:3]), InvalidInputError),
+        (lambda points, pixels: (points, pixels[:-1]), ShapeError),
+        (lambda points, pixels: (points, pixels * np.nan), NonFiniteError),
+    ],
+)
+def test_corners_that_do_not_fit_are_refused(change, error):
+    views = make_scene(0, Motion(num_views=4)).views
+    points, pixels = change(views.points_board[1], views.pixels_px[1])
+    with pytest.raises(error, match="board view 1"):
+        BoardViews([views.points_board[0], points], [views.pixels_px[0], pixels], K, DISTORTION)
+    with pytest.raises(ShapeError, match="same number"):
+        BoardViews(views.points_board, views.pixels_px[:2], K, DISTORTION)
 
 
 def test_corners_must_be_given_for_every_pose():
