@@ -34,7 +34,7 @@ demo: $(VENV)/.runtime   ## record, align, predict and evaluate on this machine
 	$(BIN)/dextouch demo
 
 # Bytecode is cached, since tests start many processes that would otherwise each compile all modules.
-test: $(VENV)/.dev       ## the default test run (eight to thirty minutes on two cores)
+test: $(VENV)/.dev       ## the default test run (about half an hour on two slow cores)
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n logical --dist loadfile
 
 screens: $(VENV)/.dev    ## pictures of every screen of the dashboard in build/screens, at 1366 and 1920 px, light and dark

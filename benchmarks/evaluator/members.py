@@ -1,10 +1,8 @@
 """The networks of each training seed, opened once in a process."""
 
-import hashlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from benchmarks.direct_judge import DirectJudge
@@ -12,6 +10,7 @@ from benchmarks.evaluator.plan import Trained
 from dextouch.errors import InvalidInputError
 from dextouch.worlds import BatchWorld
 from services.evaluation.success_classifier import SuccessClassifier
+from services.networks.weight_files import digest_of
 from services.world_model.world import open_world
 
 
@@ -50,20 +49,15 @@ def open_members(trained: tuple[Trained, ...]) -> tuple[Member, ...]:
     found = []
     for one in trained:
         world: BatchWorld[Any] = worlds(one.world)
-        about = {"world": world.description.digest, "judge": file_digest(one.probe)}
+        about = {"world": world.description.digest, "judge": digest_of(one.probe)}
         if one.direct is not None:
-            about["direct judge"] = file_digest(one.direct)
+            about["direct judge"] = digest_of(one.direct)
         direct = None if one.direct is None else directs(one.direct)
         untouched: BatchWorld[Any] | None = None if one.untouched is None else worlds(one.untouched)
         if untouched is not None:
             about["world without touch"] = untouched.description.digest
         found.append(Member(about, world, probes(one.probe), direct, untouched))
     return tuple(found)
-
-
-def file_digest(path: Path) -> str:
-    """sha256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def refuse_unequal_rivals(members: Sequence[Member]) -> None:
