@@ -14,7 +14,7 @@ SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
 SCREENS ?= build/screens
-.PHONY: demo test check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
+.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-ray wheel-test vendor release \
 	reproduce reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -34,8 +34,11 @@ demo: $(VENV)/.runtime   ## record, align, predict and evaluate on this machine
 	$(BIN)/dextouch demo
 
 # Bytecode is cached, since tests start many processes that would otherwise each compile all modules.
-test: $(VENV)/.dev       ## the default test run (about half an hour on two slow cores)
+test: $(VENV)/.dev       ## the default test run
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n logical --dist loadfile
+
+test-long: $(VENV)/.dev  ## whole services, pages, trainings and benchmarks in small
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -m "long and not slow" -n logical --dist loadfile
 
 screens: $(VENV)/.dev    ## pictures of every screen of the dashboard in build/screens, at 1366 and 1920 px, light and dark
 	mkdir -p $(SCREENS)

@@ -122,14 +122,14 @@ def _starts(task: str, seeds: Iterable[int]) -> list[_Start]:
         stage.start(stage.plan(seed))
         Ts = transform_from_pose(simulation.object_poses())
         listed = zip(simulation.scene.object_names, boxes_m, Ts, strict=True)
-        objects = tuple(_described(name, box_m, T) for name, box_m, T in listed)
+        objects = tuple(described(name, box_m, T) for name, box_m, T in listed)
         K = stage.rig.K[HEAD_CAMERA]
         T_camera = stage.rig.pose(simulation, HEAD_CAMERA)
         starts.append(_Start(task, objects, Ts, T_camera, K[1, 1] / (2 * K[1, 2])))
     return starts
 
 
-def _described(
+def described(
     name: str, box_m: Float64[np.ndarray, "6"], T: Float64[np.ndarray, "4 4"]
 ) -> SceneObject:
     """An object as a person would describe it who sees how it stands."""

@@ -1,4 +1,4 @@
-"""The benchmark stage `objects`: poses of objects from markers and clicks, against the twin's."""
+"""The benchmark stage `objects`: poses from markers, clicks and touch, against the twin's."""
 
 import argparse
 import time
@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.figures import Requirement
 from benchmarks.machine import describe_machine
 from benchmarks.object_clicks import ClickErrors, click_errors
+from benchmarks.object_touch import TouchErrors, touch_errors
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
@@ -32,6 +33,8 @@ from services.twin.tasks import EVALUATED, named_tasks
 
 PACKAGES: Final = ("numpy", "opencv-contrib-python-headless", "mujoco")
 FIRST_SEED, NUM_TAKES = 46_000, 4
+# Takes without images are cheap: so many for one with them.
+TAKES_OF_TOUCH: Final = 8
 SIDES_PX: Final = (320, 480)
 NUM_STEPS: Final = 81
 # Every so many steps of a take an image is taken.
@@ -102,12 +105,14 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                             found.setdefault(key, []).append(_errors(take, images, track))
                     step(f"{task} {seed}")
     clicked = click_errors(tasks, range(FIRST_SEED, FIRST_SEED + count))
+    touched = touch_errors(tasks, range(FIRST_SEED, FIRST_SEED + TAKES_OF_TOUCH * count))
     best, exact, usual = found[sides_px[-1], LOOKS[0], OURS], clicked[480, 0], clicked[480, 3]
+    offs = {f"{task} {name}": float(np.median(e.off_mm)) for (task, name), e in touched.items()}
     return StageReport(
         stage="objects",
         machine=describe_machine(PACKAGES),
         options={"takes": count, "tasks": ", ".join(tasks)},
-        tables=[_table(found), _click_table(clicked)],
+        tables=[_table(found), _click_table(clicked), _touch_table(touched)],
         panels=[],
         requirements=[
             Requirement("median error, sharp (mm)", _of(best, "off_mm", 0.5), "at most", 1.0),
@@ -120,6 +125,10 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             ),
             Requirement("95 % error of exact clicks (mm)", exact.off(0.95), "at most", 1.0),
             Requirement("median error of clicks, 3 px of 480 (mm)", usual.off(0.5), "at most", 8.0),
+            *(
+                Requirement(f"median error of touch, {name} (mm)", value, "at most", 12.0)
+                for name, value in offs.items()
+            ),
         ],
         data={
             f"clicks, {noise_px} px of {side_px}": {
@@ -285,3 +294,26 @@ def _click_table(clicked: Mapping[tuple[int, int], ClickErrors]) -> ResultTable:
         "refused",
     )
     return ResultTable("Poses of objects from clicks; errors: median / 95 %", columns, rows)
+
+
+def _touch_table(touched: Mapping[tuple[str, str], TouchErrors]) -> ResultTable:
+    rows = []
+    for (task, name), one in touched.items():
+        turned = one.turned_deg
+        rows.append(
+            (
+                f"{task}, {name}",
+                f"{one.share:.2f}",
+                _middle_and_most(one.off_mm),
+                _middle_and_most(one.first_mm),
+                "symmetric" if np.isnan(turned).all() else _middle_and_most(turned),
+                _middle_and_most(one.end_mm),
+            )
+        )
+    columns = ("object", "clear hold", "on the table (mm)", "first contact (mm)", "turn (deg)",
+               "at the end (mm)")  # fmt: skip
+    return ResultTable("Poses of objects from touch; errors: median / 95 %", columns, rows)
+
+
+def _middle_and_most(values: Float64[np.ndarray, " n"]) -> str:
+    return f"{np.quantile(values, 0.5):.1f} / {np.quantile(values, 0.95):.1f}"

@@ -23,6 +23,9 @@ settings.register_profile("steady", derandomize=True, deadline=None)
 settings.load_profile("steady")
 
 ROOT = Path(__file__).parents[1]
+# Whole services, pages and benchmarks: all of their tests take seconds.
+LONG_FOLDERS = frozenset({"benchmarks", "browser", "integration", "system"})
+OTHER_MARKS = ("slow", "gpu", "hardware", "vm", "containers")
 
 
 def pytest_xdist_auto_num_workers() -> int:
@@ -34,6 +37,13 @@ def pytest_runtest_setup() -> None:
     """Each test checks the shapes of its own first calls."""
     if CHECKS_SHAPES:
         shape_checks.begin_test()
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Tests of `LONG_FOLDERS` are long, but for those that have a mark of their own."""
+    is_in_folder = item.path.relative_to(ROOT / "tests").parts[0] in LONG_FOLDERS
+    if is_in_folder and not any(item.get_closest_marker(name) for name in OTHER_MARKS):
+        item.add_marker("long")
 
 
 def pytest_collection_finish() -> None:

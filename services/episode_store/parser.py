@@ -43,7 +43,7 @@ def store_parser() -> argparse.ArgumentParser:
     show = _command(commands, kind, "show", "show attributes and streams of an item", "take-7")
     show.add_argument("id", metavar="ID", help="of an episode or recording")
     _add_ids(_command(commands, kind, "verify", "verify all checksums and list damage"))
-    does = "check clicks on objects and list the places that they give"
+    does = "check clicks on objects and list the places that they and touch give"
     clicked = _command(commands, shared, "clicks", does, "--clicks objects.json --json clicks.json")
     clicked.add_argument(
         "--clicks",

@@ -125,8 +125,8 @@ class StateTrainSettings(DataSettings):
     tasks: Tasks = ()
     clicks: Path | None = Field(
         default=None,
-        description="JSON file of the tasks' objects, with clicks on them or without: clicks that "
-        "the dashboard stored are used, too (docs/objects.md)",
+        description="JSON file of the tasks' objects: how hands touch them, and clicks on them, "
+        "beside those that the dashboard stored (docs/objects.md)",
     )
     output: Path = Field(
         default=Path("runs/world_model/state.safetensors"), description="checkpoint to write"

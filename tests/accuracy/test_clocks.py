@@ -66,6 +66,7 @@ def test_error_against_truth(name, capsys):
     assert all(s.recovery_s is None or s.recovery_s <= 1.2 for s in online)
 
 
+@pytest.mark.long
 def test_every_take_recovers_from_a_step(capsys):
     """Samples alone would not do: in some takes all those of the first 1.2 s wait too long."""
     recoveries_s, least_ms = [], []
@@ -104,6 +105,7 @@ def test_stalls_are_no_steps(stall_s, step_ms):
     assert fit_clock(stalled.t_device_ns, host_ns).num_steps == (step_ms != 0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", STAMPLESS_SCENES)
 def test_samples_without_stamps_are_counted(name, capsys):
     scene = STAMPLESS_SCENES[name]

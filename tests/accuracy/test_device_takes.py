@@ -21,6 +21,8 @@ from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 
+pytestmark = pytest.mark.long
+
 SIDES = ("left", "right")
 OPTIONS = TakeOptions(images=("camera_head",))
 TRAINING = TakeOptions(images=("camera_head",), image_every=4, streams="training")

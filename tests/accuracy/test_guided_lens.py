@@ -78,6 +78,7 @@ def focal_error(views):
     return float(np.abs(np.diag(found.K)[:2] / FOCAL_PX - 1).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise_px", [0.05, 0.1, 0.2])
 def test_done_means_that_the_focal_length_is_right(noise_px, capsys):
     """Two of the views have a wrong corner; then the operator tilts the board, near, as asked."""
@@ -102,6 +103,7 @@ def test_done_means_that_the_focal_length_is_right(noise_px, capsys):
     assert max(errors) < BOUND
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("num_views", "options"),
     [
@@ -118,6 +120,7 @@ def test_views_that_leave_the_focal_length_open_are_not_done(num_views, options)
     assert guided(views) is None
 
 
+@pytest.mark.long
 def test_what_scatters_beyond_the_bound_is_never_done():
     """Sets of few and noisy views: of those that are wrong by more than the bound, all go on."""
     rng = np.random.default_rng(11)

@@ -164,6 +164,7 @@ def test_missing_axes_are_those_the_tracker_was_not_turned_about(axis, possible)
     assert refusal.value.details["missing_axes"] in possible
 
 
+@pytest.mark.long
 def test_healthy_motion_is_never_refused():
     motions = (Motion(), Motion(num_views=10), Motion(tilt_deg=22.0, sideways_m=0.05))
     for seed in range(50):
@@ -206,6 +207,7 @@ def test_an_inverted_side_is_named():
             assert refusal.value.details["inverted"] == name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [0.95, 0.975, 1.025, 1.05, 25.0 / 28.0, 1e-3, 1e3])
 @pytest.mark.parametrize("with_corners", [True, False])
 def test_a_board_of_another_size_than_was_entered_is_named(scale, with_corners):

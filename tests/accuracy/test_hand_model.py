@@ -29,6 +29,7 @@ def tip_sites(model):
     return [model.site(index).name for index in range(model.nsite)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("side", SIDES)
 def test_wuji_tables_agree_with_the_makers_model(side, capsys):
     hand = RobotHand(side)

@@ -178,6 +178,7 @@ def simulated(seed, num_views):
     )
 
 
+@pytest.mark.long
 def test_simulated_cameras_spread_as_their_sigmas_say(capsys):
     rows, columns = [0, 1, 0, 1], [0, 1, 2, 2]
     all_found = [calibrate_found(simulated(seed, 25)) for seed in range(20)]

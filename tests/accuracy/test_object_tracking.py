@@ -13,6 +13,8 @@ from services.pipelines.training_data import marked_stage
 from services.twin.episodes import record
 from services.twin.take_options import TakeOptions
 
+pytestmark = pytest.mark.long
+
 LEAN = TakeOptions(images=("camera_head",), image_every=4, streams="training")
 TASK, SEED = "stack_bowls", 2
 

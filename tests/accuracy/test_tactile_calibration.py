@@ -136,6 +136,7 @@ def test_rounding_error_is_that_of_rounded_readings(noise):
     assert abs(rms - predicted) <= 0.25 * predicted + 1.5 * sampling
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_gain_is_found_as_well_as_its_sigma_says(side, capsys):
     errors, ratios = [], []
@@ -294,6 +295,7 @@ def constant_touch(kpa, seconds=1.5):
     return ReplayStream(descriptor, t_ns, np.full((num, NUM_TAXELS), kpa, dtype=np.float32))
 
 
+@pytest.mark.long
 def test_a_recorded_mock_glove_is_calibrated_and_its_next_take_carries_it(tmp_path, capsys):
     """Real packets with losses and bit errors, the recorder, the spool, the command, and back."""
     cell = int(raw_indices(side="left")[100])

@@ -136,6 +136,7 @@ def taps(seed, *, num=8, speed_m_per_s=0.4):
     return (stamps[0], pressure, stamps[1], height), offset_s
 
 
+@pytest.mark.long
 def test_taps_are_the_fallback(capsys):
     errors_ms, ratios = [], []
     for seed in range(6):

@@ -42,6 +42,7 @@ def say(takes):
     return errors
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", TASKS)
 def test_a_retargeted_take_succeeds(task, capsys):
     (take,) = close_take(task, SEEDS[0], [OURS])

@@ -32,6 +32,7 @@ def cells():
         yield pytest.param(task, domain, marks=marks, id=f"{domain}-{task}")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("task", "domain"), list(cells()))
 def test_success_falls_with_noise(task, domain, capsys):
     stage = Stage(task, domain, TwinSettings())

@@ -51,6 +51,7 @@ CASES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_wrist_frames_are_found_and_their_sigma_is_honest(name, capsys):
     make, is_other, noise_m, hide, bounds_deg = CASES[name]

@@ -23,7 +23,7 @@ def bar(*_):
 def test_a_quick_run_compares_both_designs(tmp_path):
     chosen = options("--quick", "--tasks", "stand_bottle")
     report = objects.measure(chosen, tmp_path, bar)
-    table, clicked = report.tables
+    table, clicked, touched = report.tables
     assert [row[1] for row in table.rows] == [objects.OURS, objects.USUAL] * len(objects.LOOKS)
     sharp = [
         report.data[f"{objects.SIDES_PX[0]} px, sharp, {design}"] for design in objects.DESIGNS
@@ -31,6 +31,9 @@ def test_a_quick_run_compares_both_designs(tmp_path):
     ours, usual = (one["off_mm"] for one in sharp)
     assert ours < 2.5 < usual
     assert len(clicked.rows) == 12
+    ((name, _, ours_mm, first_mm, *_),) = touched.rows
+    assert name == "stand_bottle, bottle"
+    assert 2.0 * float(ours_mm.split()[0]) < float(first_mm.split()[0])
     # The camera looks down at 46°, from 0.75 m, with a focal length of 1.18 images: a click of sd
     # 1 px is off by 0.75 m / (1.18 · 480) across, and more along the view; medians of both.
     across_mm = 750 / (1.18 * 480)

@@ -244,6 +244,7 @@ def test_the_document_says_which_scope(keyed):
             assert paths[path][method.lower()]["security"] == [{"api_key": [needed]}], operation
 
 
+@pytest.mark.long
 async def test_only_the_key_with_the_scope_is_let_in(keyed):
     service, app = keyed
     async with client_of(app) as client:
@@ -345,6 +346,7 @@ async def test_only_operators_sign_in(page, scope):
         assert ("set-cookie" in answer.headers) is (scope == "operate")
 
 
+@pytest.mark.long
 async def test_the_dashboard_and_what_it_forwards_need_a_session(unlimited, page, upstreams):
     routes, _ = kinds_of(page)
     assert "WEBSOCKET /v1/live" in routes
@@ -366,6 +368,7 @@ OF_ADMINISTRATORS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scopes", [("operate",), ("operate", "enrol")])
 async def test_operators_reach_their_routes_until_they_sign_out(tmp_path, upstreams, scopes):
     key = ApiKey(name="someone", key=key_of("operate"), scopes=scopes)

@@ -259,6 +259,7 @@ def test_what_is_sent_comes_once_in_order_and_alike_in_all_streams(subject):
             assert sample.values.dtype == descriptor.numpy_dtype()
 
 
+@pytest.mark.long
 def test_nothing_comes_of_nothing(subject):
     subject.driver.open()
     assert subject.driver.read() == {}

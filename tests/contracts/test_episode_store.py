@@ -139,6 +139,7 @@ def test_everything_comes_back_equal(made, place, reference):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("start", "num_steps"), [(0, 17), (4, 17), (20, 1)])
 def test_windows(made, place, reference, start, num_steps):
     made.write(place.store)
@@ -264,6 +265,7 @@ def test_a_sweep_removes_what_a_dead_writer_left_and_nothing_else(store, place):
     assert store.sweep() == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "damage",
     [
@@ -314,6 +316,7 @@ def test_a_groups_size_is_that_of_its_files(place, made):
         place.store.num_bytes("nobody")
 
 
+@pytest.mark.long
 def test_a_review_stays_beside_the_content(place, made):
     made.write(place.store)
     assert place.store.review(EPISODE) is None

@@ -44,6 +44,7 @@ def test_every_service_of_the_project_is_here():
     assert set(UP) == set(BUILDERS)
 
 
+@pytest.mark.long
 def test_applications_are_built_in_one_place():
     built_in = {
         path.relative_to(ROOT).as_posix()
@@ -122,6 +123,7 @@ FOREIGN = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("headers", "status", "says"), FOREIGN)
 async def test_pages_of_other_origins_cannot_act(make_app, headers, status, says):
     app = make_app()

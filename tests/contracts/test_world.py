@@ -254,6 +254,7 @@ def test_a_step_is_pure(world, started):
     np.testing.assert_array_equal(chunk, kept)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("steps", ["all", "last"])
 @pytest.mark.parametrize("num_cameras", [None, 0, 1])
 def test_a_selector_changes_what_is_shown_and_nothing_else(world, started, steps, num_cameras):

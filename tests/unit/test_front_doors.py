@@ -148,6 +148,7 @@ def test_doors_and_what_is_behind_ones_own_are_open(line, importer):
     assert not offences(line, importer)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("folder", ["services", "benchmarks", "shared"])
 def test_code_enters_packages_through_their_doors(folder):
     found = {}
@@ -171,6 +172,7 @@ def test_pages_enter_packages_through_their_doors():
     assert not wrong, f"import these from their packages: {wrong}"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("line", "unwanted"),
     [

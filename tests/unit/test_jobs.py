@@ -43,6 +43,7 @@ def is_running(pid):
     return state != "Z"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_workers_end_with_a_parent_that_is_killed(tmp_path, number):
     script = tmp_path / "parent.py"
@@ -115,6 +116,7 @@ def test_a_bug_ends_the_run(num_processes):
         list(run_jobs(broken, range(3), Workers(num_processes)))
 
 
+@pytest.mark.long
 def test_a_job_whose_worker_is_killed_is_repeated_and_others_are_not(tmp_path):
     names = ["a", "once-1", "b", "always", "c", "once-2", "d"]
     jobs = list(run_jobs(end_the_first_time, [(str(tmp_path), n) for n in names], Workers(2)))

@@ -55,6 +55,7 @@ def url(tmp_path_factory):
     return os.fspath(store.root)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", LEARNERS)
 def test_rejected_imagined_and_unknown_episodes_are_left_out_by_all(url, name):
     found = {episode.episode_id for episode in LEARNERS[name](url)}

@@ -4,6 +4,8 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 # "A folder of photos in; their names and grey pixels out." "Bytes come in, samples go out."
 FORMULA = re.compile(
@@ -27,6 +29,7 @@ def test_the_formula_is_recognized():
     assert not has_formula('"""Clock models.\n\nSamples come in, times go out."""')
 
 
+@pytest.mark.long
 def test_module_sentences_say_what_a_module_is():
     folders = ("shared", "services", "benchmarks")
     modules = sorted(path for folder in folders for path in ROOT.glob(f"{folder}/**/*.py"))

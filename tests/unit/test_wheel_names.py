@@ -49,6 +49,7 @@ def test_an_expression_with_the_package_is_refused():
         hatch_build.installed_source("import services.twin\nservices.twin.main()\n")
 
 
+@pytest.mark.long
 def test_every_file_has_a_name_of_the_wheel(tmp_path):
     hatch_build.write_installed(ROOT / "services", tmp_path / "dextouch_services")
     for path in tmp_path.rglob("*.py"):

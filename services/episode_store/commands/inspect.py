@@ -1,4 +1,4 @@
-"""Commands that look into a store: `list`, `show`, `verify`, and `clicks` on objects."""
+"""Commands that look into a store: `list`, `show`, `verify`, and `clicks`: where objects stand."""
 
 import importlib.util
 import sys
@@ -14,6 +14,7 @@ import numpy as np
 from dextouch.episodes import (
     KINDS,
     ClickedPoses,
+    EpisodeGrid,
     EpisodeReader,
     GroupFiles,
     Kind,
@@ -22,6 +23,7 @@ from dextouch.episodes import (
     clicked_poses,
     shard_path,
     stream_arrays,
+    touched_objects,
 )
 from dextouch.episodes.care import (
     Finding,
@@ -41,6 +43,8 @@ from dextouch.schemas import (
     EpisodeSummary,
     RecordingAttributes,
     RecordingSummary,
+    SceneObject,
+    SceneObjects,
     json_ready,
     load_object_clicks,
 )
@@ -240,40 +244,65 @@ def _progress_bar(context: Context, items: list[tuple[Kind, str]]) -> Iterator[P
 
 
 def clicks(context: Context) -> Outcome:
-    """Check the clicks of a file and of the store, and list the places that they give.
+    """Check the clicks of a file and of the store, and list the places that they and touch give.
 
-    The result is a file of all of them.
+    The result is a file of all clicks.
     """
     given = load_object_clicks(context.options.clicks)
     names = sorted({*given.episodes, *context.store.list()})
     found = {name: given.episodes.get(name) or context.store.clicks(name) for name in names}
-    episodes = {name: one for name, one in found.items() if one is not None}
-    rows: list[tuple[str, ...]] = [("episode", "object", "x mm", "y mm", "heading", "± mm")]
-    for name, one in episodes.items():
-        is_lenient = name not in given.episodes
-        about = context.store.open(name).attributes
-        rows += _rows(name, one, clicked_poses(about, given, one, may_lack_headings=is_lenient))
+    rows: list[tuple[str, ...]] = [("episode", "object", "from", "x mm", "y mm", "heading", "± mm")]
+    for name, one in found.items():
+        reader = context.store.open(name)
+        if one is not None:
+            is_lenient = name not in given.episodes
+            clicked = clicked_poses(reader.attributes, given, one, may_lack_headings=is_lenient)
+            rows += _clicked_rows(name, one, clicked)
+        rows += _touched_rows(reader, given, one)
     for line in table(rows):
         context.say(line)
+    episodes = {name: one for name, one in found.items() if one is not None}
     return json_ready(given.model_copy(update={"episodes": episodes})), 0
 
 
-def _rows(name: str, clicked: EpisodeClicks, found: ClickedPoses) -> list[tuple[str, ...]]:
-    rows = []
+def _clicked_rows(
+    name: str, clicked: EpisodeClicks, found: ClickedPoses
+) -> Iterator[tuple[str, ...]]:
     for index, one in enumerate(found.objects):
         click = clicked.objects.get(one.name)
-        if click is None or click.state != "seen":
-            rows.append(
-                (name, one.name, "not clicked" if click is None else click.state, *[""] * 3)
-            )
+        if click is None:
+            if one.touch is None:
+                yield name, one.name, "", "not clicked", *[""] * 3
+        elif click.state != "seen":
+            yield name, one.name, "clicks", click.state, *[""] * 3
         elif not found.known[index]:
-            rows.append((name, one.name, "no heading", *[""] * 3))
+            yield name, one.name, "clicks", "no heading", *[""] * 3
         else:
-            axis = one.click.heading
-            T = transform_from_pose(found.poses[index])
-            x, y = T[:2, "xyz".index(axis[-1])] * (-1 if axis[0] == "-" else 1)
-            heading = f"{np.rad2deg(np.arctan2(y, x)):.0f}°"
-            place = (f"{1e3 * value:.0f}" for value in found.poses[index, :2])
-            heading = "symmetric" if one.click.symmetric else heading
-            rows.append((name, one.name, *place, heading, f"{1e3 * found.sd_m[index]:.1f}"))
-    return rows
+            place = _place(one, found.poses[index], found.sd_m[index])
+            yield name, one.name, "clicks", *place
+
+
+def _touched_rows(
+    reader: EpisodeReader, objects: SceneObjects, clicked: EpisodeClicks | None
+) -> Iterator[tuple[str, ...]]:
+    """Places of objects that have `touch` and were not clicked, of an episode that succeeded."""
+    about = reader.attributes
+    listed = objects.tasks.get(about.task, ())
+    done = () if clicked is None else clicked.objects
+    if not about.success or all(one.touch is None for one in listed):
+        return
+    track = touched_objects(EpisodeGrid(reader), objects)
+    for index, one in enumerate(listed):
+        if one.touch is not None and one.name not in done:
+            place = ("no clear hold", *[""] * 3)
+            if track.known[0, index]:
+                place = _place(one, track.poses[0, index], track.sd_m[index])
+            yield about.episode_id, one.name, "touch", *place
+
+
+def _place(one: SceneObject, pose: np.ndarray, sd_m: float) -> tuple[str, str, str, str]:
+    """Place (x, y mm), heading and error (mm) of an object at the first step, as text."""
+    axis = one.click.heading
+    x, y = transform_from_pose(pose)[:2, "xyz".index(axis[-1])] * (-1 if axis[0] == "-" else 1)
+    heading = "symmetric" if one.click.symmetric else f"{np.rad2deg(np.arctan2(y, x)):.0f}°"
+    return f"{1e3 * pose[0]:.0f}", f"{1e3 * pose[1]:.0f}", heading, f"{1e3 * sd_m:.1f}"

@@ -194,7 +194,8 @@ def _read_start(
     """True objects with noise, or a reader's where they are unknown or it shall be so.
 
     The noise of each object has its own standard deviation, of up to `pose_noise_m`; that of clicks
-    is in the poses already.
+    is in the poses already. Poses from touch say that the hand held the object, that is, the
+    outcome: such episodes start from what the reader sees, as all others without labels do.
     """
     true = data.table.objects_at(rows, start_step)
     sd_m = settings.pose_noise_m * torch.rand(true.present.shape, generator=generator).square()
@@ -203,11 +204,11 @@ def _read_start(
     turn = torch.randn(true.axes.shape, generator=generator) * sd_m[..., None, None] * 5.0
     noisy = Reading(
         ObjectPoses(true.position_m + shift, true.axes + turn, true.present),
-        torch.hypot(sd_m, data.table.clicked_sd_m[rows]),
+        torch.hypot(sd_m, data.table.placed_sd_m[rows]),
         _read_size(data.table.size[rows], generator),
     )
     known = data.table.labelled[rows] & data.table.knows_all(start_step)[rows]
-    known &= not data.starts_read
+    known &= ~data.table.touched[rows] & (not data.starts_read)
     if bool(known.all()):
         return noisy
     read: Reading = mapped(data.readings[start_step], lambda values: values[rows])

@@ -62,7 +62,8 @@ class SceneTable:
 
     `length` is the number of an episode's own steps; `objects_known` are the steps at which the
     pose of an object is known, `measured_objects` marks episodes whose poses have the errors of a
-    measurement, and `clicked_sd_m` is the standard deviation of clicked positions, 0 of others.
+    measurement, `touched` those with poses from touch, and `placed_sd_m` is the standard deviation
+    of positions from clicks or touch, 0 of others.
     `images` are those of the steps `image_steps`, where `shown`; `in_contact` marks
     pads in contact; `sent` are commanded hands where available and measured ones elsewhere, as
     given by `commanded`. `human` marks episodes in which a person acts, and `human_share` is their
@@ -91,7 +92,8 @@ class SceneTable:
     length: Int64[Tensor, " episodes"]
     objects_known: Bool[Tensor, "episodes steps objects"]
     measured_objects: Bool[Tensor, " episodes"]
-    clicked_sd_m: Float32[Tensor, "episodes objects"]
+    touched: Bool[Tensor, " episodes"]
+    placed_sd_m: Float32[Tensor, "episodes objects"]
     size: Float32[Tensor, "episodes objects 2"]
     boxes_m: Float32[Tensor, "tasks objects 6"]
 
@@ -303,7 +305,8 @@ def scene_table(
         length=torch.tensor(lengths),
         objects_known=torch.from_numpy(known),
         measured_objects=torch.tensor([track.is_measured for track in tracks]),
-        clicked_sd_m=torch.from_numpy(np.stack([_clicked_sd_m(track) for track in tracks])),
+        touched=torch.tensor(["touch" in track.sources for track in tracks]),
+        placed_sd_m=torch.from_numpy(np.stack([_sd_m(track) for track in tracks])),
         size=torch.from_numpy(np.stack([_size(e, boxes_m[e.task]) for e in episodes])),
         boxes_m=_padded(boxes_m, config),
     )
@@ -332,9 +335,9 @@ def _known(
     return known
 
 
-def _clicked_sd_m(track: ObjectTrack) -> Float32[np.ndarray, " slots"]:
+def _sd_m(track: ObjectTrack) -> Float32[np.ndarray, " slots"]:
     sd_m = np.zeros(MAX_OBJECTS, dtype=np.float32)
-    sd_m[: len(track.clicked_sd_m)] = track.clicked_sd_m
+    sd_m[: len(track.sd_m)] = track.sd_m
     return sd_m
 
 

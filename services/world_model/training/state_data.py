@@ -1,8 +1,8 @@
 """Episodes that a state model is trained and evaluated on, and their provenance.
 
-Poses of their objects are those of the twin, of markers or trackers, or clicked in the first image
-(docs/objects.md). Where others of their task have poses, episodes without are taken, too: touch and
-outcome are learned from them.
+Poses of their objects are those of the twin, of markers or trackers, clicked in the first image, or
+given by touch (docs/objects.md). Where others of their task have poses, episodes without are taken,
+too: touch and outcome are learned from them.
 """
 
 import hashlib
@@ -32,9 +32,10 @@ from dextouch.episodes import (
     scene_fraction,
     select_episodes,
     split_by_scene,
+    touched_objects,
 )
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
-from dextouch.schemas import Domain, ObjectClicks, SceneObject, load_object_clicks
+from dextouch.schemas import Domain, ObjectClicks, SceneObjects, load_object_clicks
 from services.world_model.checkpoints import learned_tasks, scene_digest
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.settings import StateTrainSettings
@@ -52,7 +53,7 @@ class SceneGrid(EpisodeGrid):
     Args:
         reader: the episode.
         image_px: as of `EpisodeGrid`.
-        listed: its objects as the file lists them; empty if it does not.
+        objects: its task's objects as a file lists them; None if it does not.
         clicked: poses at the first step from clicks; None without any.
     """
 
@@ -61,11 +62,12 @@ class SceneGrid(EpisodeGrid):
         reader: EpisodeReader,
         image_px: int | None = None,
         *,
-        listed: tuple[SceneObject, ...] = (),
+        objects: SceneObjects | None = None,
         clicked: ClickedPoses | None = None,
     ) -> None:
         super().__init__(reader, image_px)
-        self._listed, self._clicked = listed, clicked
+        self._file, self._clicked = objects, clicked
+        self._listed = () if objects is None else listed_objects(self.about, objects)
 
     @property
     def object_names(self) -> tuple[str, ...]:
@@ -86,13 +88,17 @@ class SceneGrid(EpisodeGrid):
         track = super().objects
         if track is None:
             track = ObjectTrack.unknown(len(self), len(self.object_names))
-        return track if self._clicked is None else self._clicked.fill(track)
+        if self._clicked is not None:
+            track = track.filled(self._clicked.track(len(self)))
+        if self._file is None or track.known.any(axis=0).all():
+            return track
+        return track.filled(touched_objects(self, self._file))
 
     @cached_property
     def content_sha256(self) -> str:
         """Digest of what the store holds of it, and of what a file or clicks add to that."""
         digest = super().content_sha256
-        if not set(self.objects.sources) & {"clicks", "none"}:
+        if not set(self.objects.sources) & {"clicks", "touch", "none"}:
             return digest
         added = (self.objects.poses, self.objects.known, self.boxes_m)
         return digest + hashlib.sha256(b"".join(array.tobytes() for array in added)).hexdigest()
@@ -101,7 +107,8 @@ class SceneGrid(EpisodeGrid):
     def may_have_poses(self) -> bool:
         """Whether the pose of an object may be known at some step, as seen without reading it."""
         is_clicked = self._clicked is not None and bool(self._clicked.known.any())
-        return is_clicked or has_object_poses(self.reader)
+        is_touched = self.success and any(one.touch is not None for one in self._listed)
+        return is_clicked or is_touched or has_object_poses(self.reader)
 
 
 def load_scene_episodes(
@@ -176,7 +183,6 @@ def _grid(
     about = reader.attributes
     if clicks is None or about.task not in clicks.tasks:
         return SceneGrid(reader, image_px)
-    listed = listed_objects(about, clicks)
     given = clicks.episodes.get(reader.item_id)
     stored = None
     if given is None:
@@ -184,16 +190,16 @@ def _grid(
         stored = next((store.clicks(reader.item_id) for store in held), None)
     one = given or stored
     if one is None:
-        return SceneGrid(reader, image_px, listed=listed)
+        return SceneGrid(reader, image_px, objects=clicks)
     clicked = clicked_poses(about, clicks, one, may_lack_headings=given is None)
     unfinished = [
         each.name
-        for each, known in zip(listed, clicked.known.tolist(), strict=True)
+        for each, known in zip(clicked.objects, clicked.known.tolist(), strict=True)
         if not known and each.name in one.objects and one.objects[each.name].state == "seen"
     ]
     if unfinished:
         logger.warning("clicks_without_heading", episode=reader.item_id, objects=unfinished)
-    return SceneGrid(reader, image_px, listed=listed, clicked=clicked)
+    return SceneGrid(reader, image_px, objects=clicks, clicked=clicked)
 
 
 @dataclass(frozen=True)

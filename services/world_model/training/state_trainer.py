@@ -126,9 +126,8 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     if settings.learn == "all":
         check_drawable(drawn_episodes(data))
     codec = _codec(table, config, base)
-    reads_starts = settings.labelled_share < 1 or not all(
-        bool(table.knows_all(step).all()) for step in start_steps(table)
-    )
+    is_known = all(bool(table.knows_all(step).all()) for step in start_steps(table))
+    reads_starts = settings.labelled_share < 1 or not is_known or bool(table.touched.any())
     table_file = parts / "table.safetensors"
     save_file({**table.tensors(), **_prefixed(codec)}, table_file)
     horizon_latents = _horizon_latents(table)

@@ -31,6 +31,8 @@ from .object_poses import first_camera as first_camera
 from .object_poses import has_object_poses as has_object_poses
 from .object_poses import listed_objects as listed_objects
 from .object_poses import object_track as object_track
+from .object_touch import PadContacts as PadContacts
+from .object_touch import touched_objects as touched_objects
 from .reader import EpisodeReader as EpisodeReader
 from .reader import NativeWindow as NativeWindow
 from .reader import RecordingReader as RecordingReader

@@ -4,7 +4,7 @@ A clicked pixel is a ray; where the ray meets the height of the clicked point ov
 the point is. Of an object that is not symmetric, a second click says where it points.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
@@ -33,7 +33,7 @@ from dextouch.streams import HEAD_CAMERA
 # Ground truth, and what imagined worlds say: all objects in one stream, without gaps.
 OBJECT_POSES: Final = "object_poses"
 # Where the pose of an object is from; "none" of one that is known nowhere.
-ObjectSource = Literal["twin", "markers", "tracker", "clicks", "none"]
+ObjectSource = Literal["twin", "markers", "tracker", "clicks", "touch", "none"]
 # Between two sightings that are at most so far apart, an object is taken to have moved evenly ...
 _MAX_GAP_NS: Final = 250_000_000
 # ... and to have stood still between two that are this close to one another, however far apart.
@@ -56,14 +56,14 @@ class ObjectTrack:
 
     Where a pose is not known it is the last one before, or the first one after. `sources` say where
     each object's poses are from: those that are not from the twin have the errors of a measurement,
-    a few millimetres. `clicked_sd_m` is the standard deviation of a clicked position on each axis
-    of the table, 0 of other sources.
+    a few millimetres. `sd_m` is the standard deviation of a position from clicks or touch on each
+    axis of the table, 0 of other sources.
     """
 
     poses: Float32[np.ndarray, "steps objects 7"]
     known: Bool[np.ndarray, "steps objects"]
     sources: tuple[ObjectSource, ...]
-    clicked_sd_m: Float32[np.ndarray, " objects"]
+    sd_m: Float32[np.ndarray, " objects"]
 
     @property
     def is_measured(self) -> bool:
@@ -82,9 +82,20 @@ class ObjectTrack:
     def of_one_source(
         cls, source: ObjectSource, poses: np.ndarray, known: np.ndarray
     ) -> "ObjectTrack":
-        """Objects whose poses are all from one source, which is not clicks."""
+        """Objects whose poses are all from one source, other than clicks and touch."""
         count = poses.shape[1]
         return cls(poses, known, (source,) * count, np.zeros(count, dtype=np.float32))
+
+    def filled(self, other: "ObjectTrack") -> "ObjectTrack":
+        """This track, with the objects of another where this one knows none of their poses."""
+        chosen = np.logical_and(other.known.any(axis=0), ~self.known.any(axis=0))
+        each = zip(chosen.tolist(), self.sources, other.sources, strict=True)
+        return ObjectTrack(
+            np.where(chosen[:, None], other.poses, self.poses),
+            np.where(chosen, other.known, self.known),
+            tuple(theirs if is_chosen else own for is_chosen, own, theirs in each),
+            np.where(chosen, other.sd_m, self.sd_m),
+        )
 
 
 def object_track(
@@ -174,20 +185,15 @@ class ClickedPoses:
     known: Bool[np.ndarray, " objects"]
     sd_m: Float64[np.ndarray, " objects"]
 
-    def fill(self, track: ObjectTrack) -> ObjectTrack:
-        """A track with these poses where it has none; those of fixed objects hold at every step."""
-        chosen = self.known & ~track.known.any(axis=0)
+    def track(self, num_steps: int) -> ObjectTrack:
+        """As poses at the first step alone, and at every step of fixed objects."""
         fixed = np.array([one.fixed for one in self.objects])
-        at_step = (np.arange(len(track.known)) == 0)[:, None] | fixed
-        return replace(
-            track,
-            poses=np.where(chosen[:, None], self.poses, track.poses).astype(np.float32),
-            known=np.where(chosen, at_step, track.known),
-            sources=tuple(
-                "clicks" if is_clicked else source
-                for is_clicked, source in zip(chosen.tolist(), track.sources, strict=True)
-            ),
-            clicked_sd_m=np.where(chosen, self.sd_m, track.clicked_sd_m).astype(np.float32),
+        at_step = (np.arange(num_steps) == 0)[:, None] | fixed
+        return ObjectTrack(
+            np.tile(self.poses.astype(np.float32), (num_steps, 1, 1)),
+            at_step & self.known,
+            tuple("clicks" if known else "none" for known in self.known.tolist()),
+            self.sd_m.astype(np.float32),
         )
 
 
@@ -286,13 +292,10 @@ def _pose(
 ) -> tuple[Float64[np.ndarray, "7"], float]:
     """Pose of an object, and the standard deviation of its position on each axis of the table."""
     point_px, heading_px = places_px
-    up, ahead = _axis(one.click.up), _axis(one.click.heading)
-    box_m = np.array(one.box_m)
-    half_m = float(np.abs(up) @ box_m[3:])
     given = one.click.point_m
-    point_m = box_m[:3] + half_m * up if given is None else np.array(given)
-    height_m = view.table_z_m + one.click.base_m + half_m - float(up @ box_m[:3])
-    z_m = height_m + float(up @ point_m)
+    up, box_m = _axis(one.click.up), np.array(one.box_m)
+    point_m = box_m[:3] + float(np.abs(up) @ box_m[3:]) * up if given is None else np.array(given)
+    z_m = standing_height_m(one, view.table_z_m) + float(up @ point_m)
     here_m = _on_level(point_px, z_m, view, "point_px")
     direction = np.array([1.0, 0.0, 0.0])
     if heading_px is not None and not one.click.symmetric:
@@ -305,16 +308,29 @@ def _pose(
                 f"{one.click.heading}"
             )
         direction = way_m / length_m
-    level = np.array([0.0, 0.0, 1.0])
-    R = np.stack([level, direction, np.cross(level, direction)], axis=1) @ np.stack(
-        [up, ahead, np.cross(up, ahead)]
-    )
+    R = standing_rotation(one, direction)
     pose = pose_from_transform(transform(R, here_m - R @ point_m))
     # How far a pixel along each axis of the image is on the table.
     shifts = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
     around_m, _ = points_on_level(point_px + shifts, view.camera, view.T_world_camera, z_m)
     spread_m = np.linalg.norm(around_m[::2] - around_m[1::2])
     return pose, CLICK_SD_PX * float(spread_m) / np.sqrt(2.0)
+
+
+def standing_height_m(one: SceneObject, table_z_m: float) -> float:
+    """Height (m) of the origin of an object's frame in the world, as it stands at the start."""
+    up, box_m = _axis(one.click.up), np.array(one.box_m)
+    return table_z_m + one.click.base_m + float(np.abs(up) @ box_m[3:]) - float(up @ box_m[:3])
+
+
+def standing_rotation(
+    one: SceneObject, direction: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "3 3"]:
+    """R_world_object as it stands at the start, with its heading along a level unit direction."""
+    up, ahead = _axis(one.click.up), _axis(one.click.heading)
+    level = np.array([0.0, 0.0, 1.0])
+    in_world = np.stack([level, direction, np.cross(level, direction)], axis=1)
+    return in_world @ np.stack([up, ahead, np.cross(up, ahead)])
 
 
 def _axis(name: str) -> Float64[np.ndarray, "3"]:

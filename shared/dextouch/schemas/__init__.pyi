@@ -105,6 +105,7 @@ from .scene_objects import ObjectClicks as ObjectClicks
 from .scene_objects import ObjectMarker as ObjectMarker
 from .scene_objects import SceneObject as SceneObject
 from .scene_objects import SceneObjects as SceneObjects
+from .scene_objects import TouchedAt as TouchedAt
 from .scene_objects import load_object_clicks as load_object_clicks
 from .scene_objects import load_scene_objects as load_scene_objects
 from .scene_objects import object_stream as object_stream

@@ -85,6 +85,27 @@ class ClickedAt(FrozenModel):
         return self
 
 
+class TouchedAt(FrozenModel):
+    """How hands hold an object, or put another one on it, so that touch gives its pose.
+
+    Touch counts in takes that succeeded; how the object stands before is as `click` says.
+
+    Attributes:
+        event: "grasp" for an object where it is first held; one that is not fixed moves with the
+            hand until it is let go. "release" for one where what was held is let go.
+        hand: the hand that holds; both if None, and then the middle between their grips counts.
+        point_m: the middle of the grip, in the object's frame; by default the middle of the box.
+        closing_deg: angle, as seen from above and counterclockwise, from the axis `heading` to the
+            direction from the thumb to the fingers (of both hands: from the left one to the right
+            one). Objects that are not symmetric need it.
+    """
+
+    event: Literal["grasp", "release"] = "grasp"
+    hand: Literal["left", "right"] | None = None
+    point_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat] | None = None
+    closing_deg: Annotated[FiniteFloat, Field(ge=-360, le=360)] | None = None
+
+
 class SceneObject(FrozenModel):
     """One object of a task: its name, bounding box, and what measures its pose.
 
@@ -92,7 +113,8 @@ class SceneObject(FrozenModel):
     as the head camera sees them or, if there are none, from the recorded stream `object_NAME` of a
     tracker, which sits on the object at `tracker_pose`, T_tracker_object. An object that is `fixed`
     stands still during a take: all sightings of its markers give one pose. `click` says how clicks
-    in an episode's first image give a pose, where neither measured it.
+    in an episode's first image give a pose, where neither measured it, and `touch` how hands touch
+    it, where nobody clicked either.
     """
 
     name: ObjectName
@@ -101,6 +123,8 @@ class SceneObject(FrozenModel):
     tracker_pose: Pose | None = None
     fixed: bool = False
     click: ClickedAt = Field(default=ClickedAt(), exclude_if=lambda click: click == ClickedAt())
+
+    touch: TouchedAt | None = Field(default=None, exclude_if=lambda touch: touch is None)
 
     _tracker_is_turned = field_validator("tracker_pose")(
         lambda pose: None if pose is None else _is_turned(pose)
@@ -120,6 +144,11 @@ class SceneObject(FrozenModel):
             raise ValueError(
                 f"{self.name}: got a symmetric object whose clicked point {clicked} is {off_m:.3g} "
                 "m from its axis of symmetry, expected it there; shift its frame"
+            )
+        if self.touch and self.touch.closing_deg is None and not self.click.symmetric:
+            raise ValueError(
+                f"{self.name}: touch has no closing_deg, which an object needs that is not "
+                "symmetric; measure it, or set click.symmetric if it looks the same from all sides"
             )
         return self
 
@@ -174,11 +203,13 @@ class SceneObjects(FrozenModel):
     def of_task(self, task: str) -> "SceneObjects | None":
         """The objects of one task as streams measure them; None if the file does not have it.
 
-        Without what only clicks need: that does not change an episode.
+        Without what only clicks and touch need: that does not change an episode.
         """
         if task not in self.tasks:
             return None
-        listed = tuple(one.model_copy(update={"click": ClickedAt()}) for one in self.tasks[task])
+        listed = tuple(
+            one.model_copy(update={"click": ClickedAt(), "touch": None}) for one in self.tasks[task]
+        )
         return self.model_copy(update={"tasks": {task: listed}, "table_z_m": 0.0})
 
 

@@ -74,6 +74,7 @@ def bridge_process(kind, *options):
             process.kill()
 
 
+@pytest.mark.long
 def test_a_bridge_without_samples_still_lives(kind, monkeypatch):
     # Longer than the real limit of 200 ms, so that a busy machine is not taken for a dead bridge.
     monkeypatch.setattr("services.acquisition.drivers.sdk_link.SILENCE_NS", 10**9)
@@ -116,6 +117,7 @@ def test_two_stations_hear_the_same(kind, port):
         assert first.values.tobytes() == second.values.tobytes()
 
 
+@pytest.mark.long
 @pytest.mark.system
 def test_a_bridge_that_ends_is_lost(kind):
     with bridge_process(kind) as (process, port):
@@ -127,6 +129,7 @@ def test_a_bridge_that_ends_is_lost(kind):
         driver.close()
 
 
+@pytest.mark.long
 @pytest.mark.system
 @within_s
 def test_a_killed_bridge_is_flagged_and_its_successor_found(kind, flag_within_s, back_within_s):

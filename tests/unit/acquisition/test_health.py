@@ -125,6 +125,7 @@ def test_silence_shows_within_300_ms(bench):
     assert set(bench.levels().values()) == {"STALE"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "level", "word"),
     [

@@ -115,6 +115,7 @@ def test_takes_of_a_span():
     assert [take.recording_id for take in history.takes(21)] == ["two"]
 
 
+@pytest.mark.long
 def test_a_day_takes_no_more_memory_than_an_hour():
     names = [f"stream_{index}" for index in range(3)]
     history = HealthHistory(names)

@@ -3,6 +3,7 @@
 import threading
 
 import numpy as np
+import pytest
 
 from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.health.streams import SampleQueue
@@ -53,6 +54,7 @@ def test_what_was_taken_does_not_change_when_more_comes():
     assert block.values[:, 0].tolist() == list(range(SIZE))
 
 
+@pytest.mark.long
 def test_nothing_is_lost_or_mixed_between_two_threads():
     queue, seen, count = SampleQueue(POSE), [], 20_000
     done = threading.Event()

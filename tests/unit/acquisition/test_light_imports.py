@@ -8,6 +8,7 @@ import pytest
 HEAVY = ("torch", "cv2", "zarr", "scipy", "mujoco", "serial", "hidraw")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "module",
     [

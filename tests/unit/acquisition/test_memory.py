@@ -46,6 +46,7 @@ def no_collector():
     gc.freeze()
 
 
+@pytest.mark.long
 def test_what_holds_itself_in_a_circle_is_free_then(no_collector):
     gone = weakref.ref(Circle())
     give_back_free_memory()
@@ -57,6 +58,7 @@ def test_what_holds_itself_in_a_circle_is_free_then(no_collector):
     assert gone() is None
 
 
+@pytest.mark.long
 def test_what_exists_at_the_start_is_not_looked_through_again(no_collector):
     circle = weakref.ref(Circle())
     keep_for_life()

@@ -76,6 +76,7 @@ def test_gloves_of_others_come_without_our_calibration(gloves, num_values):
     assert calibration == {}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "links",
     [
@@ -99,6 +100,7 @@ def test_a_take_by_other_links_is_whole(links, tmp_path):
         assert len(spool.read(name)) >= rate * len(stream.t_ns) - missing
 
 
+@pytest.mark.long
 def test_a_bridge_without_samples_shows_that_it_lives(tmp_path):
     station = MockStation(
         streams("head"),
@@ -124,6 +126,7 @@ def test_a_bridge_without_samples_shows_that_it_lives(tmp_path):
     assert num_recorded + num_stale == num_sent or was_silent
 
 
+@pytest.mark.long
 def test_a_fault_that_a_device_cannot_have_is_said_so(tmp_path):
     faults = FaultScript(others=DeviceFaults(wrong_side_from_s=0.2))
     links = MockLinks(gloves="justfloat_glove")

@@ -222,6 +222,7 @@ def counts(recorder):
     return {(s.task, s.operator): s.num_saved for s in session.saved}, session.last_saved
 
 
+@pytest.mark.long
 def test_saved_takes_are_counted_and_the_count_outlives_the_process(recorder, clock, tmp_path):
     for operator, recording_id in (("p7", "a"), ("p7", "b"), ("p8", "c")):
         recorder.arm(PROMPT.model_copy(update={"operator": operator}))

@@ -158,6 +158,7 @@ def check_damages(tmp_path, count, seed):
     return found
 
 
+@pytest.mark.long
 def test_damages_of_a_spool_are_noticed(tmp_path):
     found = check_damages(tmp_path, 150, seed=1)
     outcomes = {(closed, result) for closed, _, result in found}

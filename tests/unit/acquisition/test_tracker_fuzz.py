@@ -106,6 +106,7 @@ def test_what_comes_out_was_sent(make, flips, lost, cut):
     assert sequences == sorted(set(sequences))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("make", MAKERS)
 @given(st.lists(st.binary(max_size=80), max_size=20))
 def test_foreign_bytes_give_nothing(make, units):

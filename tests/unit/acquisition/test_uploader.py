@@ -102,6 +102,7 @@ class FakeStore(EpisodeStoreClient):
         return np.concatenate([b.values for b in self.batches[recording_id][stream]])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("failure", range(8))
 def test_every_interruption_is_made_up_for(tmp_path, failure):
     path = spool(tmp_path)

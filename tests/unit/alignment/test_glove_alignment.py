@@ -165,6 +165,7 @@ def test_refused_taxels_are_zero_named_and_counted(tmp_path):
     assert (pressures[:, ~measured] == 0).all()
 
 
+@pytest.mark.long
 def test_the_line_of_an_alignment_names_refused_taxels(tmp_path, capsys):
     stream, batch, calibration = own_glove()
     state = np.zeros(360)

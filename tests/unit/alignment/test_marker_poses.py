@@ -93,6 +93,7 @@ def errors(found, true):
     return way_mm, np.rad2deg(rotation_angle(found[:3, :3].T @ true[:3, :3]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("distortion", [NO_DISTORTION, DISTORTION], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("yaw_rad", [-0.4, 0.0, 0.3])
 def test_an_object_is_where_it_was_rendered(yaw_rad, distortion):
@@ -106,6 +107,7 @@ def test_an_object_is_where_it_was_rendered(yaw_rad, distortion):
     assert found.reprojection_px[0] < 0.5
 
 
+@pytest.mark.long
 def test_positions_have_no_bias_across_the_view():
     """Half a pixel, between the conventions of two libraries, would be 0.5 mm."""
     one = cube()
@@ -117,6 +119,7 @@ def test_positions_have_no_bias_across_the_view():
     assert np.abs(np.mean(off_mm, axis=0)).max() < 0.25
 
 
+@pytest.mark.long
 def test_poses_are_in_the_world_of_the_moving_camera():
     one = cube()
     T_world_camera = [
@@ -130,6 +133,7 @@ def test_poses_are_in_the_world_of_the_moving_camera():
     assert max(errors(T, T_world_object)[0] for T in found.Ts_world_object) < 2.0
 
 
+@pytest.mark.long
 def test_a_marker_of_another_size_than_stated_is_refused_beside_one_that_is_right():
     one = cube()
     wrong = one.model_copy(
@@ -154,6 +158,7 @@ def test_a_marker_that_is_there_twice_is_nobodys():
     assert len(tracked(one, [both]).t_ns) == 0
 
 
+@pytest.mark.long
 def test_the_turn_of_a_single_small_marker_follows_its_neighbours():
     """From the front, a distant marker looks the same tilted either way."""
     one = cube().model_copy(update={"markers": (cube().markers[0],)})

@@ -32,6 +32,7 @@ EXACT = RetargetOptions(temporal_weight_m2=0.0)
 MIDDLE_NODES = ("proximal", "intermediate", "distal", "tip")
 
 
+@pytest.mark.long
 def test_slopes_are_the_derivative():
     hand = hand_arrays(HAND)
     person = person_arrays(None, HAND)

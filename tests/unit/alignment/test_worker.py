@@ -34,6 +34,7 @@ def no_process_is_left():
     assert set(psutil.Process().children()) <= before
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_process_is_left")
 def test_one_process_aligns_refuses_dies_and_is_replaced(store):
     worker = AlignmentWorker(str(store.root))
@@ -85,6 +86,7 @@ def test_stopping_from_another_thread_ends_it_at_once(store):
     assert store.sweep() == 0
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_process_is_left")
 def test_many_recordings_side_by_side(store):
     wanted, impossible = not_aligned(store, OPTIONS)

@@ -156,6 +156,7 @@ def corrupted(keypoints, rng):
     return broken
 
 
+@pytest.mark.long
 def test_whatever_comes_is_an_answer_without_nan_or_a_refusal():
     num_answers, faults = 0, []
     for seed in range(150):

@@ -57,6 +57,7 @@ def images_of(path):
         return [frame.to_ndarray(format="rgb24", interpolation="BICUBIC") for frame in decoded]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fps", [None, 30, 20])
 @pytest.mark.parametrize("unit", ["rgb8", "jpeg", "h264"])
 def test_exports_hold_to_the_specification(store, folder, unit, fps):

@@ -73,6 +73,7 @@ def foreign(store, folder):
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unit", ["rgb8", "jpeg", "h264"])
 def test_our_own_dataset_gives_back_the_episodes(store, other, folder, unit):
     readers = two(store)
@@ -114,6 +115,7 @@ def test_attributes_come_back_with_the_episode_in_the_lineage(store, other, fold
         assert getattr(back, name) == getattr(reader.attributes, name), name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fps", [15, 30, 20])
 def test_what_was_imported_exports_to_the_same_numbers(store, other, tmp_path, fps):
     options = ExportOptions(fps=fps)

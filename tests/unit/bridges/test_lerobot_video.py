@@ -170,6 +170,7 @@ def write_reordered(path, images, *, x264="", **movie):
         return np.array([f.to_ndarray(format="rgb24", interpolation="BICUBIC") for f in frames])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("x264", "movie"),
     [

@@ -145,6 +145,7 @@ def test_attachments_and_metadata_say_where_it_comes_from(store, tmp_path):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unit", ["rgb8", "jpeg", "h264"])
 def test_an_episode_comes_back_equal(unit, store, other, tmp_path):
     reader = write_episode(store, unit=unit, num_steps=17)

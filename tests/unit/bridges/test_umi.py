@@ -67,6 +67,7 @@ def test_zarr_python_reads_the_layout_of_a_replay_buffer(two, tmp_path):
         start = stop
 
 
+@pytest.mark.long
 def test_equal_episodes_give_equal_bytes(two, tmp_path):
     export_umi(two, tmp_path / "one.zip")
     export_umi(two, tmp_path / "two.zip")

@@ -141,6 +141,7 @@ def test_live_images_that_add_nothing_are_told_now_and_then(image, words, tmp_pa
     assert capsys.readouterr().out.count(words) == 2
 
 
+@pytest.mark.long
 def test_a_watched_folder_is_read_once_and_left_when_the_views_suffice(tmp_path):
     views = good_views()
     photos = write_photos(tmp_path / "photos", views[:10])

@@ -44,6 +44,7 @@ def in_bash(tmp_path, *words):
     return {one.strip() for one in done.stdout.splitlines() if one.strip()}
 
 
+@pytest.mark.long
 @needs("bash")
 @pytest.mark.parametrize(
     ("words", "expected"),

@@ -51,6 +51,7 @@ def test_config_shows_all_sections_without_torch(tmp_path):
     assert shown["world_model"]["port"] == {"value": "9", "origin": "DEXTOUCH_WORLD_MODEL_PORT"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sections", [(), tuple(SECTIONS)], ids=["services", "all"])
 def test_config_example_needs_no_torch(tmp_path, sections):
     done = run(tmp_path, "config", "example", *sections)
@@ -70,6 +71,7 @@ def test_config_example_needs_no_torch(tmp_path, sections):
     ]
 
 
+@pytest.mark.long
 def test_a_command_that_computes_still_names_what_is_missing(tmp_path):
     done = run(tmp_path, "serve", "--port", "0")
     assert done.returncode == 3

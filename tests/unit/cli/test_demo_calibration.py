@@ -15,6 +15,8 @@ from services.pipelines import demo_takes as recording
 from services.pipelines import mock_takes
 from tests.unit.bridges.takes import write_episode
 
+pytestmark = pytest.mark.long
+
 SEED = 3
 
 

@@ -30,6 +30,7 @@ def run(store, *more):
     return main.main(["evaluate", "prediction", *words])
 
 
+@pytest.mark.long
 def test_windows_are_measured_by_task_beside_all_baselines(store, tmp_path, capsys):
     path = tmp_path / "result.json"
     metrics = "psnr,contact_f1"
@@ -46,6 +47,7 @@ def test_windows_are_measured_by_task_beside_all_baselines(store, tmp_path, caps
     assert "PSNR (dB) ↑" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_recorded_episodes_have_the_baseline_of_another_take(store, tmp_path, capsys):
     """Those of a station have no seed; a single one names what is missing, and why."""
     recorded = EpisodeStore(tmp_path / "recorded")

@@ -83,6 +83,7 @@ def run_without(folder, packages, lines):
     return json.loads(child.stdout)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("installed", "refused"),
     [
@@ -143,6 +144,7 @@ def test_commands_name_the_extra_that_is_missing(tmp_path, installed, refused):
         assert "--without world_model" in answers["up"][1]
 
 
+@pytest.mark.long
 def test_recorded_takes_are_replayed_without_the_twin(tmp_path):
     absent = [package for package, extra in EXTRA_OF.items() if extra == "twin"]
     line = "evaluate recorded --episodes nothing"

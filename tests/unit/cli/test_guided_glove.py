@@ -126,6 +126,7 @@ def guide(bench, tmp_path, script, monkeypatch, **changed):
     return glove.calibrate(given), asked
 
 
+@pytest.mark.long
 def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsys):
     script = [
         ("", 0.0),

@@ -45,6 +45,7 @@ def pydantic_s():
     return min(cpu_s_and_modules(code)[0] for _ in range(3))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [name for name, command in COMMANDS.items() if command.target])
 def test_help_is_cheap(name, pydantic_s):
     # On an idle 3 GHz core the settings library takes 0.1 s, and help at most 0.3 s.

@@ -52,6 +52,7 @@ def test_judged_steps_are_three_at_every_end(truth):
     assert judged_steps(episode) == {6, 7, 8, 62, 63, 64, 77, 78, 79, 80}
 
 
+@pytest.mark.long
 def test_a_judge_sees_what_it_would_have_seen_of_all_images(truth, checkpoint, tmp_path):
     report = tmp_path / "counts.json"
     flags = ["--episodes", truth.root, "--store", tmp_path / "few", "--checkpoint", checkpoint]

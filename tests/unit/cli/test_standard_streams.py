@@ -41,6 +41,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("words", COMMANDS)
 def test_a_pipe_that_nobody_reads_ends_a_command_as_sigpipe_does(folder, words):
     reading, writing = os.pipe()
@@ -54,6 +55,7 @@ def test_a_pipe_that_nobody_reads_ends_a_command_as_sigpipe_does(folder, words):
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("words", ["doctor", "--version", "store list --store store"])
 def test_messages_that_nobody_reads_leave_no_traceback_either(folder, words):
     reading, writing = os.pipe()
@@ -63,6 +65,7 @@ def test_messages_that_nobody_reads_leave_no_traceback_either(folder, words):
     assert done.returncode == 141
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("words", ["doctor", "--version", "store list --store store --json -"])
 def test_a_full_disk_is_one_message(folder, words):
     with Path("/dev/full").open("w") as full:
@@ -81,6 +84,7 @@ def closed(*numbers):
     return close
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("words", ["doctor", "store list --store store", "store list --help"])
 def test_output_that_was_closed_from_the_start_is_one_message(folder, words):
     done = run(folder, words, preexec_fn=closed(1))
@@ -89,6 +93,7 @@ def test_output_that_was_closed_from_the_start_is_one_message(folder, words):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.long
 def test_a_command_that_prints_nothing_needs_no_output(folder):
     words = "config example --output example.toml"
     assert run(folder, words, preexec_fn=closed(0, 1)).returncode == 0

@@ -32,6 +32,7 @@ def _run(folder, name, *flags):
     return output
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("hands")
 def test_curves_of_several_tokenizers_are_drawn_side_by_side(tmp_path, capsys):
     short = ("--max-steps=3", "--num-evaluations=3", "--tactile-channels=12")

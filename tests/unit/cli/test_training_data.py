@@ -112,6 +112,7 @@ def test_shares_changed_to_more_than_all_are_refused(changes):
         MIXES["ladder"].changed(**changes)
 
 
+@pytest.mark.long
 def test_a_run_goes_on_where_it_was_interrupted(tmp_path, capsys):
     scope = Scope(("stand_bottle",), image_every=40)
     first = make_training_data(
@@ -209,6 +210,7 @@ class Lift:
 """
 
 
+@pytest.mark.long
 def test_a_policy_acts_in_the_twin_and_its_actions_become_an_episode(tmp_path, monkeypatch, capsys):
     (tmp_path / "lifting_policy.py").write_text(POLICY)
     monkeypatch.chdir(tmp_path)

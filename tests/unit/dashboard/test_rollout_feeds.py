@@ -149,6 +149,7 @@ def test_as_many_topics_are_kept_as_allowed():
     assert len(feeds._watched) == MAX_TOPICS
 
 
+@pytest.mark.long
 async def test_replays_need_a_session_and_their_services():
     key = {"name": "operator", "key": "a-key-of-some-length", "scopes": ("operate",)}
     body = {"episode_id": "take-0001"}

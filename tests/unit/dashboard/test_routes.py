@@ -204,6 +204,7 @@ async def test_live_refuses_foreign_sites(make_app):
     assert (await socket.receive())["type"] == "websocket.close"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("looks", [True, False])
 @pytest.mark.parametrize("ends_by", ["signing out", "time"])
 async def test_live_ends_with_its_session(make_app, looks, ends_by):

@@ -102,6 +102,7 @@ TAKEN = (ConflictError, "id_taken")
 OTHER_KEY, OTHER_STATION = (AccessDeniedError, "other_key"), (AccessDeniedError, "other_station")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("owner", "intruder", "expected"),
     [
@@ -201,6 +202,7 @@ def age(settings, seconds):
         os.utime(path, (changed, changed))
 
 
+@pytest.mark.long
 def test_only_a_key_with_the_scope_drops_uploads_and_only_old_ones(
     serve, settings, attributes, batch_of
 ):

@@ -96,6 +96,7 @@ def outcomes(made, root, use, change):
         number += 1 + number // 6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("use", USES)
 @pytest.mark.parametrize("for_good", [False, True])
 def test_a_deleted_item_is_not_found_and_never_damaged(made, tmp_path, use, for_good):
@@ -109,6 +110,7 @@ def test_a_deleted_item_is_not_found_and_never_damaged(made, tmp_path, use, for_
     assert all(made.attributes.episode_id in error.message for error in errors)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("use", USES)
 def test_an_item_that_is_written_anew_is_never_damaged(made, tmp_path, use):
     other = episode_of(num_steps=12, camera_unit="jpeg", seed=8)
@@ -155,6 +157,7 @@ def s3_server():
         yield server
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("again", [False, True])
 def test_a_reader_of_a_bucket_finds_a_deleted_item_gone(s3_server, tmp_path, again):
     url = s3_server.url(f"deleted/{tmp_path.name}")

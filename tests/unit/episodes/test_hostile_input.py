@@ -128,6 +128,7 @@ def boundaries(folder, path):
     return sorted(cut for cut in cuts if 0 <= cut < size)
 
 
+@pytest.mark.long
 def test_files_cut_at_every_boundary_are_found(store, folder):
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         data, parts = path.read_bytes(), path.relative_to(folder).parts

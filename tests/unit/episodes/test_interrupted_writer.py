@@ -60,6 +60,7 @@ with EpisodeStore(sys.argv[1]).writer(kind="recording", attributes=attributes) a
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", ["waits", "appends"])
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGKILL])
 def test_ctrl_c_leaves_nothing_and_a_kill_what_a_sweep_removes(store, kind, state):

@@ -176,9 +176,8 @@ def test_clicks_fill_what_streams_do_not_say(store):
     track = ObjectTrack.unknown(5, 3)
     track.known[2:, 1] = True
     track.poses[:, 1, 0] = 0.5
-    filled = found.fill(
-        ObjectTrack(track.poses, track.known, ("none", "markers", "none"), track.clicked_sd_m)
-    )
+    markers = ObjectTrack(track.poses, track.known, ("none", "markers", "none"), track.sd_m)
+    filled = markers.filled(found.track(5))
     assert filled.sources == ("clicks", "markers", "clicks")
     # A fixed object stands where it was clicked; of others, the first step alone is known.
     assert filled.known.T.tolist() == [
@@ -188,7 +187,7 @@ def test_clicks_fill_what_streams_do_not_say(store):
     ]
     np.testing.assert_allclose(filled.poses[0, 0], found.poses[0], atol=1e-6)
     np.testing.assert_allclose(filled.poses[:, 1, 0], 0.5)
-    np.testing.assert_allclose(filled.clicked_sd_m, found.sd_m * [1, 0, 1], rtol=1e-6)
+    np.testing.assert_allclose(filled.sd_m, found.sd_m * [1, 0, 1], rtol=1e-6)
 
 
 def test_clicks_are_kept_beside_the_content(store):
@@ -247,7 +246,7 @@ def test_the_command_lists_places_and_collects_clicks(store, tmp_path, capsys):
     assert main([*words, "--json", str(collected)]) == 0
     printed = capsys.readouterr().out
     x_mm, y_mm, _ = 1e3 * bottle()[:3, 3]
-    assert f"filed    bottle  {x_mm:.0f}" in printed
+    assert f"filed    bottle  clicks  {x_mm:.0f}" in printed
     assert f"{y_mm:.0f}" in printed
     assert "40°" in printed
     assert "absent" in printed

@@ -135,6 +135,7 @@ episode_of().write(EpisodeStore(url, CREDENTIALS | {"work_folder": str(work)}))
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("deadly", ["claim", "action/c/0/0", "/commit.json"])
 def test_a_kill_during_the_upload_loses_nothing(url, store, tmp_path, deadly):
     work = tmp_path / "work"
@@ -377,6 +378,7 @@ def test_zarr_python_opens_it_in_the_bucket_as_it_stands(store, bucket, made):
         np.testing.assert_array_equal(group[f"{name}_t_ref_ns"][:], made.stamps_ns[name])
 
 
+@pytest.mark.long
 def test_three_hundred_episodes_are_listed(store, bucket):
     names = [f"take-{number:04d}" for number in range(300)]
     files = [

@@ -57,6 +57,7 @@ def check_kills(folder: Path, count: int, seed: int):
         assert_same(got, glove_batch(0, count))
 
 
+@pytest.mark.long
 def test_a_killed_process_loses_nothing_acknowledged(tmp_path):
     check_kills(tmp_path, 5, seed=1)
 

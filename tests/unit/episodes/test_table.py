@@ -210,6 +210,7 @@ def readers(truths, tmp_path_factory):
     return {name: store.open(truth.attributes.episode_id) for name, truth in truths.items()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["script", "push", "human"])
 def test_arrays_are_what_the_twin_recorded(truths, readers, name):
     truth, grid = truths[name].streams, EpisodeGrid(readers[name])

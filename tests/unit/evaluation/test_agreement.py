@@ -176,6 +176,7 @@ def test_intervals_hold_the_truth_where_a_bootstrap_does_not():
     assert held["bootstrap"] <= 15
 
 
+@pytest.mark.long
 def test_many_starts_leave_little_doubt():
     rates = [0.2, 0.5, 0.8]
     scores = MatchedScores(binary(rates, 3000, rng(15)), binary(rates, 3000, rng(16)))

@@ -28,6 +28,8 @@ from services.evaluation.policies.cloning_training import (
 )
 from tests.unit.evaluation import toy
 
+pytestmark = pytest.mark.long
+
 
 def start(task: str, seed: int) -> PolicyStart:
     return PolicyStart(task, toy.INSTRUCTIONS[task], seed, toy.ANCHOR, toy.K_HEAD)

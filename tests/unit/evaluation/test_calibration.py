@@ -31,6 +31,7 @@ def test_errors_in_one_bin_cancel_and_in_two_bins_do_not():
     assert expected_calibration_error(np.array([0.4, 0.6]), np.array([1, 0])) == pytest.approx(0.6)
 
 
+@pytest.mark.long
 def test_a_known_temperature_and_bias_are_found():
     rng = np.random.default_rng(1)
     honest = rng.normal(0.0, 2.0, 20_000)

@@ -19,6 +19,8 @@ from services.evaluation.success_classifier import SuccessClassifier
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
 
+pytestmark = pytest.mark.long
+
 SEEDS = range(2000, 2003)
 
 

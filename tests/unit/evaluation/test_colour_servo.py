@@ -88,6 +88,7 @@ def test_what_it_was_not_made_for_is_refused():
         begin(policy, "juggle")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", ["open_drawer", "stand_bottle"])
 def test_it_succeeds_in_the_twin(task):
     twin = TwinWorld(TwinSettings(cameras=("camera_head",)))

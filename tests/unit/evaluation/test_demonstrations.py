@@ -89,6 +89,7 @@ def test_pictures_of_an_episode(url):
     assert actions.measured.shape == actions.commanded.shape == (toy.STEPS, 67)
 
 
+@pytest.mark.long
 def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     output, figures = tmp_path / "probe.safetensors", tmp_path / "figures.json"
     flags = ["--episodes", url, "--output", str(output), "--json", str(figures)]
@@ -101,6 +102,7 @@ def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     assert json.loads(figures.read_text())["metrics"] == probe.metadata.metrics
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("network", "trained"), [("judge", SuccessClassifier), ("policy", BehaviourCloningPolicy)]
 )
@@ -115,6 +117,7 @@ def test_what_a_station_recorded_can_be_trained_on(network, trained, tmp_path):
     assert set(trained.load(output).metadata.training_episodes) <= set(store.list())
 
 
+@pytest.mark.long
 def test_a_judge_that_nothing_would_measure_is_refused_before_it_is_trained(tmp_path):
     store = EpisodeStore(tmp_path / "recorded")
     for item in toy.demonstrations(range(40), noise_m=0.03):

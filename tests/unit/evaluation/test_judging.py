@@ -27,6 +27,8 @@ from services.evaluation.success_classifier_training import (
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.shown_endings import ending_episode
 
+pytestmark = pytest.mark.long
+
 NEAR_M = 0.02
 
 

@@ -81,6 +81,7 @@ def plain_lpips(first, second, folder):
     return total
 
 
+@pytest.mark.long
 def test_lpips_is_its_definition(weights):
     images = RNG.integers(0, 256, size=(2, 3, 64, 71, 3), dtype=np.uint8)
     found = PerceptualNetworks(weights).perceptual_distance(*images)

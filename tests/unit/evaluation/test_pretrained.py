@@ -76,6 +76,7 @@ def twin():
     return TwinWorld(TwinSettings(cameras=("camera_head",)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", SIX)
 def test_both_policies_act_in_every_task(task, twin):
     begun = twin.reset(RolloutStart(task, 30007, ""))

@@ -94,6 +94,7 @@ def test_takes_are_true_episodes_of_known_outcome(store, items):
         read_takes([store], tasks=["stir"])
 
 
+@pytest.mark.long
 def test_a_right_world_earns_trust_and_a_wrong_one_does_not(store, client, probe, items):
     right, wrong = (scored(store, client, probe, name) for name in ("right", "wrong"))
     trusted, distrusted = right.trust("reach"), wrong.trust("reach")

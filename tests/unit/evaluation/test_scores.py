@@ -222,6 +222,7 @@ def test_chance_below_its_resolution_is_said_in_words():
     assert any("at least as well: fewer than one in a thousand" in s for s in sentences)
 
 
+@pytest.mark.long
 def test_agreement_of_all_tasks_correlates_all_policies_of_all_tasks():
     """Two tasks of different difficulty: their rates correlate at once, by hand."""
     easy, hard = report(GOOD).scores, []
@@ -297,6 +298,7 @@ def test_rates_are_of_decided_rollouts():
     json.dumps(found, allow_nan=False)
 
 
+@pytest.mark.long
 def test_undecided_rollouts_stand_beside_every_rate(tmp_path, capsys):
     whole = undecided(report(TEN), a={7, 8, 9}, d={0, 1, 2, 3, 4})
     print_scores(whole.to_report())
@@ -333,6 +335,7 @@ def test_a_policy_that_decided_none_of_the_common_starts_is_left_out():
     assert list(found["agreement"]["stand"]["rates"]) == ["a", "b", "d"]
 
 
+@pytest.mark.long
 def test_probe_is_judged_on_real_rollouts():
     assert report(GOOD).to_report()["probe_accuracy_on_real"] == 1.0
     # From one half on, a probability says success.
@@ -350,6 +353,7 @@ def test_different_starts_are_not_compared():
         ClosedLoopReport(tuple(moved), whole.imagined_worlds, whole.policies).agreement("model")
 
 
+@pytest.mark.long
 def test_failed_rollouts_are_missing_not_failures_of_the_policy():
     whole = report(GOOD)
 
@@ -407,6 +411,7 @@ def test_one_policy_that_fails_narrows_the_agreement_and_the_comments_say_so():
     }
 
 
+@pytest.mark.long
 def test_a_policy_without_a_start_that_ended_twice_is_named_as_left_out():
     gone = [("model", "c", seed) for seed in range(4)]
     found = lost(report(GOOD), *gone)

@@ -36,6 +36,8 @@ from services.evaluation.trained_networks import save_checkpoint
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
 
+pytestmark = pytest.mark.long
+
 STUDY = """
 name = "toy"
 tasks = ["reach", "reach far"]

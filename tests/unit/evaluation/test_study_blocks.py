@@ -16,6 +16,8 @@ from services.pipelines.study import blocks_of, main, run_block
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
 
+pytestmark = pytest.mark.long
+
 NUM_STARTS = 12
 
 

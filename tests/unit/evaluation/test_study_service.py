@@ -92,6 +92,7 @@ async def test_agreement_is_that_of_scipy_and_two_loops(root):
     assert set(found["meanings"]) >= {"rate", "pearson", "mmrv", "unreliable"}
 
 
+@pytest.mark.long
 async def test_two_policies_are_no_correlation_in_a_task_nor_over_all(tmp_path, monkeypatch):
     for task, policies in ROWS.items():
         monkeypatch.setitem(ROWS, task, {name: policies[name] for name in ("careful", "clumsy")})

@@ -115,6 +115,7 @@ def mutated(text, rng):
     return text[: word.start()] + new + text[word.end() :]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("model", "mapping"), [(URDF, MAPPING), (MJCF, FINGER)])
 @pytest.mark.parametrize("which", ["model", "mapping"])
 def test_mutated_files_give_a_sound_hand_or_an_error_of_ours(model, mapping, which, tmp_path):

@@ -144,6 +144,7 @@ def parts(received):
     return int(status.split()[1]), headers, json.loads(body)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("first", "piece"),
     [
@@ -284,6 +285,7 @@ def test_a_client_that_does_not_read_is_cut_off(served, asked):
         served.until_none_is_left()
 
 
+@pytest.mark.long
 def test_slow_but_steady_clients_are_served():
     """They take longer in all than a client may that is not as fast as 16 KiB/s."""
     piece = bytes(4 * 2**10)
@@ -300,6 +302,7 @@ def test_slow_but_steady_clients_are_served():
                 time.sleep(0.01)
 
 
+@pytest.mark.long
 def test_neither_long_work_nor_keep_alive_is_cut_off(served):
     with served.connect(GET.replace(b"/healthz", b"/v1/held") + b"\r\n") as opened:
         time.sleep(3 * TIMEOUT_S)

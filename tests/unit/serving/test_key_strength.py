@@ -75,6 +75,7 @@ def test_random_keys_are_accepted(key, monkeypatch):
     assert load(key, monkeypatch).api_keys[0].key.get_secret_value() == key
 
 
+@pytest.mark.long
 def test_no_key_of_the_documented_command_is_refused(monkeypatch):
     for _ in range(500):
         load(secrets.token_hex(32), monkeypatch)

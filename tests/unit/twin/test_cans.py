@@ -148,6 +148,7 @@ def test_states_made_by_hand_are_judged_rightly(can, left, right, hand_made):
         assert get_task(name).reached(simulation) == (False,) * 4
 
 
+@pytest.mark.long
 def test_a_can_in_the_hand_is_held_and_not_placed_and_the_other_way_round():
     simulation = played(Stage("lift_full_can", "robot", TwinSettings()), 2)
     assert [get_task(name).succeeded(simulation) for name in NAMES] == [True, True, False, False]

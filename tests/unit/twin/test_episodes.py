@@ -62,6 +62,7 @@ def human_take(bowls_stage):
     return record(bowls_stage, 3, HEAD_ONLY)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("domain", ["robot", "human"])
 def test_an_episode_has_the_agreed_streams(robot_take, human_take, domain):
     episode, expected = (robot_take, ROBOT) if domain == "robot" else (human_take, HUMAN)
@@ -112,6 +113,7 @@ def test_bodies_interpolated_together_give_the_bytes_of_each_by_itself(
     assert digest(record(bowls_stage, 3, HEAD_ONLY)) == digest(human_take)
 
 
+@pytest.mark.long
 def test_another_seed_gives_another_take(bottle_stage, robot_take):
     assert digest(record(bottle_stage, 4, HEAD_ONLY)) != digest(robot_take)
 
@@ -231,6 +233,7 @@ def test_bad_requests_are_refused(bottle_stage):
         Stage("juggle", "robot", TwinSettings())
 
 
+@pytest.mark.long
 def test_the_command_line_records_and_says_so(tmp_path, capsys):
     summary = tmp_path / "summary.json"
     arguments = [

@@ -37,6 +37,7 @@ def reached_at_every_step(stage, seed, **options):
     return np.array(reached)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_demonstration_inserts_and_its_milestones_agree(peg_stage, seed):
     reached = reached_at_every_step(peg_stage, seed)

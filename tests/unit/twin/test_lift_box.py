@@ -45,6 +45,7 @@ def test_a_box_at_one_hand_is_not_touched_by_both(hand_made):
     assert get_task("lift_box").reached(simulation) == NOTHING
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("domain", ["robot", "human"])
 def test_both_palms_press_the_box_over_an_area(domain):
     stage = Stage("lift_box", domain, TwinSettings())

@@ -25,6 +25,7 @@ def stage(request):
     return Stage(request.param, "robot", TwinSettings())
 
 
+@pytest.mark.long
 def test_a_success_reaches_all_milestones_in_order(stage, tmp_path):
     episode = record(stage, SEED, TakeOptions(images=()))
     times_s = episode.attributes.event_times_s

@@ -109,6 +109,7 @@ def test_two_flat_palms_let_go_by_going_apart(bowls_stage):
     assert 0.010 <= wider_m[40] <= 0.090
 
 
+@pytest.mark.long
 def test_a_motion_says_how_it_is_made_again(bottle_stage, tmp_path, capsys):
     options = TakeOptions(
         0.004, images=(), motion=Motion("retreat", 33), image_every=2, streams="training"

@@ -33,6 +33,7 @@ def drawer_out(simulation, *, distance_m, speed_m_s=0.0):
     mujoco.mj_forward(model, data)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("domain", ["robot", "human"])
 def test_the_demonstrator_opens_the_drawer(domain):
     stage = Stage("open_drawer", domain, SMALL)
@@ -55,6 +56,7 @@ def test_a_demonstrator_far_off_fails(stage):
     assert rates == [False, False]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_a_drawer_that_is_elsewhere_stays_shut(stage, seed):
     episode = record(stage, seed, TakeOptions(miss=True, images=()))

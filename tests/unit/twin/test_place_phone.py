@@ -48,6 +48,7 @@ def reached_at_every_step(stage, seed, **options):
     return np.array(reached)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_demonstration_places_the_phone_and_its_milestones_agree(phone_stage, seed):
     phone_stage.start(phone_stage.plan(seed))

@@ -52,6 +52,7 @@ def test_geometry_is_that_of_a_scene_compiled_with_these_sizes():
             np.testing.assert_allclose(ours, theirs, atol=1e-6, err_msg=field)
 
 
+@pytest.mark.long
 def test_a_thin_bottle_lies_lower_and_slips_from_the_hand_that_closes_for_a_usual_one(stage):
     thin, usual, thick = (taken(stage, width=width) for width in (0.8, 1.0, 1.2))
     for take, radius_m in ((thin, 0.0272), (usual, 0.034), (thick, 0.0408)):
@@ -61,6 +62,7 @@ def test_a_thin_bottle_lies_lower_and_slips_from_the_hand_that_closes_for_a_usua
     assert (thin.attributes.success, usual.attributes.success) == (False, True)
 
 
+@pytest.mark.long
 def test_a_take_after_one_of_other_sizes_is_as_always(stage):
     before = taken(stage)
     taken(stage, width=1.3, height=0.9)
@@ -91,6 +93,7 @@ def test_impossible_sizes_are_refused(width):
         Sizes(width=width)
 
 
+@pytest.mark.long
 def test_fixed_objects_keep_their_size():
     stage = Stage("insert_peg", "robot", TwinSettings(image_height_px=16, image_width_px=16))
     usual = taken(stage).attributes.object_boxes_m
@@ -99,6 +102,7 @@ def test_fixed_objects_keep_their_size():
     assert wide[1] == usual[1]
 
 
+@pytest.mark.long
 def test_rollouts_of_a_twin_with_other_sizes_begin_and_stay_with_them():
     settings = TwinSettings(cameras=(), image_height_px=16, image_width_px=16, object_width=0.8)
     twin = TwinWorld(settings)

@@ -36,6 +36,7 @@ def test_the_verdict_follows_the_pins(hand_made, pins_mm, expected):
     assert task.succeeded(simulation) is expected[-1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("domain", ["robot", "human"])
 def test_the_touch_follows_the_springs(domain):
     stage = Stage("squeeze_ball", domain, TwinSettings())
@@ -60,6 +61,7 @@ def test_the_touch_follows_the_springs(domain):
     assert np.corrcoef(squeezing[squeezing > 0.001], rising)[0, 1] > 0.9
 
 
+@pytest.mark.long
 def test_a_ball_that_is_still_squeezed_is_not_done():
     stage = Stage("squeeze_ball", "robot", TwinSettings())
     # The hand stops while it holds the ball.

@@ -20,6 +20,7 @@ def world():
     return TwinWorld(SMALL)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", ["stand_bottle", "stack_bowls"])
 def test_replaying_the_commanded_actions_reproduces_the_demonstration(world, task):
     episode = record(Stage(task, "robot", SMALL), 11, TakeOptions(images=("camera_head",)))

@@ -42,6 +42,7 @@ def assert_kept_tokens_change_nothing(model, inputs):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", [{}, *OPTIONS], ids=str)
 def test_kept_tokens_change_nothing(tiny_config, batch, options):
     model = model_with(tiny_config, **options).requires_grad_(requires_grad=False)

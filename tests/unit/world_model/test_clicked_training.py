@@ -1,4 +1,4 @@
-"""Training with clicks: takes of the twin as a lab has them, without the poses of their objects."""
+"""Training with clicks and touch: the twin's takes as a lab has them, without objects' poses."""
 
 import dataclasses
 import json
@@ -103,6 +103,7 @@ def clicks_file(truths, numbers):
     )
 
 
+@pytest.mark.long
 def test_clicks_are_poses_of_the_first_step_alone(store, truths):
     store.set_clicks(name_of(1), clicks_on(truths[1]))
     loaded = load_scene_episodes(str(store.root), clicks=clicks_file(truths, [0]))
@@ -119,7 +120,7 @@ def test_clicks_are_poses_of_the_first_step_alone(store, truths):
         )
         np.testing.assert_allclose(turn[:3, :3], np.eye(3), atol=5e-3)
     # 3 px of 64 are some 3 cm at 0.75 m, and more along the view.
-    assert 0.02 < loaded[0].objects.clicked_sd_m[0] < 0.06
+    assert 0.02 < loaded[0].objects.sd_m[0] < 0.06
     assert loaded[0].objects.is_measured
 
 
@@ -131,7 +132,7 @@ def test_streams_count_more_than_clicks(truths, tmp_path):
     (one,) = load_scene_episodes(str(store.root), clicks=given)
     assert one.objects.sources == ("twin",)
     assert one.objects.known.all()
-    assert one.objects.clicked_sd_m.tolist() == [0.0]
+    assert one.objects.sd_m.tolist() == [0.0]
     np.testing.assert_array_equal(one.objects.poses[0, 0], true_pose(truths[0]).astype(np.float32))
 
 
@@ -186,7 +187,7 @@ def clicked(seed, **changes):
     one = episode(seed)
     known = np.zeros_like(one.objects.known)
     known[0] = True
-    track = {"known": known, "sources": ("clicks",), "clicked_sd_m": np.float32([0.008])}
+    track = {"known": known, "sources": ("clicks",), "sd_m": np.float32([0.008])}
     return changed(one, **track | changes)
 
 
@@ -236,6 +237,51 @@ def test_cores_start_from_clicks_and_know_their_error(config):  # noqa: F811
     torch.testing.assert_close(start.objects.position_m[1], readings[0].objects.position_m[1])
     later = _read_start(data, rows, 8, settings, torch.Generator().manual_seed(0))
     torch.testing.assert_close(later.objects.position_m, readings[8].objects.position_m)
+
+
+def test_touch_gives_poses_of_takes_that_succeeded(store, truths):
+    box_m = truths[0].attributes.object_boxes_m[0]
+    touch = {"hand": "right", "closing_deg": -150.0}
+    bottle = {
+        "name": "bottle",
+        "box_m": box_m,
+        "click": {"up": "x", "heading": "z"},
+        "touch": touch,
+    }
+    given = ObjectClicks.model_validate({"tasks": {"stand_bottle": [bottle]}})
+    given = given.model_copy(update={"episodes": {name_of(0): clicks_on(truths[0])}})
+    loaded = load_scene_episodes(str(store.root), clicks=given)
+    succeeded = [truth.attributes.success for truth in truths]
+    assert sum(succeeded) >= 3
+    for number, (one, truth) in enumerate(zip(loaded, truths, strict=True)):
+        source = "clicks" if number == 0 else "touch" if succeeded[number] else "none"
+        assert one.objects.sources == (source,)
+        if source == "touch":
+            assert one.objects.known.all()
+            off_m = one.objects.poses[0, 0, :3] - true_pose(truth)[:3]
+            assert np.linalg.norm(off_m) < 0.02
+            assert one.content_sha256 != one.reader.content_sha256
+    check_drawable(loaded)
+
+
+def test_cores_start_from_readings_where_touch_gave_the_pose(config):  # noqa: F811
+    """The pose says that the hand held the object: a core would learn the outcome from it."""
+    takes = [changed(episode(seed), sources=("touch",)) for seed in range(2)] + [episode(2)]
+    table = scene_table(takes, config)
+    assert table.touched.tolist() == [True, True, False]
+    torch.manual_seed(0)
+    reader = train_reader(
+        table, config, ReaderSettings(num_steps=1, batch=2, bfloat16=False), seed=0
+    )
+    readings = {step: read_step(reader, table, step) for step in start_steps(table)}
+    data = CoreData(table, touch_latents(TouchCodec(8), table), readings)
+    for step in (0, 8):
+        start = _read_start(
+            data, torch.arange(3), step, CoreSettings(), torch.Generator().manual_seed(0)
+        )
+        read = readings[step].objects.position_m
+        torch.testing.assert_close(start.objects.position_m[:2], read[:2])
+        assert not torch.equal(start.objects.position_m[2], read[2])
 
 
 def test_what_is_known_at_single_steps_counts_as_moving(config):  # noqa: F811

@@ -290,6 +290,7 @@ def test_chunks_one_after_another_are_the_whole(core):
         torch.testing.assert_close(getattr(state, one.name), getattr(end, one.name))
 
 
+@pytest.mark.long
 @torch.no_grad()
 def test_a_state_is_bounded_whatever_comes(core):
     core.movable.fill_(1.0)

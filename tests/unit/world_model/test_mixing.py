@@ -153,6 +153,7 @@ def test_a_checkpoint_proves_what_it_was_trained_on(settings):
     assert "--human-episodes=3" in metadata.command
 
 
+@pytest.mark.long
 def test_an_adapted_checkpoint_has_new_tasks_the_ancestors_codecs_and_its_history(
     settings, tmp_path, capsys
 ):

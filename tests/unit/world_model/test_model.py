@@ -167,6 +167,7 @@ def test_words_kind_and_layout_matter(model, inputs, noisy):
         assert (changed - base).abs().max() > 1e-5, name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("num_steps", [5, 9, 13, 17])
 def test_a_batch_of_one_equals_a_batch_of_many(model, toy_episodes, num_steps):
     requests = [cut_window(e, 4, num_steps).request for e in toy_episodes]

@@ -75,6 +75,7 @@ CUTS = [[16] * 5, [4] * 20, [4, 12, 64], [64, 16], [48, 32]]
 CUTS += [random_cut(np.random.default_rng(seed)) for seed in range(6)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lengths", CUTS, ids=str)
 def test_every_cutting_gives_the_same(world, started, commands, lengths):
     touch, poses, doubt, end = played(world, started.state, commands, [8] * 10)
@@ -160,6 +161,7 @@ def test_hands_that_touch_nothing_leave_everything_where_it_was(world):
     assert (pressed.object_poses != held.observation.object_poses).any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("num_steps", [20, 48, 72])
 def test_a_snapshot_amid_a_rollout_goes_on_bit_for_bit(world, started, commands, num_steps):
     """Before the hands stand, at rest, and after they moved again."""

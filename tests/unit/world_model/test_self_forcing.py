@@ -126,6 +126,7 @@ def test_the_recorded_future_has_no_loss(tiny_config, toy_episodes, prediction):
         assert loss.tactile < 1e-10
 
 
+@pytest.mark.long
 def test_a_checkpoint_is_distilled_and_an_interrupted_run_goes_on(
     toy_store, toy_episodes, toy_episode, train_settings, tmp_path
 ):
@@ -154,6 +155,7 @@ def test_a_checkpoint_is_distilled_and_an_interrupted_run_goes_on(
     assert_same_run(train_on(toy_episodes, heldout, again), expected)
 
 
+@pytest.mark.long
 def test_the_command_takes_the_network_from_the_checkpoint(
     toy_store, train_settings, tmp_path, capsys
 ):

@@ -41,6 +41,8 @@ from tests.unit.world_model.test_dynamics import random_commands, start
 from tests.unit.world_model.test_state_training import PX, episode
 from tests.unit.world_model.toy_grid import changed
 
+pytestmark = pytest.mark.long
+
 BOTH = DynamicsConfig(
     tasks=("press", "squeeze"), num_objects=(1, 1), image_px=PX, width=32, touch_channels=8,
     domains=("robot", "human"),

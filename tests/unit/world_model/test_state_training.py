@@ -116,6 +116,7 @@ def reader(table, config):
     return train_reader(table, config, settings, seed=0)
 
 
+@pytest.mark.long
 def test_a_reader_finds_held_out_blocks(reader, held_out):
     error = reader_errors(reader, held_out, 0)["press"]
     # The mean place of all blocks is about 75 mm off.
@@ -131,6 +132,7 @@ def test_the_same_seed_gives_the_same_reader(table, config):
     assert all((one[name] == other[name]).all() for name in one)
 
 
+@pytest.mark.long
 def test_a_core_feels_what_it_touches_and_nothing_elsewhere(reader, table, held_out, config):
     dynamics = DynamicsModel(config)
     dynamics.codec.fit(table.tactile_kpa.float().flatten(0, 2))
@@ -147,6 +149,7 @@ def test_a_core_feels_what_it_touches_and_nothing_elsewhere(reader, table, held_
     assert StateBounds(distance=measured.distance).distance > 0
 
 
+@pytest.mark.long
 def test_object_poses_without_labels_are_never_looked_at(config):
     episodes = [episode(seed) for seed in range(8)]
     lies = [changed(e, poses=e.objects.poses + 0.07) for e in episodes]
@@ -388,6 +391,7 @@ def test_unknown_poses_train_neither_readers_nor_cores(config):
     ]  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_core_starts_where_objects_are_unknown_from_what_the_reader_sees(reader, config):
     one = episode(0)
     hidden = one.objects.known.copy()

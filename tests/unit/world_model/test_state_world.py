@@ -50,6 +50,7 @@ def test_objects_that_are_not_found_are_doubted(odds):
         assert (stepped.observation.object_poses[:, 0] == ABSENT_POSE).all()
 
 
+@pytest.mark.long
 def test_a_rollout_ends_when_hands_moved_longer_than_was_ever_trained(world, checkpoint):
     horizon = checkpoint.metadata.bounds.horizon_latents
     started = world.reset(from_observation(world))
@@ -63,6 +64,7 @@ def test_a_rollout_ends_when_hands_moved_longer_than_was_ever_trained(world, che
         world.step(state, lift, seed=0)
 
 
+@pytest.mark.long
 def test_hands_that_stand_still_never_end_a_rollout(world):
     started = world.reset(from_observation(world))
     state = started.state

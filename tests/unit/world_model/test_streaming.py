@@ -165,6 +165,7 @@ def test_streamed_training_gives_the_weights_of_training_in_memory(
             torch.testing.assert_close(got[name], weight, rtol=1e-4, atol=1e-6, msg=name)
 
 
+@pytest.mark.long
 def test_streaming_splits_and_reports_as_training_in_memory(toy_store, train_settings):
     settings = train_settings.model_copy(
         update={"heldout_percent": 50, "max_steps": 2, "streaming": True, "loader_workers": 0}

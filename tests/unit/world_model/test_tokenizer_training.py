@@ -72,6 +72,7 @@ def test_figures_are_those_of_a_plain_count():
     assert point.mae_kpa == pytest.approx(absolute / hands.size, rel=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["split_hands", "grid"])
 def test_a_short_training_brings_touch_back(name, settings):
     report = train_tokenizer(
@@ -181,6 +182,7 @@ def test_training_without_any_touch_is_refused(settings):
         train_tokenizer(settings.model_copy(update={"heldout_share": 0.5}))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("streaming", [False, True])
 def test_one_store_trains_both_and_other_scenes_are_held_out(settings, train_settings, streaming):
     trained = train_tokenizer(settings)

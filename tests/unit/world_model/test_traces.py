@@ -63,6 +63,7 @@ def tensors(outputs):
     return list(trees._tensors(outputs))
 
 
+@pytest.mark.long
 @torch.no_grad()
 @pytest.mark.parametrize(("batch", "latents"), [(1, 4), (3, 2)])
 def test_traces_give_the_same_bits(model, batch, latents):
@@ -79,6 +80,7 @@ def test_traces_give_the_same_bits(model, batch, latents):
     assert traced._traces
 
 
+@pytest.mark.long
 @torch.no_grad()
 def test_rare_shapes_and_too_many_of_them_are_not_traced(model, monkeypatch):
     traced = Traced(model, model._predicted, model._kind_of)

@@ -22,6 +22,7 @@ def heldout(toy_episode):
     return [toy_episode(seed, 25) for seed in (10_000, 10_001)]
 
 
+@pytest.mark.long
 def test_the_loss_falls(toy_episodes, train_settings):
     run = TrainingRun(toy_episodes, train_settings.model_copy(update={"max_steps": 80}))
     run.fit_codecs()
@@ -66,6 +67,7 @@ def test_averaged_weights_follow_fast_at_first(toy_episodes, train_settings):
         torch.testing.assert_close(averaged, decay * was + (1 - decay) * weight)
 
 
+@pytest.mark.long
 def test_a_report_holds_what_was_measured_on_the_stored_weights(
     toy_store, toy_episodes, heldout, train_settings
 ):
@@ -93,6 +95,7 @@ def test_a_report_holds_what_was_measured_on_the_stored_weights(
         assert json.loads(file.metadata()[METADATA_KEY])["data_hash"] == stored.metadata.data_hash
 
 
+@pytest.mark.long
 def test_training_from_a_store_splits_it_by_hash(toy_store, train_settings):
     settings = train_settings.model_copy(update={"heldout_percent": 50, "max_steps": 2})
     report = train(settings)

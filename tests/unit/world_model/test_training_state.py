@@ -86,6 +86,7 @@ def test_windows_that_were_read_ahead_are_read_again(toy_store, settings, tmp_pa
         assert_same_run(train(stopped.model_copy(update={"resume": True})), expected)
 
 
+@pytest.mark.long
 def test_a_state_of_another_run_is_refused(toy_store, settings, tmp_path):
     path = state_path(settings.output)
 

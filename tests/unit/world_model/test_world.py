@@ -256,6 +256,7 @@ def test_output_that_is_no_number_is_refused(world, toy_episode):
         world.step(state, episode.actions["commanded"][1:5], seed=0)
 
 
+@pytest.mark.long
 def test_sixty_chunks_stay_finite_and_bounded(world, toy_episode):
     episode = toy_episode(5)
     started = world.reset(make_start(episode))

@@ -43,7 +43,7 @@ class ToyGrid(EpisodeGrid):
 
 def changed(one, **values):
     """A toy with other attributes, object poses or arrays."""
-    in_track = {name: values.pop(name) for name in ("poses", "known", "sources", "clicked_sd_m")
+    in_track = {name: values.pop(name) for name in ("poses", "known", "sources", "sd_m")
                 if name in values}  # fmt: skip
     own = {field.name for field in fields(one)}
     in_about = {name: values.pop(name) for name in list(values) if name not in own}

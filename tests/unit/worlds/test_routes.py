@@ -314,6 +314,7 @@ JSON_LIKE = st.recursive(
 )
 
 
+@pytest.mark.long
 @SLACK
 @given(
     body=st.binary(max_size=5000) | JSON_LIKE.map(lambda value: json.dumps(value).encode()),

@@ -72,6 +72,7 @@ def moved_states(still):
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("uses_bfloat16", [False, True])
 @pytest.mark.parametrize("which", ["trained", "wide stem"])
 def test_images_are_those_of_the_plain_formula(image, still, which, uses_bfloat16):
@@ -156,6 +157,7 @@ def test_start_images_of_several_sizes_are_refused(small, image, still):
         Renderer(weights_of(small)).draw_all(drawings)
 
 
+@pytest.mark.long
 def test_starts_of_several_rollouts_are_remembered_up_to_a_limit(small, image, still, monkeypatch):
     prepared = []
     original = PreparedScenes.of

@@ -146,6 +146,7 @@ def test_presets_name_the_full_size_and_its_miniature(preset):
     )
 
 
+@pytest.mark.long
 def test_plans_are_printed_instead_of_training_and_provenance(checkpoint, tmp_path, capsys):
     assert checkpoint.digest
     assert run_show(["--checkpoint", str(tmp_path / "untrained.safetensors"), "--plan"]) == 0

@@ -45,6 +45,7 @@ def test_flops_of_one_more_layer_by_hand(full_config):
     assert step(deeper) - step(full_config) == 2 * (wan + tactile + attention)
 
 
+@pytest.mark.long
 def test_a_plan_without_weights_is_what_a_run_measures(
     full_config, pretrained_folder, toy_episode, tiny_config
 ):
