@@ -229,7 +229,7 @@ def _started(client: RolloutClient, world: World[Any]) -> Rollout:
             reached_is_measured=True,
             object_poses=None,
             success=None,
-            doubt=None,
+            uncertainty=None,
         )
         init = (first, AnchorPoses(np.eye(4), np.eye(4), np.eye(4)), np.eye(3))
     return client.start(world="world", task=task, seed=0, instruction=task, init=init)

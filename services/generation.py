@@ -17,7 +17,7 @@ from dextouch.schemas import (
     ReturnSelector,
     WorldDescription,
     matrix_rows,
-    rollout_doubt,
+    rollout_uncertainty,
 )
 
 SHORT_CHUNK_STEPS: Final = 4
@@ -39,8 +39,8 @@ def imagine_episode(
     commands. Its `success` is that of the *source*: the real outcome of the actions, and the label
     for training a success classifier on imagined endings. Its lineage names the source and the
     world's digest. Object poses, if the world provides them, are the stream `object_poses`, from
-    step 1 on; the world's doubt about the whole rollout, and its own estimate of success, are
-    quality figures (`RolloutDoubt.to_quality`).
+    step 1 on; the world's uncertainty about the whole rollout, and its own estimate of success, are
+    quality figures (`RolloutUncertainty.to_quality`).
 
     Args:
         source: a robot episode with head camera, touch and actions.
@@ -81,7 +81,7 @@ def imagine_episode(
             "generator_command": None,
             "streams": (),
             "K_head": matrix_rows(K_head),
-            "quality": attributes.quality | rollout_doubt(seen).to_quality(),
+            "quality": attributes.quality | rollout_uncertainty(seen).to_quality(),
         }
     )
     write_rollout(store, imagined, seen, actions)

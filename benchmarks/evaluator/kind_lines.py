@@ -96,7 +96,7 @@ class KindFigures:
 
 # Names of `group_figures` in rows.
 _COLUMNS: Final = (
-    "auc", "balanced_accuracy", "bias", "wrong_of_decided", "decided", "auc_of_doubt",
+    "auc", "balanced_accuracy", "bias", "wrong_of_decided", "decided", "auc_of_uncertainty",
     "auc_of_true_endings",
 )  # fmt: skip
 
@@ -108,7 +108,7 @@ def group_figures(sampling: Sampling, what: str, rollouts: Sequence[Rolled]) -> 
     likely, decided = (_of_verdicts(rollouts, about) for about in (_is_likely, _is_decided))
     wrong = likely != success
     told = [one for one, sure in zip(rollouts, decided, strict=True) if sure]
-    doubt = np.array([doubt_of(one.rows[IMAGINED]) for one in rollouts])
+    uncertainty = np.array([uncertainty_of(one.rows[IMAGINED]) for one in rollouts])
     too_many: Bound = ("at most", 0.08)
     off = sampling.mean(
         f"{what}, bias of the success rate", likely.astype(float) - success, rollouts, too_many
@@ -123,7 +123,10 @@ def group_figures(sampling: Sampling, what: str, rollouts: Sequence[Rolled]) -> 
         ),
         sampling.mean(f"{what}, decided", decided.astype(float), rollouts, ("at least", 0.60)),
         sampling.area_of(
-            f"{what}, doubt of wrong verdicts, AUC", (doubt, wrong), rollouts, ("at least", 0.80)
+            f"{what}, uncertainty of wrong verdicts, AUC",
+            (uncertainty, wrong),
+            rollouts,
+            ("at least", 0.80),
         ),
         sampling.area(f"{what}, judge on true endings, AUC", TRUE, rollouts, 0.95, None),
     ]  # fmt: skip
@@ -193,8 +196,8 @@ def _policy_name(one: Rolled) -> str:
     return one.policy
 
 
-def doubt_of(verdict: Mapping[str, Any]) -> float:
-    """How doubtful a verdict is: more than 1 if it is left open, otherwise by its probability."""
+def uncertainty_of(verdict: Mapping[str, Any]) -> float:
+    """How unreliable a verdict is: more than 1 if it is left open, otherwise by its probability."""
     return float(not _is_decided(verdict)) + 1 - abs(2 * float(verdict["probability"]) - 1)
 
 

@@ -12,9 +12,9 @@ from dextouch.schemas import (
     CHUNK_STEPS,
     Observation,
     ReturnSelector,
-    RolloutDoubt,
     RolloutStart,
-    rollout_doubt,
+    RolloutUncertainty,
+    rollout_uncertainty,
 )
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import StartedRollout, State, World
@@ -46,13 +46,13 @@ class TrueRollout:
 
 @dataclass(frozen=True)
 class ImaginedRollout:
-    """Imagined rollout of the same policy, with the world's doubt of all of it."""
+    """Imagined rollout of the same policy, with the world's uncertainty of all of it."""
 
     tactile_kpa: Float32[np.ndarray, "81 2 320"]
     images_of_chunks: UInt8[np.ndarray, "chunks h w 3"]
     last_images: UInt8[np.ndarray, "3 h w 3"]
     object_poses: Float32[np.ndarray, "3 objects 7"] | None
-    doubt: RolloutDoubt
+    uncertainty: RolloutUncertainty
 
     def ending(self, task: str) -> Ending:
         """What the judge sees of it."""
@@ -62,7 +62,7 @@ class ImaginedRollout:
             task,
             self.object_poses,
             imagined=True,
-        ).with_doubt(self.doubt)
+        ).with_uncertainty(self.uncertainty)
 
 
 def play_in_twin(
@@ -162,7 +162,7 @@ def play_in_imagination(
         _stacked(images, seen),
         seen.images[HEAD_CAMERA][-NUM_SEEN_STEPS:],
         None if poses is None else poses[-NUM_SEEN_STEPS:],
-        rollout_doubt(shown),
+        rollout_uncertainty(shown),
     )
 
 

@@ -27,7 +27,7 @@ from benchmarks.evaluator.still_hand import StillRollout, hold_still, still_figu
 from dextouch.clients import Policy
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions
-from dextouch.schemas import RolloutDoubt, RolloutStart
+from dextouch.schemas import RolloutStart, RolloutUncertainty
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
@@ -127,13 +127,15 @@ class PolicyRollout:
         if path.is_file():
             kept = read_arrays(path)
             poses = kept.pop("object_poses", None)
-            doubt = RolloutDoubt.model_validate_json(str(kept.pop("doubt")))
-            return ImaginedRollout(**kept, object_poses=poses, doubt=doubt)
+            uncertainty = RolloutUncertainty.model_validate_json(str(kept.pop("uncertainty")))
+            return ImaginedRollout(**kept, object_poses=poses, uncertainty=uncertainty)
         imagined = play_in_imagination(
             world, self._first, self._actor, self._for_policy, shows_chunks=self._shows_chunks
         )
         arrays = {n: a for n, a in vars(imagined).items() if isinstance(a, np.ndarray)}
-        write_arrays(path, arrays | {"doubt": np.array(imagined.doubt.model_dump_json())})
+        write_arrays(
+            path, arrays | {"uncertainty": np.array(imagined.uncertainty.model_dump_json())}
+        )
         return imagined
 
     def _path(self, kind: str, *digests: str) -> Path:
@@ -153,7 +155,7 @@ class PolicyRollout:
             self._first_image,
             self._boxes_m,
         )
-        return {"doubted": imagined.doubt.reason, **figures}
+        return {"unreliable": imagined.uncertainty.reason, **figures}
 
     @property
     def _true_ending(self) -> Ending:

@@ -109,8 +109,8 @@ def _play(check: Check, subject: Subject) -> None:
         stepped = subject.world.step(state, chunk, seed=index, selector=worlds.TOUCH_ONLY)
         state = stepped.state
         check.finite("touch of moving hands", stepped.observation.tactile_kpa)
-        doubt = stepped.observation.doubt
-        check.true("every answer says how far it is trusted", doubt is not None)
+        uncertainty = stepped.observation.uncertainty
+        check.true("every answer says how far it is trusted", uncertainty is not None)
 
 
 @cache

@@ -18,11 +18,11 @@ from dextouch.metrics import tactile
 from dextouch.schemas import (
     CHUNK_STEPS,
     ID_PATTERN,
-    Doubt,
     EpisodeDetail,
     Observation,
     RolloutAnswer,
     StartRequest,
+    Uncertainty,
     WorldDescription,
     WorldList,
     decode_answer,
@@ -51,12 +51,12 @@ class StartComparison(FrozenModel):
     episode_id: str = Field(pattern=ID_PATTERN)
 
 
-class ChunkDoubt(FrozenModel):
-    """What the imagining world says about one chunk; None where it reports no doubt."""
+class ChunkUncertainty(FrozenModel):
+    """What the imagining world says about one chunk; None where it reports no uncertainty."""
 
     first_step: int
     last_step: int
-    doubt: Doubt | None
+    uncertainty: Uncertainty | None
 
 
 class ComparisonView(FrozenModel):
@@ -86,7 +86,7 @@ class ComparisonView(FrozenModel):
     pressure_error_kpa: tuple[float, ...] = ()
     contact_f1: tuple[float, ...] = ()
     in_contact: tuple[bool, ...] = ()
-    doubts: tuple[ChunkDoubt, ...] = ()
+    uncertainties: tuple[ChunkUncertainty, ...] = ()
 
 
 @dataclass
@@ -275,10 +275,10 @@ class Comparisons:
         run.messages.append(message)
         view = run.view
         joined = {name: getattr(view, name) + values for name, values in added.items()}
-        doubted = ChunkDoubt(
+        unreliable = ChunkUncertainty(
             first_step=real.first_step,
             last_step=real.first_step + len(real) - 1,
-            doubt=imagined.doubt,
+            uncertainty=imagined.uncertainty,
         )
         run.view = view.model_copy(
             update=joined
@@ -286,7 +286,9 @@ class Comparisons:
                 "num_chunks": len(run.messages),
                 "real_success": real.success,
                 # The start is given, not imagined.
-                "doubts": (*view.doubts, doubted) if real.first_step else view.doubts,
+                "uncertainties": (*view.uncertainties, unreliable)
+                if real.first_step
+                else view.uncertainties,
             }
         )
 

@@ -226,9 +226,9 @@ def fit_combinations(
 ) -> dict[str, Combination]:
     """Combination of a calibrated probe with the world's own estimates, of every task.
 
-    Only imagined endings count that the world estimates and does not doubt, since it is for these
-    that the probe decides. Objects of unusual sizes have a combination of their own: a world is
-    right about them less often.
+    Only imagined endings count that the world estimates and does not call unreliable, since it is
+    for these that the probe decides. Objects of unusual sizes have a combination of their own: a
+    world is right about them less often.
     """
     found: dict[str, Combination] = {}
     for task, unusual_sizes in product(probe.shape.tasks, (False, True)):
@@ -237,7 +237,7 @@ def fit_combinations(
             row
             for row, ending in enumerate(endings)
             if ending.success_probability is not None
-            and ending.doubted is None
+            and ending.unreliable is None
             and ending.has_unusual_sizes == unusual_sizes
         ]
         outcomes = success[rows]

@@ -18,7 +18,13 @@ from jaxtyping import Float64
 
 from dextouch.clients import Policy, Rollout
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, StorageError
-from dextouch.schemas import MAX_SEED, Observation, ReturnSelector, RolloutDoubt, rollout_doubt
+from dextouch.schemas import (
+    MAX_SEED,
+    Observation,
+    ReturnSelector,
+    RolloutUncertainty,
+    rollout_uncertainty,
+)
 from dextouch.streams import HEAD_CAMERA
 from dextouch.tracing import current_trace_id, in_trace
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
@@ -149,9 +155,9 @@ class PlayedRollout:
         return self.observations[-1]
 
     @property
-    def doubt(self) -> RolloutDoubt:
-        """The world's doubt of the whole rollout."""
-        return rollout_doubt(self.observations)
+    def uncertainty(self) -> RolloutUncertainty:
+        """The world's uncertainty of the whole rollout."""
+        return rollout_uncertainty(self.observations)
 
 
 @dataclass(frozen=True)
@@ -199,7 +205,7 @@ class RolloutRunner:
             with in_trace():
                 played = self._play(start, actor, policy, world, repeat)
             ending = Ending.of(
-                played.ending, start.task, imagined=world != REAL, doubt=played.doubt
+                played.ending, start.task, imagined=world != REAL, uncertainty=played.uncertainty
             )
         except DexTouchError as error:
             return rollout_failure(error, start, policy, world, repeat), None

@@ -22,7 +22,13 @@ from dextouch.episodes import (
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
-from dextouch.schemas import MAX_OBJECTS, Observation, RolloutDoubt, is_rollout, rollout_doubt
+from dextouch.schemas import (
+    MAX_OBJECTS,
+    Observation,
+    RolloutUncertainty,
+    is_rollout,
+    rollout_uncertainty,
+)
 from dextouch.streams import HEAD_CAMERA
 from dextouch.tactile.layout import NUM_TAXELS, split_pads
 from services.evaluation.matched_starts import start_digest
@@ -71,7 +77,7 @@ class Ending:
 
     `object_poses` are T_world_object (x y z m, qw qx qy qz) of at most three objects, NaN for an
     unknown object; only imagined worlds provide them. `images` are None if they were not
-    requested; images or object poses are required. `doubted` is the reason why the world itself
+    requested; images or object poses are required. `unreliable` is the reason why the world itself
     flags its prediction as uncertain, `success_probability` its own estimate of the outcome, and
     `size_deviation` how much the size of an object differs from the usual one; all are of the whole
     rollout.
@@ -82,7 +88,7 @@ class Ending:
     task: str
     object_poses: Float32[np.ndarray, "3 objects 7"] | None = None
     imagined: bool = False
-    doubted: str | None = None
+    unreliable: str | None = None
     success_probability: float | None = None
     size_deviation: float | None = None
 
@@ -103,7 +109,7 @@ class Ending:
         task: str,
         *,
         imagined: bool,
-        doubt: RolloutDoubt | None = None,
+        uncertainty: RolloutUncertainty | None = None,
     ) -> "Ending":
         """Ending shown by the last observation of a rollout.
 
@@ -111,7 +117,7 @@ class Ending:
             observation: the last one.
             task: of the rollout.
             imagined: whether a world model imagined it.
-            doubt: of the whole rollout; None if it has no observation but this one.
+            uncertainty: of the whole rollout; None if it has no observation but this one.
 
         Raises:
             InvalidInputError: fewer than three steps.
@@ -130,15 +136,19 @@ class Ending:
             None if poses is None else poses[-NUM_SEEN_STEPS:],
             imagined,
         )
-        return ending.with_doubt(rollout_doubt([observation]) if doubt is None else doubt)
+        return ending.with_uncertainty(
+            rollout_uncertainty([observation]) if uncertainty is None else uncertainty
+        )
 
-    def with_doubt(self, doubt: RolloutDoubt) -> "Ending":
+    def with_uncertainty(self, uncertainty: RolloutUncertainty) -> "Ending":
         """The ending with what the world says about the whole rollout."""
         return replace(
             self,
-            doubted=None if doubt.reason is None else f"at step {doubt.step}, {doubt.reason}",
-            success_probability=doubt.success_probability,
-            size_deviation=doubt.size_deviation,
+            unreliable=None
+            if uncertainty.reason is None
+            else f"at step {uncertainty.step}, {uncertainty.reason}",
+            success_probability=uncertainty.success_probability,
+            size_deviation=uncertainty.size_deviation,
         )
 
 
@@ -197,7 +207,7 @@ def read_ending_episode(reader: EpisodeReader, *, image_px: int = USUAL_IMAGE_PX
     last, touch_kpa = len(grid) - 1, grid.touch()[0]
     ends = (early_step(grid.scene, last), middle_step(grid.scene, last), last - 1, last)
     endings = {end: _read_ending(grid, touch_kpa, end) for end in ends}
-    endings[last] = endings[last].with_doubt(RolloutDoubt.from_quality(about.quality))
+    endings[last] = endings[last].with_uncertainty(RolloutUncertainty.from_quality(about.quality))
     endings = {end: ending for end, ending in endings.items() if ending.shows_scene}
     times = about.event_times_s
     # None noted in a true failure means none reached.

@@ -422,8 +422,8 @@ class SuccessClassifier:
                     f"itself with {ending.success_probability:.2f}"
                 )
             probability, band = float(joint.probabilities(*pair)[0]), joint.band
-        if ending.doubted is not None:
-            return probability, f"the world flags its prediction: {ending.doubted}"
+        if ending.unreliable is not None:
+            return probability, f"the world flags its prediction: {ending.unreliable}"
         if unknown_size is not None:
             return probability, unknown_size
         if contradiction is None and band > 0 and abs(probability - self.threshold) <= band:

@@ -18,10 +18,10 @@ from dextouch.hands.actions import (
 from dextouch.schemas import (
     EVERYTHING,
     ActionKind,
-    Doubt,
     Observation,
     ReturnSelector,
     RolloutStart,
+    Uncertainty,
     WorldDescription,
 )
 from dextouch.streams import HEAD_CAMERA, pack
@@ -71,7 +71,7 @@ MAX_CHUNK_STEPS = 64
 ABSENT_POSE = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0, 0.0], dtype=np.float32)
 # A rollout is flagged once its hands have moved 1.5 times the length of a training episode and ends
 # at four times that length, since no longer ones were trained on.
-DOUBTED_HORIZONS, LAST_HORIZONS = 1.5, 4.0
+UNRELIABLE_HORIZONS, LAST_HORIZONS = 1.5, 4.0
 
 
 @dataclass(frozen=True)
@@ -340,7 +340,7 @@ class StateWorld:
             action_reached=chunk,
             reached_is_measured=False,
             object_poses=poses,
-            doubt=self._doubt(state, steps, index),
+            uncertainty=self._uncertainty(state, steps, index),
         ).selected(selector)
         drawing = None
         if selector.wants(HEAD_CAMERA):
@@ -380,7 +380,7 @@ class StateWorld:
             for stepped, drawing in answers
         ]
 
-    def _doubt(self, state: StateRollout, steps: ImaginedSteps, index: int) -> Doubt:
+    def _uncertainty(self, state: StateRollout, steps: ImaginedSteps, index: int) -> Uncertainty:
         bounds = self._metadata.bounds
         # Of the worst latent step, independent of the chunk length.
         disagreement_m = float(steps.disagreement_m[index].max())
@@ -389,7 +389,7 @@ class StateWorld:
         seen = state.memory.start.objects.present[..., :count]
         found = bool((seen > PRESENCE_THRESHOLD).all())
         reason = None
-        if state.num_moving > DOUBTED_HORIZONS * bounds.horizon_latents:
+        if state.num_moving > UNRELIABLE_HORIZONS * bounds.horizon_latents:
             reason = "hands moved longer than in any episode of training"
         elif not found:
             reason = "an object of the task was not found at the start, or not by all members"
@@ -402,7 +402,7 @@ class StateWorld:
             times = distance / bounds.latent_distance
             reason = f"hands are {times:.1f} times as far from training as allowed"
         success = steps.success[:, index, -1]
-        return Doubt(
+        return Uncertainty(
             disagreement=disagreement_m,
             distance=distance,
             outside=reason is not None,

@@ -10,7 +10,7 @@ from benchmarks.evaluator import kind_lines, rollouts, work
 from benchmarks.evaluator.benchmark import add_options, figures_of_tasks, row_table
 from benchmarks.evaluator.drawn import Rolled
 from benchmarks.evaluator.keeping import KeptRows
-from benchmarks.evaluator.kind_lines import VERDICTS, doubt_of
+from benchmarks.evaluator.kind_lines import VERDICTS, uncertainty_of
 from benchmarks.evaluator.kinds import KindsPlan, mistakes_digest
 from benchmarks.evaluator.lines import TaskFigures
 from benchmarks.evaluator.plan import StudyPlan, Trained
@@ -90,8 +90,8 @@ def test_lines_by_hand(rolled):
     decided = lines["mistakes (development), decided"]
     assert (decided.value, decided.sense, decided.bound) == (0.75, "at least", 0.60)
     # Doubts of wrong verdicts are 1 + 0.8 and 0.8, of right ones 0.2 and 0.4.
-    doubt = lines["mistakes (development), doubt of wrong verdicts, AUC"]
-    assert (doubt.value, doubt.bound) == (1.0, 0.80)
+    uncertainty = lines["mistakes (development), uncertainty of wrong verdicts, AUC"]
+    assert (uncertainty.value, uncertainty.bound) == (1.0, 0.80)
     assert lines["mistakes (development), judge on true endings, AUC"].value == 1.0
     # Rates of the four policies, real 1 0 0 1 and imagined 1 0 1 0.
     assert lines[f"{POLICIES}, Pearson"].value == pytest.approx(0.0)
@@ -133,7 +133,7 @@ def test_rows_by_kind_stand_beside_the_ladder(rolled):
     every = rows["all development"]
     assert (every["auc"], every["auc_least"], every["auc_greatest"]) == (0.875, 0.75, 1.0)
     assert (rows["overshoot"]["auc"], rows["frame_yaw"]["auc"]) == (1.0, 0.5)
-    assert rows["overshoot"]["auc_of_doubt"] is None
+    assert rows["overshoot"]["auc_of_uncertainty"] is None
     table = row_table("kinds", task.kind_rows())
     assert table.rows[1][:3] == ("a", "all development", "4")
     # Lines of the ladder are about the ladder alone.
@@ -146,8 +146,10 @@ def test_rows_by_kind_stand_beside_the_ladder(rolled):
 
 def test_open_verdicts_are_more_doubtful_than_decided_ones():
     told = [("success", 0.98), ("failure", 0.4), ("cannot tell", 0.95), ("cannot tell", 0.55)]
-    doubts = [doubt_of({"probability": p, "decision": decision}) for decision, p in told]
-    assert doubts == sorted(doubts)
+    uncertainties = [
+        uncertainty_of({"probability": p, "decision": decision}) for decision, p in told
+    ]
+    assert uncertainties == sorted(uncertainties)
 
 
 def test_policies_of_other_names_have_no_kind():

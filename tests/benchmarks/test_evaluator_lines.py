@@ -16,7 +16,7 @@ from benchmarks.evaluator.restarts import chunks_that_move
 from benchmarks.evaluator.still_hand import StillRollout, still_figures
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import HandTrajectory
-from dextouch.schemas import RolloutDoubt
+from dextouch.schemas import RolloutUncertainty
 
 SCRIPTS = ("script 0 mm", "script 9 mm")
 COPY = "chained contact F1 less copy, worst chunk where anything moves"
@@ -175,7 +175,7 @@ def _true_and_imagined(touch_kpa: float, level: int) -> tuple[TrueRollout, Imagi
         object_poses=poses,
     )
     imagined = ImaginedRollout(
-        touch + np.float32(touch_kpa), images, images[:3], None, RolloutDoubt()
+        touch + np.float32(touch_kpa), images, images[:3], None, RolloutUncertainty()
     )
     return real, imagined
 

@@ -22,12 +22,12 @@ def test_members_alone_predict_as_within_the_ensemble(tmp_path):
     write_state_checkpoint(path, whole.dynamics, whole.renderer, whole.metadata)
     together = _stepped(StateWorld(whole)).state.memory
     alone = [_stepped(open_world(one)) for one in write_single_members(path, tmp_path / "each")]
-    assert len({one.observation.doubt.success_probability for one in alone}) == 2
+    assert len({one.observation.uncertainty.success_probability for one in alone}) == 2
     for member, one in enumerate(alone):
         assert one.state.memory.success.flatten().tolist() == pytest.approx(
             together.success[member].tolist(), abs=1e-6
         )
-        assert one.observation.doubt.success_spread == 0.0
+        assert one.observation.uncertainty.success_spread == 0.0
     assert single_member(whole.dynamics, 1).core.members == 1
 
 

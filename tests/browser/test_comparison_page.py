@@ -9,7 +9,7 @@ from playwright.sync_api import expect
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import EndedError
-from dextouch.schemas import EVERYTHING, Doubt, RolloutStart
+from dextouch.schemas import EVERYTHING, RolloutStart, Uncertainty
 from dextouch.worlds import SteppedRollout, WorldServiceSettings, create_world_app
 from services.dashboard.app import create_app
 from services.dashboard.settings import DashboardSettings
@@ -19,7 +19,7 @@ from tests.unit.evaluation import toy
 from tests.unit.evaluation.toy_store import write
 
 SEED = 3
-DOUBTED = "the hand is 20 mm from where it was sent"
+UNRELIABLE = "the hand is 20 mm from where it was sent"
 PIXELS = """canvas => [canvas.width, canvas.height,
   [...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data]]"""
 
@@ -36,11 +36,11 @@ class DoubtfulWorld(toy.ToyWorld):
             raise EndedError("dream: lost", reason="the spot is out of sight")
         stepped = super().step(state, actions, seed=seed, selector=selector)
         outside = state.step == 32
-        doubt = Doubt(
-            disagreement=0.02, distance=0.5, outside=outside, reason=DOUBTED if outside else None
+        uncertainty = Uncertainty(
+            disagreement=0.02, distance=0.5, outside=outside, reason=UNRELIABLE if outside else None
         )
         return SteppedRollout(
-            stepped.state, replace(stepped.observation, doubt=doubt), stepped.info
+            stepped.state, replace(stepped.observation, uncertainty=uncertainty), stepped.info
         )
 
 
@@ -143,10 +143,10 @@ def test_both_worlds_side_by_side_with_their_errors(page, serve_dashboard, item,
             count = int((kpa >= 2).sum())
             said = f"{count} taxels in contact, peak {kpa.max():.0f} kPa" if count else "no contact"
             expect(page.locator(f"#imagined_{side}_text")).to_have_text(said)
-        doubt = page.locator("#imagined_doubt")
-        said = {0: "given", 20: "within", 40: f"unreliable: {DOUBTED}"}
-        later = f"unreliable since step 48: {DOUBTED}"
-        expect(doubt).to_contain_text(said.get(step, later))
+        uncertainty = page.locator("#imagined_uncertainty")
+        said = {0: "given", 20: "within", 40: f"unreliable: {UNRELIABLE}"}
+        later = f"unreliable since step 48: {UNRELIABLE}"
+        expect(uncertainty).to_contain_text(said.get(step, later))
     assert page.locator("#charts canvas").count() == 3
     # Nothing is left behind in the worlds.
     for url in (twin, model):

@@ -8,20 +8,20 @@ import pytest
 from playwright.sync_api import expect
 
 from dextouch.clients import RolloutClient
-from dextouch.schemas import EVERYTHING, Doubt, ReturnSelector
+from dextouch.schemas import EVERYTHING, ReturnSelector, Uncertainty
 from dextouch.worlds import SteppedRollout, WorldServiceSettings, create_world_app
 from services.dashboard.app import create_app
 from services.dashboard.settings import DashboardSettings
 from tests.unit.worlds.fakes import SumWorld, actions
 
-DOUBTED = "objects are 12 mm apart in two predictions, the bound is 8 mm"
+UNRELIABLE = "objects are 12 mm apart in two predictions, the bound is 8 mm"
 START = {"world": "sum", "task": "stand_bottle", "seed": 7, "instruction": "stand <b>it</b> up"}
 PIXELS = """canvas => [canvas.width, canvas.height,
   [...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data]]"""
 
 
 class NoisyWorld(SumWorld):
-    """Every step has its own image and touch; the third chunk is doubted."""
+    """Every step has its own image and touch; the third chunk is unreliable."""
 
     def step(self, state, actions, *, seed, selector=EVERYTHING):
         stepped = super().step(state, actions, seed=seed)
@@ -31,10 +31,15 @@ class NoisyWorld(SumWorld):
         }
         touch = rng.uniform(0, 30, seen.tactile_kpa.shape).astype(np.float32)
         outside = state.step == 8
-        doubt = Doubt(
-            disagreement=0.012, distance=1.5, outside=outside, reason=DOUBTED if outside else None
+        uncertainty = Uncertainty(
+            disagreement=0.012,
+            distance=1.5,
+            outside=outside,
+            reason=UNRELIABLE if outside else None,
         )
-        told = replace(seen, images=images, tactile_kpa=touch, doubt=doubt).selected(selector)
+        told = replace(seen, images=images, tactile_kpa=touch, uncertainty=uncertainty).selected(
+            selector
+        )
         return SteppedRollout(stepped.state, told, stepped.info)
 
 
@@ -85,9 +90,9 @@ def test_a_rollout_is_watched_step_by_step(opened, world_url):
         expect(opened.locator("#watched_note")).to_have_text("")
 
         assert_shows(opened, rollout.step(actions(4, 0.1)))
-        expect(opened.locator("#watched_note")).to_have_text(f"Unreliable steps: {DOUBTED}")
+        expect(opened.locator("#watched_note")).to_have_text(f"Unreliable steps: {UNRELIABLE}")
         expect(row).to_contain_text("unreliable")
-        expect(row).to_contain_text(DOUBTED)
+        expect(row).to_contain_text(UNRELIABLE)
         # Of an earlier step, which the operator goes back to.
         opened.get_by_label("step of the newest chunk").focus()
         opened.keyboard.press("ArrowLeft")
@@ -96,7 +101,7 @@ def test_a_rollout_is_watched_step_by_step(opened, world_url):
             assert np.array_equal(shown_image(opened, camera), images[-2])
         # The next chunk is within the bound, but what it goes on from is not.
         assert_shows(opened, rollout.step(actions(4, 0.1)))
-        since = f"unreliable since step 12: {DOUBTED}"
+        since = f"unreliable since step 12: {UNRELIABLE}"
         expect(opened.locator("#watched_note")).to_have_text(since)
         expect(row).to_contain_text(since)
         expect(row).to_contain_text("unreliable")

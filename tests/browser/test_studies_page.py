@@ -11,8 +11,8 @@ from services.evaluation.settings import StudyServiceSettings
 from services.evaluation.studies.app import create_app as create_studies
 from tests.unit.evaluation.study_rows import (
     DEFINITION,
-    DOUBTED,
     ROWS,
+    UNRELIABLE,
     WORLDS,
     counted,
     disagreements,
@@ -102,9 +102,9 @@ def test_two_policies_are_shown_without_a_correlation(opened, root, monkeypatch)
 def test_what_cannot_be_trusted_is_said_beside_the_number(opened, root):
     finish(root)
     opened.get_by_role("link", name="touch and sight").click()
-    doubted = opened.locator("tr[data-task=stand_bottle][data-policy=hold] [data-world=model]")
+    unreliable = opened.locator("tr[data-task=stand_bottle][data-policy=hold] [data-world=model]")
     # Text of a result stays text.
-    expect(doubted).to_contain_text(f"1 of 8 cannot tell: {DOUBTED}")
+    expect(unreliable).to_contain_text(f"1 of 8 cannot tell: {UNRELIABLE}")
     failed = opened.locator("tr[data-task=open_drawer][data-policy=hold] [data-world=real]")
     expect(failed).to_contain_text("1 of 8 failed to run and are not counted")
 

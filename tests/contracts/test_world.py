@@ -177,7 +177,7 @@ def move(seen: Observation, num_steps: int) -> np.ndarray:
 
 
 def assert_same(one: Observation, other: Observation, *, tolerance: float = 0.0) -> None:
-    assert one.doubt == other.doubt
+    assert one.uncertainty == other.uncertainty
     assert (one.object_poses is None) == (other.object_poses is None)
     if one.object_poses is not None:
         np.testing.assert_allclose(one.object_poses, other.object_poses, rtol=0, atol=tolerance)

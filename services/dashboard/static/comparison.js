@@ -1,12 +1,12 @@
 // Real against imagined: starts a replay, follows it as its chunks arrive, and goes back to any step.
 
-import { chunkOf, difference, doubtAt, firstDoubted, readChunk, SIDES, stepOf } from "./comparison_chunks.js";
+import { chunkOf, difference, uncertaintyAt, firstUnreliable, readChunk, SIDES, stepOf } from "./comparison_chunks.js";
 import { ComparisonCharts } from "./comparison_charts.js";
 import { element, setText } from "./dom.js";
 import { number } from "./format.js";
 import { HandCanvas } from "./hands.js";
 import { drawRgb } from "./rgb_canvas.js";
-import { badge, doubtOf } from "./rollout_rows.js";
+import { badge, uncertaintyOf } from "./rollout_rows.js";
 import { ask } from "./session.js";
 import { StepPlayer } from "./step_player.js";
 
@@ -119,12 +119,12 @@ export class ComparisonPanel {
       for (const side of ["left", "right"]) this.hands[world][side].update(worlds[world][side]);
     }
     drawRgb(find("difference_image"), chunk.height, chunk.width, difference(worlds.real.rgb, worlds.imagined.rgb));
-    const said = doubtAt(this.view.doubts, step);
-    const earlier = firstDoubted(this.view.doubts, step);
-    const doubt = said ? doubtOf({ doubt: said.doubt, rollout_doubt: earlier, kind: "model", next_chunk: 1 }) : { text: "given, not imagined", reason: "" };
-    find("imagined_doubt").dataset.outside = Boolean(earlier);
-    const words = said?.doubt?.outside ? `unreliable: ${doubt.reason}` : earlier ? doubt.reason : said ? `doubt ${doubt.text}` : doubt.text;
-    setText(find("imagined_doubt"), words);
+    const said = uncertaintyAt(this.view.uncertainties, step);
+    const earlier = firstUnreliable(this.view.uncertainties, step);
+    const uncertainty = said ? uncertaintyOf({ doubt: said.uncertainty, rollout_doubt: earlier, kind: "model", next_chunk: 1 }) : { text: "given, not imagined", reason: "" };
+    find("imagined_uncertainty").dataset.outside = Boolean(earlier);
+    const words = said?.uncertainty?.outside ? `unreliable: ${uncertainty.reason}` : earlier ? uncertainty.reason : said ? `uncertainty ${uncertainty.text}` : uncertainty.text;
+    setText(find("imagined_uncertainty"), words);
     const { pixel_error, pressure_error_kpa, contact_f1, in_contact } = this.view;
     setText(find("comparison_text"), `step ${step}: pixels ${number(pixel_error[step], 2)}, pressure ${number(pressure_error_kpa[step], 3, "kPa")}, `
       + `contact F1 ${in_contact[step] ? number(contact_f1[step], 2) : "undefined (no contact)"}`);

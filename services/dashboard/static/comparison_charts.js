@@ -1,4 +1,4 @@
-// Errors over the steps of a comparison: three plots with one cursor, shaded where imagination is doubted.
+// Errors over the steps of a comparison: three plots with one cursor, shaded where imagination is unreliable.
 
 import { css } from "./canvas.js";
 import uPlot from "./vendor/uplot/uPlot.esm.js";
@@ -57,8 +57,8 @@ export class ComparisonCharts {
   }
 
   shade(plot) {
-    for (const { first_step, last_step, doubt } of this.view.doubts) {
-      if (doubt?.outside) this.band(plot, first_step, last_step, css("--warn_ground"));
+    for (const { first_step, last_step, uncertainty } of this.view.uncertainties) {
+      if (uncertainty?.outside) this.band(plot, first_step, last_step, css("--warn_ground"));
     }
   }
 

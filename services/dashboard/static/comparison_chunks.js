@@ -34,13 +34,13 @@ export function difference(real, imagined) {
   return real.map((value, index) => Math.abs(value - imagined[index]));
 }
 
-// Doubt of the chunk that holds a step; null at the start, which is given.
-export function doubtAt(doubts, step) {
-  return doubts.find((one) => step >= one.first_step && step <= one.last_step) ?? null;
+// Uncertainty of the chunk that holds a step; null at the start, which is given.
+export function uncertaintyAt(uncertainties, step) {
+  return uncertainties.find((one) => step >= one.first_step && step <= one.last_step) ?? null;
 }
 
-// Reason and step of the first doubted chunk up to a step, which makes the rest unreliable; null if none.
-export function firstDoubted(doubts, step) {
-  const first = doubts.find((one) => one.doubt?.outside && one.first_step <= step);
-  return first ? { reason: first.doubt.reason, step: first.last_step } : null;
+// Reason and step of the first unreliable chunk up to a step, which makes the rest unreliable; null if none.
+export function firstUnreliable(uncertainties, step) {
+  const first = uncertainties.find((one) => one.uncertainty?.outside && one.first_step <= step);
+  return first ? { reason: first.uncertainty.reason, step: first.last_step } : null;
 }

@@ -1,4 +1,4 @@
-// Open rollouts → rows of the table, and the words for their state and doubt.
+// Open rollouts → rows of the table, and the words for their state and uncertainty.
 
 import { element, showChildren } from "./dom.js";
 import { age } from "./format.js";
@@ -15,18 +15,18 @@ export function stateOf(rollout) {
   return { level: "OK", word: "running" };
 }
 
-// Doubt of the newest chunk in words; `reason` is what to read beside a number that cannot be trusted.
-// Once a chunk was doubted, the rest of the rollout is unreliable, too.
-export function doubtOf(rollout) {
-  const { doubt, kind, rollout_doubt: whole } = rollout;
-  if (doubt) {
-    const estimate = doubt.success_probability ?? null;
+// Uncertainty of the newest chunk in words; `reason` is what to read beside a number that cannot be trusted.
+// Once a chunk was unreliable, the rest of the rollout is unreliable, too.
+export function uncertaintyOf(rollout) {
+  const { doubt: uncertainty, kind, rollout_doubt: whole } = rollout;
+  if (uncertainty) {
+    const estimate = uncertainty.success_probability ?? null;
     const success = estimate === null ? "" : `, success ${(100 * estimate).toFixed(0)} % by its own estimate`;
-    const figures = `disagreement ${doubt.disagreement.toPrecision(2)}, distance ${doubt.distance.toPrecision(2)}${success}`;
+    const figures = `disagreement ${uncertainty.disagreement.toPrecision(2)}, distance ${uncertainty.distance.toPrecision(2)}${success}`;
     const earlier = whole?.reason ? `unreliable since step ${whole.step}: ${whole.reason}` : "";
-    return { text: doubt.outside ? `above its bound: ${figures}` : `within its bound: ${figures}`, reason: doubt.reason ?? earlier };
+    return { text: uncertainty.outside ? `above its bound: ${figures}` : `within its bound: ${figures}`, reason: uncertainty.reason ?? earlier };
   }
-  if (kind === "model") return { text: "not reported", reason: rollout.next_chunk === 0 ? "" : "This model has no doubt figure: nothing says how reliable these steps are." };
+  if (kind === "model") return { text: "not reported", reason: rollout.next_chunk === 0 ? "" : "This model has no uncertainty figure: nothing says how reliable these steps are." };
   return { text: "–", reason: "" };
 }
 
@@ -40,7 +40,7 @@ export function badge({ level, word }) {
 
 export function rolloutRow(rollout, isWatched, watch) {
   const state = stateOf(rollout);
-  const doubt = doubtOf(rollout);
+  const uncertainty = uncertaintyOf(rollout);
   const button = element("button", { type: "button", "aria-pressed": isWatched }, isWatched ? "Watching" : "Watch");
   button.addEventListener("click", () => watch(rollout));
   return element("tr", { "data-level": state.level === "OK" ? null : state.level, "data-watch": rollout.watch_id, "data-key": rollout.watch_id },
@@ -52,7 +52,7 @@ export function rolloutRow(rollout, isWatched, watch) {
     element("td", { class: "number" }, String(rollout.last_step), why(rollout.model_rate_hz ? `${(rollout.last_step / rollout.model_rate_hz).toFixed(1)} s` : "")),
     element("td", { class: "number" }, age(rollout.age_s)),
     element("td", { class: "number" }, age(rollout.idle_s)),
-    element("td", { class: "doubt" }, doubt.text, why(doubt.reason)),
+    element("td", { class: "uncertainty" }, uncertainty.text, why(uncertainty.reason)),
     element("td", {}, button));
 }
 

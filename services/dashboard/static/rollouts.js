@@ -5,7 +5,7 @@ import { element, setText } from "./dom.js";
 import { HandCanvas } from "./hands.js";
 import { LiveLink } from "./live.js";
 import { drawRgb } from "./rgb_canvas.js";
-import { badge, doubtOf, showRollouts, stateOf } from "./rollout_rows.js";
+import { badge, uncertaintyOf, showRollouts, stateOf } from "./rollout_rows.js";
 import { ask, pagePath } from "./session.js";
 import { imageOf, readSteps, touchOf } from "./step_messages.js";
 import { StepPlayer } from "./step_player.js";
@@ -86,7 +86,7 @@ function showSteps(message) {
   if (message.header.topic !== watched?.topic) return;
   steps = message;
   const { observation, rollout } = message.header;
-  const reliability = doubtOf({ ...watched.rollout, ...rollout, doubt: observation.doubt });
+  const reliability = uncertaintyOf({ ...watched.rollout, ...rollout, doubt: observation.doubt });
   if (rollout.ended) note(`The world ended this rollout: ${rollout.ended}`, "ERROR");
   else if (observation.doubt?.outside) note(`Unreliable steps: ${reliability.reason}`, "WARN");
   else if (reliability.reason) note(reliability.reason, "WARN");

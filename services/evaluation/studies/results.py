@@ -270,7 +270,7 @@ def keep_rollout(
         anchor=StoredAnchor.from_poses(start.anchor),
         K_head=matrix_rows(start.K_head),
         success=played.success,
-        quality=played.doubt.to_quality(),
+        quality=played.uncertainty.to_quality(),
         trace_id=played.trace_id,
         lineage=(
             LineageEntry(kind="rollout", id=f"{header.name}: {cell.policy} in {cell.world}"),

@@ -48,8 +48,8 @@ MEANINGS: Final = {
     "interval": "Intervals contain the true policies' figure with 95 % probability; with few "
     "policies or starts they are wide.",
     "unreliable": "The success classifier cannot tell: its probability is too close to 0.5, it and "
-    "the world's own estimate contradict each other, or the world doubted its prediction at a "
-    "step. "
+    "the world's own estimate contradict each other, or the world called its prediction unreliable "
+    "at a step. "
     f"With fewer than {LEAST_DECIDED:.0%} of its rollouts decided a policy is not compared.",
 }
 REPORT_FILE: Final = "report.json"

@@ -329,8 +329,8 @@ class RecurrentCore(nn.Module):
         first_m = start.objects.position_m[:, :used]
         box = self.boxes_m[start.task, :used] * start.size[:, :used, BOX_AXES]
         moves = self.movable[start.task, :used] * present
-        doubt = 5.0 * compressed(start.sd_m[:, :used])
-        known = torch.cat([box * 10.0, torch.stack([moves, present, doubt], dim=-1)], dim=-1)
+        spread = 5.0 * compressed(start.sd_m[:, :used])
+        known = torch.cat([box * 10.0, torch.stack([moves, present, spread], dim=-1)], dim=-1)
         wrist_m = torch.cat([state.wrist_m[:, None], commands.points_m[:, :, -1, :, 0]], dim=1)
         R = _rotation(torch.cat([state.wrist_axes[:, None], commands.axes], dim=1))
         turn = R[:, 1:] @ R[:, :-1].transpose(-1, -2)

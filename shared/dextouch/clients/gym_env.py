@@ -44,8 +44,8 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
     episode, `max_chunks` truncates it. A world without a success check never terminates. A world
     that cannot continue a rollout truncates it: the observation is then the last one again, and
     `info["ended"]` says why (None otherwise). `info` also holds `success` (None where unknown),
-    `doubt` of the chunk, `rollout_doubt` of all chunks so far, and the numbers that the world
-    reports about the chunk.
+    `uncertainty` of the chunk, `rollout_uncertainty` of all chunks so far, and the numbers that the
+    world reports about the chunk.
 
     Args:
         client: of the service.
@@ -135,8 +135,8 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
             "success": rollout.observation.success,
             "last_step": rollout.info.last_step,
             "told": dict(rollout.told),
-            "doubt": rollout.observation.doubt,
-            "rollout_doubt": rollout.info.rollout_doubt,
+            "uncertainty": rollout.observation.uncertainty,
+            "rollout_uncertainty": rollout.info.rollout_uncertainty,
             "ended": None,
         }
 

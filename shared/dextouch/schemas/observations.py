@@ -29,7 +29,14 @@ from dextouch.geometry import rigid_error
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
 from dextouch.images import decode_jpeg, encode_jpeg, jpeg_size
 from dextouch.schemas.common import first_problems
-from dextouch.schemas.rollouts import ActionKind, Doubt, RolloutDoubt, RolloutInfo, StartRequest
+from dextouch.schemas.rollouts import (
+    WIRE_NAMES,
+    ActionKind,
+    RolloutInfo,
+    RolloutUncertainty,
+    StartRequest,
+    Uncertainty,
+)
 from dextouch.streams import pack, unpack
 
 # Tolerance of the norm of a unit quaternion in float32.
@@ -78,7 +85,7 @@ class Observation:
     measured by a twin or a robot; in an imagined world, which does not sense joints, the commanded
     actions (`reached_is_measured` says which). `object_poses` are T_world_object (x y z in m, qw qx
     qy qz) as estimated by an imagined world, in the order of the description's `object_names`; None
-    in worlds without object poses, such as a robot. `doubt` is about the whole chunk.
+    in worlds without object poses, such as a robot. `uncertainty` is about the whole chunk.
     """
 
     first_step: int
@@ -88,7 +95,7 @@ class Observation:
     reached_is_measured: bool
     success: bool | None = None
     object_poses: Float32[np.ndarray, "n objects 7"] | None = None
-    doubt: Doubt | None = None
+    uncertainty: Uncertainty | None = None
 
     def __len__(self) -> int:
         return len(self.tactile_kpa)
@@ -122,12 +129,12 @@ class Observation:
         return replace(shown, images=wanted)
 
 
-def rollout_doubt(observations: Iterable[Observation]) -> RolloutDoubt:
-    """The doubt of a whole rollout, from its observations in their order."""
-    doubt = RolloutDoubt()
+def rollout_uncertainty(observations: Iterable[Observation]) -> RolloutUncertainty:
+    """The uncertainty of a whole rollout, from its observations in their order."""
+    uncertainty = RolloutUncertainty()
     for seen in observations:
-        doubt = doubt.after(seen.doubt, last_step=seen.last_step)
-    return doubt
+        uncertainty = uncertainty.after(seen.uncertainty, last_step=seen.last_step)
+    return uncertainty
 
 
 @dataclass(frozen=True)
@@ -215,10 +222,14 @@ def _name_of(dtype: "np.dtype[Any]") -> str:
 class ObservationFields(FrozenModel):
     """The non-array fields of an observation."""
 
+    model_config = WIRE_NAMES
+
     first_step: int
     reached_is_measured: bool
     success: bool | None = None
-    doubt: Doubt | None = Field(default=None, exclude_if=lambda doubt: doubt is None)
+    uncertainty: Uncertainty | None = Field(
+        default=None, exclude_if=lambda uncertainty: uncertainty is None, alias="doubt"
+    )
 
 
 class AnswerFields(FrozenModel):

@@ -1,10 +1,10 @@
-"""Schemas of rollouts without arrays: worlds, requests to start and fork, progress and doubt."""
+"""Schemas of rollouts without arrays: worlds, requests to start and fork, and their progress."""
 
 from collections.abc import Mapping
 from operator import not_
 from typing import Final, Literal
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
@@ -15,7 +15,9 @@ MAX_SEED = 2**63 - 1
 # Steps of an action chunk at the model rate of 15 Hz, as in the paper: the usual length, which
 # policies, models in the paper's form and comparisons have.
 CHUNK_STEPS: Final = 16
-# Quality figures of imagined episodes, and the fields of `RolloutDoubt` that they hold.
+# Version 1 of the API says doubt for uncertainty, and so does the episode format.
+WIRE_NAMES: Final = ConfigDict(validate_by_name=True, serialize_by_alias=True)
+# Quality figures of imagined episodes, and the fields of `RolloutUncertainty` that they hold.
 _QUALITY: Final = {
     "imagined_doubted_step": "step",
     "imagined_success_probability": "success_probability",
@@ -80,7 +82,7 @@ class ForkRequest(FrozenModel):
     seed: int | None = Field(default=None, ge=0, le=MAX_SEED)
 
 
-class Doubt(FrozenModel):
+class Uncertainty(FrozenModel):
     """Uncertainty of an imagining world about its prediction.
 
     `disagreement` and `distance` are non-negative, and comparable within one world digest only. The
@@ -109,7 +111,7 @@ class Doubt(FrozenModel):
     )
 
     @model_validator(mode="after")
-    def _a_reason_if_outside(self) -> "Doubt":
+    def _a_reason_if_outside(self) -> "Uncertainty":
         if self.outside != (self.reason is not None):
             raise ValueError(
                 f"got outside {self.outside} with reason {self.reason!r}, expected a reason where "
@@ -118,11 +120,11 @@ class Doubt(FrozenModel):
         return self
 
 
-class RolloutDoubt(FrozenModel):
-    """What the doubt of all chunks of a rollout says about its outcome.
+class RolloutUncertainty(FrozenModel):
+    """What the uncertainty of all chunks of a rollout says about its outcome.
 
-    An outcome depends on every step before it, so one doubted chunk makes the rest of the rollout
-    doubtful.
+    An outcome depends on every step before it, so one unreliable chunk makes the rest of the
+    rollout unreliable, too.
 
     Attributes:
         reason: of the first chunk that was outside the world's bound; None if none was.
@@ -138,18 +140,18 @@ class RolloutDoubt(FrozenModel):
     success_spread: float | None = None
     size_deviation: float | None = None
 
-    def after(self, doubt: Doubt | None, *, last_step: int) -> "RolloutDoubt":
-        """The doubt of the rollout after one more chunk.
+    def after(self, uncertainty: Uncertainty | None, *, last_step: int) -> "RolloutUncertainty":
+        """The uncertainty of the rollout after one more chunk.
 
         Args:
-            doubt: of the chunk; None where the world reports none.
+            uncertainty: of the chunk; None where the world reports none.
             last_step: last step of the chunk.
         """
         reason, step = self.reason, self.step
-        if reason is None and doubt is not None and doubt.outside:
-            reason, step = doubt.reason, last_step
-        newest = {name: getattr(doubt, name, None) for name in _ESTIMATES}
-        return RolloutDoubt(reason=reason, step=step, **newest)
+        if reason is None and uncertainty is not None and uncertainty.outside:
+            reason, step = uncertainty.reason, last_step
+        newest = {name: getattr(uncertainty, name, None) for name in _ESTIMATES}
+        return RolloutUncertainty(reason=reason, step=step, **newest)
 
     def to_quality(self) -> dict[str, float]:
         """The known numbers as quality figures of an episode; the reason's text is lost."""
@@ -157,19 +159,21 @@ class RolloutDoubt(FrozenModel):
         return {figure: float(value) for figure, value in known.items() if value is not None}
 
     @staticmethod
-    def from_quality(quality: Mapping[str, float]) -> "RolloutDoubt":
-        """The doubt that `to_quality` noted; unknown where the episode has no such figures."""
+    def from_quality(quality: Mapping[str, float]) -> "RolloutUncertainty":
+        """The uncertainty that `to_quality` noted; unknown where an episode has no such figures."""
         known = {name: quality.get(figure) for figure, name in _QUALITY.items()}
-        reason = None if known["step"] is None else "the world doubted its prediction"
-        return RolloutDoubt.model_validate(known | {"reason": reason})
+        reason = None if known["step"] is None else "the world called its prediction unreliable"
+        return RolloutUncertainty.model_validate(known | {"reason": reason})
 
 
 class RolloutInfo(FrozenModel):
     """State of a rollout; `next_chunk` is the only chunk number accepted next.
 
-    `ended` is why its world cannot continue it, omitted while it can; `rollout_doubt` the doubt of
+    `ended` is why its world cannot continue it, omitted while it can; `rollout_uncertainty` that of
     all chunks so far, omitted while the world reports none.
     """
+
+    model_config = WIRE_NAMES
 
     id: str
     world: str
@@ -182,18 +186,20 @@ class RolloutInfo(FrozenModel):
     last_step: int
     ttl_s: float
     ended: str | None = Field(default=None, exclude_if=_is_none)
-    rollout_doubt: RolloutDoubt | None = Field(default=None, exclude_if=_is_none)
+    rollout_uncertainty: RolloutUncertainty | None = Field(
+        default=None, exclude_if=_is_none, alias="rollout_doubt"
+    )
 
-    def after(self, doubt: Doubt | None, num_steps: int) -> "RolloutInfo":
-        """The state after one more chunk of this doubt and number of steps."""
-        last_step, so_far = self.last_step + num_steps, self.rollout_doubt
-        if doubt is not None or so_far is not None:
-            so_far = (so_far or RolloutDoubt()).after(doubt, last_step=last_step)
+    def after(self, uncertainty: Uncertainty | None, num_steps: int) -> "RolloutInfo":
+        """The state after one more chunk of this uncertainty and number of steps."""
+        last_step, so_far = self.last_step + num_steps, self.rollout_uncertainty
+        if uncertainty is not None or so_far is not None:
+            so_far = (so_far or RolloutUncertainty()).after(uncertainty, last_step=last_step)
         return self.model_copy(
             update={
                 "next_chunk": self.next_chunk + 1,
                 "last_step": last_step,
-                "rollout_doubt": so_far,
+                "rollout_uncertainty": so_far,
             }
         )
 
@@ -207,11 +213,13 @@ class WatchedRollout(FrozenModel):
         key: name of the API key that began it; empty without keys.
         age_s: since its start.
         idle_s: since its newest chunk, or its start.
-        doubt: of the newest chunk; None where the world reports none.
-        rollout_doubt: of all chunks so far; None where the world reports none.
+        uncertainty: of the newest chunk; None where the world reports none.
+        rollout_uncertainty: of all chunks so far; None where the world reports none.
         success: at the newest step; None where unknown.
         trace_id: of the request that began it; None if another version of DexTouch began it.
     """
+
+    model_config = WIRE_NAMES
 
     watch_id: str
     world: str
@@ -227,8 +235,8 @@ class WatchedRollout(FrozenModel):
     key: str = ""
     age_s: float
     idle_s: float
-    doubt: Doubt | None = None
-    rollout_doubt: RolloutDoubt | None = None
+    uncertainty: Uncertainty | None = Field(default=None, alias="doubt")
+    rollout_uncertainty: RolloutUncertainty | None = Field(default=None, alias="rollout_doubt")
     success: bool | None = None
     trace_id: str | None = None
 

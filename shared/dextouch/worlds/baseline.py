@@ -81,7 +81,7 @@ class CopyFirstWorld:
             first_step=0,
             reached_is_measured=False,
             success=None,
-            doubt=None,
+            uncertainty=None,
         )
         return StartedRollout(state, state, start.anchor, start.K_head)
 

@@ -25,10 +25,10 @@ from dextouch.errors import (
     UnavailableError,
 )
 from dextouch.schemas import (
-    Doubt,
     Observation,
     ReturnSelector,
     RolloutInfo,
+    Uncertainty,
     WatchedRollout,
     WatchedRollouts,
     answer_parts,
@@ -57,23 +57,30 @@ class WatchNote:
     client: str = ""
     key: str = ""
     begun_host_ns: int = 0
-    doubt: Doubt | None = None
+    uncertainty: Uncertainty | None = None
     success: bool | None = None
     trace_id: str | None = None
 
     def to_bytes(self, info: Mapping[str, Any]) -> bytes:
         """Serialize the note with the progress of its rollout and the time of this write."""
-        doubt = None if self.doubt is None else self.doubt.model_dump()
-        known = (self.client, self.key, self.begun_host_ns, doubt, self.success, self.trace_id)
+        uncertainty = None if self.uncertainty is None else self.uncertainty.model_dump()
+        known = (
+            self.client,
+            self.key,
+            self.begun_host_ns,
+            uncertainty,
+            self.success,
+            self.trace_id,
+        )
         return msgpack.packb((info, time.time_ns(), known))
 
     @staticmethod
     def from_bytes(note: bytes) -> "tuple[dict[str, Any], int, WatchNote]":
         """Progress, time of the write on the host clock (ns), and the note."""
         info, written_host_ns, known = msgpack.unpackb(note)
-        client, key, begun_host_ns, doubt, success, trace_id = known
-        doubted = None if doubt is None else Doubt.model_validate(doubt)
-        shown = WatchNote(client, key, begun_host_ns, doubted, success, trace_id)
+        client, key, begun_host_ns, uncertainty, success, trace_id = known
+        unreliable = None if uncertainty is None else Uncertainty.model_validate(uncertainty)
+        shown = WatchNote(client, key, begun_host_ns, unreliable, success, trace_id)
         return info, written_host_ns, shown
 
 
@@ -349,16 +356,17 @@ class RolloutWatch:
 
 def _watched(info: dict[str, Any], written_host_ns: int, note: WatchNote) -> WatchedRollout:
     now_ns = time.time_ns()
+    names = {field.alias or name for name, field in WatchedRollout.model_fields.items()}
     return WatchedRollout(
         watch_id=watch_id_of(info["id"]),
         client=note.client,
         key=note.key,
         age_s=max(0.0, _NS * (now_ns - note.begun_host_ns)),
         idle_s=max(0.0, _NS * (now_ns - written_host_ns)),
-        doubt=note.doubt,
+        doubt=note.uncertainty,
         success=note.success,
         trace_id=note.trace_id,
-        **{name: info[name] for name in WatchedRollout.model_fields.keys() & info.keys()},
+        **{name: info[name] for name in names & info.keys()},
     )
 
 

@@ -177,7 +177,7 @@ class RolloutService:
             shown = started.observation.selected(selector)
             parts = await parts_of(info, shown, selector, origin=origin)
             note = WatchNote(
-                client, owner, time.time_ns(), shown.doubt, shown.success, current_trace_id()
+                client, owner, time.time_ns(), shown.uncertainty, shown.success, current_trace_id()
             )
             # No chunk has this response; it is kept for those who watch.
             record = RolloutRecord(info, snapshot, None, pack(*parts), placed, note)
@@ -302,12 +302,12 @@ class RolloutService:
             num_steps=num_steps,
             selector=selector,
         )
-        info = before.after(seen.doubt, num_steps)
+        info = before.after(seen.uncertainty, num_steps)
         began_s = time.perf_counter()
         parts = await parts_of(info, seen, selector, info=outcome.stepped.info)
         payload = pack(*parts)
         encoded_s = time.perf_counter() - began_s
-        note = replace(stored.note, doubt=seen.doubt, success=seen.success)
+        note = replace(stored.note, uncertainty=seen.uncertainty, success=seen.success)
         record = RolloutRecord(
             info, outcome.snapshot, request_sha256, payload, stored.version, note
         )

@@ -79,7 +79,7 @@ def test_success_ends_and_length_truncates(env):
 def test_a_rollout_that_its_world_ends_is_truncated(env):
     env.reset(seed=0)
     before, *_, info = env.step(actions(4))
-    assert (info["ended"], info["doubt"], info["rollout_doubt"]) == (None, None, None)
+    assert (info["ended"], info["uncertainty"], info["rollout_uncertainty"]) == (None, None, None)
     seen, reward, terminated, truncated, info = env.step(actions(4, 4e6))
     assert (reward, terminated, truncated) == (0.0, False, True)
     assert info["ended"] == "too many to count"

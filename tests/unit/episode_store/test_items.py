@@ -163,10 +163,10 @@ async def test_outliers_of_a_task_are_flagged_until_they_are_rejected(http, stor
         write_take(store, f"take-{number}", num_steps=60 + number % 3, success=True)
     write_take(store, "long", num_steps=300, success=True)
     write_take(store, "alone", task="juggle", num_steps=300, success=True)
-    doubtful = [{"stream": "head", "num_samples": 9, "warnings": ["skew"]}]
-    write_take(store, "clock", num_steps=61, success=True, clocks=doubtful)
+    unreliable = [{"stream": "head", "num_samples": 9, "warnings": ["skew"]}]
+    write_take(store, "clock", num_steps=61, success=True, clocks=unreliable)
     assert await names(http, flagged=True) == ["recording/clock", "recording/long"]
-    # 300 steps are 20 s, the others 4 s: far more than a doubt about a clock.
+    # 300 steps are 20 s, the others 4 s: far more than any doubt about a clock.
     order = {"sort": "findings", "descending": True, "flagged": True}
     assert await names(http, **order) == ["recording/long", "recording/clock"]
     (long,) = (await listed(http, id="long"))["items"]

@@ -5,11 +5,11 @@ import math
 
 from scipy import stats
 
-DOUBTED = "the world flags its prediction: two predictions are <b>14 mm</b> apart"
+UNRELIABLE = "the world flags its prediction: two predictions are <b>14 mm</b> apart"
 TASKS = ("stand_bottle", "open_drawer")
 FIRST_SEED, NUM_STARTS = 500, 8
-# Outcomes from the starts in order: S success, F failure, D success that the probe doubts and that
-# counts in no rate, X failed to run, . no result yet.
+# Outcomes from the starts in order: S success, F failure, D success that the probe leaves open and
+# that counts in no rate, X failed to run, . no result yet.
 ROWS = {
     "stand_bottle": {
         "careful": {"real": "SSSSSSSF", "model": "SSSSSSFF", "blurred": "SSFFSSFF"},
@@ -48,13 +48,13 @@ def row(world, policy, task, seed, letter):
     place = {"world": world, "policy": policy, "task": task, "seed": seed}
     if letter == "X":
         return place | {"error": "UnavailableError", "message": "no answer", "traceback": None}
-    doubted = DOUBTED if letter == "D" else None
+    unreliable = UNRELIABLE if letter == "D" else None
     success = letter in "SD"
     return place | {
         "start_digest": f"{task} {seed}",
         "success": success,
-        "probability": 0.55 if doubted else 0.9 if success else 0.1,
-        "cannot_tell": doubted,
+        "probability": 0.55 if unreliable else 0.9 if success else 0.1,
+        "cannot_tell": unreliable,
         "repeat": 0,
     }
 

@@ -8,7 +8,7 @@ import pytest
 from dextouch.clients import http_link
 from dextouch.clients.rollouts import RolloutClient
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
-from dextouch.schemas import Doubt
+from dextouch.schemas import Uncertainty
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.baseline import CopyFirstWorld
 from services.evaluation.closed_loop import EvaluationPlan, evaluate
@@ -30,11 +30,13 @@ class Hesitant(toy.ToyWorld):
     def step(self, state, actions, **options):
         stepped = super().step(state, actions, **options)
         is_second = state.step == 16
-        doubt = Doubt(
+        uncertainty = Uncertainty(
             disagreement=0, distance=0, outside=is_second, reason="slipped" if is_second else None,
             success_probability=0.25 if stepped.observation.last_step == 80 else 1.0,
         )  # fmt: skip
-        return toy.replace(stepped, observation=toy.replace(stepped.observation, doubt=doubt))
+        return toy.replace(
+            stepped, observation=toy.replace(stepped.observation, uncertainty=uncertainty)
+        )
 
 
 class Forgetful(toy.ToyWorld):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas import Doubt, Observation, RolloutDoubt
+from dextouch.schemas import Observation, RolloutUncertainty, Uncertainty
 from services.evaluation.calibration import fit_combinations
 from services.evaluation.endings import Ending, EndingEpisode, milestones_of
 from services.evaluation.success_classifier import (
@@ -153,11 +153,11 @@ def test_an_ending_with_neither_images_nor_poses_is_refused(judge):
 def test_it_cannot_tell_what_the_world_doubts(judge):
     ending = _episode("reach", 0, imagined=True).final
     plain = judge.verdict(ending)
-    doubted = judge.verdict(replace(ending, doubted="the hands left the training data"))
-    assert doubted.decision == "cannot tell"
-    assert doubted.reason is not None
-    assert "left the training data" in doubted.reason
-    assert doubted.likely_success == plain.likely_success
+    unreliable = judge.verdict(replace(ending, unreliable="the hands left the training data"))
+    assert unreliable.decision == "cannot tell"
+    assert unreliable.reason is not None
+    assert "left the training data" in unreliable.reason
+    assert unreliable.likely_success == plain.likely_success
 
 
 def test_it_cannot_tell_within_its_band(judge):
@@ -225,9 +225,9 @@ def test_it_cannot_tell_within_the_band_of_both_estimates(judge):
         verdict = probe.verdict(ending)
         assert (verdict.probability, verdict.decision) == (pytest.approx(0.7), decision)
     assert "within 0.21 of 0.5" in verdict.reason
-    # Doubt of the world comes first.
-    doubted = probe.verdict(replace(ending, doubted="at step 8, slipped"))
-    assert doubted.reason == "the world flags its prediction: at step 8, slipped"
+    # Uncertainty of the world comes first.
+    unreliable = probe.verdict(replace(ending, unreliable="at step 8, slipped"))
+    assert unreliable.reason == "the world flags its prediction: at step 8, slipped"
 
 
 def test_objects_of_unusual_sizes_are_decided_by_their_own_combination(judge):
@@ -241,8 +241,8 @@ def test_objects_of_unusual_sizes_are_decided_by_their_own_combination(judge):
     assert "differs by 18% from the usual" in verdict.reason
     fitted = _with_combination(judge, name="reach/unusual sizes", **weights, band=0.19)
     assert fitted.verdict(unusual).decision == "success"
-    doubted = fitted.verdict(replace(unusual, doubted="at step 8, slipped"))
-    assert doubted.reason == "the world flags its prediction: at step 8, slipped"
+    unreliable = fitted.verdict(replace(unusual, unreliable="at step 8, slipped"))
+    assert unreliable.reason == "the world flags its prediction: at step 8, slipped"
 
 
 def test_estimates_of_development_endings_are_fitted_and_kept_in_the_checkpoint():
@@ -272,12 +272,12 @@ def test_estimates_of_development_endings_are_fitted_and_kept_in_the_checkpoint(
     )
     found = SuccessClassifier(checkpoint).verdict(ending.final)
     assert found.world_probability in {0.1, 0.9}
-    doubted = [
-        replace(e, endings={**e.endings, e.last_step: replace(e.final, doubted="slipped")})
+    unreliable = [
+        replace(e, endings={**e.endings, e.last_step: replace(e.final, unreliable="slipped")})
         for e in estimated(range(600, 660), sure=1.0)
     ]
     probe = SuccessClassifier(checkpoint)
-    assert fit_combinations(probe, doubted, risk=0.1, margin=0.0) == {}
+    assert fit_combinations(probe, unreliable, risk=0.1, margin=0.0) == {}
     assert fit_combinations(probe, _episodes(range(600, 660)), risk=0.1, margin=0.0) == {}
 
 
@@ -333,20 +333,24 @@ def test_an_ending_of_an_observation():
         action_reached=np.zeros((5, 67)),
         reached_is_measured=False,
         object_poses=steps * np.ones((1, 7), np.float32),
-        doubt=Doubt(disagreement=0, distance=1),
+        uncertainty=Uncertainty(disagreement=0, distance=1),
     )
     ending = Ending.of(seen, "reach", imagined=True)
     assert ending.tactile_kpa[:, 0, 0].tolist() == [2, 3, 4]
     assert ending.object_poses[:, 0, 0].tolist() == [2, 3, 4]
-    assert ending.doubted is None
+    assert ending.unreliable is None
     outside = replace(
-        seen, images={}, doubt=Doubt(disagreement=0, distance=9, outside=True, reason="far away")
+        seen,
+        images={},
+        uncertainty=Uncertainty(disagreement=0, distance=9, outside=True, reason="far away"),
     )
     ending = Ending.of(outside, "reach", imagined=True)
-    assert (ending.images, ending.doubted) == (None, "at step 80, far away")
-    whole = RolloutDoubt(reason="slipped", step=16, success_probability=0.25, size_deviation=0.1)
-    ending = Ending.of(outside, "reach", imagined=True, doubt=whole)
-    assert (ending.doubted, ending.success_probability) == ("at step 16, slipped", 0.25)
+    assert (ending.images, ending.unreliable) == (None, "at step 80, far away")
+    whole = RolloutUncertainty(
+        reason="slipped", step=16, success_probability=0.25, size_deviation=0.1
+    )
+    ending = Ending.of(outside, "reach", imagined=True, uncertainty=whole)
+    assert (ending.unreliable, ending.success_probability) == ("at step 16, slipped", 0.25)
     assert (ending.size_deviation, ending.has_unusual_sizes) == (0.1, False)
     with pytest.raises(InvalidInputError, match="at least 3"):
         Ending.of(seen.last(), "reach", imagined=True)

@@ -11,7 +11,7 @@ import pytest
 from dextouch.clients import RolloutClient, http_link
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
-from dextouch.schemas import Doubt
+from dextouch.schemas import Uncertainty
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.closed_loop import EvaluationPlan, begin_matched, evaluate
 from services.evaluation.endings import read_ending_episode
@@ -103,8 +103,8 @@ class Spread(toy.ToyWorld):
 
     def step(self, state, actions, **options):
         stepped = super().step(state, actions, **options)
-        doubt = Doubt(disagreement=0, distance=0, success_spread=0.125)
-        return replace(stepped, observation=replace(stepped.observation, doubt=doubt))
+        uncertainty = Uncertainty(disagreement=0, distance=0, success_spread=0.125)
+        return replace(stepped, observation=replace(stepped.observation, uncertainty=uncertainty))
 
 
 @pytest.fixture(scope="module")

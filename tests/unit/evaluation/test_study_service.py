@@ -13,8 +13,8 @@ from services.evaluation.studies.app import create_app
 from services.evaluation.studies.results import StudyResults
 from tests.unit.evaluation.study_rows import (
     DEFINITION,
-    DOUBTED,
     ROWS,
+    UNRELIABLE,
     WORLDS,
     counted,
     disagreements,
@@ -74,7 +74,7 @@ async def test_rates_and_intervals_are_those_of_the_rows(root):
         assert one["num_unreliable"] == letters.count("D")
         assert one["num_finished"] == trials + letters.count("D")
         assert one["is_comparable"]
-        assert one["reasons"] == [DOUBTED] * ("D" in letters)
+        assert one["reasons"] == [UNRELIABLE] * ("D" in letters)
 
 
 async def test_agreement_is_that_of_scipy_and_two_loops(root):
@@ -118,8 +118,8 @@ async def test_disagreements_come_first_and_the_doubted_ones_last(root):
     places = {(one["world"], one["task"], one["policy"], one["seed"]) for one in unlike}
     assert places == set(disagreements())
     assert len(unlike) == len(places)
-    doubted = [one["unreliable"] is not None for one in unlike]
-    assert doubted == sorted(doubted)
+    unreliable = [one["unreliable"] is not None for one in unlike]
+    assert unreliable == sorted(unreliable)
     summary = await read(root, "/v1/studies/touch")
     assert summary["num_disagreements"] == len(places)
     assert all(one["episode_id"].startswith("rollout-") for one in unlike)

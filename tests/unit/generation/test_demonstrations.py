@@ -8,7 +8,7 @@ import pytest
 from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
 from dextouch.images import scaled_square
-from dextouch.schemas import EVERYTHING, Doubt
+from dextouch.schemas import EVERYTHING, Uncertainty
 from dextouch.worlds import CopyFirstWorld, SteppedRollout, WorldServiceSettings, create_world_app
 from services.evaluation.endings import read_ending_episode
 from services.generation import imagine_episode
@@ -60,7 +60,7 @@ def test_an_imagined_episode_shows_what_the_world_showed(sources, client, tmp_pa
 class _PoseWorld(CopyFirstWorld):
     """Repeats the first image, and says that one bowl rises by a millimetre a step.
 
-    It doubts its second chunk; success becomes likelier from step to step.
+    It calls its second chunk unreliable; success becomes likelier from step to step.
     """
 
     @property
@@ -73,12 +73,12 @@ class _PoseWorld(CopyFirstWorld):
         steps = state.first_step + 1 + np.arange(len(actions))
         poses = np.zeros((len(actions), 2, 7), np.float32)
         poses[:, :, 3], poses[:, 1, 2] = 1.0, 0.001 * steps
-        doubt = Doubt(
+        uncertainty = Uncertainty(
             disagreement=0, distance=0,
             outside=steps[0] == 17, reason="slipped" if steps[0] == 17 else None,
             success_probability=float(steps[-1]) / 100, success_spread=0.5,
         )  # fmt: skip
-        seen = replace(stepped.observation, object_poses=poses, doubt=doubt)
+        seen = replace(stepped.observation, object_poses=poses, uncertainty=uncertainty)
         return SteppedRollout(stepped.state, seen.selected(selector))
 
 
@@ -101,7 +101,7 @@ def test_imagined_poses_are_kept_for_the_judge(sources, tmp_path):
     )
     assert sources[0].attributes.quality.items() <= quality.items()
     assert ending.success_probability == 0.8
-    assert ending.doubted == "at step 32, the world doubted its prediction"
+    assert ending.unreliable == "at step 32, the world called its prediction unreliable"
     # Only the end is what these figures are about.
     endings = read_ending_episode(reader).endings
     assert {one.success_probability for step, one in endings.items() if step != 80} == {None}

@@ -11,21 +11,21 @@ from hypothesis import strategies as st
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
 from dextouch.schemas import (
     EVERYTHING,
-    Doubt,
     Observation,
     ReturnSelector,
-    RolloutDoubt,
     RolloutInfo,
     RolloutOrigin,
     RolloutStart,
+    RolloutUncertainty,
     StartRequest,
+    Uncertainty,
     answer_parts,
     decode_answer,
     decode_observation,
     decode_start,
     encode_observation,
     encode_start,
-    rollout_doubt,
+    rollout_uncertainty,
 )
 from dextouch.schemas.observations import check_observation_arrays
 from dextouch.streams import pack, unpack
@@ -65,7 +65,7 @@ def golden_observation() -> Observation:
 
 
 def imagined_observation() -> Observation:
-    """The same as an imagining world gives it: two objects' poses, and doubt."""
+    """The same as an imagining world gives it: two objects' poses, and uncertainty."""
     poses = np.zeros((2, 2, 7), np.float32)
     poses[:, :, 0] = [[0.25, -0.5], [0.125, -0.5]]
     poses[:, :, 3:] = [0.5, 0.5, -0.5, 0.5]
@@ -74,12 +74,14 @@ def imagined_observation() -> Observation:
         reached_is_measured=False,
         success=None,
         object_poses=poses,
-        doubt=Doubt(disagreement=0.5, distance=2.25, outside=True, reason="bottle out of view"),
+        uncertainty=Uncertainty(
+            disagreement=0.5, distance=2.25, outside=True, reason="bottle out of view"
+        ),
     )
 
 
 def assert_same(one: Observation, other: Observation) -> None:
-    for field in ("first_step", "reached_is_measured", "success", "doubt"):
+    for field in ("first_step", "reached_is_measured", "success", "uncertainty"):
         assert getattr(one, field) == getattr(other, field)
     assert set(one.images) == set(other.images)
     for camera, images in one.images.items():
@@ -129,7 +131,7 @@ def test_what_an_imagining_world_adds_comes_back():
 
 def test_what_older_services_do_not_send_is_none():
     old = decode_answer((GOLDEN / "answer.msgpack").read_bytes(), max_bytes=10**6)
-    assert (old.observation.object_poses, old.observation.doubt) == (None, None)
+    assert (old.observation.object_poses, old.observation.uncertainty) == (None, None)
     assert old.rollout.ended is None
 
 
@@ -151,30 +153,30 @@ def test_what_older_services_do_not_send_is_none():
 )
 def test_doubt_that_contradicts_itself_is_refused(fields):
     good = {"disagreement": 0.0, "distance": 0.0, "outside": False, "reason": None}
-    Doubt.model_validate(good)
+    Uncertainty.model_validate(good)
     raw, arrays = unpack(encode_observation(observation()), max_bytes=10**6)
     with pytest.raises(InvalidInputError, match="doubt"):
         decode_observation(pack(raw | {"doubt": good | fields}, arrays), max_bytes=10**6)
 
 
 def test_an_estimate_of_success_comes_back_and_is_omitted_where_there_is_none():
-    estimated = Doubt(
+    estimated = Uncertainty(
         disagreement=0, distance=0, success_probability=0.75, success_spread=0.5, size_deviation=0.2
     )
-    seen = dataclasses.replace(imagined_observation(), doubt=estimated)
+    seen = dataclasses.replace(imagined_observation(), uncertainty=estimated)
     assert_same(decode_answer(encode_answer(INFO, seen), max_bytes=10**6).observation, seen)
     raw, _ = unpack(encode_observation(imagined_observation()), max_bytes=10**6)
     # As services without these fields send it, and as older clients need it.
     assert set(raw["doubt"]) == {"disagreement", "distance", "outside", "reason"}
 
 
-def test_one_doubted_chunk_makes_the_rollout_doubtful():
+def test_one_doubted_chunk_makes_the_rollout_unreliable():
     def told(step, probability=None, spread=None, reason=None):
-        doubt = Doubt(
+        uncertainty = Uncertainty(
             disagreement=0, distance=0, outside=reason is not None, reason=reason,
             success_probability=probability, success_spread=spread,
         )  # fmt: skip
-        return dataclasses.replace(observation(4, first_step=step - 3), doubt=doubt)
+        return dataclasses.replace(observation(4, first_step=step - 3), uncertainty=uncertainty)
 
     start = observation(1)
     chunks = [
@@ -183,27 +185,27 @@ def test_one_doubted_chunk_makes_the_rollout_doubtful():
         told(12, reason="lost"),
         told(16, 1, 0),
     ]
-    found = rollout_doubt([start, *chunks])
+    found = rollout_uncertainty([start, *chunks])
     assert (found.reason, found.step) == ("slipped", 8)
     assert (found.success_probability, found.success_spread) == (1.0, 0.0)
-    assert rollout_doubt([start, *chunks[:3]]).success_probability is None
-    assert rollout_doubt([start, chunks[0]]).reason is None
-    assert rollout_doubt([start]) == RolloutDoubt()
+    assert rollout_uncertainty([start, *chunks[:3]]).success_probability is None
+    assert rollout_uncertainty([start, chunks[0]]).reason is None
+    assert rollout_uncertainty([start]) == RolloutUncertainty()
     # The same by the last step alone, which some clients ask for.
-    assert rollout_doubt([start, *(one.last() for one in chunks)]) == found
+    assert rollout_uncertainty([start, *(one.last() for one in chunks)]) == found
 
 
 def test_a_doubt_is_kept_as_figures_of_an_episode():
-    doubt = RolloutDoubt(
+    uncertainty = RolloutUncertainty(
         reason="slipped", step=8, success_probability=0.25, success_spread=0.5, size_deviation=0.2
     )
-    quality = doubt.to_quality()
+    quality = uncertainty.to_quality()
     assert set(map(type, quality.values())) == {float}
-    back = RolloutDoubt.from_quality({"residual_mm": 1.0, **quality})
-    assert back == doubt.model_copy(update={"reason": back.reason})
+    back = RolloutUncertainty.from_quality({"residual_mm": 1.0, **quality})
+    assert back == uncertainty.model_copy(update={"reason": back.reason})
     assert back.reason is not None
-    assert RolloutDoubt().to_quality() == {}
-    assert RolloutDoubt.from_quality({"residual_mm": 1.0}) == RolloutDoubt()
+    assert RolloutUncertainty().to_quality() == {}
+    assert RolloutUncertainty.from_quality({"residual_mm": 1.0}) == RolloutUncertainty()
 
 
 def test_the_state_of_a_rollout_carries_its_doubt():
@@ -211,9 +213,13 @@ def test_the_state_of_a_rollout_carries_its_doubt():
         update={"next_chunk": INFO.next_chunk + 1, "last_step": INFO.last_step + 4}
     )
     assert "rollout_doubt" not in INFO.after(None, 4).model_dump()
-    doubted = INFO.after(Doubt(disagreement=0, distance=0, outside=True, reason="slipped"), 4)
-    later = doubted.after(Doubt(disagreement=0, distance=0), 8).after(None, 4)
-    assert later.rollout_doubt == RolloutDoubt(reason="slipped", step=INFO.last_step + 4)
+    unreliable = INFO.after(
+        Uncertainty(disagreement=0, distance=0, outside=True, reason="slipped"), 4
+    )
+    later = unreliable.after(Uncertainty(disagreement=0, distance=0), 8).after(None, 4)
+    assert later.rollout_uncertainty == RolloutUncertainty(
+        reason="slipped", step=INFO.last_step + 4
+    )
     assert (later.next_chunk, later.last_step) == (INFO.next_chunk + 3, INFO.last_step + 16)
     answer = decode_answer(encode_answer(later, observation(4)), max_bytes=10**6)
     assert answer.rollout == later

@@ -52,15 +52,17 @@ def commands(started):
 
 def played(world, state, commands, lengths):
     """Touch, object poses, and the state after the last of some chunks."""
-    touch, poses, doubts, first = [], [], [], 0
+    touch, poses, uncertainties, first = [], [], [], 0
     for length in lengths:
         step = world.step(state, commands[first : first + length], seed=0, selector=TOUCH_ONLY)
         state, first = step.state, first + length
         touch.append(step.observation.tactile_kpa)
         poses.append(step.observation.object_poses)
-        doubts.append((step.observation.doubt.disagreement, step.observation.doubt.distance))
+        uncertainties.append(
+            (step.observation.uncertainty.disagreement, step.observation.uncertainty.distance)
+        )
     assert first == len(commands)
-    return np.concatenate(touch), np.concatenate(poses), np.max(doubts, axis=0), state
+    return np.concatenate(touch), np.concatenate(poses), np.max(uncertainties, axis=0), state
 
 
 def random_cut(rng):
@@ -78,11 +80,11 @@ CUTS += [random_cut(np.random.default_rng(seed)) for seed in range(6)]
 @pytest.mark.long
 @pytest.mark.parametrize("lengths", CUTS, ids=str)
 def test_every_cutting_gives_the_same(world, started, commands, lengths):
-    touch, poses, doubt, end = played(world, started.state, commands, [8] * 10)
+    touch, poses, uncertainty, end = played(world, started.state, commands, [8] * 10)
     other = played(world, started.state, commands, lengths)
     np.testing.assert_allclose(other[0], touch, atol=1e-3, rtol=0)
     np.testing.assert_allclose(other[1], poses, atol=1e-5, rtol=0)
-    np.testing.assert_allclose(other[2], doubt, atol=1e-6, rtol=1e-5)
+    np.testing.assert_allclose(other[2], uncertainty, atol=1e-6, rtol=1e-5)
     assert other[3].num_moving == end.num_moving
     assert other[3].memory.num_still == end.memory.num_still
     hidden = [end.memory.state.hidden for end in (other[3], end)]
@@ -181,5 +183,5 @@ def test_a_snapshot_amid_a_rollout_goes_on_bit_for_bit(world, started, commands,
             assert (one == other).all()
         assert (expected.observation.images["camera_head"]
             == got.observation.images["camera_head"]).all()  # fmt: skip
-        assert expected.observation.doubt == got.observation.doubt
+        assert expected.observation.uncertainty == got.observation.uncertainty
         assert world.snapshot(state) == world.snapshot(restored)

@@ -1,4 +1,4 @@
-"""What a state world refuses, doubts and ends; the rest is in the contract of all worlds."""
+"""What a state world refuses, flags and ends; the rest is in the contract of all worlds."""
 
 import dataclasses
 
@@ -44,8 +44,8 @@ def test_objects_that_are_not_found_are_doubted(odds):
     untrained_state_checkpoint.cache_clear()
     started = world.reset(from_observation(world))
     stepped = world.step(started.state, move(started.observation, 4), seed=0)
-    assert stepped.observation.doubt.outside
-    assert "not found" in stepped.observation.doubt.reason
+    assert stepped.observation.uncertainty.outside
+    assert "not found" in stepped.observation.uncertainty.reason
     if odds[0] < 0:
         assert (stepped.observation.object_poses[:, 0] == ABSENT_POSE).all()
 
@@ -59,7 +59,7 @@ def test_a_rollout_ends_when_hands_moved_longer_than_was_ever_trained(world, che
         step = world.step(state, lift, seed=0)
         state = step.state
     assert state.num_moving == 4 * horizon
-    assert step.observation.doubt.outside
+    assert step.observation.uncertainty.outside
     with pytest.raises(EndedError, match="four times"):
         world.step(state, lift, seed=0)
 
@@ -173,8 +173,10 @@ def test_the_size_of_objects_is_reported_beside_the_usual_one(world):
         state = dataclasses.replace(started.state, memory=dataclasses.replace(memory, start=start))
         for movable in (1.0, 0.0):
             world._dynamics.core.movable[:, 0] = movable
-            doubt = world.step(state, move(started.observation, 4), seed=0).observation.doubt
-            assert doubt.size_deviation == pytest.approx(movable * expected, abs=1e-6)
+            uncertainty = world.step(
+                state, move(started.observation, 4), seed=0
+            ).observation.uncertainty
+            assert uncertainty.size_deviation == pytest.approx(movable * expected, abs=1e-6)
 
 
 def test_success_is_estimated_by_all_members():
@@ -188,13 +190,15 @@ def test_success_is_estimated_by_all_members():
     world = StateWorld(checkpoint)
     started = world.reset(from_observation(world))
     stepped = world.step(started.state, move(started.observation, 8), seed=0)
-    doubt = stepped.observation.doubt
-    assert doubt.success_probability == pytest.approx(1 / (1 + np.exp(-0.5)), abs=1e-6)
+    uncertainty = stepped.observation.uncertainty
+    assert uncertainty.success_probability == pytest.approx(1 / (1 + np.exp(-0.5)), abs=1e-6)
     spread = 1 / (1 + np.exp(-2.0)) - 1 / (1 + np.exp(1.0))
-    assert doubt.success_spread == pytest.approx(spread, abs=1e-6)
+    assert uncertainty.success_spread == pytest.approx(spread, abs=1e-6)
     # Hands that stand for two seconds change nothing, nor does a snapshot.
     held = stepped.state
     for _ in range(3):
         step = world.step(held, hold(stepped.observation, 16), seed=0)
         held = world.restore(world.snapshot(step.state))
-    assert step.observation.doubt.success_probability == pytest.approx(doubt.success_probability)
+    assert step.observation.uncertainty.success_probability == pytest.approx(
+        uncertainty.success_probability
+    )

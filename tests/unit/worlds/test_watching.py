@@ -11,7 +11,7 @@ from httpx import ASGITransport, AsyncClient
 from pydantic import SecretStr
 
 from dextouch.clients import RolloutClient
-from dextouch.schemas import Doubt, RolloutDoubt, decode_answer
+from dextouch.schemas import RolloutUncertainty, Uncertainty, decode_answer
 from dextouch.serving.keys import ApiKey
 from dextouch.streams import unpack
 from dextouch.worlds import WorldServiceSettings, create_world_app
@@ -97,11 +97,11 @@ class DoubtfulWorld(SumWorld):
     def step(self, state, rows, **options):
         stepped = super().step(state, rows, **options)
         slipped = bool((rows == -1.0).any())
-        doubt = Doubt(
+        uncertainty = Uncertainty(
             disagreement=0, distance=0, outside=slipped, reason="slipped" if slipped else None,
             success_probability=0.25,
         )  # fmt: skip
-        return replace(stepped, observation=replace(stepped.observation, doubt=doubt))
+        return replace(stepped, observation=replace(stepped.observation, uncertainty=uncertainty))
 
 
 def test_every_answer_after_a_doubted_chunk_says_so():
@@ -110,18 +110,18 @@ def test_every_answer_after_a_doubted_chunk_says_so():
         RolloutClient(url) as client,
         client.start(**BODY) as rollout,
     ):
-        assert rollout.info.rollout_doubt is None
+        assert rollout.info.rollout_uncertainty is None
         rollout.step(actions(4))
-        assert rollout.info.rollout_doubt == RolloutDoubt(success_probability=0.25)
+        assert rollout.info.rollout_uncertainty == RolloutUncertainty(success_probability=0.25)
         rollout.step(actions(4, -1.0))
         rollout.step(actions(8))
-        expected = RolloutDoubt(reason="slipped", step=8, success_probability=0.25)
-        assert rollout.observation.doubt.reason is None
-        assert rollout.info.rollout_doubt == expected
-        # Branches share the doubted past, and watchers see it.
+        expected = RolloutUncertainty(reason="slipped", step=8, success_probability=0.25)
+        assert rollout.observation.uncertainty.reason is None
+        assert rollout.info.rollout_uncertainty == expected
+        # Branches share the unreliable past, and watchers see it.
         with rollout.fork(seed=5) as branch:
             branch.step(actions(4))
-            assert branch.info.rollout_doubt == expected
+            assert branch.info.rollout_uncertainty == expected
         (one,) = httpx.get(f"{url}/v1/watch").json()["rollouts"]
         assert one["rollout_doubt"] == expected.model_dump()
         assert one["doubt"]["reason"] is None

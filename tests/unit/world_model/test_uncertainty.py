@@ -1,4 +1,4 @@
-"""What bounds of doubt were measured of is what rollouts are asked, whatever their chunks."""
+"""What bounds of uncertainty were measured of is what rollouts are asked, whatever their chunks."""
 
 import numpy as np
 import pytest
@@ -68,12 +68,12 @@ def test_a_long_chunk_is_as_doubtful_as_the_worst_of_its_parts():
     rows = np.repeat(started.observation.action_reached, 64, axis=0)
     # Far away in the middle, and back.
     rows[:, 9] += 0.4 * np.sin(np.linspace(0, np.pi, 64))
-    whole = world.step(started.state, rows, seed=0, selector=TOUCH_ONLY).observation.doubt
+    whole = world.step(started.state, rows, seed=0, selector=TOUCH_ONLY).observation.uncertainty
     state, parts = started.state, []
     for first in range(0, 64, 4):
         step = world.step(state, rows[first : first + 4], seed=0, selector=TOUCH_ONLY)
         state = step.state
-        parts.append(step.observation.doubt)
+        parts.append(step.observation.uncertainty)
     np.testing.assert_allclose(whole.distance, max(p.distance for p in parts), rtol=1e-5)
     np.testing.assert_allclose(whole.disagreement, max(p.disagreement for p in parts), rtol=1e-4)
     assert whole.disagreement > 0
