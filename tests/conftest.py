@@ -25,6 +25,7 @@ settings.load_profile("steady")
 ROOT = Path(__file__).parents[1]
 # Whole services, pages and benchmarks: all of their tests take seconds.
 LONG_FOLDERS = frozenset({"benchmarks", "browser", "integration", "system"})
+NOT_LONG = "not long and "
 OTHER_MARKS = ("slow", "gpu", "hardware", "vm", "containers")
 
 
@@ -37,6 +38,18 @@ def pytest_runtest_setup() -> None:
     """Each test checks the shapes of its own first calls."""
     if CHECKS_SHAPES:
         shape_checks.begin_test()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Of paths that are named, the long tests are run, too."""
+    if config.args_source is pytest.Config.ArgsSource.ARGS:
+        config.option.markexpr = config.option.markexpr.replace(NOT_LONG, "")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """What is not run is not imported, either."""
+    is_long = collection_path.parent == ROOT / "tests" and collection_path.name in LONG_FOLDERS
+    return True if is_long and NOT_LONG in config.option.markexpr else None
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:

@@ -5,7 +5,6 @@ import pytest
 import zarr
 
 tensorstore = pytest.importorskip("tensorstore", reason="tensorstore is not installed")
-xarray = pytest.importorskip("xarray", reason="xarray is not installed")
 
 
 @pytest.fixture
@@ -47,6 +46,7 @@ def test_tensorstore_reads_the_numbers(folder):
 # zarr-python says so of every file in a group that is no array; the commit record is one.
 @pytest.mark.filterwarnings("ignore:Object at commit.json is not recognized")
 def test_xarray_lines_streams_up_by_name(folder, store):
+    xarray = pytest.importorskip("xarray", reason="xarray is not installed")
     made, path = folder
     with xarray.open_zarr(path, consolidated=False) as data:
         for name, true in numeric_arrays(made).items():

@@ -5,7 +5,6 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from diffusers import UniPCMultistepScheduler
 from scipy.integrate import solve_ivp
 
 from dextouch.errors import InvalidInputError
@@ -52,6 +51,8 @@ def exact(index):
 @pytest.mark.parametrize("num_steps", [1, 2, 3, 5, 20])
 @pytest.mark.parametrize("shift", [1.0, 3.0])
 def test_unipc_is_that_of_diffusers(num_steps, shift):
+    from diffusers import UniPCMultistepScheduler  # seconds, in every process that collects tests
+
     found = sample(denoise, noise(), num_steps=num_steps, shift=shift, sampler="unipc")
     for index, start in enumerate(noise()):
         scheduler = UniPCMultistepScheduler(

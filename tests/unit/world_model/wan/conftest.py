@@ -4,12 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from diffusers import AutoencoderKLWan, WanTransformer3DModel
-from tokenizers import Tokenizer
-from tokenizers.models import WordLevel
-from tokenizers.pre_tokenizers import Whitespace
-from tokenizers.processors import TemplateProcessing
-from transformers import PreTrainedTokenizerFast, UMT5Config, UMT5EncoderModel
 
 from services.world_model.network.configuration import NetworkConfig, WanConfig
 
@@ -27,12 +21,16 @@ def wan_config():
 @pytest.fixture(scope="session")
 def transformer(wan_config):
     """Random everywhere; diffusers starts biases and norms at zero and one."""
+    from diffusers import WanTransformer3DModel  # seconds, in every process that collects tests
+
     sizes = wan_config.transformer_sizes(num_layers=LAYERS, num_heads=HEADS, head_width=HEAD_WIDTH)
     return shaken(WanTransformer3DModel(**sizes), seed=0)
 
 
 @pytest.fixture(scope="session")
 def autoencoder(wan_config):
+    from diffusers import AutoencoderKLWan
+
     return shaken(AutoencoderKLWan(**wan_config.autoencoder_sizes()), seed=1)
 
 
@@ -57,6 +55,8 @@ def full_config(wan_config):
 
 @pytest.fixture(scope="session")
 def text_encoder(wan_config):
+    from transformers import UMT5Config, UMT5EncoderModel
+
     torch.manual_seed(2)
     sizes = UMT5Config(
         vocab_size=32, d_model=wan_config.text_width, d_kv=8, d_ff=16, num_layers=2, num_heads=4,
@@ -77,6 +77,12 @@ def pretrained_folder(tmp_path_factory, transformer, autoencoder, text_encoder):
 
 
 def save_tokenizer(folder):
+    from tokenizers import Tokenizer
+    from tokenizers.models import WordLevel
+    from tokenizers.pre_tokenizers import Whitespace
+    from tokenizers.processors import TemplateProcessing
+    from transformers import PreTrainedTokenizerFast
+
     marks = {"pad_token": "<pad>", "eos_token": "</s>", "unk_token": "<unk>"}
     words = [*marks.values(), "push", "the", "box", "with", "both", "hands", "stand"]
     numbers = {word: number for number, word in enumerate(words)}

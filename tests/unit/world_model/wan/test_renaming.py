@@ -1,7 +1,6 @@
 """Names of tensors in the original files and in diffusers."""
 
 import pytest
-from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffusers
 
 from dextouch.errors import InvalidInputError
 from services.world_model.network.configuration import WanConfig
@@ -90,6 +89,8 @@ def test_the_published_size_has_its_tensors_and_weights(full_transformer):
 
 
 def test_original_transformer_names_become_those_of_diffusers(full_transformer):
+    from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffusers
+
     blocks = [f"blocks.{index}.{name}" for index in range(30) for name in ORIGINAL_BLOCK]
     original = ORIGINAL_TOP + blocks
     # diffusers' own converter tells where each tensor goes.
