@@ -203,11 +203,11 @@ class DirectJudge:
         """
         tasks = self._config.tasks
         seen = observed_start(start, tasks=tasks, image_px=self._config.image_px)
-        standing = hand_motion(seen.reached[None], seen.anchor)
+        holding = hand_motion(seen.reached[None], seen.anchor)
         first = first_steps(
-            [seen.image], [seen.K_head], [seen.tactile_kpa], [standing], [tasks.index(start.task)]
+            [seen.image], [seen.K_head], [seen.tactile_kpa], [holding], [tasks.index(start.task)]
         )
-        parts = [Commands.standing([standing]), Commands.of([hand_motion(actions, seen.anchor)])]
+        parts = [Commands.holding([holding]), Commands.of([hand_motion(actions, seen.anchor)])]
         commands = combined(parts, lambda pair: torch.cat(pair, dim=1))
         counted = torch.ones((1, len(commands)), dtype=torch.bool)
         odds = self._network(Attempts(first, self._network.reader(first), commands, counted))

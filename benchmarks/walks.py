@@ -217,15 +217,15 @@ def _started(client: RolloutClient, world: World[Any]) -> Rollout:
     task = description.tasks[0]
     init = None
     if "task_seed" not in description.starts_from:
-        standing = np.zeros((1, 67))
+        holding = np.zeros((1, 67))
         for part in POSE_SLICES:
-            standing[:, part] = IDENTITY_POSE_9D
+            holding[:, part] = IDENTITY_POSE_9D
         size = (1, description.image_height_px, description.image_width_px, 3)
         first = Observation(
             first_step=0,
             images={camera: np.zeros(size, dtype=np.uint8) for camera in description.cameras},
             tactile_kpa=np.zeros((1, 2, 320), dtype=np.float32),
-            action_reached=standing,
+            action_reached=holding,
             reached_is_measured=True,
             object_poses=None,
             success=None,

@@ -224,7 +224,7 @@ class StateWorld:
                 [self._description.tasks.index(start.task)],
             ),
             torch.from_numpy(first.tactile_kpa)[None],
-            Commands.standing([motion]),
+            Commands.holding([motion]),
             torch.tensor([float(start.action_kind == "commanded")]),
         )
         rollout = StateRollout(

@@ -139,8 +139,8 @@ class ModelWorld:
         # The checks of a chunk, so that they fail here rather than at the first one.
         if self._model.text_features is not None:
             self._model.text_features.of(start.instruction)
-        standing = np.repeat(first.reached[None], self._description.chunk_multiple, axis=0)
-        build_inputs(self._requests([state], [standing]), self._model.config)
+        holding = np.repeat(first.reached[None], self._description.chunk_multiple, axis=0)
+        build_inputs(self._requests([state], [holding]), self._model.config)
         return StartedRollout(state, first.observation(), first.anchor, first.K_head)
 
     def step(
@@ -271,8 +271,8 @@ class ModelWorld:
             step=step,
             task=str(task),
         )
-        standing = np.repeat(state.reached[None], self._description.chunk_multiple, axis=0)
-        build_inputs(self._requests([state], [standing]), self._model.config)
+        holding = np.repeat(state.reached[None], self._description.chunk_multiple, axis=0)
+        build_inputs(self._requests([state], [holding]), self._model.config)
         return state
 
 

@@ -26,9 +26,9 @@ from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile.layout import NUM_TAXELS
 from services.world_model.dynamics.features import (
     BOX_AXES,
-    LOOKS,
     MAX_DISTANCE_M,
     NUM_POINTS,
+    SAMPLE_OFFSETS,
     SLOT_SIZE,
     STEPS_PER_LATENT,
     Commands,
@@ -49,8 +49,8 @@ _SIDES = 2
 _SLOT_WIDTH, _HAND_WIDTH = 64, 96
 # Of an object: size (6), movability, presence, uncertainty, height, and way from the start (3).
 _ABOUT_SIZE = 6 + 1 + 1 + 1 + 1 + 3
-# Joints, wrist axes, heights of the points at all looks, wrist velocity (twice scaled), side.
-OWN_SIZE = 20 + 6 + len(LOOKS) * NUM_POINTS + 2 * 3 + 1
+# Joints, wrist axes, heights of the points at all samples, wrist velocity (twice scaled), side.
+OWN_SIZE = 20 + 6 + len(SAMPLE_OFFSETS) * NUM_POINTS + 2 * 3 + 1
 # Of an object at the end: the above, axes, position, and way over the table and upwards.
 _END_SIZE = _ABOUT_SIZE + 6 + 3 + 2
 _PAIRS = tuple(combinations(range(MAX_OBJECTS), 2))
@@ -283,13 +283,13 @@ class RecurrentCore(nn.Module):
         return torch.stack(flags, dim=1)
 
     def first_state(
-        self, start: SceneStart, standing: Commands, human: Float32[Tensor, " batch"] | None = None
+        self, start: SceneStart, holding: Commands, human: Float32[Tensor, " batch"] | None = None
     ) -> CoreState:
         """The state before the first step, with the measured hands as one latent step.
 
         Args:
             start: start of the rollout.
-            standing: the measured hands.
+            holding: the measured hands.
             human: 1 where a person acts, 0 for robots; None for robots alone, as in rollouts.
         """
         known = [
@@ -301,8 +301,8 @@ class RecurrentCore(nn.Module):
             self.begin(torch.cat(known, dim=1)),
             start.objects.position_m,
             rotations(start.objects.axes)[..., [2, 0]].transpose(-1, -2),
-            standing.points_m[:, -1, -1, :, 0],
-            standing.axes[:, -1],
+            holding.points_m[:, -1, -1, :, 0],
+            holding.axes[:, -1],
         )
 
     def forward(

@@ -23,11 +23,11 @@ from services.world_model.dynamics.trees import mapped
 NUM_POINTS: Final = 12
 NEAR_M = 0.01
 # Features are computed at these of the four steps of a latent: hands may shake within one.
-LOOKS = (1, 2, 3, 4)
+SAMPLE_OFFSETS = (1, 2, 3, 4)
 # The wrist is left out: it touches nothing.
 _FIRST_POINT = 1
 _PER_POINT = 7
-SLOT_SIZE = len(LOOKS) * (NUM_POINTS - _FIRST_POINT) * _PER_POINT
+SLOT_SIZE = len(SAMPLE_OFFSETS) * (NUM_POINTS - _FIRST_POINT) * _PER_POINT
 # The core runs once every four steps of the model grid, the rate of video latents.
 STEPS_PER_LATENT: Final = 4
 # What models of older releases know.
@@ -108,7 +108,7 @@ def compressed(distance_m: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:
 
 
 def slot_features(
-    points_m: Float32[Tensor, "batch looks 2 points 3"],
+    points_m: Float32[Tensor, "batch samples 2 points 3"],
     position_m: Float32[Tensor, "batch objects 3"],
     R: Float32[Tensor, "batch objects 3 3"],
     boxes_m: Float32[Tensor, "batch objects 6"],
@@ -119,7 +119,7 @@ def slot_features(
     middle, in the object's frame; its offset from the object, in the world's.
 
     Args:
-        points_m: points of both hands in the world at the `LOOKS`.
+        points_m: points of both hands in the world at the `SAMPLE_OFFSETS`.
         position_m: of the objects' frames in the world.
         R: rotations of the objects' frames to the world.
         boxes_m: middle and half sizes of each object's box in its frame.
@@ -178,11 +178,11 @@ class DynamicsConfig(FrozenModel):
 class Commands:
     """Motion of both hands at the sampled steps of each latent.
 
-    `points_m` are those of `HandMotion` at the `LOOKS` of each latent, `axes` and `joints_rad` at
-    its end.
+    `points_m` are those of `HandMotion` at the `SAMPLE_OFFSETS` of each latent, `axes` and
+    `joints_rad` at its end.
     """
 
-    points_m: Float32[Tensor, "batch latents looks 2 points 3"]
+    points_m: Float32[Tensor, "batch latents samples 2 points 3"]
     axes: Float32[Tensor, "batch latents 2 6"]
     joints_rad: Float32[Tensor, "batch latents 2 20"]
 
@@ -201,16 +201,18 @@ class Commands:
     @classmethod
     def of(cls, motions: list[HandMotion]) -> "Commands":
         """Commands of a batch: for each entry, the hand motion over the next 4k steps."""
-        looks = np.arange(0, len(motions[0]), STEPS_PER_LATENT)[:, None] + np.array(LOOKS) - 1
-        ends = looks[:, -1]
+        samples = (
+            np.arange(0, len(motions[0]), STEPS_PER_LATENT)[:, None] + np.array(SAMPLE_OFFSETS) - 1
+        )
+        ends = samples[:, -1]
         return cls(
-            torch.from_numpy(np.stack([motion.points_m[looks] for motion in motions])),
+            torch.from_numpy(np.stack([motion.points_m[samples] for motion in motions])),
             torch.from_numpy(np.stack([motion.axes[ends] for motion in motions])),
             torch.from_numpy(np.stack([motion.joints_rad[ends] for motion in motions])),
         )
 
     @classmethod
-    def standing(cls, motions: list[HandMotion]) -> "Commands":
+    def holding(cls, motions: list[HandMotion]) -> "Commands":
         """The single latent step, with resting hands, that starts a rollout (one step each)."""
         return cls.of([motion[np.zeros(STEPS_PER_LATENT, dtype=np.int64)] for motion in motions])
 

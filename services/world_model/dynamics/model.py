@@ -97,7 +97,7 @@ class Stillness:
 def stillness(
     points_m: Float32[Tensor, "batch 2 points 3"],
     num_still: Int64[Tensor, " batch"],
-    commanded_m: Float32[Tensor, "batch latents looks 2 points 3"],
+    commanded_m: Float32[Tensor, "batch latents samples 2 points 3"],
 ) -> Stillness:
     """Track hands that have stood at `points_m` for `num_still` latent steps.
 
@@ -106,12 +106,12 @@ def stillness(
     not chunks, so that it does not matter how a client splits its commands into chunks.
     """
     moved, rested = [], []
-    for looks_m in commanded_m.unbind(1):
-        off_m = (looks_m - points_m[:, None]).norm(dim=-1).amax((-1, -2, -3))
+    for samples_m in commanded_m.unbind(1):
+        off_m = (samples_m - points_m[:, None]).norm(dim=-1).amax((-1, -2, -3))
         moves = off_m >= STILL_M
         rested.append(~moves & (num_still >= REST_LATENTS))
         moved.append(moves)
-        points_m = torch.where(moves[:, None, None, None], looks_m[:, -1], points_m)
+        points_m = torch.where(moves[:, None, None, None], samples_m[:, -1], points_m)
         num_still = torch.where(moves, 0, num_still + 1)
     return Stillness(points_m, num_still, torch.stack(moved, 1), torch.stack(rested, 1))
 
@@ -220,7 +220,7 @@ class DynamicsModel(nn.Module):
         self,
         first: FirstStep,
         tactile_kpa: Float32[Tensor, "batch 2 320"],
-        standing: Commands,
+        holding: Commands,
         commanded: Float32[Tensor, " batch"],
     ) -> SceneMemory:
         """Estimate the scene at an observed step.
@@ -230,13 +230,13 @@ class DynamicsModel(nn.Module):
         Args:
             first: the step as input of the readers.
             tactile_kpa: pressure at that step.
-            standing: the measured hands, from `Commands.standing`.
+            holding: the measured hands, from `Commands.holding`.
             commanded: 1 if the rollout's actions are commanded, 0 if they are measured.
         """
         known = (self.codec.encode(tactile_kpa), first.pads_kpa, first.task, commanded)
         readings: list[Reading] = [reader(first) for reader in self.readers()]
         start = stacked([SceneStart(one.objects, one.sd_m, one.size, *known) for one in readings])
-        each, still = folded(start), standing.repeated(self.core.members)
+        each, still = folded(start), holding.repeated(self.core.members)
         future, state = self.core(still, each, self.core.first_state(each, still))
         return SceneMemory(
             start=start,
@@ -245,7 +245,7 @@ class DynamicsModel(nn.Module):
             disagreement_m=_spread_m(start.objects),
             tactile_kpa=torch.minimum(tactile_kpa, self.codec.peak_kpa),
             success=unfolded(future, self.core.members).success[..., -1].sigmoid(),
-            points_m=standing.points_m[:, -1, -1],
+            points_m=holding.points_m[:, -1, -1],
             num_still=REST_LATENTS * (tactile_kpa.amax((1, 2)) < FREE_KPA).long(),
         )
 

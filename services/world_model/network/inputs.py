@@ -32,7 +32,12 @@ from dextouch.hands.actions import (
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.schemas import MAX_OBJECTS, ActionKind
 from dextouch.tactile.layout import NUM_TAXELS
-from services.world_model.dynamics.features import LOOKS, SLOT_SIZE, hand_motion, slot_features
+from services.world_model.dynamics.features import (
+    SAMPLE_OFFSETS,
+    SLOT_SIZE,
+    hand_motion,
+    slot_features,
+)
 from services.world_model.network.attention import (
     MIRROR_CAMERA,
     MIRROR_WRIST,
@@ -43,7 +48,7 @@ from services.world_model.network.attention import (
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
 from services.world_model.network.instruction import instruction_ids
 
-_PER_SLOT = SLOT_SIZE // len(LOOKS) + 6 + 1
+_PER_SLOT = SLOT_SIZE // len(SAMPLE_OFFSETS) + 6 + 1
 # Of a hand: every slot's features, its box and whether it holds an object; and the side.
 GEOMETRY_SIZE = MAX_OBJECTS * _PER_SLOT + 1
 _PER_M = 10.0

@@ -84,11 +84,11 @@ def train_reader(
     _fit_heights(reader, table, config)
     later = [step for step in table.image_steps if step % 4 == 0 and step > 0]
     known = torch.nonzero(table.labelled)[:, 0]
-    is_told = _knows_some(table, config)
+    is_known = _knows_some(table, config)
     # Later steps of each episode, in their order; of further ones nothing is known, they have no
     # image or lie behind its end.
     reached = (torch.tensor(later) < table.length[:, None]) & table.shown[:, _places(table, later)]
-    reached &= is_told[:, later]
+    reached &= is_known[:, later]
     counts = reached.sum(1)
     order = torch.argsort(~reached, dim=1, stable=True)
 
@@ -97,7 +97,7 @@ def train_reader(
         drawn = torch.randint(len(later), rows.shape, generator=generator)
         amid = torch.tensor(later)[order[rows, drawn % counts[rows].clamp_min(1)]]
         is_first = torch.rand(rows.shape, generator=generator) < settings.first_fraction
-        is_first &= is_told[rows, 0]
+        is_first &= is_known[rows, 0]
         steps = torch.where(is_first | (counts[rows] == 0), 0, amid)
         return _loss(
             reader,

@@ -15,8 +15,8 @@ from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
 from dextouch.schemas import MAX_OBJECTS
 from services.world_model.dynamics.features import (
     FREE_KPA,
-    LOOKS,
     MAX_DISTANCE_M,
+    SAMPLE_OFFSETS,
     SIZE_RANGE,
     STEPS_PER_LATENT,
     Commands,
@@ -187,17 +187,19 @@ class SceneTable:
     def commands(self, rows: Tensor, start: int, use_measured: Bool[Tensor, " batch"]) -> Commands:
         """Measured hands at `start`, then the sent (or measured) ones until the end."""
         latents = torch.arange(start, self.num_steps - 1, STEPS_PER_LATENT)
-        looks = latents[:, None] + torch.tensor(LOOKS)
-        ends = looks[:, -1]
+        samples = latents[:, None] + torch.tensor(SAMPLE_OFFSETS)
+        ends = samples[:, -1]
 
         def taken(name: str, steps: Tensor) -> Tensor:
             sent: Tensor = getattr(self.sent, name)[rows][:, steps]
             return chosen(use_measured, getattr(self.measured, name)[rows][:, steps], sent)
 
         here = self.measured
-        standing = here.points_m[rows, start][:, None, None].expand(-1, 1, len(LOOKS), -1, -1, -1)
+        holding = here.points_m[rows, start][:, None, None].expand(
+            -1, 1, len(SAMPLE_OFFSETS), -1, -1, -1
+        )
         return Commands(
-            torch.cat([standing, taken("points_m", looks)], dim=1),
+            torch.cat([holding, taken("points_m", samples)], dim=1),
             torch.cat([here.axes[rows, start][:, None], taken("axes", ends)], dim=1),
             torch.cat([here.joints_rad[rows, start][:, None], taken("joints_rad", ends)], dim=1),
         )

@@ -19,8 +19,8 @@ from services.world_model.dynamics.core import (
     direction_free_inputs,
 )
 from services.world_model.dynamics.features import (
-    LOOKS,
     NUM_POINTS,
+    SAMPLE_OFFSETS,
     Commands,
     DynamicsConfig,
     ObjectPoses,
@@ -110,7 +110,7 @@ def test_pixels_of_the_sky_stay_within_reach():
 
 def random_points(*batch, seed=0, scale_m=0.1):
     generator = torch.Generator().manual_seed(seed)
-    return scale_m * torch.randn(*batch, len(LOOKS), 2, NUM_POINTS, 3, generator=generator)
+    return scale_m * torch.randn(*batch, len(SAMPLE_OFFSETS), 2, NUM_POINTS, 3, generator=generator)
 
 
 def matrix(turn):
@@ -130,7 +130,7 @@ def test_distances_to_a_box_are_those_of_another_library():
         matrix(rotation)[None, None],
         torch.tensor(np.concatenate([middle, half]), dtype=torch.float32)[None, None],
     )
-    each = found.reshape(2, len(LOOKS), NUM_POINTS - 1, 7)
+    each = found.reshape(2, len(SAMPLE_OFFSETS), NUM_POINTS - 1, 7)
     distance_m = 0.01 * torch.sinh(2 * each[..., 0])
     inside = 0
     for hand, look, point in np.ndindex(*each.shape[:3]):
@@ -165,14 +165,14 @@ def test_features_of_a_scene_that_is_moved_and_turned_are_the_same():
 
 
 def test_features_hold_a_millimetre_near_an_object():
-    points = torch.zeros(1, len(LOOKS), 2, NUM_POINTS, 3)
+    points = torch.zeros(1, len(SAMPLE_OFFSETS), 2, NUM_POINTS, 3)
     points[..., 0] = 0.02
     moved = points.clone()
     moved[0, 1, 1, 3, 0] += 0.001
     about = (torch.zeros(1, 1, 3), matrix(Rotation.identity()).expand(1, 1, 3, 3),
              torch.tensor([0.0, 0, 0, 0.02, 0.02, 0.02]).expand(1, 1, 6))  # fmt: skip
     change = slot_features(moved, *about) - slot_features(points, *about)
-    each = change.reshape(2, len(LOOKS), NUM_POINTS - 1, 7)[1, 1, 2]
+    each = change.reshape(2, len(SAMPLE_OFFSETS), NUM_POINTS - 1, 7)[1, 1, 2]
     # Outside the box by a millimetre: the distance to it changes most.
     np.testing.assert_allclose(each[0], np.arcsinh(0.1) / 2, rtol=1e-4)
     assert change.count_nonzero() == 3
@@ -365,7 +365,7 @@ def begun(model, tasks=(0, 1)):
         torch.tensor(tasks),
     )  # fmt: skip
     touch = 5 * torch.rand(batch, 2, 320, generator=torch.Generator().manual_seed(3))
-    return model.begin(first, touch, Commands.standing([motion] * batch), torch.ones(batch))
+    return model.begin(first, touch, Commands.holding([motion] * batch), torch.ones(batch))
 
 
 def lifted(num_steps):

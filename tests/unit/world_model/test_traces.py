@@ -6,7 +6,12 @@ import torch
 from dextouch.schemas import MAX_OBJECTS
 from services.world_model.dynamics import trees
 from services.world_model.dynamics.core import NUM_PADS, CoreState, SceneStart
-from services.world_model.dynamics.features import LOOKS, Commands, DynamicsConfig, ObjectPoses
+from services.world_model.dynamics.features import (
+    SAMPLE_OFFSETS,
+    Commands,
+    DynamicsConfig,
+    ObjectPoses,
+)
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.trees import Traced
 from services.world_model.state_world import StateWorld
@@ -42,7 +47,7 @@ def inputs(model, seed, *, batch=1, latents=4, task=0):
         return ObjectPoses(0.2 * normal(*lead, MAX_OBJECTS, 3), axes, present)
 
     commands = Commands(
-        0.3 * normal(batch, latents, len(LOOKS), 2, 12, 3), normal(batch, latents, 2, 6),
+        0.3 * normal(batch, latents, len(SAMPLE_OFFSETS), 2, 12, 3), normal(batch, latents, 2, 6),
         normal(batch, latents, 2, 20),
     )  # fmt: skip
     each = objects(members, batch)
