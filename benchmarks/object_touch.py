@@ -85,22 +85,22 @@ def _takes(task: str, seeds: Iterable[int], folder: Path) -> tuple[list[EpisodeG
     options = TakeOptions(noise_m=_NOISE_M, image_every=40, streams="training")
     names = [write_episode(store, record(stage, seed, options)) for seed in seeds]
     takes = [EpisodeGrid(store.open(name)) for name in names]
-    first = takes[0]
-    Ts = _true_poses(first)[0]
-    plain = [
-        described(name, box_m, T)
-        for name, box_m, T in zip(first.object_names, first.boxes_m, Ts, strict=True)
-    ]
-    listed = [
-        one.model_copy(
+    listed = described_objects(takes[0])
+    return [take for take in takes if take.success], SceneObjects(tasks={task: listed})
+
+
+def described_objects(take: EpisodeGrid) -> tuple[SceneObject, ...]:
+    """Objects of a take of the twin as a lab describes them."""
+    each = zip(take.object_names, take.boxes_m, _true_poses(take)[0], strict=True)
+    return tuple(
+        described(name, box_m, T).model_copy(
             update={
-                "touch": TouchedAt.model_validate(GRIPS[task][one.name]),
-                "fixed": one.name in _FIXED,
+                "touch": TouchedAt.model_validate(GRIPS[take.task][name]),
+                "fixed": name in _FIXED,
             }
         )
-        for one in plain
-    ]
-    return [take for take in takes if take.success], SceneObjects(tasks={task: tuple(listed)})
+        for name, box_m, T in each
+    )
 
 
 def _true_poses(take: EpisodeGrid) -> Float64[np.ndarray, "steps objects 4 4"]:

@@ -94,12 +94,21 @@ STAGES = {
     ),
     "objects": StageEntry(
         "benchmarks.objects",
-        "find objects by the markers on them, compared with the usual recipe",
+        "find objects by markers, clicks and touch, compared with the usual recipes",
         "Renders takes of the twin whose objects carry ArUco markers, sharp and with blur and "
         "noise, and compares the poses that alignment measures (all markers of an object, edges "
         "fitted, the two solutions told apart) with those of the usual recipe (the largest marker, "
         "corners refined by gradients) and with the truth: errors, share of images in which "
-        "objects were found, and time an image.",
+        "objects were found, and time an image. Errors of clicks by their noise, and of touch in "
+        "takes that succeeded, compared with the place of the first contact.",
+    ),
+    "touch": StageEntry(
+        "benchmarks.touch_alone",
+        "train a world model on takes whose objects nothing but touch has located",
+        "Records takes of the twin with mistakes, leaves the poses of their objects and the times "
+        "of events out, and trains a world model and a judge on the rest, with a file that says "
+        "how objects are held. Replays the takes of split C: AUC of imagined success against the "
+        "recorded outcomes. Finished steps are kept in --keep, so an interrupted run resumes.",
     ),
     "starts": StageEntry(
         "benchmarks.starts",

@@ -184,6 +184,7 @@ def write_recording(store, streams, domain, *, recording_id="take", edit=None, l
             )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("domain", ["human", "robot"])
 def test_errors_against_truth(tmp_path, domain, capsys):
     store = EpisodeStore(tmp_path)

@@ -111,6 +111,7 @@ def rms_ms(estimate_ns, take, counts=slice(None)):
     return float(np.sqrt(np.mean((error_ms - np.median(error_ms)) ** 2)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", BOUNDS_MS)
 @pytest.mark.parametrize("stop_s", STOPS_S)
 def test_a_clock_that_stood_still_is_cut(path, stop_s, capsys):

@@ -30,6 +30,7 @@ def tell(capsys, text):
         sys.stdout.write(f"\n{text}")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SCENES | MORE_SCENES)
 def test_error_against_truth(name, capsys):
     scene = find(name)
@@ -90,6 +91,7 @@ def find(name):
     return (SCENES | MORE_SCENES)[name]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step_ms", [0.0, 200.0, -30.0, -9.0, -3.0])
 @pytest.mark.parametrize("stall_s", [0.5, 2.5])
 def test_stalls_are_no_steps(stall_s, step_ms):
@@ -211,6 +213,7 @@ def probe(code, *words):
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
 
 
+@pytest.mark.long
 def test_online_clock_costs_microseconds(capsys):
     # Beside a loop of plain Python, so that a slow or busy machine slows both: 20 us where a step
     # of the loop takes 0.27 us.

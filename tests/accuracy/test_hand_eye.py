@@ -43,6 +43,7 @@ def nees(result, scene):
     return error @ np.linalg.solve(result.covariance, error) / 6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("with_corners", [True, False])
 def test_mount_is_as_near_as_promised_and_its_sigma_honest(with_corners, capsys):
     ours, theirs, normalised, published = [], [], [], []
@@ -77,6 +78,7 @@ def test_mount_is_as_near_as_promised_and_its_sigma_honest(with_corners, capsys)
     assert (ratios <= 1.8).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("factor", [0.3, 3.0])
 def test_wrongly_declared_noise_is_corrected(factor):
     """The views know better: sigma stays honest where the declaration is three times off."""
@@ -125,6 +127,7 @@ DEGENERATE = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", DEGENERATE)
 def test_degenerate_motion_is_refused_with_the_axes_to_add(name):
     motion, num_missing = DEGENERATE[name]

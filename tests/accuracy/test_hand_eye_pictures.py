@@ -53,6 +53,7 @@ def given_lens(folder):
     )
 
 
+@pytest.mark.long
 def test_mount_from_pictures_with_blurred_and_moving_views(camera, tmp_path, capsys):
     rng = np.random.default_rng(5)
     mount = transform(rotation_from_vector(rng.normal(size=3)), rng.normal(scale=0.05, size=3))
@@ -121,6 +122,7 @@ def test_corners_of_sharp_pictures_are_where_they_are(camera, capsys):
     assert np.abs(off_px.mean(axis=0)).max() <= 0.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shift_px", [(6.0, 0.0), (0.0, 6.0), (4.5, 4.5)])
 def test_pictures_of_a_moving_board_are_blurred(camera, shift_px):
     board = parse_board(CHARUCO)

@@ -70,6 +70,7 @@ def test_robot_motion_is_recovered(side, natural, capsys):
     assert result.tip_error_m.max() <= 1e-6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("num_starts", "share"), [(1, 0.999), (8, 1.0)])
 def test_cold_poses_anywhere_are_found(num_starts, share, capsys):
     hand = RobotHand("right")

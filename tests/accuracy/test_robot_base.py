@@ -30,6 +30,7 @@ def pairs(seed, *, num=20, turn_rad=0.6, axes=(1, 1, 1), span_m=0.25, has_mount=
     return tracker @ noise(0.05, 0.5), effector @ noise(0.02, 0.2), T_world_base, T_effector_tracker
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_given", [True, False])
 def test_base_is_found_and_its_sigma_honest(is_given, capsys):
     errors, normalised = [], []
@@ -108,6 +109,7 @@ def test_places_that_hardly_differ_are_refused_where_the_mount_is_given():
     assert refusal.value.details["missing_axes"] == ["x", "y", "z"]
 
 
+@pytest.mark.long
 def test_healthy_pairs_are_never_refused():
     for seed in range(20):
         tracker, effector, T_world_base, mount = pairs(100 + seed, num=10 + seed % 20)

@@ -158,6 +158,7 @@ def test_gain_is_found_as_well_as_its_sigma_says(side, capsys):
     assert 0.6 <= normalised <= 1.6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_every_fault_gets_its_name_and_no_other_taxel_does(seed):
     rng = np.random.default_rng(seed)

@@ -76,6 +76,7 @@ def test_a_sheet_shows_human_and_replay(tmp_path):
     assert jpeg_size(path.read_bytes()) == (3 * 128 + 2 * 4, 9 * 128)
 
 
+@pytest.mark.long
 def test_a_robot_take_is_refused():
     stage = Stage("stack_bowls", "robot", TwinSettings())
     episode = record(stage, 0, TakeOptions(images=()))

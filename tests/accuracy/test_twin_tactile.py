@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 
 from dextouch.geometry import transform_from_pose
 from dextouch.tactile.layout import NUM_TIP_TAXELS, PALM_PITCH_M, PALM_SHAPE, PALM_TAXEL_AREA_M2
@@ -108,6 +109,7 @@ def _reference_n(shape: Shape, hand, T_world_wrist: np.ndarray, force_n: float) 
     return STIFFNESS_PA_M * area * np.maximum(depth + middle, 0.0).sum(axis=(2, 3))
 
 
+@pytest.mark.long
 def test_palm_pressure_has_the_shape_of_an_elastic_foundation(capsys):
     rows = []
     for name, shape in SHAPES.items():

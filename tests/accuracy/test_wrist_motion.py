@@ -150,6 +150,7 @@ def test_relative_motion_does_not_see_where_the_world_is(new_world, poses):
     np.testing.assert_array_equal(again[0], IDENTITY_POSE_9D)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_poses_come_back_from_stored_actions_whatever_the_anchor(dtype, capsys):
     worst = np.zeros(2)
@@ -172,6 +173,7 @@ def test_poses_come_back_from_stored_actions_whatever_the_anchor(dtype, capsys):
     assert worst[1] <= BOUND_DEG
 
 
+@pytest.mark.long
 @given(POSES)
 def test_nine_numbers_in_float32_are_the_pose(pose):
     T = pose_of(pose)

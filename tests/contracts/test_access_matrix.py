@@ -228,6 +228,7 @@ def test_every_service_has_a_table():
     assert set(BUILDERS) - set(APPS) == {"twin", "world_model"}
 
 
+@pytest.mark.long
 def test_every_route_has_a_scope_or_is_public(keyed):
     """Add a row for a new route: which scope should it need?"""
     service, app = keyed
@@ -235,6 +236,7 @@ def test_every_route_has_a_scope_or_is_public(keyed):
     assert operations(app) == set(TABLE[service]) | PUBLIC | pages | BY_TOKEN.get(service, set())
 
 
+@pytest.mark.long
 def test_the_document_says_which_scope(keyed):
     service, app = keyed
     paths = app.openapi()["paths"]
@@ -258,6 +260,7 @@ async def test_only_the_key_with_the_scope_is_let_in(keyed):
                     assert (status, reason) == (403, "missing_scope"), (operation, scope)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("presented", NO_KEYS)
 async def test_without_a_key_nobody_is_let_in(unlimited, keyed, presented):
     service, app = keyed
@@ -268,6 +271,7 @@ async def test_without_a_key_nobody_is_let_in(unlimited, keyed, presented):
             assert status == 401, (operation, presented)
 
 
+@pytest.mark.long
 async def test_probes_and_pages_say_nothing_secret(keyed):
     service, app = keyed
     pages = RATING_PAGE if service == "rating" else set()
@@ -278,6 +282,7 @@ async def test_probes_and_pages_say_nothing_secret(keyed):
             assert not any(key_of(scope) in answer.text for scope in SCOPES)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("presented", NO_KEYS)
 async def test_no_key_replaces_an_enrolment_token(tmp_path, presented):
     """Not even one with every scope, nor one that is presented in place of the token."""

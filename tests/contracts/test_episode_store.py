@@ -125,6 +125,7 @@ def die(writer):
     os.close(writer._lock)
 
 
+@pytest.mark.long
 def test_everything_comes_back_equal(made, place, reference):
     made.write(place.store)
     reader = place.again().open(EPISODE)
@@ -155,6 +156,7 @@ def test_windows(made, place, reference, start, num_steps):
     np.testing.assert_array_equal(ours.actions, theirs.actions)
 
 
+@pytest.mark.long
 def test_kinds_are_listed_apart(made, place):
     for episode_id in ("b", "a"):
         made.write(place.store, episode_id=episode_id)
@@ -287,6 +289,7 @@ def test_damaged_arrays_are_named(made, place, damage):
     np.testing.assert_array_equal(reader.read("action").values, made.values["action"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["commit.json", "zarr.json"])
 def test_damaged_records_are_refused(made, place, name):
     made.write(place.store)
@@ -295,6 +298,7 @@ def test_damaged_records_are_refused(made, place, name):
         place.again().open(EPISODE)
 
 
+@pytest.mark.long
 def test_readers_are_shared_by_threads_and_pickled(made, place, reference):
     reader = made.write(place.store)
     carried = pickle.loads(pickle.dumps(reader))  # noqa: S301 our own bytes, as a data loader's
@@ -306,6 +310,7 @@ def test_readers_are_shared_by_threads_and_pickled(made, place, reference):
         np.testing.assert_array_equal(window.tactile_kpa, expected.tactile_kpa)
 
 
+@pytest.mark.long
 def test_a_groups_size_is_that_of_its_files(place, made):
     made.write(place.store)
     sizes = []

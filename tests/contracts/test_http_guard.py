@@ -132,6 +132,7 @@ async def test_pages_of_other_origins_cannot_act(make_app, headers, status, says
             assert_refused(await client.request(method, path, headers=headers), status, says)
 
 
+@pytest.mark.long
 async def test_rebound_names_cannot_read(make_app):
     app = make_app()
     async with client_of(app, "http://evil.example:8000") as client:
@@ -139,6 +140,7 @@ async def test_rebound_names_cannot_read(make_app):
             assert_refused(await client.request(method, path), 421, "allowed_hosts")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", None])
 async def test_pages_of_other_origins_open_no_websocket(make_app, origin):
     host = b"127.0.0.1:8000" if origin else b"evil.example"
@@ -160,6 +162,7 @@ async def test_pages_of_other_origins_open_no_websocket(make_app, origin):
     assert "allowed_" in sent[0]["reason"]
 
 
+@pytest.mark.long
 async def test_own_pages_tools_and_named_origins_may_act(make_app):
     origins = ("https://lab.example:443", "http://[FE80:0:0:0:0:0:0:2]:80", "https://Desk.lab:8443")
     hosts = ("lab-pc", "fd00::7", "FE80:0:0:0:0:0:0:1")
@@ -207,6 +210,7 @@ async def test_a_dashboard_sends_who_is_not_signed_in_to_its_page():
 BY_FORM = ["text/plain", FORM, "multipart/form-data; boundary=x", ""]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("content_type", BY_FORM)
 async def test_what_a_form_can_send_is_refused(make_app, content_type):
     """A no-cors request names one of these types, or none (a Blob without a type)."""
@@ -238,6 +242,7 @@ HOSTILE_TYPES = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("content_type", HOSTILE_TYPES)
 async def test_no_content_type_breaks_a_service(make_app, content_type):
     """Extended parameters (RFC 8187) change nothing: their media type is what counts."""
@@ -278,6 +283,7 @@ async def test_a_service_with_keys_asks_for_one_before_it_reads(make_app):
     assert not asked
 
 
+@pytest.mark.long
 async def test_probes_and_keys_work_under_any_name(make_app):
     """Health checks and Prometheus have no key and use the names of containers."""
     app = make_app(**keyed())
@@ -290,6 +296,7 @@ async def test_probes_and_keys_work_under_any_name(make_app):
             assert answer.status_code not in {415, 421}, (path, answer.text)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("announced", [True, False])
 async def test_no_route_reads_a_body_that_is_longer_than_its_own(make_app, announced):
     """Of JSON no route needs more than 1 MiB; of anything more than `max_body_bytes`."""

@@ -242,6 +242,7 @@ def test_a_step_gives_as_many_steps_as_actions(world, started, multiples):
     )
 
 
+@pytest.mark.long
 def test_a_step_is_pure(world, started):
     chunk = move(started.observation, world.description.chunk_multiple)
     before = world.snapshot(started.state)

@@ -94,6 +94,7 @@ def noted(value):
     Path(os.environ["NOTED"], f"{os.getpid()}-{value}").touch()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("num_processes", [1, 2])
 def test_jobs_give_their_results_and_errors(num_processes):
     jobs = list(run_jobs(refuse_odd, range(5), Workers(num_processes)))
@@ -131,6 +132,7 @@ def test_a_job_whose_worker_is_killed_is_repeated_and_others_are_not(tmp_path):
     assert sum(by_name[name].value for name in "abcd") <= 4 + 3
 
 
+@pytest.mark.long
 def test_workers_are_prepared(tmp_path, monkeypatch):
     monkeypatch.setenv("NOTED", str(tmp_path))
     jobs = run_jobs(square, range(6), Workers(2), prepare=partial(noted, "ready"))

@@ -21,6 +21,8 @@ from services.world_model.training.dataset import index_episodes, load_episodes
 from services.world_model.training.state_data import load_state_data
 from services.world_model.training.tokenizer_trainer import load_hands
 
+pytestmark = pytest.mark.long
+
 LEARNERS = {
     "joint world model": load_episodes,
     "joint world model, streaming": index_episodes,
@@ -55,7 +57,6 @@ def url(tmp_path_factory):
     return os.fspath(store.root)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("name", LEARNERS)
 def test_rejected_imagined_and_unknown_episodes_are_left_out_by_all(url, name):
     found = {episode.episode_id for episode in LEARNERS[name](url)}

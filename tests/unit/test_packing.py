@@ -156,6 +156,7 @@ MESSAGE = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.long
 @given(data=st.binary() | (MESSAGE | ANYTHING).map(msgpack.packb), cut=st.integers(0, 5))
 def test_whatever_comes_is_read_or_refused_by_name(data, cut):
     for body in (data, data[: len(data) - cut], data[cut:]):

@@ -19,6 +19,7 @@ def test_modules_are_the_same_objects():
     assert GloveSettings is Own
 
 
+@pytest.mark.long
 def test_either_name_may_come_first():
     code = (
         "import dextouch_services.twin.tasks as a, services.twin.tasks as b;"

@@ -168,6 +168,7 @@ def all_conventions():
             yield FrameConvention(handedness=handedness, axes=axes)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("convention", list(all_conventions()), ids=lambda c: "".join(c.axes))
 def test_the_frame_of_a_sender_is_the_product_of_matrices(convention):
     rng = np.random.default_rng(4)

@@ -105,6 +105,7 @@ def test_silent_devices_are_stale(bench):
     assert bench.monitor.report().level == "STALE"
 
 
+@pytest.mark.long
 def test_a_clean_run_alerts_nobody(bench):
     for _ in range(40):
         bench.second()

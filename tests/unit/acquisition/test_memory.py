@@ -18,6 +18,7 @@ def resident_bytes():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
+@pytest.mark.long
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told")
 def test_free_memory_goes_back():
     # Pieces below the size that the system gets back by itself, the newest one kept.

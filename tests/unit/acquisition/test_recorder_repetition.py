@@ -68,6 +68,7 @@ def test_discard_may_be_repeated(recorder):
     assert list(recorder.spool_root.iterdir()) == []
 
 
+@pytest.mark.long
 def test_rerecord_arms_the_same_prompt(recorder):
     recorder.arm(PROMPT)
     recorder.record("a")

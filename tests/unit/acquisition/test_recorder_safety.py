@@ -256,6 +256,7 @@ def test_impossible_safety_is_refused(wrong):
         SpoolSafety(**wrong)
 
 
+@pytest.mark.long
 def test_an_incomplete_take_keeps_that_and_the_cause(make_recorder, clock):
     recorder = make_recorder()
     for name, is_complete in (("whole", True), ("torn", False)):

@@ -84,6 +84,7 @@ def undamaged(make):
     return greeting, units, truth
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("make", MAKERS)
 @settings(max_examples=50)
 @given(

@@ -130,6 +130,7 @@ for number in range(100_000):
 """
 
 
+@pytest.mark.long
 def test_what_was_committed_survives_kill_9(folder):
     child = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(folder)],
@@ -157,6 +158,7 @@ def test_pragmas_that_survive_a_power_failure(folder):
     database.close()
 
 
+@pytest.mark.long
 def test_one_process_has_the_jobs(folder):
     database = JobDatabase(folder)
     with pytest.raises(ConflictError, match="another alignment service"):

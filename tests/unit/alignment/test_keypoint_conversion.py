@@ -24,6 +24,7 @@ def turned(recorded, calibration, *, calibrated):
             calibration[calibration_name(side)] = matrix_rows(T)
 
 
+@pytest.mark.long
 def test_calibrated_axes_give_the_same_joints(tmp_path):
     store = EpisodeStore(tmp_path)
     streams = truth_streams("human")

@@ -150,6 +150,7 @@ def test_an_object_without_a_visible_marker_is_not_seen():
     assert found.Ts_world_object.shape == (0, 4, 4)
 
 
+@pytest.mark.long
 def test_a_marker_that_is_there_twice_is_nobodys():
     one = cube()
     image = photo(seen_from_above(0.0, shift_m=(-0.15, 0.0)), one, only=(3,))

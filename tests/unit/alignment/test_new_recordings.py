@@ -72,6 +72,7 @@ async def looked(store, jobs, name="last"):
     await until(done)
 
 
+@pytest.mark.long
 async def test_recordings_that_arrive_become_episodes_once(store, worker):
     write_recording(store, "before")
     async with served(store) as jobs:
@@ -140,6 +141,7 @@ async def test_what_cannot_be_aligned_is_listed_with_its_reason_and_not_tried_ag
     assert worker.started == ["last"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("deleted", [False, True])
 async def test_a_recording_with_an_episode_is_left_alone_even_in_the_trash(store, worker, deleted):
     write_recording(store, "take")

@@ -28,6 +28,7 @@ def retarget(store, tmp_path, item_id):
     return main(["align", "retarget", item_id, *files, *report]), load_hand(model, mapping)
 
 
+@pytest.mark.long
 def test_fingers_point_where_the_persons_do(store, tmp_path, capsys):
     write_recording(store, truth_streams("human"), "human")
     episode = store.open(align_recording(store, "take", AlignmentOptions()).episode_id)

@@ -72,6 +72,7 @@ def slanted(hand):
     return HandModel("right", fingers, name="slanted")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", [HAND, slanted(HAND)], ids=["Wuji", "slanted"])
 def test_points_of_the_solver_are_those_of_the_hand(model):
     hand = hand_arrays(model)

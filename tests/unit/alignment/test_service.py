@@ -144,6 +144,7 @@ async def test_other_options_are_another_episode(serve, store):
     assert len(store.list(kind="episode")) == 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("body", "status", "word"),
     [
@@ -334,6 +335,7 @@ DAMAGES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 async def test_damaged_jobs_are_told_left_alone_and_tried_again(
     serve, store, damage, monkeypatch, capsys

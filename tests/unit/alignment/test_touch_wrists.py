@@ -38,6 +38,7 @@ def wrists(store, recording_id, options):
     return reached.Ts_world_wrist_left, reached.joints_left_rad, episode
 
 
+@pytest.mark.long
 def test_gaps_of_gloves_cost_no_step(store):
     whole, _, _ = wrists(store, "whole", TOUCH)
     _, _, tracked = wrists(store, "gaps", AlignmentOptions())

@@ -62,6 +62,7 @@ def test_one_process_aligns_refuses_dies_and_is_replaced(store):
     assert worker._child is None
 
 
+@pytest.mark.long
 def test_stopping_from_another_thread_ends_it_at_once(store):
     worker = AlignmentWorker(str(store.root))
     worker.start()

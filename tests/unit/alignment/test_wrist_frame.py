@@ -45,6 +45,7 @@ def test_the_frame_of_a_mean_hand_is_exact(side, make):
         assert frame.turn_rad < 1e-7
 
 
+@pytest.mark.long
 @settings(max_examples=30)
 @given(st.lists(st.floats(-np.pi, np.pi), min_size=3, max_size=3), st.integers(0, 20))
 def test_the_frame_turns_with_the_hand(vector, seed):

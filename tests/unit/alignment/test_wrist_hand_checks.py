@@ -48,6 +48,7 @@ def test_the_mean_hand_has_the_axes_of_the_twins_people(side):
         mean_hand_m("both")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("make", [moving_hand, flat_hand])
 def test_hands_of_people_are_taken(side, make):
@@ -108,6 +109,7 @@ def test_other_orders_are_named(seed):
         check_hand_shape(keypoints[:, order(linux)] * 1e3)
 
 
+@pytest.mark.long
 def test_every_order_of_chains_and_joints_is_named():
     keypoints = tracked("right", 7)[:20]
     num_orders = 0
@@ -137,6 +139,7 @@ def test_a_hand_one_joint_off_is_named(seed):
         check_hand_shape(shifted)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("make", [moving_hand, flat_hand])
 @pytest.mark.parametrize("side", SIDES)
 def test_the_other_hand_is_recognised_and_named(side, make):

@@ -74,6 +74,7 @@ def test_keypoints_in_other_axes_need_a_calibration(side):
         )
 
 
+@pytest.mark.long
 def test_joints_of_a_turned_hand_are_those_of_the_hand():
     rng = np.random.default_rng(2)
     keypoints, R = moving_hand("right", rng, 20), any_rotation(rng)

@@ -234,6 +234,7 @@ def test_the_sound_dataset_comes_in(folder, store):
     assert import_lerobot(folder, store) == ["stand-bottle-0003"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unit", ["h264", "rgb8"])
 @pytest.mark.parametrize("name", DAMAGE)
 def test_damage_is_named_and_nothing_is_stored(folder, store, name, unit):
@@ -299,6 +300,7 @@ def test_a_feature_of_a_video_cannot_leave_by_its_name(folder, store):
     assert store.list() == []
 
 
+@pytest.mark.long
 def test_any_flipped_byte_of_the_metadata_is_survived(folder, store):
     """Whatever a byte says: our error or a sound import, never another exception."""
     rng = np.random.default_rng(11)
@@ -315,6 +317,7 @@ def test_any_flipped_byte_of_the_metadata_is_survived(folder, store):
         (folder / name).write_bytes(whole)
 
 
+@pytest.mark.long
 def test_a_flipped_byte_of_a_video_is_survived(folder):
     rng = np.random.default_rng(12)
     path = folder / VIDEO

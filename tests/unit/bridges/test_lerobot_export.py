@@ -252,6 +252,7 @@ def _mixed(store):
     return [make_episode().write(store), make_episode(seed=4, commanded=False).write(store)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("make", "options", "error", "words"),
     [

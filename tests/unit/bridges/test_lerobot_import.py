@@ -100,6 +100,7 @@ def test_our_own_dataset_gives_back_the_episodes(store, other, folder, unit):
             assert back.streams[camera].unit == unit
 
 
+@pytest.mark.long
 def test_attributes_come_back_with_the_episode_in_the_lineage(store, other, folder):
     reader = two(store)[0]
     export_lerobot([reader], folder, repo_id="touch")
@@ -192,6 +193,7 @@ def test_ids_that_exist_are_refused_and_a_prefix_helps(store, folder):
     assert ids == [f"again-{reader.attributes.episode_id}" for reader in readers]
 
 
+@pytest.mark.long
 def test_datasets_of_others_come_in_by_a_mapping(store, other, folder):
     readers = two(store)
     shutil.rmtree(store.root)

@@ -142,6 +142,7 @@ def test_the_sound_dataset_is_sound(sound):
     assert problems(sound) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sentence", FAULTS)
 def test_a_fault_is_named(sound, tmp_path, sentence):
     shutil.copytree(sound.parent, tmp_path / "copy")

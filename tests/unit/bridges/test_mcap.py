@@ -248,6 +248,7 @@ def test_an_export_that_fails_leaves_nothing(store, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["store"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("keep", [0.1, 0.5, 0.9, 0.999])
 def test_a_truncated_file_is_refused_and_the_store_stays_empty(keep, store, other, tmp_path):
     path = tmp_path / "take.mcap"

@@ -50,6 +50,7 @@ def test_advice_names_what_is_missing(views, words):
     assert re.search(words, todo)
 
 
+@pytest.mark.long
 def test_advice_asks_for_the_edges_and_for_more_only_when_all_else_is_there():
     board = boards.parse_board(BOARD)
     views = [boards.find_board(str(i), render(T), board) for i, T in enumerate(good_views())]
@@ -126,6 +127,7 @@ def test_live_views_are_kept_only_when_still_and_new(tmp_path):
     assert (tmp_path / "to/pictures/coverage_head.svg").is_file()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("image", "words"),
     [

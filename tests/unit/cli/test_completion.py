@@ -65,6 +65,7 @@ def test_bash_completes(words, expected, tmp_path):
     assert all(one.startswith(prefix) for one in in_bash(tmp_path, *words))
 
 
+@pytest.mark.long
 @needs("bash")
 def test_bash_completes_files(tmp_path):
     (tmp_path / "marks.sqlite").touch()

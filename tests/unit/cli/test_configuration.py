@@ -120,6 +120,7 @@ def test_every_command_refuses_an_unknown_section(write, capsys):
     assert "dextouch.toml:4: unknown section [dashbord]" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_show_says_where_each_setting_comes_from(write, monkeypatch, capsys):
     write(FILE)
     monkeypatch.setenv("DEXTOUCH_DASHBOARD_STATION", "desk 4")

@@ -43,6 +43,7 @@ def run(folder, *words, **variables):
     )
 
 
+@pytest.mark.long
 def test_config_shows_all_sections_without_torch(tmp_path):
     done = run(tmp_path, "config", "show", "--json", "shown.json", DEXTOUCH_WORLD_MODEL_PORT="9")
     assert done.returncode == 0, done.stderr

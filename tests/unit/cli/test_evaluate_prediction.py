@@ -13,6 +13,8 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.world_model.shipped_checkpoints import paper_form_checkpoint
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
@@ -30,7 +32,6 @@ def run(store, *more):
     return main.main(["evaluate", "prediction", *words])
 
 
-@pytest.mark.long
 def test_windows_are_measured_by_task_beside_all_baselines(store, tmp_path, capsys):
     path = tmp_path / "result.json"
     metrics = "psnr,contact_f1"
@@ -47,7 +48,6 @@ def test_windows_are_measured_by_task_beside_all_baselines(store, tmp_path, caps
     assert "PSNR (dB) ↑" in capsys.readouterr().out
 
 
-@pytest.mark.long
 def test_recorded_episodes_have_the_baseline_of_another_take(store, tmp_path, capsys):
     """Those of a station have no seed; a single one names what is missing, and why."""
     recorded = EpisodeStore(tmp_path / "recorded")

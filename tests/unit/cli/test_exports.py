@@ -159,6 +159,7 @@ def test_lerobot_replaces_only_what_is_a_data_set(store, dextouch, tmp_path):
     assert "not a LeRobot data set" in err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("form", ["lerobot", "mcap"])
 @pytest.mark.parametrize("unit", ["jpeg", "h264"])
 def test_damaged_images_are_left_out_and_named(store, dextouch, tmp_path, form, unit):
@@ -184,6 +185,7 @@ def test_damaged_images_are_left_out_and_named(store, dextouch, tmp_path, form, 
     np.testing.assert_array_equal(again.stamps_ns("camera_head"), stamps[kept])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("form", ["lerobot", "umi"])
 def test_an_episode_without_a_whole_image_does_not_stop_a_data_set(store, dextouch, tmp_path, form):
     write_damaged(store, "jpeg", damaged=(5,))

@@ -16,6 +16,8 @@ from services.world_model.checkpoints import write_state_checkpoint
 from services.world_model.training.dataset import load_episodes
 from tests.contracts.test_world import untrained_state_checkpoint
 
+pytestmark = pytest.mark.long
+
 SEEDS = (4, 5, 8)
 
 
@@ -65,7 +67,6 @@ def split_of_seed(store, seed):
     return split
 
 
-@pytest.mark.long
 def test_demonstrations_are_imagined_whole(generate, truth, tmp_path):
     strips = tmp_path / "strips.html"
     status, made = generate(seeds="4:5", strips=strips)
@@ -91,7 +92,6 @@ def test_demonstrations_are_imagined_whole(generate, truth, tmp_path):
     assert target.revision(made[0]) == revision
 
 
-@pytest.mark.long
 def test_scenes_of_the_world_model_are_refused(generate, truth, capsys):
     assert (split_of_seed(truth, 4), split_of_seed(truth, 5)) == ("A", "B")
     status, _ = generate(seeds="4:6")
@@ -110,7 +110,6 @@ def test_failures_are_imagined_on_request_only(generate, capsys):
     assert (status, len(made)) == (0, 1)
 
 
-@pytest.mark.long
 def test_imagined_episodes_are_trained_on_only_when_asked(generate, truth, tmp_path):
     generate(seeds="4:5")
     imagined = EpisodeStore(tmp_path / "imagined")

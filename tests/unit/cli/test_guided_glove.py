@@ -185,6 +185,7 @@ def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsy
     assert again[name] == first[name]
 
 
+@pytest.mark.long
 def test_a_glove_that_was_touched_rests_once_more(bench, tmp_path, monkeypatch, capsys):
     bench.creeps = True
     ask, _ = operator(bench, [("", 20.0), ("", 0.0), ("", None)])

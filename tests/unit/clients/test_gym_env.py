@@ -111,6 +111,7 @@ def test_wrong_use_is_named(client, env):
         env.reset(options={"start": None})
 
 
+@pytest.mark.long
 def test_abandoned_episodes_are_ended_at_the_service(client):
     env = WorldEnv(client, world="sum", chunk_steps=4, **ASKED)
     for seed in range(100):  # More than the service keeps alive.

@@ -141,6 +141,7 @@ async def test_requests_that_are_refused_early_are_kept(connect, folder):
     assert [(r["action"], r["status"]) for r in rows] == [("sign in", 403), ("recorder: stop", 401)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", ["a\nb", "<img src=x>", BIDI, "\x00\x1b[31m", "é\ud83d\ude00" * 500]
 )
@@ -252,6 +253,7 @@ def test_a_torn_line_is_skipped_and_counted(folder):
     assert page.num_damaged == 1
 
 
+@pytest.mark.long
 def test_what_was_told_survives_a_kill(folder):
     child = subprocess.Popen(
         [sys.executable, "-c", CHILD, str(folder)], stdout=subprocess.PIPE, text=True, cwd="."
@@ -283,6 +285,7 @@ def test_old_files_make_room_for_new_ones(folder):
     assert kept == list(range(999, 999 - 80, -1))
 
 
+@pytest.mark.long
 def test_people_who_cannot_sign_in_do_not_displace_the_others(folder):
     log = AuditLog(folder, max_bytes=2**20)
     log.write(entry(0))

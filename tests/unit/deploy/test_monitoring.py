@@ -100,6 +100,7 @@ def test_all_files_are_here():
     assert len(ALL) > 80
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("place", "expression"), ALL, ids=[place for place, _ in ALL])
 def test_an_expression_asks_for_what_is_exported(place, expression, exported):
     parsed = promql.parse(expression)
@@ -179,6 +180,7 @@ def promtool():
     return needed_program("promtool", package="prometheus")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -194,6 +196,7 @@ def test_promtool_agrees(arguments, promtool):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.long
 def test_a_wrong_limit_fails_the_unit_tests(tmp_path, promtool):
     rules = (PROMETHEUS / "rules.yml").read_text()
     (tmp_path / "rules.yml").write_text(

@@ -70,6 +70,7 @@ async def test_order_and_filters(http, rows, query, expected):
     assert await ids(http, **query) == expected
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sort", ["id", "time", "duration", "task", "operator", "station"])
 @pytest.mark.parametrize("descending", [False, True])
 async def test_pages_join_to_the_list_even_if_a_row_goes(http, store, rows, sort, descending):

@@ -78,6 +78,7 @@ def test_it_commits_only_what_was_announced(ingest, store, attributes, batch_of)
     assert got.content == content
 
 
+@pytest.mark.long
 def test_its_death_is_survived(ingest, store, commit):
     ingest.finish("take-1", COUNTS)
     child = commit._child._process

@@ -37,6 +37,7 @@ def clock(residual_ms, **changes):
     return [fields | {"residual_rms_ms": residual_ms} | changes]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_aligned", [False, True])
 @pytest.mark.parametrize("kind", ["take", "recording", "episode"])
 async def test_an_incomplete_take_is_to_be_reviewed(settings, store, is_aligned, kind):
@@ -86,6 +87,7 @@ async def test_a_first_take_that_lost_over_a_tenth_of_its_steps(
     assert found == ({"take-1": [("beyond_limit", message)]} if is_listed else {})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("residual_ms", "changes", "is_listed"),
     [

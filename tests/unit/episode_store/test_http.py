@@ -86,6 +86,7 @@ async def test_pages(http, store):
     assert (await http.get("/v1/episodes", params={"limit": 0})).status_code == 422
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "path", "status", "words"),
     [

@@ -350,6 +350,7 @@ class Breaking:
         self.inner.close()
 
 
+@pytest.mark.long
 def test_forty_stations_at_once_read_no_log_again(start, attributes, batch_of, monkeypatch):
     """With its files closed in between, each batch would cost a reading of all before it."""
     read_again = []

@@ -56,6 +56,7 @@ def items(store):
 TAKES = ["episode/dream-1", "recording/take-1", "recording/take-2", "episode/twin-1"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("query", "expected"),
     [
@@ -158,6 +159,7 @@ async def test_reviewing_needs_its_own_scope(settings, store):
     assert store.review("a") is None
 
 
+@pytest.mark.long
 async def test_outliers_of_a_task_are_flagged_until_they_are_rejected(http, store):
     for number in range(9):
         write_take(store, f"take-{number}", num_steps=60 + number % 3, success=True)

@@ -176,6 +176,7 @@ def test_an_upload_outlives_the_rotation_of_its_key(serve, attributes, batch_of)
         assert client("bench").finish("take-1", COUNTS).state == "finished"
 
 
+@pytest.mark.long
 def test_uploads_begun_without_keys_go_on_with_keys(serve, attributes, batch_of):
     with serve({}) as client:
         begin(client("nobody"), attributes, batch_of)

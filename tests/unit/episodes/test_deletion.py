@@ -174,6 +174,7 @@ def test_a_recording_with_and_without_what_was_made_of_it(filled, tmp_path):
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("num_removed", range(6))
 def test_an_interrupted_deletion_is_completed_by_repeating_it(
     filled, tmp_path, monkeypatch, num_removed
@@ -294,6 +295,7 @@ def test_checkpoints_are_searched_by_name(filled, tmp_path):
     assert not receipt.complete
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("operator", ["Zoë", 'a"b', "x y", "a.b*", "ü\\n"])
 def test_pseudonyms_of_any_letters(store, made, tmp_path, operator):
     write_recording(store, "take", operator)

@@ -70,6 +70,7 @@ print(json.dumps({"appended": num_appended, "told": told, "left": left}))
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare to mount a small disk with")
 def test_a_disk_that_is_really_full(tmp_path):
     disk = tmp_path / "disk"

@@ -40,6 +40,7 @@ def encode(name, count):
     return units
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ENCODERS)
 def test_a_missing_picture_is_found_where_it_was(name):
     units = encode(name, 40)

@@ -85,6 +85,7 @@ def test_all_of_it_is_whole(store):
     assert len(everything(store)) == 12
 
 
+@pytest.mark.long
 def test_random_damage_is_found_named_and_never_served(whole_store, store, folder):
     """20 files and bytes drawn with a seed: verify names the place, reading refuses or is right."""
     truth = {name: read() for name, read in everything(whole_store).items()}
@@ -248,6 +249,7 @@ def test_forged_rows_of_one_storage_chunk(store, folder, name):
             read()
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("bounded_memory")
 @pytest.mark.parametrize("name", [TOUCH, VIDEO, STILLS])
 @pytest.mark.parametrize(

@@ -96,6 +96,7 @@ def test_without_a_distortion_the_lens_is_straight(store):
     np.testing.assert_allclose(found.poses[2], [0, -0.1, TABLE_Z_M + 0.001, 1, 0, 0, 0], atol=1e-7)
 
 
+@pytest.mark.long
 def test_the_error_is_that_of_three_pixels(store):
     about = written(store)
     found = clicked_poses(about, objects(), clicks())

@@ -312,6 +312,7 @@ def test_an_upload_under_a_foreign_claim_waits_and_overwrites_nothing(store, buc
     store.open(EPISODE).verify()
 
 
+@pytest.mark.long
 def test_equal_content_of_two_writers_is_no_conflict_in_the_bucket(store, bucket, url, tmp_path):
     made = episode_of()
     made.write(store)

@@ -63,6 +63,7 @@ def check_salvaged(store, truth, gone):
     return lost
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("array", "number", "stream", "rows"),
     [
@@ -103,6 +104,7 @@ def test_several_damages_add_up(store, folder, truth):
     check_salvaged(store, truth, gone)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [TOUCH, VIDEO, STILLS, f"{STILLS}_t_ref_ns"])
 @pytest.mark.parametrize("place", [-1, -5, -20, -28])
 def test_a_damaged_index_costs_no_sample(store, folder, truth, name, place):
@@ -130,6 +132,7 @@ def test_of_a_truncated_file_the_front_is_kept(store, folder, truth, name, kept)
     check_salvaged(store, truth, {name: list(range(kept, len(truth[name])))})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [TOUCH, VIDEO, f"{STILLS}_t_ref_ns"])
 @pytest.mark.parametrize("cut", [-16, -32, -6, 16])
 def test_an_index_that_is_cut_or_shifted_names_no_other_chunk(store, folder, truth, name, cut):

@@ -214,6 +214,7 @@ def damage_cases(folder):
     return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
+@pytest.mark.long
 def test_every_flipped_byte_is_found(made, store):
     """One bit of every file, at its start, middle and end: verify names it, nothing is silent."""
     made.write(store)
@@ -335,6 +336,7 @@ def write_streams(store, made, count, announced=0):
             writer.append(descriptor.name, values=np.zeros(3, "f4"), t_ref_ns=stamps)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("announced", [0, 101])
 def test_a_stream_too_many_is_refused_by_name(store, made, announced):
     """docs/episode_format.md: at most 100 streams."""

@@ -235,6 +235,7 @@ def test_arrays_are_what_the_twin_recorded(truths, readers, name):
     np.testing.assert_array_equal(grid.boxes_m, np.array(facts.object_boxes_m))
 
 
+@pytest.mark.long
 def test_streams_at_their_own_rates_are_brought_to_the_grid(truths, readers):
     truth, grid = truths["whole"].streams, EpisodeGrid(readers["whole"])
     # 30 Hz images: every second one. 100 Hz poses: every 20th is on every third step.

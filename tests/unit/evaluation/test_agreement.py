@@ -59,6 +59,7 @@ def test_three_policies_in_order_are_chance_once_in_six():
     assert math.isnan(chance_of_correlation(scores, [np.ones(3)], rng()))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("num_policies", [6, 10])
 def test_chance_is_that_of_scipy(num_policies):
     real = rng(2).random(num_policies)
@@ -135,6 +136,7 @@ def test_noise_shared_by_series_is_seen():
     assert abs(found[0, 2]) < 0.05 * found[0, 0]
 
 
+@pytest.mark.long
 def test_posterior_is_that_of_importance_sampling():
     scores = MatchedScores(binary([0.2, 0.8], 10, rng(10)), binary([0.3, 0.7], 10, rng(11)))
     draws = posterior_scores(scores, rng(12), num_draws=20_000)
@@ -213,6 +215,7 @@ def test_a_world_without_spread_has_no_correlation():
     assert (pearson.interval, pearson.undefined_share) == (None, 1.0)
 
 
+@pytest.mark.long
 def test_two_policies_have_no_correlation_also_over_several_tasks():
     """Two points lie on a line; four points of two policies only tell easy tasks from hard ones."""
     tasks = [

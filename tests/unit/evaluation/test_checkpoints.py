@@ -29,6 +29,7 @@ def changed(checkpoint: Checkpoint, **tensors: torch.Tensor | None) -> Checkpoin
     return Checkpoint(checkpoint.metadata, {k: v for k, v in merged.items() if v is not None})
 
 
+@pytest.mark.long
 def test_round_trip(policy_checkpoint, probe_checkpoint, tmp_path):
     for kind, checkpoint, build in (
         (KIND, policy_checkpoint, BehaviourCloningPolicy),

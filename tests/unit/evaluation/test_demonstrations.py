@@ -127,6 +127,7 @@ def test_a_judge_that_nothing_would_measure_is_refused_before_it_is_trained(tmp_
         run_train_judge([*flags, "--training.held-out-share", "0.02"])
 
 
+@pytest.mark.long
 def test_policies_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     output = tmp_path / "policy.safetensors"
     training = ["--training.num-training-steps", "4", "--training.held-out-share", "0.5"]

@@ -123,6 +123,7 @@ def test_an_empty_report_is_a_page_too(tmp_path):
     assert "Policies" not in text
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("part", [k for k in REPORT if k != "about"])
 def test_every_part_may_come_alone_or_be_missing(tmp_path, part):
     page(tmp_path, {part: REPORT[part]})

@@ -189,6 +189,7 @@ def test_one_policy_that_never_ended_leaves_two():
     assert lost(report(GOOD), *gone)["agreement"]["stand"]["pearson"] == "undefined (2 policies)"
 
 
+@pytest.mark.long
 def test_two_policies_of_two_tasks_are_no_correlation_together():
     first = report({name: TWO[name] for name in ("real", "dream")}).scores
     second = tuple(replace(s, task="pour", success=not s.success) for s in first)

@@ -61,6 +61,7 @@ async def test_studies_that_are_gone_are_told(root):
     assert not root.exists()
 
 
+@pytest.mark.long
 async def test_rates_and_intervals_are_those_of_the_rows(root):
     found = await read(root, "/v1/studies/touch")
     rates = {(one["task"], one["policy"], one["world"]): one for one in found["rates"]}
@@ -77,6 +78,7 @@ async def test_rates_and_intervals_are_those_of_the_rows(root):
         assert one["reasons"] == [UNRELIABLE] * ("D" in letters)
 
 
+@pytest.mark.long
 async def test_agreement_is_that_of_scipy_and_two_loops(root):
     found = await read(root, "/v1/studies/touch")
     agreement = {(one["task"], one["world"]): one for one in found["agreement"]}
@@ -109,6 +111,7 @@ async def test_two_policies_are_no_correlation_in_a_task_nor_over_all(tmp_path, 
         assert not any("Pearson's r is" in text for text in one["comments"])
 
 
+@pytest.mark.long
 async def test_disagreements_come_first_and_the_doubted_ones_last(root):
     listed = await read(root, "/v1/studies/touch/rollouts?limit=500")
     rows = listed["rollouts"]
@@ -218,6 +221,7 @@ async def test_unknown_names_and_limits(root, path, status):
     assert answer.headers["content-type"] == "application/problem+json"
 
 
+@pytest.mark.long
 async def test_reading_needs_its_scope(root):
     async with client(root, api_keys=KEYS) as opened:
         for path in ("/v1/studies", "/v1/studies/touch", "/v1/studies/touch/rollouts"):

@@ -19,6 +19,8 @@ from services.evaluation.success_classifier_training import (
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.shown_endings import ending_episode, final_ending
 
+pytestmark = pytest.mark.long
+
 
 def _episodes(demonstrations):
     return [ending_episode(d) for d in demonstrations]

@@ -39,6 +39,7 @@ def client():
         yield client
 
 
+@pytest.mark.long
 def test_an_imagined_episode_shows_what_the_world_showed(sources, client, tmp_path):
     source, store = sources[0], EpisodeStore(tmp_path)
     name = imagine_episode(source, client, "copy-first", store)
@@ -165,6 +166,7 @@ class _Coarse(CopyFirstWorld):
         return super().description.model_copy(update={"chunk_multiple": 8, "max_chunk_steps": 16})
 
 
+@pytest.mark.long
 def test_what_is_left_over_of_a_chunk_is_cut_off(tmp_path):
     stage = Stage("stack_bowls", "robot", TwinSettings())
     truth = record(stage, 3, TakeOptions(images=("camera_head",), streams="training"))

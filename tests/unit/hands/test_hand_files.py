@@ -78,6 +78,7 @@ def test_wrist_origin_and_lengths_of_directions(tmp_path):
     np.testing.assert_allclose(apart, np.broadcast_to(shift, apart.shape), rtol=0, atol=1e-15)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(40))
 def test_random_mjcf_chains_move_as_in_mujoco(seed, tmp_path):
     num_hinges = 3 + seed % 4

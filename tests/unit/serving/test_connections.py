@@ -236,6 +236,7 @@ def padded(first, num_bytes, name=b"X-A: "):
     return first + name + b"b" * (num_bytes - used) + b"\r\n\r\n"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("first", [GET, UPGRADE, POST + b"Content-Length: 3\r\n"])
 @pytest.mark.parametrize("num_bytes", [2**16 + 1, 100_000, 200_000])
 def test_headers_over_the_limit_are_refused_however_they_arrive(first, num_bytes):

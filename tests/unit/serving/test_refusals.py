@@ -73,6 +73,7 @@ async def test_an_address_that_guesses_is_slowed_and_a_valid_key_is_not(clock, k
     assert await guess(app, "10.0.0.9", 3) == [401, 401, 429]
 
 
+@pytest.mark.long
 async def test_all_addresses_together_are_slowed_and_a_valid_key_is_not(clock):
     app = probe_app(clock)
     found = []
@@ -82,6 +83,7 @@ async def test_all_addresses_together_are_slowed_and_a_valid_key_is_not(clock):
     assert (await ask(app, "10.0.7.1", KEY)).status_code == 200
 
 
+@pytest.mark.long
 async def test_an_address_that_goes_on_guessing_does_not_use_up_the_share_of_others(clock):
     app = probe_app(clock)
     await guess(app, "10.0.0.9", 300)
@@ -186,6 +188,7 @@ async def test_pages_of_other_sites_and_foreign_hosts_leave_a_line():
     assert found == [(403, "foreign_origin"), (421, "foreign_host")]
 
 
+@pytest.mark.long
 async def test_a_flood_is_counted_rather_than_logged(clock):
     app = probe_app(clock)
     with capture_logs() as logs:

@@ -42,6 +42,7 @@ def played(stage, seed, num_steps=NUM_GRID_STEPS - 1):
     return stage.simulation
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_the_first_observation_of_a_seed_is_the_same_in_all_four_tasks(world, seed):
     started = [world.reset(RolloutStart(name, seed, "")) for name in NAMES]
@@ -54,6 +55,7 @@ def test_the_first_observation_of_a_seed_is_the_same_in_all_four_tasks(world, se
             assert images.tobytes() == also.images[camera].tobytes()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("domain", ["robot", "human"])
 def test_demonstrations_of_a_seed_are_the_same_until_the_can_is_lifted(domain):
     stages = [Stage(name, domain, TwinSettings()) for name in NAMES]
@@ -83,6 +85,7 @@ def lift_of_contacts_n(simulation):
     return total_n
 
 
+@pytest.mark.long
 def test_the_same_motion_carries_the_weight_that_only_the_instruction_tells():
     thumbs_n, wrists_m = [], []
     for name, mass_kg in (("lift_full_can", 0.5), ("lift_empty_can", 0.125)):

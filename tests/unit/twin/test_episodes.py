@@ -85,6 +85,7 @@ def test_actions_are_relative_to_what_is_measured_at_step_0(robot_take):
     assert 1e-3 < np.abs(gap[:, 9:12]).max() < 0.05
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes_on_a_fresh_stage(robot_take):
     again = record(Stage("stand_bottle", "robot", TwinSettings()), 3, HEAD_ONLY)
     assert digest(again) == digest(robot_take)
@@ -118,6 +119,7 @@ def test_another_seed_gives_another_take(bottle_stage, robot_take):
     assert digest(record(bottle_stage, 4, HEAD_ONLY)) != digest(robot_take)
 
 
+@pytest.mark.long
 def test_cameras_that_are_not_asked_for_change_nothing_else(bottle_stage, robot_take):
     blind = record(bottle_stage, 3, BLIND)
     assert "camera_head" not in blind.streams
@@ -133,6 +135,7 @@ def test_a_miss_keeps_the_motion_and_loses_the_touch(bottle_stage, robot_take):
     assert miss.pad_forces_n.sum() < 0.2 * robot_take.pad_forces_n.sum()
 
 
+@pytest.mark.long
 def test_a_frozen_take_stops_where_it_is(bottle_stage, robot_take):
     frozen = record(bottle_stage, 3, TakeOptions(images=(), frozen_from_step=30))
     commanded = frozen.streams["action_commanded"].values
@@ -174,6 +177,7 @@ def test_ids_differ_for_every_way_to_make_an_episode():
     assert len(set(ids)) == len(ids) == 17
 
 
+@pytest.mark.long
 def test_images_of_every_fourth_step_and_the_last_three(bottle_stage, robot_take):
     options = TakeOptions(images=("camera_head",), image_every=4, streams="training")
     lean = record(bottle_stage, 3, options)
@@ -193,6 +197,7 @@ def test_images_of_every_fourth_step_and_the_last_three(bottle_stage, robot_take
     )
 
 
+@pytest.mark.long
 def test_actions_of_another_seed_are_those_of_its_own_take(bottle_stage, robot_take):
     take = record(bottle_stage, 5, TakeOptions(images=(), actions_of_seed=3))
     own = robot_take.streams["action_commanded"].values
@@ -202,6 +207,7 @@ def test_actions_of_another_seed_are_those_of_its_own_take(bottle_stage, robot_t
     assert take.attributes.quality["actions_of_seed"] == 3
 
 
+@pytest.mark.long
 def test_played_actions_repeat_the_take_they_come_from(bottle_stage, robot_take):
     actions = robot_take.streams["action_commanded"].values
     again = record(bottle_stage, 3, BLIND, played=PlayedActions("mine", actions, "by hand"))

@@ -112,6 +112,7 @@ def test_the_peg_has_two_millimetres_of_room(aside_m, touches, hand_made):
         assert (contacts_with_socket(simulation) > 0) is touches
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(6))
 def test_both_objects_are_in_the_head_cameras_view(peg_stage, seed):
     peg_stage.start(peg_stage.plan(seed))

@@ -52,6 +52,7 @@ def test_a_take_that_holds_still_reaches_nothing(stage):
     assert frozen.attributes.event_times_s == {}
 
 
+@pytest.mark.long
 def test_the_last_milestone_is_success(stage):
     stage.start(stage.plan(SEED))
     reached = stage.task.reached(stage.simulation)

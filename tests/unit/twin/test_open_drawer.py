@@ -51,6 +51,7 @@ def test_the_demonstrator_opens_the_drawer(domain):
         assert not peak_n[0].any()
 
 
+@pytest.mark.long
 def test_a_demonstrator_far_off_fails(stage):
     rates = [record(stage, seed, TakeOptions(0.1, images=())).attributes.success for seed in (0, 2)]
     assert rates == [False, False]
@@ -82,6 +83,7 @@ def test_the_verdict_follows_the_drawer(hand_made, distance_m, speed_m_s, expect
     assert task.succeeded(simulation) is expected[-1]
 
 
+@pytest.mark.long
 def test_a_drawer_that_a_hand_holds_open_is_not_done(stage):
     # The hand stops where the pull ends, before it unloads.
     episode = record(stage, 0, TakeOptions(images=(), frozen_from_step=40))
@@ -103,6 +105,7 @@ def test_seeds_place_the_handle_in_the_head_cameras_view(stage):
         assert ((pixels > 0) & (pixels < SMALL.image_width_px)).all()
 
 
+@pytest.mark.long
 def test_a_snapshot_keeps_where_the_cabinet_stands():
     world = TwinWorld(SMALL)
     commanded = record(Stage("open_drawer", "robot", SMALL), 5, BLIND).streams["action_commanded"]

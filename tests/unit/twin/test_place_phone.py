@@ -76,6 +76,7 @@ def test_a_miss_places_nothing(phone_stage, seed):
     assert not reached_at_every_step(phone_stage, seed, miss=True)[:, 1:].any()
 
 
+@pytest.mark.long
 def test_a_demonstrator_far_off_fails(phone_stage):
     assert not reached_at_every_step(phone_stage, 0, noise_m=0.1)[-1, -1]
 

@@ -28,6 +28,7 @@ def contacts_by_name_m(simulation):
     return np.array(found).reshape(-1, 3)
 
 
+@pytest.mark.long
 def test_the_demonstrator_grasps_high_and_then_low(stage):
     plan = stage.plan(1)
     stage.start(plan)
@@ -50,6 +51,7 @@ def test_the_demonstrator_grasps_high_and_then_low(stage):
     assert held[last].all()
 
 
+@pytest.mark.long
 def test_a_can_held_by_its_upper_half_is_not_enough(stage):
     episode = record(stage, 1, TakeOptions(images=(), frozen_from_step=22))
     assert tuple(episode.attributes.event_times_s) == ("touched", "lifted")

@@ -39,6 +39,7 @@ def test_the_verdict_follows_flag_and_plunger(hand_made, flag_rad, depth_m, expe
     assert task.succeeded(simulation) is expected[-1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("domain", ["robot", "human"])
 def test_a_strike_is_short_and_strong(domain):
     episode = record(Stage("strike_bell", domain, TwinSettings()), 0, TakeOptions(images=()))

@@ -37,6 +37,7 @@ def test_the_verdict_follows_the_lever(hand_made, degrees, speed_rad_s, expected
     assert task.succeeded(simulation) is expected[-1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("domain", ["robot", "human"])
 def test_the_right_palm_turns_the_lever_against_its_friction(domain):
     stage = Stage("turn_lever", domain, TwinSettings())
@@ -53,6 +54,7 @@ def test_the_right_palm_turns_the_lever_against_its_friction(domain):
     assert 60 < np.rad2deg(yaw_rad[0] - yaw_rad[-1]) < 80
 
 
+@pytest.mark.long
 def test_a_palm_that_stays_at_the_lever_is_not_done():
     stage = Stage("turn_lever", "robot", TwinSettings())
     # The hand stops where the push ends.

@@ -1,6 +1,7 @@
 """Images as other cameras take them: the truth stays where the intrinsics say."""
 
 import numpy as np
+import pytest
 import torch
 
 from services.world_model.dynamics.start_reader import FirstStep, StartReader
@@ -53,6 +54,7 @@ def test_a_spot_moves_as_the_intrinsics_say():
     assert (moved[same] == 0).all()
 
 
+@pytest.mark.long
 def test_light_colour_noise_and_sharpness_vary_within_bounds():
     first = steps(with_a_spot(32.0, 32.0), 400)
     images, _ = as_another_camera(first, torch.Generator().manual_seed(1))

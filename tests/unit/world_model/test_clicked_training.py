@@ -39,6 +39,8 @@ from tests.unit.world_model.test_state_training import (  # noqa: F401 (fixture)
 )
 from tests.unit.world_model.toy_grid import changed
 
+pytestmark = pytest.mark.long
+
 OPTIONS = TakeOptions(images=("camera_head",), image_every=4, streams="training")
 NUM_TAKES = 6
 
@@ -103,7 +105,6 @@ def clicks_file(truths, numbers):
     )
 
 
-@pytest.mark.long
 def test_clicks_are_poses_of_the_first_step_alone(store, truths):
     store.set_clicks(name_of(1), clicks_on(truths[1]))
     loaded = load_scene_episodes(str(store.root), clicks=clicks_file(truths, [0]))

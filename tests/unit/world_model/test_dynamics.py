@@ -425,6 +425,7 @@ def test_hands_that_stand_for_two_seconds_bring_everything_to_rest(model):
     assert not any(torch.equal(*pair) for pair in hidden)
 
 
+@pytest.mark.long
 def test_hands_that_creep_do_not_stand_still(model):
     memory, path = begun(model), still_actions(16 * 20)
     path[:, 2] = 2e-5 * np.arange(1, len(path) + 1)

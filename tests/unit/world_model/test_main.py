@@ -10,6 +10,7 @@ from services.world_model.command_line import run_show, run_train
 from tests.contracts.test_world import untrained_state_checkpoint
 
 
+@pytest.mark.long
 def test_train_then_show(toy_store, tmp_path, capsys):
     output, report = tmp_path / "m.safetensors", tmp_path / "report.json"
     flags = {

@@ -89,6 +89,7 @@ def test_larger_subsets_contain_smaller_ones_in_any_order():
         subset_by_hash(episodes, 10, what="robot")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("streaming", [False, True])
 def test_subsets_of_both_domains_leave_the_held_out_robots_as_they_are(settings, streaming):
     settings = settings.model_copy(update={"streaming": streaming})
@@ -109,6 +110,7 @@ def test_subsets_of_both_domains_leave_the_held_out_robots_as_they_are(settings,
     assert [e.episode_id for e in load_split(given)[1]] == ["toy-50"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("streaming", [False, True])
 def test_no_episode_counts_twice_and_all_have_one_rate(settings, tmp_path, streaming):
     settings = settings.model_copy(update={"streaming": streaming, "human_episodes": None})
@@ -133,6 +135,7 @@ def test_tasks_that_people_and_robots_share_are_refused_unless_allowed(settings)
     check_tasks([*robots, *people, *heldout], allowed)
 
 
+@pytest.mark.long
 def test_a_checkpoint_proves_what_it_was_trained_on(settings):
     report = train(settings.model_copy(update={"max_steps": 1}))
     trained, heldout = load_split(settings)

@@ -48,6 +48,7 @@ def batch(toy_episodes):
     return WindowSampler(toy_episodes, np.random.default_rng(0), max_steps=17).draw(2, 17)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_every_option_learns_and_predicts(tiny_config, batch, options):
     model = model_with(tiny_config, **options)
@@ -66,6 +67,7 @@ def test_every_option_learns_and_predicts(tiny_config, batch, options):
     assert bool(future.tactile_kpa.any()) == model.config.use_touch
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("conditioning", ["adaln", "cross_attention"])
 def test_each_latent_depends_on_its_own_actions_first(tiny_config, batch, conditioning):
     """With attention off, latent j is a function of actions 4j-3 … 4j, and step t of action t."""

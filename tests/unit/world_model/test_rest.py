@@ -123,6 +123,7 @@ def test_hands_that_come_back_within_a_latent_step_have_moved():
     assert not followed.at_rest.any()
 
 
+@pytest.mark.long
 def test_resting_rollouts_of_a_batch_leave_moving_ones_alone(world, started, commands):
     still = np.repeat(commands[:1], 64, axis=0)
     resting = world.step(started.state, still, seed=0, selector=TOUCH_ONLY).state

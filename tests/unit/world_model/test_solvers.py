@@ -48,6 +48,7 @@ def exact(index):
     return solved.y[:, -1].reshape(start.shape)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("num_steps", [1, 2, 3, 5, 20])
 @pytest.mark.parametrize("shift", [1.0, 3.0])
 def test_unipc_is_that_of_diffusers(num_steps, shift):

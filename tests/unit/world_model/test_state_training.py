@@ -125,6 +125,7 @@ def test_a_reader_finds_held_out_blocks(reader, held_out):
     assert error.presence == 1.0
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_reader(table, config):
     settings = ReaderSettings(num_steps=3, batch=4, bfloat16=False)
     one = train_reader(table, config, settings, seed=5).state_dict()

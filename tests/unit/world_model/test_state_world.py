@@ -162,6 +162,7 @@ def test_images_of_a_batch_are_drawn_together_as_requested(world, monkeypatch):
             assert np.abs(drawn.astype(int) - images.astype(int)).max() <= 1
 
 
+@pytest.mark.long
 def test_the_size_of_objects_is_reported_beside_the_usual_one(world):
     started = world.reset(from_observation(world))
     for factors, expected in (((1.0, 0.75), 0.25), ((1.3, 0.9), 0.3)):

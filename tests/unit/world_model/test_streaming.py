@@ -181,6 +181,7 @@ def test_streaming_splits_and_reports_as_training_in_memory(toy_store, train_set
         train(given)
 
 
+@pytest.mark.long
 def test_the_command_line_streams(toy_store, tmp_path, capsys):
     output, report = tmp_path / "m.safetensors", tmp_path / "report.json"
     flags = {

@@ -148,6 +148,7 @@ def test_a_learned_tokenizer_needs_its_file(train_settings, toy_episodes, tmp_pa
         train_on(toy_episodes[:4], toy_episodes[4:], both)
 
 
+@pytest.mark.long
 def test_the_file_decides_the_network(settings):
     about = train_tokenizer(settings).metadata
     network = about.network(NetworkConfig(video_width=16))

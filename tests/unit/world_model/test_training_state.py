@@ -109,6 +109,7 @@ def test_a_state_of_another_run_is_refused(toy_store, settings, tmp_path):
             read_state(path, {})
 
 
+@pytest.mark.long
 def test_a_run_can_start_from_a_checkpoint(toy_episodes, toy_episode, settings, tmp_path):
     heldout = [toy_episode(10_000, 25)]
     first = train_on(toy_episodes[:3], heldout, settings.model_copy(update={"max_steps": 2}))
@@ -139,6 +140,7 @@ def test_a_run_can_start_from_a_checkpoint(toy_episodes, toy_episode, settings, 
         train_on(toy_episodes[3:], heldout, later.model_copy(update={"network": wider}))
 
 
+@pytest.mark.long
 def test_a_state_is_kept_now_and_then(toy_episodes, toy_episode, settings, monkeypatch):
     kept = []
     monkeypatch.setattr(

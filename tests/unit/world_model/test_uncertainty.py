@@ -51,6 +51,7 @@ def asked(dynamics, table, start):
     return torch.cat(found, dim=1)
 
 
+@pytest.mark.long
 def test_bounds_are_of_the_chunks_that_rollouts_are_asked(dynamics, table):
     measured = evaluate_dynamics(dynamics, table[0])
     chunks = torch.cat([asked(dynamics, table[0], start) for start in (0, 16, 32)], dim=1)
@@ -60,6 +61,7 @@ def test_bounds_are_of_the_chunks_that_rollouts_are_asked(dynamics, table):
     np.testing.assert_allclose(measured.distance, distance, rtol=1e-3)
 
 
+@pytest.mark.long
 def test_a_long_chunk_is_as_doubtful_as_the_worst_of_its_parts():
     checkpoint = seeing_checkpoint()
     checkpoint.dynamics.core.highest.zero_()

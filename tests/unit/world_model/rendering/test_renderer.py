@@ -113,6 +113,7 @@ def test_the_table_is_redrawn_as_the_camera_moves_if_it_may_be(image, still, red
     np.testing.assert_allclose(table, share if redraws_table else 0.0, rtol=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("uses_bfloat16", [False, True])
 def test_alone_or_in_company_an_image_is_the_same(small, image, still, uses_bfloat16):
     rng = np.random.default_rng(0)
@@ -128,6 +129,7 @@ def test_alone_or_in_company_an_image_is_the_same(small, image, still, uses_bflo
     np.testing.assert_array_equal(again, together)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("uses_bfloat16", [False, True])
 def test_a_trace_of_single_images_gives_the_same_bytes(small, image, still, uses_bfloat16):
     rng = np.random.default_rng(1)
@@ -163,6 +165,7 @@ def test_a_scene_without_slots_is_drawn(renderer, image, still):
     assert drawn.shape == (1, 64, 64, 3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", [[0, 0, 0.0], [0, 0, -1.0], [1e5, -1e5, 1e5], [0.05, 0.08, 0.0]])
 @pytest.mark.parametrize("flip", [0.0, np.pi / 2, np.pi])
 def test_wherever_the_camera_is_images_are_drawn(renderer, image, still, place, flip):

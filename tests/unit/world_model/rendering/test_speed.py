@@ -101,6 +101,7 @@ def test_images_are_those_of_the_plain_formula(image, still, which, uses_bfloat1
         assert (off > 0).mean() < 1e-3
 
 
+@pytest.mark.long
 def test_a_start_that_is_remembered_draws_the_same_bits(small, image, still):
     remembering = Renderer(weights_of(small))
     states = moved_states(still)
@@ -138,6 +139,7 @@ def drawings_of(image, still):
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("uses_bfloat16", [False, True])
 def test_rollouts_drawn_together_are_drawn_as_one_at_a_time(small, image, still, uses_bfloat16):
     torch.set_num_threads(1)

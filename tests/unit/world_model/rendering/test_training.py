@@ -32,6 +32,7 @@ def trained(clips, small, settings):
     return network
 
 
+@pytest.mark.long
 def test_a_short_training_draws_nearer_to_the_truth_than_the_warp(trained, clips):
     report = evaluate_drawing(trained, clips)
     drawn, warp = report.chunks["drawn"][0], report.chunks["warp"][0]

@@ -45,6 +45,7 @@ def _pretrained(model):
     }
 
 
+@pytest.mark.long
 def test_every_pretrained_tensor_reaches_the_model(model, transformer, autoencoder):
     loaded = _pretrained(model)
     expected = transformer.state_dict()
@@ -77,6 +78,7 @@ def test_the_original_layout_gives_the_same_model(
     assert all(torch.equal(there[n], t) for n, t in model.state_dict().items())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_a_checkpoint_holds_every_bit_and_the_text_features(
     tmp_path, full_config, pretrained_folder, precision, metadata
@@ -142,6 +144,7 @@ def _full_size():
         return JointWorldModel(config)
 
 
+@pytest.mark.long
 def test_kept_clean_tokens_change_nothing(model, toy_episodes):
     with torch.no_grad():
         for weight in model.parameters():

@@ -68,6 +68,7 @@ def relative_error(got, expected):
     return ((got - expected).norm() / expected.norm()).item()
 
 
+@pytest.mark.long
 def test_each_latent_with_its_own_time_equals_times_per_token(
     full_config, transformer, latents, text
 ):

@@ -37,6 +37,7 @@ def _predicted(model, request):
     return model.predict(inputs, noise)
 
 
+@pytest.mark.long
 def test_bfloat16_weights_predict_nearly_the_same(model, episode):
     request = cut_window(episode, 0, 17, action_kind="commanded").request
     exact = _predicted(model, request)
