@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 import structlog
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from dextouch.episodes import (
     SPLITS,
@@ -35,6 +35,8 @@ from dextouch.episodes import (
     touched_objects,
 )
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.geometry import invert, pose_from_transform, transform, transform_from_pose
+from dextouch.geometry.rotations import rotation_from_vector, vector_from_rotation
 from dextouch.schemas import Domain, ObjectClicks, SceneObjects, load_object_clicks
 from services.world_model.checkpoints import learned_tasks, scene_digest
 from services.world_model.dynamics.features import DynamicsConfig
@@ -44,6 +46,8 @@ from services.world_model.training.scene_table import vocabulary
 from services.world_model.training.transfer import Base
 
 logger = structlog.get_logger(__name__)
+# Fewer takes with clicks and touch correct no grip: their median would hardly be better than it.
+_LEAST_GRIPS: Final = 5
 _NEEDED: Final = (needs.WHOLE, needs.OUTCOME, needs.TOUCH, needs.FIRST_IMAGE)
 
 
@@ -68,6 +72,7 @@ class SceneGrid(EpisodeGrid):
         super().__init__(reader, image_px)
         self._file, self._clicked = objects, clicked
         self._listed = () if objects is None else listed_objects(self.about, objects)
+        self._Ts_touched_object: Float64[np.ndarray, "objects 4 4"] | None = None
 
     @property
     def object_names(self) -> tuple[str, ...]:
@@ -90,9 +95,43 @@ class SceneGrid(EpisodeGrid):
             track = ObjectTrack.unknown(len(self), len(self.object_names))
         if self._clicked is not None:
             track = track.filled(self._clicked.track(len(self)))
-        if self._file is None or track.known.any(axis=0).all():
+        if self._touched is None or track.known.any(axis=0).all():
             return track
-        return track.filled(touched_objects(self, self._file))
+        return track.filled(self._touched)
+
+    @cached_property
+    def _touched(self) -> ObjectTrack | None:
+        """Poses from touch, corrected if there is a correction; None where touch says nothing."""
+        if self._file is None or not self._is_touched:
+            return None
+        track = touched_objects(self, self._file)
+        if self._Ts_touched_object is None:
+            return track
+        Ts = transform_from_pose(track.poses.astype(np.float64)) @ self._Ts_touched_object
+        return replace(track, poses=pose_from_transform(Ts).astype(np.float32))
+
+    @property
+    def _is_touched(self) -> bool:
+        return self.success and any(one.touch is not None for one in self._listed)
+
+    def grip_errors(
+        self,
+    ) -> tuple[Float64[np.ndarray, "objects 4 4"], Bool[np.ndarray, " objects"]]:
+        """T_touched_object at the first step, of objects that were clicked and touched, too."""
+        count = len(self.object_names)
+        if self._clicked is None or self._touched is None:
+            return np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, dtype=np.bool_)
+        touched = transform_from_pose(self._touched.poses[0].astype(np.float64))
+        clicked = transform_from_pose(self._clicked.poses)
+        return invert(touched) @ clicked, np.logical_and(
+            self._clicked.known, self._touched.known[0]
+        )
+
+    def correct_grips(self, Ts_touched_object: Float64[np.ndarray, "objects 4 4"]) -> None:
+        """Correct poses from touch by what grips of the task are off, before they are used."""
+        self._Ts_touched_object = Ts_touched_object
+        for name in ("_touched", "objects", "content_sha256"):
+            self.__dict__.pop(name, None)
 
     @cached_property
     def content_sha256(self) -> str:
@@ -107,8 +146,7 @@ class SceneGrid(EpisodeGrid):
     def may_have_poses(self) -> bool:
         """Whether the pose of an object may be known at some step, as seen without reading it."""
         is_clicked = self._clicked is not None and bool(self._clicked.known.any())
-        is_touched = self.success and any(one.touch is not None for one in self._listed)
-        return is_clicked or is_touched or has_object_poses(self.reader)
+        return is_clicked or self._is_touched or has_object_poses(self.reader)
 
 
 def load_scene_episodes(
@@ -261,7 +299,34 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
             )
     data = StateData(training, heldout)
     _check_together(data)
+    _correct_grips(data.episodes)
     return data
+
+
+def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
+    """Correct poses from touch by the takes of a task that have clicks, too, for each domain.
+
+    What a grip is stated to be is off by much the same in all takes.
+    """
+    grids = [one for one in episodes if isinstance(one, SceneGrid)]
+    for task, domain in sorted({(one.task, one.domain) for one in grids}):
+        of_both = [one for one in grids if (one.task, one.domain) == (task, domain)]
+        errors = [one.grip_errors() for one in of_both]
+        Ts, known = np.stack([T for T, _ in errors]), np.stack([is_known for _, is_known in errors])
+        corrections = np.tile(np.eye(4), (known.shape[1], 1, 1))
+        for index in np.flatnonzero(known.sum(axis=0) >= _LEAST_GRIPS):
+            own = Ts[known[:, index], index]
+            turn = np.median(vector_from_rotation(own[:, :3, :3]), axis=0)
+            shift_m = np.median(own[:, :3, 3], axis=0)
+            corrections[index] = transform(rotation_from_vector(turn), shift_m)
+            logger.info(
+                "touch_corrected_by_clicks", task=task, domain=domain,
+                object=of_both[0].object_names[index],
+                shift_mm=round(1e3 * float(np.linalg.norm(shift_m)), 1),
+                turn_deg=round(float(np.rad2deg(np.linalg.norm(turn))), 1), takes=len(own),
+            )  # fmt: skip
+        for one in of_both:
+            one.correct_grips(corrections)
 
 
 def _elsewhere(people: list[SceneGrid], heldout: Sequence[EpisodeGrid]) -> list[SceneGrid]:

@@ -19,6 +19,7 @@ from services.twin.take_options import TakeOptions
 from services.world_model.checkpoints import read_state_checkpoint, write_state_checkpoint
 from services.world_model.dynamics.features import TouchCodec
 from services.world_model.settings import CoreSettings, ReaderSettings, StateTrainSettings
+from services.world_model.training import state_data
 from services.world_model.training.core_training import CoreData, _read_start, start_steps
 from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_table import SceneTable, scene_table
@@ -263,6 +264,32 @@ def test_touch_gives_poses_of_takes_that_succeeded(store, truths):
             assert np.linalg.norm(off_m) < 0.02
             assert one.content_sha256 != one.reader.content_sha256
     check_drawable(loaded)
+
+
+def test_clicks_correct_what_a_grip_is_stated_to_be(store, truths, tmp_path, monkeypatch):
+    monkeypatch.setattr(state_data, "_LEAST_GRIPS", 2)
+    succeeded = [n for n, truth in enumerate(truths) if truth.attributes.success]
+    clicked, others = succeeded[:2], succeeded[2:]
+    assert others
+    given = json.loads(clicks_file(truths, clicked).model_dump_json())
+    # Held 4 cm from the middle of the bottle, and 30° from its axis, as it never is.
+    touch = {"hand": "right", "closing_deg": -120.0, "point_m": [0.0, 0.0, 0.05]}
+    given["tasks"]["stand_bottle"][0]["touch"] = touch
+    path = tmp_path / "clicks.json"
+    path.write_text(json.dumps(given))
+    data = load_state_data(
+        StateTrainSettings(episodes=(str(store.root),), clicks=path, image_px=PX, heldout_share=0.3)
+    )
+    by_name = {one.episode_id: one for one in data.episodes}
+    for number in others:
+        one, true = by_name[name_of(number)], transform_from_pose(true_pose(truths[number]))
+        assert one.objects.sources == ("touch",)
+        found = transform_from_pose(one.objects.poses[0, 0].astype(float))
+        assert np.linalg.norm(found[:2, 3] - true[:2, 3]) < 0.015
+        turned_rad = np.arccos(np.clip(found[:3, 2] @ true[:3, 2], -1, 1))
+        assert np.rad2deg(turned_rad) < 6.0
+    for number in clicked:
+        assert by_name[name_of(number)].objects.sources == ("clicks",)
 
 
 def test_cores_start_from_readings_where_touch_gave_the_pose(config):  # noqa: F811
